@@ -207,16 +207,6 @@ def test_a_wrong_scan_is_refused_with_its_place(tmp_path: Path, scan: str, text:
     assert all(problem.line == N_LINES + 1 for problem in caught.value.problems), lines
 
 
-def test_a_figure_that_needs_an_image_is_refused_without_one(tmp_path: Path) -> None:
-    session = opened(tmp_path, f"use: climb, {OVER}, points: 3")
-    text = (tmp_path / "s.yaml").read_text("utf-8")
-    start = text.index("  - image"), text.index("scan:")
-    (tmp_path / "s.yaml").write_text(text[: start[0]] + text[start[1] :], "utf-8")
-    assert session.assembly.search is not None
-    with pytest.raises(ConfigError, match="no shot has a filling_fraction: it takes no image"):
-        labseq.Session.open(tmp_path / "s.yaml")
-
-
 def test_a_scan_whose_shots_were_all_skipped_is_complete_when_it_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

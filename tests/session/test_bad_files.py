@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import labseq
@@ -135,20 +133,6 @@ def test_wrong_options_are_reported_with_the_files() -> None:
     ]
 
 
-@pytest.mark.parametrize("dry_run", [True, "slow"])
-def test_a_wrong_kind_of_dry_run_is_refused(dry_run: Any) -> None:
-    write({})
-    assert messages(dry_run=dry_run) == [f"dry_run is {dry_run!r}; expected one of 'off', 'full', 'fast'"]
-
-
-@pytest.mark.parametrize("overrides", ["shots=5", [("shots", "5")]])
-def test_overrides_of_the_wrong_type_are_refused(overrides: Any) -> None:
-    write({})
-    assert messages(overrides=overrides) == [
-        f"overrides is {overrides!r}; expected a list of texts such as ['shots=5']"
-    ]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -165,14 +149,6 @@ def test_what_a_constructor_refuses_has_its_place(old: str, new: str, words: str
     (message,) = messages()
     assert message.startswith("p.yaml:67:3: ")
     assert words in message
-
-
-def test_thresholds_are_looked_for_beside_the_profile() -> None:
-    write({"threshold: 1630": "threshold: t.npy"})
-    Path("lab").mkdir()
-    Path("p.yaml").rename("lab/p.yaml")
-    np.save("lab/t.npy", np.full((20, 20), 1630.0))
-    check(labseq.Session.open("s.yaml", profile=os.fspath(Path("lab", "p.yaml"))))
 
 
 PLUGIN = """

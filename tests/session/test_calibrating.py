@@ -152,14 +152,19 @@ def test_another_one_than_that_in_use_may_be_chosen(bench: Bench) -> None:
     bench.use("overlay", values={"offset_m": [2e-7, 0.0]})
     bench.write(f"calibrations: {{use: {{overlay: {old.id[:6]}}}}}\n")
     assert bench.session().assembly.bench.calibrations["overlay"].id == old.id
-
-
-def test_a_choice_that_does_not_exist_is_refused_with_its_place(bench: Bench) -> None:
     bench.write("calibrations: {use: {overlay: abc}}\n")
     with pytest.raises(ConfigError, match="there is no calibration of overlay 'abc'") as caught:
         bench.session()
     (note,) = caught.value.problems[0].notes
     assert note.startswith("asked for by the key 'calibrations.use.overlay' of ")
+
+
+def test_a_dry_run_of_a_real_lab_has_a_store_of_its_own(bench: Bench) -> None:
+    path = bench.folder / "bench.yaml"
+    path.write_text(PROFILE.replace("camera: {use: virtual}", "camera: {use: andor}"), "utf-8")
+    real, rehearsed = (open_store(str(path), mode)[0].folder for mode in ("off", "full"))
+    assert real == bench.folder / "calibrations" / "bench"
+    assert rehearsed == real / "dry-run"
 
 
 def test_one_of_another_grid_is_refused(bench: Bench) -> None:
@@ -179,23 +184,6 @@ def test_a_damaged_one_that_is_in_use_is_refused(bench: Bench, kind: Calibration
     assert problem.source == str(path)
     assert f"'labseq calibration use {kind}=off --profile " in problem.notes[0]
     assert "bench.yaml' puts it aside" in problem.notes[0]
-
-
-def test_a_damaged_note_of_what_is_in_use_is_reported_once(bench: Bench) -> None:
-    bench.use("overlay")
-    (bench.store.folder / "active.json").write_text("{", "utf-8")
-    with pytest.raises(ConfigError, match=r"active\.json: this file is damaged") as caught:
-        bench.session()
-    assert len(caught.value.problems) == 1
-    assert not bench.session("profile.calibrations=off").assembly.bench.calibrations
-
-
-def test_a_dry_run_of_a_real_lab_has_a_store_of_its_own(tmp_path: Path) -> None:
-    path = tmp_path / "lab.yaml"
-    path.write_text(PROFILE.replace("camera: {use: virtual}", "camera: {use: andor}"), "utf-8")
-    real, rehearsed = (open_store(str(path), mode)[0].folder for mode in ("off", "full"))
-    assert real == tmp_path / "calibrations" / "lab"
-    assert rehearsed == real / "dry-run"
 
 
 def test_a_tone_program_is_made_with_them(bench: Bench) -> None:

@@ -110,28 +110,6 @@ def test_a_scanned_variable_changes_what_follows_from_it_and_nothing_else(tmp_pa
     assert done.scan["written"][0] == ["20 ms", "30 us"]
 
 
-def test_what_depends_on_a_scanned_setting_is_scanned_too(tmp_path: Path) -> None:
-    done = run(tmp_path, "scan: {shot.1.image.exposure: [30 ms, 45 ms]}\n")
-    exposures = [[image.exposure_s for image in shot.images] for shot in done.shots]
-    assert exposures == [pytest.approx([x, 2 * x, 2 * x / 3]) for x in (0.03, 0.045)]
-
-
-def test_a_scanner_may_choose_a_variable(tmp_path: Path) -> None:
-    scan = """scan:
-  use: climb
-  over: {variables.dop: {from: 1, to: 9}, variables.hold: {from: 5 ms, to: 60 ms}}
-  maximise: filling_fraction
-  points: 3
-"""
-    done = run(tmp_path, scan)
-    first = done.shots[0].parameters
-    assert (first["variables.dop"], first["variables.hold"]) == (2, 0.02)
-    for shot in done.shots:
-        assert shot.parameters["planner.degree_of_parallelism"] == shot.parameters["variables.dop"]
-        assert isinstance(shot.parameters["variables.dop"], int)
-        assert shot.cycles[0].window_s == pytest.approx(shot.parameters["variables.hold"] + 0.005)
-
-
 def test_a_run_with_expressions_is_resumed(tmp_path: Path) -> None:
     scan = "scan: {variables.hold: [20 ms, 35 ms]}\nrepeats: 2\n"
     whole = run(tmp_path, scan)

@@ -95,13 +95,6 @@ def test_a_file_that_is_no_npy_is_refused(tmp_path: Path, content: bytes) -> Non
     assert "expected a two-dimensional array" in message(tmp_path / "a.npy")
 
 
-def test_a_header_that_promises_too_much_is_refused(tmp_path: Path) -> None:
-    with (tmp_path / "a.npy").open("wb") as file:
-        header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 40, 1 << 20)}
-        np.lib.format.write_array_header_2_0(file, header)
-    assert "it cannot be read" in message(tmp_path / "a.npy")
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -203,13 +196,3 @@ def test_a_file_that_is_no_shot_is_refused(tmp_path: Path) -> None:
     assert "this is a folder" in message(tmp_path)
     np.save(tmp_path / "loading.npy", ARRAY)
     assert "did you mean 'loading.npy'?" in message(tmp_path / "laoding.npy")
-
-
-def test_a_shot_without_cycles_is_refused(tmp_path: Path) -> None:
-    sequence = tmp_path / "load.yaml"
-    lines = (ROOT / "sequences" / "compact_225.yaml").read_text("utf-8").splitlines()
-    kept = [line for line in lines if "rearrange" not in line]
-    sequence.write_text("\n".join(kept), "utf-8")
-    with labseq.Session.open(sequence, profile="virtual", shots=1, seed=1, output=tmp_path) as session:
-        path = shot_file(session.run())
-    assert "this shot has no cycles" in message(path)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.errors import DeviceError, InvalidPlanError, PlanError
+from labseq.errors import InvalidPlanError, PlanError
 from labseq.testing.fakes import RecordingObserver
 
 from .whole_runs import ROOT, run
@@ -142,26 +142,3 @@ def test_a_plugin_that_changes_the_folder_does_no_harm(tmp_path, monkeypatch):
         assert session.run().path.is_relative_to(tmp_path / "here")
     assert Path.cwd() != tmp_path
     assert list((tmp_path / "here" / ".active").iterdir()) == []
-
-
-def test_a_detector_of_the_wrong_shape_stops_the_run(tmp_path):
-    text = """
-import numpy as np
-import labseq
-LABSEQ_API = 1
-
-class Wrong:
-    def __init__(self, settings, context): pass
-    def detect(self, frame):
-        return np.zeros((3, 3), bool), np.zeros((3, 3), np.float32)
-
-@labseq.plugin.hookimpl
-def labseq_register(registry):
-    registry.detector("wrong", Wrong)
-"""
-    path = with_plugin(tmp_path, text, SEQUENCE.replace("use: mine", "use: psca"))
-    profile = (ROOT / "hardware_profiles" / "virtual.yaml").read_text(encoding="utf-8")
-    start, end = profile.index("\ndetector:"), profile.index("\ndevices:")
-    (tmp_path / "virtual.yaml").write_text(profile[:start] + "\ndetector: {use: wrong}\n" + profile[end:])
-    with pytest.raises(DeviceError, match="the occupancy is bool"):
-        run(tmp_path, path, seed=1)

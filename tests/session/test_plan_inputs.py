@@ -54,29 +54,13 @@ def test_what_is_no_target_is_refused(text: str) -> None:
         parse_target(text)
 
 
-@settings(max_examples=40)
-@given(st.text("abcxyz019:=,[]. ", max_size=30))
-def test_any_target_is_read_or_refused(text: str) -> None:
-    try:
-        name, values = parse_target(text)
-    except ConfigError:
-        return
-    assert name
-    assert all(key.isidentifier() for key in values)
-
-
 def test_a_target_is_centred_or_at_its_origin() -> None:
     assert first_site(inputs()) == (2, 2)
     assert first_site(inputs(origin="0,5")) == (0, 5)
+    assert first_site(inputs(str(SEQUENCE), origin="4,1")) == (4, 1)
+    assert inputs(str(SEQUENCE)).target.n_atoms == 225
     assert first_site(inputs("compact:15x15,origin=[5, 0]")) == (5, 0)
     assert first_site(inputs("compact:15x15,origin=[5, 0]", origin=" 1 , 2 ")) == (1, 2)
-
-
-def test_the_target_of_a_sequence() -> None:
-    found = inputs(str(SEQUENCE))
-    assert found.target.n_atoms == 225
-    assert first_site(found) == (2, 2)
-    assert first_site(inputs(str(SEQUENCE), origin="4,1")) == (4, 1)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.errors import CheckFailedError, ConfigError, DeviceError
+from labseq.errors import CheckFailedError, ConfigError
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 
@@ -149,18 +149,6 @@ def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
     assert len(stopped.shots) == 5
 
 
-def test_policies_are_in_the_record(tmp_path: Path) -> None:
-    step = "{}\n    policy: {timeout: 2 s, retries: 1}"
-    path = sequence(tmp_path, step=step, policy={"over_budget": "warn"})
-    with labseq.Session.open(path) as session:
-        resolved = session.assembly.resolved
-        assert resolved["shot"][0]["policy"] == {"timeout": 2.0, "retries": 1}
-        assert "policy" not in resolved["shot"][1]
-        assert resolved["policy"]["over_budget"] == "warn"
-        assert resolved["profile"]["budgets"]["plan"] == 5e-3
-        assert session.assembly.policy.steps[0].over_budget == "warn"
-
-
 def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
     path = write(tmp_path)
     text = path.read_text(encoding="utf-8").replace(
@@ -221,16 +209,6 @@ def test_a_scan_cannot_change_a_policy(tmp_path: Path) -> None:
     path.write_text(text.replace("500 ms}", "500 ms}\n    policy: {retries: 0}"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"a scan cannot change 'shot\.0\.policy\.retries'"):
         labseq.Session.open(path)
-
-
-def test_options_change_policies(tmp_path: Path) -> None:
-    path = sequence(tmp_path, step="{at: [0]}", attempts=1)
-    changes = ["policy.when_exhausted=skip_point", "policy.on_failure=repeat_shot"]
-    output = tmp_path / "data"
-    with labseq.Session.open(path, seed=5, overrides=changes, output=output) as session:
-        assert list(session.run().skipped) == [0]
-    with labseq.Session.open(path, seed=5, output=output) as session, pytest.raises(DeviceError):
-        session.run()
 
 
 def test_an_adaptive_scan_reports_a_point_whose_last_shots_are_skipped(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def test_another_planner_is_checked_and_counted(taken):
 
 
 def test_one_setting_of_the_own_planner_can_be_changed(taken):
-    found = replay(taken, ReplayRequest(overrides=["planner.degree_of_parallelism=2"], shots="1"))
+    found = replay(taken, ReplayRequest(overrides=["planner.degree_of_parallelism=2"], shots=" 1 , 1-1"))
     assert found.used["planner"]["degree_of_parallelism"] == 2
     assert found.changed == {"planner": {"degree_of_parallelism": 2}}
     assert found.n_shots == 1
@@ -235,13 +235,6 @@ def test_a_text_that_was_edited_is_refused(taken, tmp_path):
     (folder / "sequence.yaml").write_text(SEQUENCE + "# later\n")
     with pytest.raises(RecordingError, match=r"sequence.yaml: is not what run.json says"):
         replay(open_run(folder), ReplayRequest())
-
-
-@pytest.mark.parametrize(
-    ("text", "numbers"), [("2-4", [2, 3, 4]), (" 1 , 3 - 3", [1, 3]), ("1-2,2", [1, 2]), (None, [1, 2, 3, 4])]
-)
-def test_ranges_of_shots(taken, text, numbers):
-    assert [shot.index + 1 for shot in shots_of(taken, text)] == numbers
 
 
 @pytest.mark.parametrize(

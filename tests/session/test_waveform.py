@@ -16,7 +16,6 @@ from labseq.bench.waveform import (
     WaveformRequest,
     plan_waveform,
     read_batches,
-    read_sample_rate,
 )
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Plan, SegmentKind
@@ -153,15 +152,32 @@ def test_a_range_of_batches_never_cuts_a_chain(linked: list[bool], first: int, l
     if fine:
         assert read_batches(f"{first}-{last}", plan) == range(first - 1, last)
     else:
-        with pytest.raises(ConfigError):
+        with pytest.raises(ConfigError, match="batches"):
             read_batches(f"{first}-{last}", plan)
 
 
-def test_the_range_of_a_whole_chain_is_suggested() -> None:
-    sites = [([(0, i)], [(0, i + 1)]) for i in range(4)]
-    chain = [labseq.Batch(np.array(a), np.array(b), i in (1, 2)) for i, (a, b) in enumerate(sites)]
-    with pytest.raises(ConfigError, match="expected --batches 1-3"):
-        read_batches("2", Plan.from_batches(chain))
+SLOW = ("profile.mobile_tweezers.speed=0.5 um/s",)
+
+
+@pytest.mark.parametrize(
+    ("request_", "error", "message"),
+    [
+        (PlanRequest("random:3x3@1", "compact:3x3", seed=1), ConfigError, "nothing to play: the plan has no"),
+        (
+            PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=SLOW),
+            ConfigError,
+            r"the waveform is .* s long; expected at most 60 s; look",
+        ),
+        (
+            PlanRequest("random:30x30@0.6", "compact:20x20", seed=1),
+            LimitError,
+            r"the limit is the band of 82 to 118 MHz; name the machine with --profile",
+        ),
+    ],
+)
+def test_what_cannot_be_played_is_refused(request_: PlanRequest, error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        waveform(request_)
 
 
 @pytest.mark.parametrize(
@@ -209,48 +225,3 @@ def test_the_profiles_mobile_tweezers_choose_the_sample_rate(
     assert len(made.warnings) == n_warnings
     assert waveform(request, rate=RATE).renderer.sample_rate_hz == 250e6
     assert waveform(rate=None).renderer.sample_rate_hz == DEFAULT_RATE_HZ
-
-
-def test_a_shot_brings_the_sample_rate_that_it_was_taken_with() -> None:
-    machine = {"mobile_tweezers": {"use": "spcm", "sample_rate": 5e8}}
-    assert read_sample_rate(None, REQUEST, machine).hz == 5e8
-    assert read_sample_rate("300 MHz", REQUEST, machine).hz == 300e6
-    assert read_sample_rate(None, REQUEST, {"mobile_tweezers": {"use": "virtual"}}).hz == DEFAULT_RATE_HZ
-
-
-def test_the_share_of_each_render_path() -> None:
-    jerk = ["profile.mobile_tweezers.speed_profile=minimum_jerk"]
-    made = waveform(
-        PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=jerk)
-    )
-    row, column = made.statistics()
-    assert 0.0 < max(row.path_share["direct"], column.path_share["direct"]) < 1.0
-    assert sum(row.path_share.values()) == pytest.approx(1.0) == sum(column.path_share.values())
-
-
-def test_a_profile_with_too_low_a_sample_rate_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(PROFILE.format(tweezers="{use: spcm, sample_rate: 200 MHz}"), "utf-8")
-    request = PlanRequest(REQUEST.occupancy, REQUEST.target, seed=3, profile=str(path))
-    with pytest.raises(ConfigError, match=r"mine\.yaml: tones up to .* cannot be sampled at 200 MHz"):
-        waveform(request, rate=None)
-
-
-def test_where_nothing_is_to_be_done_there_is_nothing_to_play() -> None:
-    with pytest.raises(ConfigError, match="there is nothing to play: the plan has no batches"):
-        waveform(PlanRequest("random:3x3@1", "compact:3x3", seed=1))
-
-
-def test_a_waveform_that_would_take_hours_is_refused() -> None:
-    slow = "profile.mobile_tweezers.speed=0.5 um/s"
-    virtual = PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=[slow])
-    with pytest.raises(ConfigError, match=r"the waveform is .* s long; expected at most 60 s; look"):
-        waveform(virtual)
-
-
-def test_a_grid_wider_than_the_band_points_to_the_profile() -> None:
-    request = PlanRequest("random:30x30@0.6", "compact:20x20", seed=1)
-    with pytest.raises(
-        LimitError, match=r"the limit is the band of 82 to 118 MHz; name the machine with --profile"
-    ):
-        waveform(request)
