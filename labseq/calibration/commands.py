@@ -137,14 +137,8 @@ def calibrate(
     from labseq.calibration.measure import CalibrationRequest
     from labseq.calibration.terminal import calibrate_kind
 
+    changes = tuple(overrides or ())
     request = CalibrationRequest(
-        profile=profile,
-        source=source,
-        shots=shots,
-        seed=seed,
-        overrides=tuple(overrides or ()),
-        output=output,
-        dry_run=dry_run_mode(dry_run),
-        force=force,
+        profile, source, shots, seed, changes, output, dry_run_mode(dry_run), force=force
     )
     calibrate_kind(kind, request, as_json=as_json)

@@ -32,7 +32,6 @@ from labseq.console.options import (
     dry_run_mode,
     profile_option,
     run_argument,
-    run_options,
 )
 from labseq.queue.commands import queue
 from labseq.scaffold.commands import NEW_EXAMPLES, SCHEMA_EXAMPLES, new, schema
@@ -134,8 +133,11 @@ def run(
 ) -> None:
     """Run a sequence and record every shot."""
     from labseq.cli.run import run_sequence
+    from labseq.session import Options
 
-    options = run_options(profile, dry_run, shots, seed, overrides, output, realtime=realtime)
+    options = Options(
+        profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime
+    )
     run_sequence(sequence, options, as_json=as_json)
 
 

@@ -1,14 +1,11 @@
 """The options of `labseq plan` and `labseq waveform`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
 from labseq.console.options import JsonFile, profile_option
-
-if TYPE_CHECKING:
-    from labseq.session.planning import PlanRequest
 
 PLAN_EXAMPLES: Final = """\b
 Examples:
@@ -97,8 +94,9 @@ def plan(
     Batches and cycles are counted from 1, rows and columns from 0.
     """
     from labseq.cli.plan import PlanOutput, plan_once
+    from labseq.session.planning import PlanRequest
 
-    request = _request(occupancy, target, planner, dop, seed, origin, profile, overrides)
+    request = PlanRequest(occupancy, target, planner, dop, tuple(overrides or ()), seed, origin, profile)
     plan_once(request, PlanOutput(step=step, json=json, png=png))
 
 
@@ -146,31 +144,8 @@ def waveform(
     """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
     from labseq.bench.waveform import WaveformRequest
     from labseq.cli.waveform import WaveformOutput, show_waveform
-
-    request = _request(plan, target, planner, dop, seed, origin, profile, overrides)
-    output = WaveformOutput(json=json, png=png, npz=npz)
-    show_waveform(WaveformRequest(request, batches, sample_rate), output)
-
-
-def _request(
-    occupancy: str,
-    target: str | None,
-    planner: str,
-    dop: int | None,
-    seed: int | None,
-    origin: str | None,
-    profile: str | None,
-    overrides: list[str] | None,
-) -> "PlanRequest":
     from labseq.session.planning import PlanRequest
 
-    return PlanRequest(
-        occupancy=occupancy,
-        target=target,
-        planner=planner,
-        degree_of_parallelism=dop,
-        overrides=tuple(overrides or ()),
-        seed=seed,
-        origin=origin,
-        profile=profile,
-    )
+    request = PlanRequest(plan, target, planner, dop, tuple(overrides or ()), seed, origin, profile)
+    output = WaveformOutput(json=json, png=png, npz=npz)
+    show_waveform(WaveformRequest(request, batches, sample_rate), output)

@@ -9,12 +9,9 @@ from __future__ import annotations
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import typer
-
-if TYPE_CHECKING:
-    from labseq.session import Options
 
 _FILES: Final = ("sequence", "profile")
 _YAML: Final = (".yaml", ".yml")
@@ -148,27 +145,3 @@ Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run 
 RunFolder = Annotated[
     Path | None, run_argument("The run's folder, or any file in it; default: the newest run.")
 ]
-
-
-def run_options(
-    profile: str | None,
-    dry_run: DryRunKind | None,
-    shots: int | None,
-    seed: int | None,
-    overrides: list[str] | None,
-    output: Path | None,
-    *,
-    realtime: bool,
-) -> Options:
-    """The options of a run, now or in the queue."""
-    from labseq.session import Options
-
-    return Options(
-        profile=profile,
-        shots=shots,
-        seed=seed,
-        overrides=tuple(overrides or ()),
-        output=output,
-        dry_run=dry_run_mode(dry_run),
-        realtime=realtime,
-    )

@@ -14,7 +14,7 @@ from labseq.console.options import (
     Seed,
     SequenceFile,
     Shots,
-    run_options,
+    dry_run_mode,
 )
 from labseq.files import data_root
 
@@ -56,8 +56,11 @@ def add(
     The entry keeps the text of the sequence as it is now: later changes of the file have no effect on it.
     """
     from labseq.queue.terminal import add_entry
+    from labseq.session import Options
 
-    options = run_options(profile, dry_run, shots, seed, overrides, output, realtime=realtime)
+    options = Options(
+        profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime
+    )
     add_entry(sequence, options)
 
 

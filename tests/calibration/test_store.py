@@ -163,3 +163,12 @@ def test_what_a_killed_process_left_is_reported(store: Store, monkeypatch: pytes
     with pytest.raises(ConfigError, match=r"active.json.part: another labseq is writing.*delete it"):
         store.use(stored, GRID)
     assert part.exists()
+
+
+def test_a_note_that_leads_out_of_the_folder_is_refused(store: Store) -> None:
+    stored = store.add(overlay())
+    store.use(stored, GRID)
+    note = store.folder / "active.json"
+    note.write_text(note.read_text("utf-8").replace(stored.path.name, "../../else.json"), "utf-8")
+    with pytest.raises(ConfigError, match="outside of its folder"):
+        store.active()
