@@ -21,7 +21,6 @@ class Head:
     Attributes:
         model: Name that the camera reports.
         sensor_shape: (height, width) in pixels.
-        pixel_m: Side of a pixel, in metres.
         em_rates_hz: Read-out rates of the amplifier behind the EM register, fastest first.
         conventional_rates_hz: Read-out rates of the conventional amplifier.
         shifts_s: Times to shift all rows by one, fastest first.
@@ -31,7 +30,6 @@ class Head:
 
     model: str
     sensor_shape: tuple[int, int]
-    pixel_m: float
     em_rates_hz: tuple[float, ...]
     conventional_rates_hz: tuple[float, ...]
     shifts_s: tuple[float, ...]
@@ -46,7 +44,6 @@ class Head:
 IXON_897: Final = Head(
     "DU-897",
     (512, 512),
-    16e-6,
     (17e6, 10e6, 5e6, 1e6),
     (3e6, 1e6, 80e3),
     (0.3e-6, 0.5e-6, 0.9e-6, 1.7e-6, 3.3e-6),
@@ -56,7 +53,6 @@ IXON_897: Final = Head(
 IXON_888: Final = Head(
     "DU-888",
     (1024, 1024),
-    13e-6,
     (30e6, 20e6, 10e6, 1e6),
     (1e6, 0.1e6),
     (0.6e-6, 1.13e-6, 2.2e-6, 4.33e-6),

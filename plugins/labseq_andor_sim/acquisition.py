@@ -97,8 +97,8 @@ class Acquisition:
         self._buffer: OrderedDict[int, Frame] = OrderedDict()
         self._n_arrived = self.n_fetched = 0
 
-    @implements("GetSizeOfCircularBuffer", outputs=1)
-    def _get_buffer_size(self) -> int:
+    @property
+    def _buffer_size(self) -> int:
         height, width = self._timing.optics.frame_shape
         return self._faults.buffer_frames or max(2, BUFFER_BYTES // (2 * height * width))
 
@@ -147,12 +147,6 @@ class Acquisition:
         self.proceed()
         idle = self._fault if self._fault != Code.SUCCESS else Code.IDLE
         return (Code.ACQUIRING if self.is_acquiring else idle,)  # an output, not the return code
-
-    @implements("GetAcquisitionProgress", outputs=2)
-    def _get_progress(self) -> tuple[int, int]:
-        """Accumulated exposures, and frames so far."""
-        self.proceed()
-        return 0, self._n_arrived
 
     @implements("GetNumberNewImages", outputs=2)
     def _get_new(self) -> tuple[int, int]:
@@ -253,7 +247,7 @@ class Acquisition:
             return
         self._n_arrived = number
         self._buffer[number] = frame
-        if len(self._buffer) > self._get_buffer_size():
+        if len(self._buffer) > self._buffer_size:
             self._buffer.popitem(last=False)
         if not self._n_left and not self._coming:
             self._finish()

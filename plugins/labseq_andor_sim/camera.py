@@ -51,7 +51,6 @@ class SimulatedCamera:
         "GetHeadModel": lambda self: self.head.model,
         "GetCameraSerialNumber": lambda self: self._serial,
         "GetHardwareVersion": lambda _: (0, 0, 0, 0, *FIRMWARE),
-        "GetPixelSize": lambda self: (self.head.pixel_m * 1e6, self.head.pixel_m * 1e6),
     }
 
     def __init__(

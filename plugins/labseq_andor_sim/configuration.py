@@ -50,10 +50,7 @@ class Amplifiers:
         "GetNumberVSSpeeds": lambda self: len(self._head.shifts_s),
         "GetFastestRecommendedVSSpeed": lambda self: self._recommended_shift,
         "GetNumberPreAmpGains": lambda self: len(self._head.preamp_gains),
-        "GetBaselineClamp": lambda self: int(self.baseline_clamp),
-        "GetEMAdvanced": lambda self: int(self._is_advanced),
         "GetEMGainRange": lambda self: self._gain_range,
-        "GetEMCCDGain": lambda self: self.em_gain,
     }
 
     def __init__(self, head: Head) -> None:
@@ -194,7 +191,6 @@ class Optics:
 
     getters: ClassVar[Mapping[str, Callable[[Any], object]]] = {
         "GetDetector": lambda self: self._detector[::-1],
-        "IsInternalMechanicalShutter": lambda _: 1,
         "GetShutterMinTimes": lambda _: (SHUTTER_MS, SHUTTER_MS),
     }
 

@@ -6,8 +6,8 @@ It plays a program in no time at all, and answers at once.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 from labseq_ttl.protocol import (
     DEAF,
@@ -118,24 +118,24 @@ class ModelBox:
 
     def __init__(self) -> None:
         self.on = 0
-        self._commands: Mapping[str, Callable[[list[str]], str]] = {
-            "id": self._identify,
-            "state": self._state,
-            "polarity": self._set_polarity,
-            "serial": self._set_serial,
-            "set": self._set_lines,
-            "timeout": self._set_limit,
-            "put": self._put,
-            "get": self._get,
-            "arm": self._arm,
-            "fire": self._fire,
-            "await": self._await,
-            "off": self._off,
-            "lead": self._begin_leading,
-            "deaf": self._end_leading,
-            "answer": self._answer_leader,
-            "leader": self._report_to_leader,
-        }
+        self._commands: dict[str, tuple[Callable[..., str], tuple[int, ...] | None]] = {
+            "id": (self._identify, None),
+            "state": (self._state, None),
+            "polarity": (self._set_polarity, (OUTPUTS,)),
+            "serial": (self._set_serial, (0xFFFF,)),
+            "set": (self._set_lines, (OUTPUTS,)),
+            "timeout": (self._set_limit, (0xFFFF,)),
+            "put": (self._put, None),
+            "get": (self._get, (SLOTS - 1, EDGES - 1)),
+            "arm": (self._arm, (SLOTS - 1, EDGES)),
+            "fire": (self._fire, ()),
+            "await": (self._await, ()),
+            "off": (self._off, None),
+            "lead": (self._begin_leading, (OUTPUTS, OUTPUTS, OUTPUTS, MAX_MS)),
+            "deaf": (self._end_leading, None),
+            "answer": (self._answer_leader, (1,)),
+            "leader": (self._report_to_leader, None),
+        }  # with the upper limits of their arguments; None: they are not looked at
         self._out = bytearray()
         self._polarity = self._serial = 0
         self._boots = -1  # as an erased memory counts
@@ -229,7 +229,7 @@ class ModelBox:
 
     def _take(self, byte: int) -> None:
         if byte == STOP[0]:
-            self._off([])
+            self._off()
             self._line.clear()
             self._send(f"!off {self._boots:04x}")
         elif byte == ord("\n"):
@@ -249,7 +249,11 @@ class ModelBox:
         try:
             if name not in self._commands:
                 raise RefusedError("unknown")
-            answer = f"{said[0]} ok {self._commands[name](words)}".rstrip()
+            method, limits = self._commands[name]
+            arguments: list[Any] = [] if limits is None else [*numbers(words, *limits)]
+            if name == "put":  # as many edges as there are
+                arguments = [words]
+            answer = f"{said[0]} ok {method(*arguments)}".rstrip()
         except RefusedError as refusal:
             answer = f"{said[0]} no {refusal}"
         self._send(answer)
@@ -261,30 +265,27 @@ class ModelBox:
     def _send(self, text: str) -> None:
         self._out += framed(text)
 
-    def _identify(self, words: list[str]) -> str:
-        del words
+    def _identify(self) -> str:
         return f"{NAME} {VERSION:02x} {self._serial:04x} {self._boots:04x} {self._cause:02x}"
 
-    def _state(self, words: list[str]) -> str:
-        del words
+    def _state(self) -> str:
         doing = "idle" if self._armed is None else "armed"
         return f"{doing} {self._boots:04x} {self._runs:04x} {self.on:04x} {self._polarity:04x}"
 
-    def _set_polarity(self, words: list[str]) -> str:
-        (self._polarity,) = numbers(words, OUTPUTS)
+    def _set_polarity(self, mask: int) -> str:
+        self._polarity = mask
         return ""
 
-    def _set_serial(self, words: list[str]) -> str:
-        (self._serial,) = numbers(words, 0xFFFF)
+    def _set_serial(self, number: int) -> str:
+        self._serial = number
         return ""
 
-    def _set_lines(self, words: list[str]) -> str:
-        (self.on,) = numbers(words, OUTPUTS)
+    def _set_lines(self, mask: int) -> str:
+        self.on = mask
         return ""
 
-    def _set_limit(self, words: list[str]) -> str:
-        numbers(words, 0xFFFF)  # the model has no clock
-        return ""
+    def _set_limit(self, _ms: int) -> str:
+        return ""  # the model has no clock
 
     def _put(self, words: list[str]) -> str:
         slot, first = numbers(words[:2], SLOTS - 1, EDGES - 1)
@@ -306,23 +307,19 @@ class ModelBox:
             if not rest:
                 return f"{len(edges):02x}"
 
-    def _get(self, words: list[str]) -> str:
-        slot, i = numbers(words, SLOTS - 1, EDGES - 1)
+    def _get(self, slot: int, i: int) -> str:
         if i >= len(self._slots[slot]):
             raise RefusedError("gap")
         ticks, mask = self._slots[slot][i]
         return f"{ticks:08x} {mask:04x}"
 
-    def _arm(self, words: list[str]) -> str:
-        slot, n_edges = numbers(words, SLOTS - 1, EDGES)
+    def _arm(self, slot: int, n_edges: int) -> str:
         if not n_edges or n_edges != len(self._slots[slot]):
             raise RefusedError("gap")
         self._armed = slot
         return f"{self._boots:04x}"
 
-    def _fire(self, words: list[str]) -> str:
-        if words:
-            raise RefusedError("arguments")
+    def _fire(self) -> str:
         if self._armed is None:
             raise RefusedError("unarmed")
         edges, self._armed = self._slots[self._armed], None
@@ -338,33 +335,28 @@ class ModelBox:
         self._runs = (self._runs + 1) & 0xFFFF
         return ""
 
-    def _await(self, words: list[str]) -> str:
-        if not words and self._leader.state != DEAF:
+    def _await(self) -> str:
+        if self._leader.state != DEAF:
             raise RefusedError("led")
-        return self._fire(words)
+        return self._fire()
 
-    def _begin_leading(self, words: list[str]) -> str:
-        busy, ready, failed, _ = numbers(words, OUTPUTS, OUTPUTS, OUTPUTS, MAX_MS)
+    def _begin_leading(self, busy: int, ready: int, failed: int, _deadline_ms: int) -> str:
         self._leader.begin(busy, ready, failed)
         return f"{self._leader.level:02x}"
 
-    def _end_leading(self, words: list[str]) -> str:
-        del words
+    def _end_leading(self) -> str:
         self._leader.end()
         return ""
 
-    def _answer_leader(self, words: list[str]) -> str:
-        (is_ready,) = numbers(words, 1)
+    def _answer_leader(self, is_ready: int) -> str:
         if self._leader.state == DEAF:
             raise RefusedError("deaf")
         return self._leader.answer(is_ready=bool(is_ready))
 
-    def _report_to_leader(self, words: list[str]) -> str:
-        del words
+    def _report_to_leader(self) -> str:
         leader = self._leader
         return f"{leader.state:02x} {leader.n_go_signals:04x} {leader.more_came:02x} {leader.level:02x}"
 
-    def _off(self, words: list[str]) -> str:
-        del words
+    def _off(self) -> str:
         self._armed, self.on = None, 0
         return ""

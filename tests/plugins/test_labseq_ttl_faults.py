@@ -161,7 +161,7 @@ def test_an_end_that_nobody_heard_is_asked_for(monkeypatch: pytest.MonkeyPatch) 
 class Dies(ModelBox):
     """Plays nothing more, and does not say so."""
 
-    def _fire(self, words: list[str]) -> str:
+    def _fire(self) -> str:
         self._armed = None
         return ""
 
@@ -185,7 +185,7 @@ class Other(ModelBox):
 
     says = "shutter 01 0000 0000 01"
 
-    def _identify(self, words: list[str]) -> str:
+    def _identify(self) -> str:
         return self.says
 
 
