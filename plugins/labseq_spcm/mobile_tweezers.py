@@ -1,7 +1,7 @@
 """Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator.
 
-The order of calls follows the manual: reset, channels, clock, outputs and trigger once in ``open``;
-mode and data in ``prepare``; outputs on, start and trigger in ``play``.
+The order of calls follows the manual: in ``open`` the card is identified, reset and set up (``set_up.py``),
+then its mode; in ``prepare`` come the data, in ``play`` the outputs, the start and the trigger.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.dds import Dds, choose_cores
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
+from labseq_spcm.set_up import check_type, set_amplitude, set_up, switch_output
 from labseq_spcm.settings import SpcmSettings
 
-BOTH_CHANNELS: Final = 0b11
 RAMP_S: Final = 0.3e-3
 """How long the amplifiers take to ramp down a program that is cut short."""
 RAMP_STEPS: Final = 15
@@ -138,97 +138,19 @@ class SpcmMobileTweezers(MobileTweezers):
             return
         self._card = card = AwgCard(self._name, self.library, self._clock)
         try:
-            self._check_type(card)
-            card.command(card.spcm.M2CMD_CARD_RESET, "reset")
-            card.set(card.spcm.SPC_CHENABLE, BOTH_CHANNELS, "active channels")
-            rate_hz = self._set_clock(card)
-            self._set_outputs(card)
-            self._set_trigger(card)
-            self._facts = self._read_facts(card, rate_hz)
+            check_type(card, self._settings)
+            self._facts = set_up(card, self._settings, self._amplitude_mv)
             self._clock.sleep(limits.RELAY_S)
-            self._mode = self._new_mode(card, rate_hz)
+            self._mode = self._new_mode(card)
         except BaseException:
             self._disconnect()
             raise
 
-    def _check_type(self, card: AwgCard) -> None:
-        spcm, settings = card.spcm, self._settings
-        n_channels = card.read(spcm.SPC_MIINST_MODULES) * card.read(spcm.SPC_MIINST_CHPERMODULE)
-        family = (card.read(spcm.SPC_PCITYP) & spcm.TYP_FAMILYMASK) >> 8
-        if family != limits.FAMILY or n_channels != 2:
-            text = f"the card '{settings.card}' is a {card.product} with {n_channels} channels"
-            raise DeviceError(
-                self._name, f"{text}; expected {limits.FAMILY_NAME}: name another one as `card`"
-            )
-        if settings.serial and card.serial_number != settings.serial:
-            text = f"the card '{settings.card}' has the serial number {card.serial_number}"
-            raise DeviceError(self._name, f"{text}; expected {settings.serial}: name another one as `card`")
-        if settings.mode == "dds":
-            if not card.read(spcm.SPC_PCIEXTFEATURES) & spcm.SPCM_FEAT_EXTFW_DDS20:
-                text = f"the {card.product} was bought without DDS; use mode: replay"
-                raise DeviceError(self._name, text)
-            return
-        fastest_hz = card.read(spcm.SPC_MIINST_MAXADCLOCK)
-        if settings.sample_rate > fastest_hz:
-            text = f"the {card.product} makes at most {fastest_hz / 1e6:g} MS/s"
-            raise DeviceError(
-                self._name, f"{text}; lower sample_rate from {settings.sample_rate / 1e6:g} MHz"
-            )
-
-    def _set_clock(self, card: AwgCard) -> float:
-        """Set the sample clock; returns the rate that it really makes, in Hz."""
-        spcm, reference_hz = card.spcm, self._settings.reference_clock
-        if reference_hz is None:
-            card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_INTPLL, "clock mode")
-        else:
-            card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
-            card.set(spcm.SPC_REFERENCECLOCK, round(reference_hz), "reference clock in Hz")
-        rate_hz = limits.DDS_RATE_HZ if self._settings.mode == "dds" else self._settings.sample_rate
-        return float(card.set(spcm.SPC_SAMPLERATE, round(rate_hz), "sample rate in Hz", limits.RATE_STEP_HZ))
-
-    def _set_outputs(self, card: AwgCard) -> None:
-        """Relays open, then amplitude, 0 V when stopped, no filter."""
-        spcm, zero = card.spcm, card.spcm.SPCM_STOPLVL_ZERO
-        _open_relay(card, spcm.SPC_ENABLEOUT0)
-        _open_relay(card, spcm.SPC_ENABLEOUT1)
-        self._set_amplitude(card, self._amplitude_mv)
-        card.set(spcm.SPC_CH0_STOPLEVEL, zero, "output 0 when stopped")
-        card.set(spcm.SPC_CH1_STOPLEVEL, zero, "output 1 when stopped")
-        card.set(spcm.SPC_FILTER0, 0, "filter of output 0")
-        card.set(spcm.SPC_FILTER1, 0, "filter of output 1")
-
-    def _set_trigger(self, card: AwgCard) -> None:
-        """No source at all for the software trigger: it is forced, which works alike in all modes."""
-        spcm, settings = card.spcm, self._settings
-        card.set(spcm.SPC_TRIG_ANDMASK, spcm.SPC_TMASK_NONE, "trigger AND mask")
-        if settings.trigger == "software":
-            card.set(spcm.SPC_TRIG_ORMASK, spcm.SPC_TMASK_NONE, "trigger source")
-            return
-        edge = spcm.SPC_TM_POS if settings.trigger_edge == "rising" else spcm.SPC_TM_NEG
-        card.set(spcm.SPC_TRIG_ORMASK, spcm.SPC_TMASK_EXT0, "trigger source")
-        card.set(spcm.SPC_TRIG_EXT0_MODE, edge, "trigger edge")
-        card.set(spcm.SPC_TRIG_TERM, int(settings.trigger_50_ohm), "trigger termination")
-        level_mv = round(1e3 * settings.trigger_level)
-        card.set(spcm.SPC_TRIG_EXT0_LEVEL0, level_mv, "trigger level in mV", limits.TRIGGER_STEP_MV)
-
-    def _read_facts(self, card: AwgCard, rate_hz: float) -> dict[str, Any]:
-        version = card.read(card.spcm.SPC_GETDRVVERSION)
-        is_dds = self._settings.mode == "dds"
-        return {
-            "model": card.product,
-            "serial_number": card.serial_number,
-            "driver_version": f"{version >> 24}.{version >> 16 & 0xFF}.{version & 0xFFFF}",
-            "sample_rate_hz": rate_hz,
-            "trigger_delay_s": limits.DDS_DELAY_S if is_dds else limits.trigger_delay_s(rate_hz),
-            "amplitude_mv": self._amplitude_mv,
-            "trigger_level_mv": card.read(card.spcm.SPC_TRIG_EXT0_LEVEL0),
-        }
-
-    def _new_mode(self, card: AwgCard, rate_hz: float) -> PlayMode:
+    def _new_mode(self, card: AwgCard) -> PlayMode:
         if self._cores is not None:
             return Dds(card, self._cores)
         mode = Replay if self._settings.mode == "replay" else Fifo
-        return mode(card, self._settings, rate_hz)
+        return mode(card, self._settings, self._facts["sample_rate_hz"])
 
     def close(self) -> None:
         """Bring the outputs into the safe state and close the card; legal in any state."""
@@ -282,8 +204,8 @@ class SpcmMobileTweezers(MobileTweezers):
             raise DeviceError(self._name, text)
         duration_s, self._duration_s = self._duration_s, None
         spcm = card.spcm
-        card.set(spcm.SPC_ENABLEOUT0, 1, "output")
-        card.set(spcm.SPC_ENABLEOUT1, 1, "output")
+        switch_output(card, 0, on=True)
+        switch_output(card, 1, on=True)
         command = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER
         if self._settings.trigger == "external":
             self._due_s = math.inf
@@ -347,9 +269,9 @@ class SpcmMobileTweezers(MobileTweezers):
                 self._ramp_down(card)
         steps: list[Callable[[], None]] = [
             card.stop,
-            partial(_open_relay, card, card.spcm.SPC_ENABLEOUT0),
-            partial(_open_relay, card, card.spcm.SPC_ENABLEOUT1),
-            partial(self._set_amplitude, card, self._amplitude_mv),
+            partial(switch_output, card, 0, on=False),
+            partial(switch_output, card, 1, on=False),
+            partial(set_amplitude, card, self._amplitude_mv),
         ]
         failures = [failure for step in steps if (failure := _attempt_twice(step)) is not None]
         if failures:
@@ -362,11 +284,7 @@ class SpcmMobileTweezers(MobileTweezers):
         for step in range(1, RAMP_STEPS + 1):
             self._clock.sleep(RAMP_S / RAMP_STEPS)
             drop_mv = (self._amplitude_mv - end_mv) * step / RAMP_STEPS
-            self._set_amplitude(card, round(self._amplitude_mv - drop_mv))
-
-    def _set_amplitude(self, card: AwgCard, amplitude_mv: int) -> None:
-        card.set(card.spcm.SPC_AMP0, amplitude_mv, "amplitude of output 0 in mV")
-        card.set(card.spcm.SPC_AMP1, amplitude_mv, "amplitude of output 1 in mV")
+            set_amplitude(card, round(self._amplitude_mv - drop_mv))
 
     def self_test(self) -> None:
         """Check the card's temperatures, its clock and its memory, outputs off; drops the prepared program.
@@ -408,10 +326,6 @@ class SpcmMobileTweezers(MobileTweezers):
     def _check_idle(self, call: str) -> None:
         if self._due_s is not None:
             raise DeviceError(self._name, f"{call} while a program plays; call wait() first")
-
-
-def _open_relay(card: AwgCard, register: int) -> None:
-    card.set(register, 0, "output")
 
 
 def _attempt_twice(step: Callable[[], None]) -> LabseqError | None:
