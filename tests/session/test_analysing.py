@@ -94,9 +94,7 @@ def log_of(run: labseq.Run, name: str) -> Path:
 
 
 def test_every_shot_of_a_run_is_analysed_beside_it(tmp_path):
-    done = run(
-        tmp_path, "[{use: survival, atoms: moved, finish_within: 60 s}, {use: mean, finish_within: 60 s}]"
-    )
+    done = run(tmp_path, "[{use: survival, atoms: moved, finish_within: 60 s}]")
     assert warnings(done) == []
     rows = done.analysis("survival")
     assert [row["shot"] for row in rows] == [0, 1, 2]
@@ -108,8 +106,6 @@ def test_every_shot_of_a_run_is_analysed_beside_it(tmp_path):
         made = analysis.shot(shot)
         assert np.array_equal(row["expected"], made["expected"])
         assert (row["n_expected"], row["n_survived"]) == (made["n_expected"], made["n_survived"])
-    assert fillings(done) == [shot.occupancies[-1].mean() for shot in done.shots]
-    assert log_of(done, "mean").read_text().splitlines() == [f"looking at {i}" for i in range(3)]
     assert not log_of(done, "survival").exists()
 
 
@@ -126,7 +122,9 @@ def test_analyses_that_fail_leave_the_run_alone(tmp_path, monkeypatch):
     assert "analysis 'nomapping' failed: shot 1: TypeError: the result is int; expected a mapping" in text
     assert len(warnings(done)) == 6
     assert done.analysis("fails")[1] == {"shot": 1, "error": "ValueError: too dark"}
-    assert 'raise ValueError("too dark")' in log_of(done, "fails").read_text()
+    log = log_of(done, "fails").read_text()
+    assert log.startswith("looking at 0\n")
+    assert 'raise ValueError("too dark")' in log
 
     monkeypatch.chdir(tmp_path)
     Path("mended").touch()

@@ -1,4 +1,4 @@
-"""``labseq bench planners`` in processes of its own: stopped, and with JSON alone on stdout."""
+"""``labseq bench planners``, stopped: what is done is kept, with JSON alone on stdout."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from labseq.cli import main
 
 pytestmark = pytest.mark.system
 
@@ -37,6 +39,8 @@ class Stuck:
     def plan(self, occupancy, target):
         self.n_calls += 1
         if self.n_calls > 60:
+            if "STUCK_SIGNAL" in os.environ:
+                os.kill(os.getpid(), int(os.environ["STUCK_SIGNAL"]))
             threading.Event().wait()
         return labseq.Plan.from_batches([])
 
@@ -46,61 +50,83 @@ def labseq_register(registry):
     registry.planner("stuck", Stuck)
 """
 
-SMALL = ("--grid", "6x6", "--target", "compact:3x3", "--loadings", "200")
+COMMAND = [
+    "bench",
+    "planners",
+    "--grid",
+    "6x6",
+    "--target",
+    "compact:3x3",
+    "--loadings",
+    "200",
+    "--planners",
+    "stuck",
+]
+FILES = ["--csv", "out.csv", "--json", "-"]
 
 
-def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    (folder / "plugins").mkdir()
-    (folder / "plugins" / "stuck.py").write_text(STUCK, "utf-8")
-    environment = {"LABSEQ_PLUGIN_PATH": str(folder / "plugins"), "STUCK_LOG": str(folder / "pids")}
-    return subprocess.Popen(
-        [sys.executable, "-m", "labseq", "bench", "planners", *SMALL, *arguments],
-        cwd=folder,
-        env={**os.environ, **environment},
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "stuck.py").write_text(STUCK, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path / "plugins"))
+    monkeypatch.setenv("STUCK_LOG", str(tmp_path / "pids"))
+    monkeypatch.chdir(tmp_path)
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    """Two workers, after 100 loadings of 200."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "labseq", *COMMAND, "--workers", "2", *arguments],
         text=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
     )
+    assert child.stderr is not None
+    line = ""
+    while line != "100 of 200 loadings\n":
+        line = child.stderr.readline()
+        assert line, f"it ended early: {child.poll()}"
+    return child
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals between processes")
-@pytest.mark.parametrize(
-    ("n_workers", "n_done", "number", "code"), [(2, 100, signal.SIGINT, 130), (1, 50, signal.SIGTERM, 143)]
-)
-def test_what_is_done_is_kept(tmp_path: Path, n_workers: int, n_done: int, number: int, code: int) -> None:
-    arguments = ("--planners", "stuck", "--workers", str(n_workers), "--csv", "out.csv", "--json", "-")
-    with start(tmp_path, *arguments) as child:
-        assert child.stderr is not None
-        line = ""
-        while line != f"{n_done} of 200 loadings\n":
-            line = child.stderr.readline()
-            assert line, f"it ended early: {child.poll()}"
-        if number == signal.SIGINT:
-            os.killpg(child.pid, number)  # as a terminal does: every process gets it
-        else:
-            child.send_signal(number)
-        out, err = child.communicate(timeout=60)
-    assert child.returncode == code, err
+def check_kept(n_done: int, out: str, err: str) -> None:
     assert "Traceback" not in err
     assert f"INCOMPLETE: {n_done} of 200 loadings" in err
     assert err.splitlines()[-1].startswith("stopped by ")
     values = json.loads(out)
     assert values["complete"] is False
     assert [row["n_loadings"] for row in values["rows"]] == [n_done]
-    assert len((tmp_path / "out.csv").read_text("utf-8").splitlines()) == 2
-    for pid in {int(pid) for pid in (tmp_path / "pids").read_text().split()}:
+    assert len(Path("out.csv").read_text("utf-8").splitlines()) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals between processes")
+def test_what_is_done_is_kept() -> None:
+    with start(*FILES) as child:
+        os.killpg(child.pid, signal.SIGINT)  # as a terminal does: every process gets it
+        out, err = child.communicate(timeout=60)
+    assert child.returncode == 130, err
+    check_kept(100, out, err)
+    for pid in {int(pid) for pid in Path("pids").read_text().split()}:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals between processes")
+def test_what_is_done_is_kept_without_other_processes(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STUCK_SIGNAL", str(int(signal.SIGTERM)))
+    with pytest.raises(SystemExit, match=r"^143$"):
+        main([*COMMAND, "--workers", "1", *FILES])
+    check_kept(50, *capfd.readouterr())
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
-def test_a_process_that_dies_ends_the_comparison_with_what_is_done(tmp_path: Path) -> None:
-    with start(tmp_path, "--planners", "stuck", "--workers", "2") as child:
-        assert child.stderr is not None
-        while (line := child.stderr.readline()) != "100 of 200 loadings\n":
-            assert line
-        pids = {int(pid) for pid in (tmp_path / "pids").read_text().split()} - {child.pid}
+def test_a_process_that_dies_ends_the_comparison_with_what_is_done() -> None:
+    with start() as child:
+        pids = {int(pid) for pid in Path("pids").read_text().split()} - {child.pid}
         os.kill(min(pids), signal.SIGKILL)
         out, err = child.communicate(timeout=60)
     assert child.returncode == 1

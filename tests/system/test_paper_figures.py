@@ -1,6 +1,6 @@
 """Figures 4 and 5 of the paper, out of ordinary sequences on the fitted virtual lab.
 
-A hundred shots or so here; ``poe soak`` takes 10,000 of figure 5, and ``docs/make_paper_figures.py`` all of
+A few dozen shots here; ``poe soak`` takes 10,000 of figure 5, and ``docs/make_paper_figures.py`` all of
 both.
 """
 
@@ -27,7 +27,7 @@ sys.modules[spec.name] = script
 spec.loader.exec_module(script)
 
 SEQUENCES = Path(__file__).parents[2] / "sequences"
-N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "60"))
+N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "40"))
 MISSED = 5e-5
 """Atoms that the detector misses, as docs/explanation/virtual-images.md has them."""
 

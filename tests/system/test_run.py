@@ -22,13 +22,9 @@ def labseq_command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "labseq", *map(str, arguments)]
 
 
-def call(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = labseq_command(*arguments)
-    return subprocess.run(command, capture_output=True, encoding="utf-8", cwd=cwd, timeout=120, check=False)
-
-
 def test_run_then_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    done = call("run", SEQUENCE, "--json", "--shots", "2", "--seed", "1", cwd=tmp_path)
+    command = labseq_command("run", SEQUENCE, "--json", "--shots", "2", "--seed", "1")
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("\n") == 1
     answer = json.loads(done.stdout)
@@ -67,16 +63,17 @@ def test_check_opens_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_wrong_sequence(tmp_path: Path) -> None:
+def test_a_wrong_sequence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text(SEQUENCE.read_text("utf-8").replace("shots: 20", "shoots: 20"), "utf-8")
     line = wrong.read_text("utf-8").splitlines().index("shoots: 20") + 1
-    done = call("run", wrong, "--json", cwd=tmp_path)
-    assert done.returncode == 2
-    assert f"{wrong}:{line}:1: " in done.stderr
-    answer = json.loads(done.stdout)
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(["run", str(wrong), "--json"])
+    out, err = capfd.readouterr()
+    assert f"{wrong}:{line}:1: " in err
+    answer = json.loads(out)
     assert (answer["run_dir"], answer["status"]) == (None, "failed")
-    message, _, excerpt = done.stderr.strip().partition("\n")
+    message, _, excerpt = err.strip().partition("\n")
     assert answer["error"] == message
     assert "^^^^^^" in excerpt
 
