@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -71,6 +72,7 @@ class Block:
         return tuple(found[1].split("; ")) if found and found[1] else ()
 
 
+@cache
 def blocks_of(page: Path) -> list[Block]:
     """The fenced blocks of a page in order, but for directives, which the build of the docs runs."""
     text, name = page.read_text("utf-8"), page.relative_to(ROOT).as_posix()
