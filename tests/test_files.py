@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import filelock
 import pytest
 from hypothesis import given, strategies as st
 
@@ -170,17 +169,6 @@ def test_an_append_that_fails_leaves_no_trace(
     assert read_lines(log.path)[0] == [{"a": 1}, {"a": 3}]
 
 
-def test_damaged_lines_in_the_middle_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "log"
-    path.write_bytes(b'{"a": 1}\n\x00\x00\n[1]\n{"a": 2}\n')
-    assert read_lines(path) == ([{"a": 1}, {"a": 2}], [2, 3])
-
-
-def test_a_log_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="cannot be read"):
-        read_lines(tmp_path)
-
-
 def test_packaged_profiles_of_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "__file__", str(tmp_path / "labseq" / "places.py"))
     assert packaged_profiles_dir() == tmp_path.resolve() / "hardware_profiles"
@@ -331,13 +319,3 @@ def test_a_folder_without_locks_is_told_from_one_that_cannot_be_written(
     with pytest.raises(OSError, match=r".") as caught:
         Lock(tmp_path / "file" / "a.lock", "x").take()
     assert not knows_no_locks(caught.value)
-
-
-def test_an_older_package_says_it_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise NotImplementedError("FileSystem does not appear to support flock")
-
-    monkeypatch.setattr(filelock.FileLock, "acquire", refuse)
-    with pytest.raises(OSError, match="support flock") as caught:
-        Lock(tmp_path / "a.lock", "x").take()
-    assert knows_no_locks(caught.value)

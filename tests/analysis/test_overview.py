@@ -55,13 +55,6 @@ def test_a_run_without_rearrangement_has_the_rest(write: Write) -> None:
         picture_of(run, "losses")
 
 
-def test_a_run_without_images_has_its_stages(write: Write) -> None:
-    run = write([make_shot(0, n_cycles=0, judged=False, images=[])])
-    assert kinds(overview(run)) == [[draw_stages]]
-    with pytest.raises(ConfigError, match="nothing to show of filling"):
-        picture_of(run, "filling")
-
-
 def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cycle(write: Write) -> None:
     drawing = overview(write([make_shot(i, n_defects=i, judged=False) for i in range(3)]))
     filling, success = drawn(drawing), drawn(drawing, 1)
@@ -84,17 +77,6 @@ def test_defects_stand_beside_those_of_independent_sites(write: Write) -> None:
     assert (low[1], high[1]) == jeffreys(0, 6)
     independent = [math.comb(6, k) * (1 / 6) ** k * (5 / 6) ** (6 - k) for k in range(7)]
     assert chart.expected == pytest.approx(independent[: len(chart.expected)])
-
-
-@pytest.mark.parametrize("n_defects", [0, 6])
-def test_shots_that_are_all_alike_can_be_drawn(write: Write, n_defects: int) -> None:
-    chart = drawn(picture_of(write([make_shot(i, n_defects=n_defects) for i in range(2)]), "defects"))
-    assert chart.expected[n_defects] == 1.0
-
-
-def test_a_run_that_goes_on_says_so(write: Write) -> None:
-    run = write([make_shot(0)], status="running", n_shots=20)
-    assert "(running, 1 of 20 shots)" in overview(run).note
 
 
 def test_a_run_without_shots_says_so(write: Write) -> None:

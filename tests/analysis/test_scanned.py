@@ -7,7 +7,6 @@ from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from labseq.analysis.charts import draw_curves, draw_map
@@ -105,10 +104,3 @@ def test_points_of_an_optimiser_are_drawn_in_their_order(write: Write) -> None:
     ((chart, _),) = charts(taken(write, scan(("a", a), ("b", b))))
     assert chart.x_label == "point of the scan"
     assert chart.curves[""][0].tolist() == [1, 2, 3, 4, 5, 6]
-
-
-def test_a_scan_in_progress_has_blank_cells(write: Write) -> None:
-    rows = list(product("12", "xy"))
-    of = scan(("a", [a for a, _ in rows]), ("b", [b for _, b in rows]))
-    (filling, _), *_ = charts(taken(write, of, n_shots=3))
-    assert np.isnan(filling.values).tolist() == [[False, False], [False, True]]

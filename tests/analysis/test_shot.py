@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from labseq.analysis.shot import save_shot, shot_picture
@@ -42,12 +41,6 @@ def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:
     assert [panel.title.partition(":")[0] for panel in panels] == ["after cycle 1", "after cycle 2"]
 
 
-def test_without_frames_the_sites_are_drawn_alone(write: Write, tmp_path: Path) -> None:
-    drawing = shot_picture(write([make_shot(0)]), 1)
-    assert drawing.note.endswith("no frames: not kept")
-    save_shot(tmp_path / "shot.svg", drawing)
-
-
 def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> None:
     drawing = shot_picture(write([make_shot(0, kept=True)]), 1)
     assert drawing.sites_px is None
@@ -75,15 +68,3 @@ def test_what_is_not_there_is_told(write: Write, number: int, cycle: int | None,
     run = write([make_shot(0), make_shot(1, n_cycles=0)])
     with pytest.raises(ConfigError, match=told):
         shot_picture(run, number, cycle)
-
-
-def test_an_array_that_cannot_be_made_out_is_told(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq.analysis.shot.MAX_SITES", 4)
-    with pytest.raises(ConfigError, match="4 x 5 sites are too many"):
-        shot_picture(write([make_shot(0)]), 1)
-
-
-def test_rows_that_shift_to_the_left_are_drawn_so(write: Write) -> None:
-    run = write([make_shot(0)], resolved={"profile": {"grid": {"shear": -1}}})
-    assert shot_picture(run, 1).grid.shear == -1
-    assert np.isclose(shot_picture(run, 1).grid.spacing_m, 4e-6)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.analysis.overview import evenly
-from labseq.analysis.timing import quantiles, timing_of, writing_s
+from labseq.analysis.timing import timing_of, writing_s
 from labseq.recording import Run, open_run
 
 from .records import make_shot
@@ -57,12 +57,6 @@ def test_a_model_knows_nothing_of_writing(write: Write) -> None:
         (stage,) = (one for one in timing_of(run, run.shots).stages if one.stage == "write")
         assert math.isnan(stage.session_s[0]) is simulated
         assert stage.host_s[0] > 0
-
-
-@given(st.lists(st.floats(0, 1), min_size=1))
-def test_quantiles_lie_within_the_values(values: list[float]) -> None:
-    p50, p99 = quantiles(values)
-    assert min(values) <= p50 <= p99 <= max(values)
 
 
 @given(st.integers(0, 50), st.integers(1, 20))

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
 from .scripts import load_script
 
@@ -43,17 +42,6 @@ def test_perfect_rearrangement_reaches_it(period_s: float, missed: float | None)
     reached = perfect_rearrangement(n_shots, 225, period_s, losses, seed=3)
     most = max_defect_free(225, period_s, 0.045, losses)
     assert reached == pytest.approx(most, abs=4 * np.sqrt(most * (1 - most) / n_shots))
-
-
-@given(st.integers(1, 1000), st.floats(0.01, 1.0), st.floats(0.01, 0.2), st.floats(0.0, 1e-3))
-def test_it_falls_with_atoms_time_light_and_missed_atoms(n: int, t: float, s: float, missed: float) -> None:
-    losses = PAPER._replace(false_negative=missed)
-    most = max_defect_free(n, t, s, losses)
-    assert 0.0 < most < 1.0
-    assert max_defect_free(n + 1, t, s, losses) < most
-    assert max_defect_free(n, 1.1 * t, s, losses) < most
-    assert max_defect_free(n, t, 1.1 * s, losses) < most
-    assert most <= max_defect_free(n, t, s, PAPER)
 
 
 def test_the_losses_are_those_that_the_simulation_tells() -> None:

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from labseq.bench.comparison import Comparison, Condition, PlannerEntry, set_up
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.bench.planners import compare
 from labseq.bench.report import Report, save_histogram
-from labseq.errors import ConfigError, StopRequested
+from labseq.errors import ConfigError
 from labseq.pictures.figures import make_figure
 
 from .scripts import load_script
@@ -105,12 +105,6 @@ def test_a_planner_that_scans_is_drawn_by_its_scans(tmp_path: Path, monkeypatch:
     assert (times[1].y < 0.1).all()
 
 
-def test_an_incomplete_comparison_says_so(report: Report) -> None:
-    stopped = replace(report, n_done=7, ended_by=StopRequested(), rows=report.rows[:1])
-    assert "incomplete: 7 of 30" in stopped.extent_text
-    assert [one.law for one in points_of(stopped, figure())] == [None, None]
-
-
 def test_a_comparison_is_drawn_as_a_histogram(tmp_path: Path) -> None:
     entry = PlannerEntry("psca", (("degree_of_parallelism", "3"),))
     report = compared(CONDITIONS[:1], entry, PlannerEntry("psca"))
@@ -119,13 +113,3 @@ def test_a_comparison_is_drawn_as_a_histogram(tmp_path: Path) -> None:
     save_histogram(tmp_path / "none.png", replace(report, rows=()))
     with pytest.raises(ConfigError, match="the picture cannot be written"):
         save_histogram(tmp_path / "nowhere" / "histogram.png", report)
-
-
-@pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_has_targets_that_its_loadings_can_mostly_fill(name: str) -> None:
-    conditions = FIGURES[name].conditions
-    for course in set_up(Comparison((PlannerEntry("psca"),), conditions, 1, 1)):
-        n_sites = course.grid.n_rows * course.grid.n_cols
-        mean, spread = course.loading * n_sites, (course.loading * (1 - course.loading) * n_sites) ** 0.5
-        assert mean - 1.9 * spread > course.target.n_atoms
-        assert course.runners[0].degree_of_parallelism <= course.motion.max_tweezers

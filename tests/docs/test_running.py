@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from .blocks import Block
-from .running import PageError, Reader, labseq
+from .running import PageError, Reader
 
 
 @pytest.fixture(autouse=True)
@@ -33,12 +33,9 @@ def read(*blocks: Block) -> Reader:
     ("wrong", "said"),
     [
         (block("console", "labseq run none.yaml\n"), "exits with 2, not 0"),
-        (block("console", "labseq --version\n", exit_code="2"), "exits with 0, not 2"),
         (block("console", "make everything\n"), "'make' is not labseq's"),
         (block("console", "labseq run a.yaml | mail\n", run_with=""), "'mail' is not labseq's|exits with"),
         (block("text", "shown\n"), "say above it"),
-        (block("json", "{}\n"), "say above it"),
-        (block("", "shown\n"), "nobody runs ''"),
         (block("bash", "labseq --version\n"), "nobody runs 'bash'"),
     ],
     ids=lambda value: value.text.strip() if isinstance(value, Block) else "",
@@ -58,15 +55,11 @@ def test_python_that_fails_is_named_with_its_place() -> None:
     ("shown", "how", "is_right"),
     [
         ("a 1.5(2) b", "", True),
-        ("a ... b", "", True),
         ("a 2 b", "", False),
         ("a 2 b", "numbers differ", True),
         ("a  -3e-4   b", "numbers differ", True),
-        ("a 2 c", "numbers differ", False),
-        ("b", "", False),
         ("a 1.5(2) b\nid 1", "", False),
         ("id 0123456789ab", "numbers differ", True),
-        ("id 0123456789ab", "", False),
     ],
 )
 def test_what_is_shown_is_compared(shown: str, how: str, is_right: bool) -> None:
@@ -83,14 +76,3 @@ def test_a_block_that_is_not_run_is_passed_over() -> None:
     read(block("console", "make it && labseq --version\n", not_run=" (make): for a reason"))
     with pytest.raises(PageError, match="'rm' is not labseq's"):
         read(block("console", "make it && rm it\n", not_run=" (make): for a reason"))
-
-
-def test_a_file_is_written_where_the_page_says(folder: Path) -> None:
-    read(block("yaml", "a: 1\n", file="my/file.yaml"))
-    assert (folder / "my" / "file.yaml").read_text() == "a: 1\n"
-
-
-def test_the_streams_are_left_as_they_were(capfd: pytest.CaptureFixture[str]) -> None:
-    labseq(["--version"])
-    print("still here")
-    assert capfd.readouterr().out == "still here\n"

@@ -89,10 +89,3 @@ def test_a_new_field_of_a_later_labseq_is_no_damage(queue: Queue) -> None:
     file = queue.folder / "0001.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "colour": "red"}))
     assert len(queue.entries()) == 1
-
-
-def test_a_data_root_without_a_queue_is_empty(tmp_path: Path) -> None:
-    queue = Queue(tmp_path / "nowhere")
-    assert queue.entries() == []
-    assert queue.holder() is None
-    assert not queue.folder.exists()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from labseq.errors import ConfigError, DeviceError, RecordingError, StopRequested
+from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.files import Process
 from labseq.queue.queue import Opening, Queue, QueueRun
 from labseq.recording import open_run
@@ -83,17 +83,6 @@ def test_a_failure_ends_the_queue_and_is_kept(queue: Queue) -> None:
     again = Taking()
     again.run(queue)
     assert again.begun == [2]  # what failed is not tried again by itself
-    assert states(queue) == {1: "failed"}
-
-
-def test_the_queue_may_keep_going(queue: Queue) -> None:
-    add(queue)
-    add(queue)
-    taking = Taking(lambda run_dir: shutil.rmtree(run_dir / "shots"))
-    runs = taking.run(queue, keep_going=True)
-    assert taking.begun == [1, 2]
-    assert isinstance(runs.first_error, RecordingError)
-    assert taking.failures == [runs.first_error]
     assert states(queue) == {1: "failed"}
 
 
@@ -208,14 +197,3 @@ def test_an_entry_of_a_living_process_is_left_alone(queue: Queue) -> None:
     assert states(queue) == {1: "running"}
     with pytest.raises(ConfigError, match="entry 1 is running; 'labseq stop' ends it first"):
         queue.remove([1])
-
-
-def test_devices_in_use_leave_the_entry_waiting(queue: Queue) -> None:
-    add(queue)
-
-    def refuse(opening: Opening) -> None:
-        raise DeviceError("bench", "its devices are in use")
-
-    with pytest.raises(DeviceError):
-        QueueRun(queue, refuse, lambda _: None, lambda _: None).run()
-    assert states(queue) == {1: "waiting"}

@@ -135,17 +135,6 @@ def test_a_run_is_resumed(stopped: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert (code, err) == (2, f"{stopped}: the run cannot be resumed: it is complete: no shot is missing\n")
 
 
-def test_what_has_changed_is_reported_line_by_line(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    record = json.loads((stopped / "run.json").read_text(encoding="utf-8"))
-    record["resolved"]["attempts"] = 7
-    (stopped / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    code, _, err = call(capsys, "resume", str(stopped))
-    assert code == 2
-    assert err.splitlines()[0] == f"{stopped}: attempts was 7, is 3"
-    assert "--accept-changes" in err.splitlines()[1]
-    assert call(capsys, "resume", str(stopped), "--accept-changes")[0] == 0
-
-
 def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from labseq.files import write_file
     from labseq.recording import mark_active, marker_roots

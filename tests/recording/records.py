@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
+from labseq.recording import Run, RunWriter, open_run
 
 START = "2026-11-20T10:00:00.000000+00:00"
 SHAPE = (4, 5)
@@ -141,3 +143,11 @@ def assert_same(a: Any, b: Any, where: str = "") -> None:
         assert math.isnan(b), where
     else:
         assert a == b, where
+
+
+def write(root: Path, *shots: ShotRecord, **changes: Any) -> Run:
+    """Write shots as a run that has not ended, and open it; keywords change the record of the run."""
+    writer = RunWriter.create(root, make_run(**changes))
+    for shot in shots:
+        writer.write_shot(shot)
+    return open_run(writer.run_dir)

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from labseq.recording import RunWriter, mark_active, open_run
-from labseq.recording.doctor import Report, examine
+from labseq.recording.doctor import examine
 
 from .damages import (
     LOST,
@@ -140,14 +140,6 @@ def test_two_files_of_a_name_are_both_kept(run_dir: Path) -> None:
         examine(run_dir)
     kept = [(run_dir / "quarantine" / f"shot_000009.h5.part{end}").read_bytes() for end in ("", ".2")]
     assert kept == [b"first", b"second"]
-
-
-def test_a_dead_run_is_marked_as_interrupted(run_dir: Path) -> None:
-    dead_run(run_dir)
-    examine(run_dir)
-    state = json.loads((run_dir / "STATE").read_text())
-    assert (state["state"], state["pid"]) == ("failed", 2**22 + 1)
-    assert open_run(run_dir).error == "interrupted: the process that ran it is gone"
 
 
 def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> None:
@@ -351,9 +343,3 @@ def test_a_disk_that_takes_nothing_leaves_all_as_it_was(
         report = examine(run_dir)
     assert all(one.left and "the disk is full" in one.done for one in report.findings)
     assert {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file() and p.name != ".lock"} == before
-
-
-def test_a_folder_without_runs_is_well(tmp_path: Path) -> None:
-    (tmp_path / "pictures" / "of a cat").mkdir(parents=True)
-    (tmp_path / "a.txt").touch()
-    assert examine(tmp_path) == Report()

@@ -18,7 +18,7 @@ from labseq.errors import ConfigError
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.export import ENDINGS, check_export, export_run
 
-from .records import make_run, make_shot
+from .records import make_run, make_shot, write
 from .scanned import ADDRESSES, POINTS, write_scan
 
 
@@ -58,9 +58,9 @@ def test_csv_is_a_table_with_a_line_of_names_and_a_table_of_units(run: Run, tmp_
 
 
 def test_csv_has_nothing_where_nothing_is_known(tmp_path: Path) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot(filling_fraction=math.nan, readings={"a,b\n": 'say "µ"'}))
-    with exported(open_run(writer.run_dir), "csv", tmp_path).open(encoding="utf-8", newline="") as file:
+    with exported(
+        write(tmp_path, make_shot(filling_fraction=math.nan, readings={"a,b\n": 'say "µ"'})), "csv", tmp_path
+    ).open(encoding="utf-8", newline="") as file:
         (row,) = csv.DictReader(file)
     assert row["filling_fraction"] == ""
     assert row["reading.a,b\n"] == 'say "µ"'
@@ -90,9 +90,9 @@ def test_netcdf_reads_back_as_it_was(run: Run, tmp_path: Path) -> None:
 
 def test_names_that_netcdf_does_not_take_are_changed(tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot(readings={"laser/780": 1.5}))
-    with xarray.open_dataset(exported(open_run(writer.run_dir), "netcdf", tmp_path)) as data:
+    with xarray.open_dataset(
+        exported(write(tmp_path, make_shot(readings={"laser/780": 1.5})), "netcdf", tmp_path)
+    ) as data:
         assert data["reading.laser_780"].values.tolist() == [1.5]
 
 
@@ -162,15 +162,6 @@ def test_an_archive_holds_the_files_of_the_run(run: Run, tmp_path: Path) -> None
         assert files["odd.bin"][()].tobytes() == b"\xff\0"
         assert files["analysis/fits.jsonl"][()] == b'{"shot": 0}\n'
         assert archive.attrs["format"] == "labseq-archive"
-
-
-def test_an_archive_opens_with_a_plot_and_a_table(run: Run, tmp_path: Path) -> None:
-    with h5py.File(exported(run, "archive", tmp_path)) as archive:
-        table: Any = archive[str(archive.attrs["default"])]
-        assert table.attrs["NX_class"] == "NXdata"
-        assert table[table.attrs["signal"]].shape == table[table.attrs["axes"][0]].shape == (12,)
-        np.testing.assert_array_equal(table["filling_fraction"], [s.filling_fraction for s in run.shots])
-        assert table["shot.2.rearrange.window"].attrs["units"] == "s"
 
 
 def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_path: Path) -> None:

@@ -32,13 +32,6 @@ def test_counters_go_on_whatever_the_name(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {day}
 
 
-def test_counters_outgrow_four_digits(tmp_path: Path) -> None:
-    day = make_run_folder(tmp_path, "a", NOON).parent
-    (day / "9999_z").mkdir()
-    assert make_run_folder(tmp_path, "b", NOON).name == "10000_b"
-    assert make_run_folder(tmp_path, "b", NOON).name == "10001_b"
-
-
 def test_a_claim_left_by_a_killed_process_is_stepped_over(tmp_path: Path) -> None:
     day = make_run_folder(tmp_path, "a", NOON).parent
     (day / ".0002.claim").mkdir()

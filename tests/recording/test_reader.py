@@ -17,7 +17,7 @@ from labseq.recording import RunWriter, open_run
 from labseq.recording.folders import INDEX_FILE
 from labseq.recording.reader import Follower
 
-from .records import make_run, make_shot
+from .records import make_run, make_shot, write
 
 
 @pytest.fixture
@@ -57,15 +57,6 @@ def test_a_run_tells_what_it_was(run_dir: Path) -> None:
     assert (shot.filling_fraction, shot.seen_defect_free_cycle) == (0.5, 2)
     assert math.isnan(run.shots[2].filling_fraction)
     assert "Shot 1" in repr(shot)
-
-
-def test_a_run_without_shots_has_no_averages(tmp_path: Path) -> None:
-    run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
-    assert math.isnan(run.defect_free)
-    assert math.isnan(run.filling_fraction)
-    assert run.summary()["defect_free"] is None
-    assert run.summary()["filling_fraction"] is None
-    assert len(run.shots) == len(run.attempts) == len(run.events) == 0
 
 
 def test_the_index_is_enough_to_open_a_run(run_dir: Path) -> None:
@@ -127,10 +118,7 @@ def test_a_line_with_a_value_of_the_wrong_kind_is_damaged(run_dir: Path, name: s
 
 
 def test_a_shot_written_again_counts_once(tmp_path: Path) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot(0, success=False))
-    writer.write_shot(make_shot(0, success=True))
-    (shot,) = open_run(writer.run_dir).shots
+    (shot,) = write(tmp_path, make_shot(0, success=False), make_shot(0, success=True)).shots
     assert shot.success
     shot.verify()
 
@@ -215,14 +203,6 @@ def test_a_damaged_shot_file_is_explained(run_dir: Path, part: float) -> None:
         _ = shot.occupancies
     with pytest.raises(RecordingError, match="is damaged"):
         _ = shot.frames
-
-
-def test_a_shot_file_that_lacks_something_is_explained(run_dir: Path) -> None:
-    shot = open_run(run_dir).shots[0]
-    with h5py.File(shot.file, "r+") as file:
-        del file["entry/timing"]
-    with pytest.raises(RecordingError, match="is damaged"):
-        _ = shot.timing
 
 
 def test_several_values_of_a_shot_read_its_file_once(run_dir: Path) -> None:

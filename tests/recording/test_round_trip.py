@@ -27,7 +27,7 @@ from labseq.model import (
 )
 from labseq.recording import RunWriter, open_run
 
-from .records import assert_same, make_run, make_shot
+from .records import assert_same, make_run, make_shot, write
 
 text = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=20)
 small = st.integers(0, 2**31 - 1)
@@ -142,9 +142,7 @@ def test_every_record_comes_back(
 
 def test_a_rich_shot_comes_back_by_every_door(tmp_path: Path) -> None:
     shot = make_shot(seed=2**100)
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(shot)
-    (found,) = open_run(writer.run_dir).shots
+    (found,) = write(tmp_path, shot).shots
     assert_same(found.record(), shot)
     assert_same(found.frames, np.stack([i.frame.image for i in shot.images if i.frame]))
     assert_same(found.occupancies, np.stack([i.occupancy for i in shot.images]))
@@ -162,32 +160,20 @@ def test_a_rich_shot_comes_back_by_every_door(tmp_path: Path) -> None:
     assert found.devices["camera"] == {"model": "EMCCD"}
 
 
-def test_a_shot_of_nothing_comes_back(tmp_path: Path) -> None:
-    shot = make_shot(n_images=0, batches=(), timing=[], filling_fraction=float("nan"))
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(shot)
-    (found,) = open_run(writer.run_dir).shots
-    assert_same(found.record(), shot)
-    assert found.frames.shape == (0, 0, 0)
-    assert found.occupancies.shape == (0, 4, 5)
-    assert found.confidences.shape == (0, 4, 5)
-    assert found.plans == ()
-
-
 def test_values_that_json_lacks_become_null(tmp_path: Path) -> None:
     readings = {"power_w": float("nan"), "spectrum": np.array([1.0, np.inf]), "n": np.int16(3)}
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot(readings=readings, parameters={3: np.float32(0.5)}))
-    (found,) = open_run(writer.run_dir).shots
+    (found,) = write(tmp_path, make_shot(readings=readings, parameters={3: np.float32(0.5)})).shots
     assert found.readings == {"power_w": None, "spectrum": [1.0, None], "n": 3}
     assert found.parameters == {"3": 0.5}
     assert found.row["parameters"] == {"3": 0.5}
 
 
 def test_text_that_hdf5_refuses_is_escaped(tmp_path: Path) -> None:
-    writer = RunWriter.create(tmp_path, make_run(provenance={"user": "a\udc80", "log": "x\0" * 400}))
-    writer.write_shot(make_shot(error="a\0b\udc80", status="failed"))
-    (found,) = open_run(writer.run_dir).attempts
+    (found,) = write(
+        tmp_path,
+        make_shot(error="a\0b\udc80", status="failed"),
+        provenance={"user": "a\udc80", "log": "x\0" * 400},
+    ).attempts
     assert found.record().error == "a\\x00b\\udc80"
     assert found.provenance["user"] == "a\udc80"
 
@@ -195,9 +181,7 @@ def test_text_that_hdf5_refuses_is_escaped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("record_frames", "kept"), [("last", [2]), ("none", [])])
 def test_frames_that_are_not_kept_are_none(tmp_path: Path, record_frames: str, kept: list[int]) -> None:
     shot = make_shot()
-    writer = RunWriter.create(tmp_path, make_run(record_frames=record_frames))
-    writer.write_shot(shot)
-    (found,) = open_run(writer.run_dir).shots
+    (found,) = write(tmp_path, shot, record_frames=record_frames).shots
     images = [
         image if i in kept else dataclasses.replace(image, frame=None) for i, image in enumerate(shot.images)
     ]
@@ -220,20 +204,7 @@ def test_compressed_frames_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_frames_of_several_sizes_are_given_one_by_one(tmp_path: Path) -> None:
     shot = make_shot()
     shot.images[1] = dataclasses.replace(shot.images[1], frame=Frame(np.ones((2, 3), np.uint16), 0.1, 0.2))
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(shot)
-    (found,) = open_run(writer.run_dir).shots
+    (found,) = write(tmp_path, shot).shots
     with pytest.raises(RecordingError, match="several sizes"):
         _ = found.frames
     assert_same(found.record(), shot)
-
-
-def test_frames_of_several_cameras_come_in_the_order_of_the_images(tmp_path: Path) -> None:
-    shot = make_shot()
-    for i, camera in enumerate(["b", "a", "b"]):
-        frame = Frame(np.full((2, 2), i, np.uint16), 0.1, 0.2, camera)
-        shot.images[i] = dataclasses.replace(shot.images[i], frame=frame)
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(shot)
-    (found,) = open_run(writer.run_dir).shots
-    assert list(found.frames[:, 0, 0]) == [0, 1, 2]

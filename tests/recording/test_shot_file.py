@@ -49,17 +49,6 @@ def test_viewers_open_the_frames() -> None:
         np.testing.assert_array_equal(signal[1], shot.images[1].frame.image)  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def test_viewers_open_the_occupancies_where_there_are_no_frames() -> None:
-    shot = make_shot()
-    with opened(ShotEncoder(make_run(record_frames="none"), "day/run").encode(shot)) as file:
-        view = default_plot(file)
-        assert view.name == "/entry/detection"
-        np.testing.assert_array_equal(view["occupancy"][2], shot.images[2].occupancy)
-        assert view["occupancy"].attrs["interpretation"] == "image"
-        assert list(view.attrs["axes"]) == ["t_s", ".", "."]
-        assert "camera" not in file["entry"]
-
-
 def test_the_tables_hold_every_move() -> None:
     shot = make_shot()
     with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
@@ -95,11 +84,6 @@ def test_atom_events_are_kept_as_tables(tmp_path: Path) -> None:
     assert list(atom_events) == ["a_b", "flights"]
     assert atom_events["flights"].tobytes() == flights.tobytes()
     assert atom_events["a_b"].dtype == flights.dtype
-
-
-def test_a_shot_without_atom_events_has_no_group_for_them() -> None:
-    with opened(ShotEncoder(make_run(), "day/run").encode(make_shot())) as file:
-        assert "atom_events" not in file["entry"]
 
 
 def test_any_hdf5_from_1_8_on_can_read_it() -> None:

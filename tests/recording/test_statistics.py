@@ -157,14 +157,6 @@ def test_a_damaged_summary_is_an_error(of_defects: Any, recorded: Any, damage: d
         summary_of({**shot.row, **damage})
 
 
-def test_an_empty_run_has_nothing_to_tell(recorded: Any) -> None:
-    run = recorded()
-    found = statistics_of(run.shots, run.target)
-    assert (found.n_shots, found.cycles, found.defects) == (0, (), ())
-    assert found.seen == Rate(0, 0)
-    assert json.loads(json.dumps(found.as_dict()))["filling"] == {"mean": None, "error": None}
-
-
 def test_a_summary_survives_the_index(of_defects: Any) -> None:
     summary = summarise(of_defects(0, (2, None, 0), last=1, lost__vacuum=3), make_run().target)
     assert summary_of(json.loads(json.dumps(asdict(summary)))) == summary

@@ -16,8 +16,8 @@ from labseq.errors import ConfigError, RecordingError
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.columns import columns_of
 
-from .records import make_run, make_shot
-from .scanned import ADDRESSES, DEGREES, N_REPEATS, POINTS, WINDOWS_S, write_scan
+from .records import make_run, make_shot, write
+from .scanned import ADDRESSES, DEGREES, N_REPEATS, WINDOWS_S, write_scan
 
 pytest.importorskip("pandas")
 pytest.importorskip("xarray")
@@ -81,10 +81,11 @@ def test_every_column_has_a_unit_and_a_description(run: Run) -> None:
 
 
 def test_what_is_not_known_is_nan(tmp_path: Path) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot(0, filling_fraction=float("nan"), n_images=0, readings={"a": 1, "b": "on"}))
-    writer.write_shot(make_shot(1, readings={"c": True}, parameters={"x": [1, 2]}, calibrations={}))
-    table = open_run(writer.run_dir).to_dataframe()
+    table = write(
+        tmp_path,
+        make_shot(0, filling_fraction=float("nan"), n_images=0, readings={"a": 1, "b": "on"}),
+        make_shot(1, readings={"c": True}, parameters={"x": [1, 2]}, calibrations={}),
+    ).to_dataframe()
     for name in ("filling_fraction", "n_defects", "reading.c", "duration_s"):
         assert np.isnan(table[name][0]), name
     assert np.isnan(table["reading.a"][1])
@@ -103,12 +104,6 @@ def test_attempts_have_rows_where_they_are_asked_for(tmp_path: Path) -> None:
     assert list(zip(table.index, table["status"], strict=True)) == [
         (0, "failed"), (0, "complete"), (1, "complete")
     ]  # fmt: skip
-
-
-def test_a_run_without_shots_is_an_empty_table(tmp_path: Path) -> None:
-    run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
-    assert run.to_dataframe().shape[0] == 0
-    assert run.to_xarray().sizes["shot"] == 0
 
 
 def test_the_index_is_enough_for_a_table(run: Run, tmp_path: Path) -> None:
@@ -164,15 +159,6 @@ def test_without_a_scan_the_axis_is_that_of_the_shots(tmp_path: Path) -> None:
     assert data["shot"].values.tolist() == [0, 2]
     assert data["occupancy"].dims == ("shot", "image", "row", "col")
     assert data["target_fill"].values.sum() == 6
-
-
-def test_a_damaged_scan_is_explained(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path, points=POINTS[:1], n_repeats=2)
-    record = json.loads((folder / "run.json").read_text("utf-8"))
-    record["scan"]["point_of_shot"] = [0]
-    (folder / "run.json").write_text(json.dumps(record), "utf-8")
-    with pytest.raises(RecordingError, match=r"run\.json: has a damaged scan"):
-        open_run(folder).to_xarray()
 
 
 @pytest.mark.parametrize("package", ["pandas", "xarray"])

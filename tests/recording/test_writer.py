@@ -163,13 +163,6 @@ def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path) -> None:
         RunWriter.create(tmp_path / "file", make_run())
 
 
-@pytest.mark.parametrize("name", ["run.json", "../x"])
-def test_an_extra_file_cannot_stand_in_the_way(tmp_path: Path, name: str) -> None:
-    with pytest.raises(RecordingError, match="cannot be an extra file"):
-        RunWriter.create(tmp_path, make_run(), {name: ""})
-    assert files(tmp_path) == set()
-
-
 def n_disk_calls(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> int:
     disk = FullDisk(10**9, 0)
     with disk.inserted(monkeypatch):
@@ -213,18 +206,6 @@ def test_a_full_disk_at_any_moment_of_a_shot_leaves_the_others_whole(
     assert writer.n_written == 1 + n_calls
     for found in open_run(writer.run_dir).shots:
         assert len(found.record().images) == 3
-
-
-def test_a_full_disk_at_the_end_is_an_error_and_harms_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot())
-    with FullDisk(0, 99).inserted(monkeypatch), pytest.raises(RecordingError, match=r"STATE.*disk is full"):
-        writer.finish("failed", "the disk is full")
-    run = open_run(writer.run_dir)
-    assert run.status == "running"
-    run.shots[0].verify()
 
 
 def test_devices_are_added_once_they_are_open(tmp_path: Path) -> None:
@@ -279,13 +260,6 @@ def test_devices_of_a_run_that_had_not_come_so_far_are_noted(tmp_path: Path) -> 
     stopped_dir = RunWriter.create(tmp_path, make_run(devices={})).run_dir
     reopen(stopped_dir, make_run(), 0).set_devices({"camera": {"model": "second"}})
     assert open_run(stopped_dir).record["devices"] == {"camera": {"model": "second"}}
-
-
-def test_the_shots_know_what_is_true_of_them(stopped_dir: Path) -> None:
-    writer = reopen(stopped_dir, make_run(provenance={"labseq": "later"}))
-    writer.write_shot(make_shot(1))
-    first, second = open_run(stopped_dir).shots
-    assert (first.provenance["labseq"], second.provenance["labseq"]) == ("0.1.0", "later")
 
 
 def test_no_file_is_overwritten(stopped_dir: Path) -> None:

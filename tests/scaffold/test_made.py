@@ -20,7 +20,6 @@ import labseq
 from labseq.config.document import Document
 from labseq.registry import KINDS
 from labseq.session import load_plugins
-from labseq.session.check import check
 from tests.nested import run_pytest
 
 
@@ -94,12 +93,6 @@ def test_nothing_is_left_to_fill_in(made: Any) -> None:
     ]
     assert files
     assert not [path for path in files if "${" in path.read_text(encoding="utf-8")]
-
-
-def test_the_sequence_is_checked_without_a_warning(made: Any) -> None:
-    with labseq.Session.open(made.path / "first.yaml") as session:
-        report = check(session)
-    assert report.warnings == ()
 
 
 def test_a_sequence_runs_on_the_profile(made: Any, tmp_path: Path) -> None:

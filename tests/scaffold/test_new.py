@@ -67,12 +67,6 @@ def test_what_exists_is_never_written_over(tmp_path: Path) -> None:
     assert [*(tmp_path / "plugins").iterdir()] == [tmp_path / "plugins" / "spiral"]
 
 
-def test_a_file_in_the_way_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "plugins").write_text("")
-    with pytest.raises(ConfigError, match="it cannot be made"):
-        make_plugin("planner", "spiral", tmp_path)
-
-
 @pytest.mark.parametrize("name", ["plugins", ".labseq"])
 def test_a_file_in_the_way_of_a_folder_is_reported(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("")
@@ -125,11 +119,3 @@ def test_a_new_plugin_is_in_the_schemas_that_are_there(tmp_path: Path) -> None:
     make_plugin("planner", "spiral", tmp_path)
     assert '"spiral"' in schema.read_text(encoding="utf-8")
     assert not (tmp_path / ".labseq" / "profile.schema.json").exists()
-
-
-def test_what_the_tests_need_is_reported_where_it_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("labseq.scaffold.new.find_spec", lambda _: None)
-    commands = make_plugin("planner", "spiral", tmp_path).commands
-    assert commands[:2] == ('pip install "labseq[testing]"', "pytest plugins/spiral")

@@ -46,14 +46,6 @@ def test_a_planner_from_an_empty_folder(capsys: pytest.CaptureFixture[str]) -> N
     assert "labseq new sequence" not in capsys.readouterr().out  # there is one
 
 
-def test_a_package(capsys: pytest.CaptureFixture[str]) -> None:
-    assert code_of("new", "camera", "mycam", "--package") == 0
-    out = capsys.readouterr().out
-    assert "  pip install -e labseq-mycam\n  pytest labseq-mycam\n" in out
-    assert Path("labseq-mycam/src/labseq_mycam/camera.py").is_file()
-    assert Path("labseq-mycam/tests/test_mycam.py").is_file()
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
