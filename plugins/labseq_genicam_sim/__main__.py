@@ -62,7 +62,7 @@ class SimulatedCamera:
             camera's own thread, which answers nothing meanwhile.
     """
 
-    def __init__(self, setup: Setup, expose: Callable[[Exposure], bytes | bytearray | None]) -> None:
+    def __init__(self, setup: Setup, expose: Callable[[Exposure], bytes | None]) -> None:
         self._library = load_library()
         self._expose = expose
         self.faults = setup.faults
@@ -103,18 +103,18 @@ class SimulatedCamera:
         if self._cable is not None:
             host = self._register(STREAM_ADDRESS).to_bytes(4, "big")
             self._cable.aim(socket.inet_ntoa(host), self._register(STREAM_PORT) & 0xFFFF)
-        image = self._expose(Exposure(n, exposure_us, gain, pixel_format, *values))
+        image = self._expose(Exposure(n, exposure_us, gain, pixel_format, *values)) or b""
         faults = self.faults
         if faults.unplugged_at is not None and n >= faults.unplugged_at:
             os._exit(0)
-        if faults.late_s:
-            time.sleep(faults.late_s)
+        if faults.late_by:
+            time.sleep(faults.late_by)
         size = ctypes.c_size_t()
         address = self._library.arv_buffer_get_data(buffer, ctypes.byref(size))
         room = self._library.arv_fake_camera_get_payload(self._registers)
-        is_whole = image is not None and len(image) == room
+        is_whole = len(image) == room
         if is_whole:
-            ctypes.memmove(address, (ctypes.c_char * room).from_buffer(image), room)
+            ctypes.memmove(address, image, room)
         self._lose(faults.packet_loss if is_whole and n not in faults.failed_frames else HALF, n)
 
     def _lose(self, fraction: float, n: int) -> None:
@@ -161,7 +161,7 @@ class Process:
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._images: queue.SimpleQueue[bytearray | None] = queue.SimpleQueue()
+        self._images: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
 
     def run(self) -> None:
         """Run the camera until the parent is gone."""
@@ -172,7 +172,7 @@ class Process:
         setup = Setup(**values | {"faults": Faults(**values["faults"])})
         try:
             self._camera = SimulatedCamera(setup, self._expose)
-            if setup.faults.is_busy:  # control of the camera, as another application would have it
+            if setup.faults.busy:  # control of the camera, as another application would have it
                 self._other = Camera(self._camera.address)
         except AravisError as error:
             self._channel.send(REFUSED, str(error).encode())
@@ -183,7 +183,7 @@ class Process:
             if kind in (IMAGE, NO_IMAGE):
                 self._images.put(data if kind == IMAGE else None)
 
-    def _expose(self, exposure: Exposure) -> bytearray | None:
+    def _expose(self, exposure: Exposure) -> bytes | None:
         try:
             self._channel.send(EXPOSE, to_json(exposure))
         except OSError:
@@ -196,9 +196,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when it ends
     output = os.dup(1)
     os.dup2(2, 1)  # what libraries print must not mix with the messages
-    reader = os.fdopen(0, "rb", buffering=0)
-    writer = os.fdopen(output, "wb", buffering=0)
-    Process(Channel(reader, writer)).run()
+    Process(Channel(os.fdopen(0, "rb"), os.fdopen(output, "wb"))).run()
     sys.stderr.flush()
     os._exit(0)
 

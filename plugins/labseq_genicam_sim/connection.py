@@ -45,22 +45,14 @@ class SimulatedConnection(CameraConnection):
         self._is_wired = trigger_line(context.lines, "camera") is not None
         self._mode = settings.mode
         self._readout_s = settings.readout
-        faults = settings.faults
-        self._late_s = faults.late_by
-        self._ignores_triggers = faults.ignores_triggers
+        self._late_s = settings.faults.late_by
+        self._ignores_triggers = settings.faults.ignores_triggers
         self._made: deque[Frame | None] = deque()
         self._sensor = SimulatedSensor(self._world, context.clock)
         self._fake = FakeCamera(
             self._expose,
             sensor_shape=self._world.sensor_shape,
-            faults=Faults(
-                faults.packet_loss,
-                faults.failed_frames,
-                faults.late_by,
-                faults.unplugged_at,
-                is_busy=faults.busy,
-                ignores_triggers=faults.ignores_triggers,
-            ),
+            faults=Faults(**settings.faults.model_dump()),
         )
         self._acquisition: Acquisition | None = None
         self._series: Series | None = None

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import IO, Final
 
 import numpy as np
@@ -84,7 +85,6 @@ class FakeCamera:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
-            bufsize=0,
             start_new_session=True,  # Ctrl-C is for the parent
         )
         assert self._process.stdin is not None
@@ -114,7 +114,8 @@ class FakeCamera:
         self._service.join(STOP_TIMEOUT_S)
         for pipe in (self._process.stdin, self._process.stdout, self._log):
             assert pipe is not None
-            pipe.close()
+            with suppress(OSError):  # what was not sent goes nowhere
+                pipe.close()
         self._process = None
 
     def __enter__(self) -> FakeCamera:
@@ -218,7 +219,7 @@ def _pixels(image: NDArray[np.uint16], exposure: Exposure) -> NDArray[np.uint16]
     return np.ascontiguousarray(image, np.uint8 if exposure.pixel_format == MONO["Mono8"] else "<u2")
 
 
-def _receive(channel: Channel) -> tuple[bytes, bytearray] | None:
+def _receive(channel: Channel) -> tuple[bytes, bytes] | None:
     try:
         return channel.receive()
     except (OSError, ValueError):  # closed meanwhile

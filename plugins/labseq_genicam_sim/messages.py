@@ -27,22 +27,22 @@ GAIN_STEP: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Failures to simulate. The camera's process, or the library in it, really fails.
+    """Failures to simulate, as in the settings. The camera's process, or the library in it, really fails.
 
     Attributes:
         packet_loss: Fraction of the packets of frames that are never sent, 0 to 1.
         failed_frames: Numbers of the frames, from 0, that come with half of their packets.
-        late_s: Delay of each frame, in seconds. The camera answers nothing meanwhile.
+        late_by: Delay of each frame, in seconds. The camera answers nothing meanwhile.
         unplugged_at: Number of the frame at which the camera vanishes, before it is sent; None for never.
-        is_busy: Whether another application controls the camera.
+        busy: Whether another application controls the camera.
         ignores_triggers: Whether its software trigger has no effect.
     """
 
     packet_loss: float = 0.0
     failed_frames: Sequence[int] = ()
-    late_s: float = 0.0
+    late_by: float = 0.0
     unplugged_at: int | None = None
-    is_busy: bool = False
+    busy: bool = False
     ignores_triggers: bool = False
 
 
@@ -108,12 +108,7 @@ class Exposure:
 
 
 class Channel:
-    """Messages over a pipe in each direction; any thread may send, one receives.
-
-    Args:
-        reader: Source of messages.
-        writer: Destination of messages, unbuffered.
-    """
+    """Messages over a pipe in each direction; any thread may send, one receives."""
 
     def __init__(self, reader: IO[bytes], writer: IO[bytes]) -> None:
         self._reader = reader
@@ -124,28 +119,15 @@ class Channel:
         """Send a message; ``data`` is any object with contiguous bytes."""
         view = memoryview(data).cast("B")
         with self._sending:
-            self._write(memoryview(HEAD.pack(kind, len(view))))
-            self._write(view)
+            self._writer.write(HEAD.pack(kind, len(view)))
+            self._writer.write(view)
+            self._writer.flush()
 
-    def receive(self) -> tuple[bytes, bytearray] | None:
+    def receive(self) -> tuple[bytes, bytes] | None:
         """Wait for a message; None when the other side is gone."""
-        head = self._read(HEAD.size)
-        if head is None:
+        head = self._reader.read(HEAD.size)
+        if len(head) < HEAD.size:
             return None
         kind, size = HEAD.unpack(head)
-        data = self._read(size)
-        return None if data is None else (kind, data)
-
-    def _write(self, view: memoryview) -> None:
-        while view:
-            view = view[self._writer.write(view) :]
-
-    def _read(self, size: int) -> bytearray | None:
-        data = bytearray(size)
-        view = memoryview(data)
-        while view:
-            n = self._reader.readinto(view)  # type: ignore[attr-defined]
-            if not n:
-                return None
-            view = view[n:]
-        return data
+        data = self._reader.read(size)
+        return (kind, data) if len(data) == size else None
