@@ -28,7 +28,7 @@ def test_errors_are_the_builtin_that_a_reader_expects(kind, builtin):
     assert issubclass(kind, builtin)
 
 
-def test_a_problem_says_where_what_and_what_to_do():
+def test_a_problem_has_a_place_and_a_remedy():
     problem = Problem("'rwos' is unknown", "a.yaml", 3, 7, "one of rows, cols", "did you mean 'rows'?")
     assert str(problem) == "a.yaml:3:7: 'rwos' is unknown; expected one of rows, cols; did you mean 'rows'?"
 

@@ -64,7 +64,7 @@ def test_what_is_shown_reads_back(value, dimension):
     assert parse_quantity(shown, dimension) == pytest.approx(value, rel=1e-2, abs=1e-9)
 
 
-def test_every_dimension_has_words_and_a_format():
+def test_every_dimension_has_a_name_and_a_format():
     for dimension in UNITS:
         assert dimension in expected(dimension)
         assert format_quantity(1.0, dimension)

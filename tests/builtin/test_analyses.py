@@ -84,7 +84,7 @@ def test_each_pair_of_images_has_its_own_moves():
 
 
 @pytest.mark.parametrize("images", [[], [image("11000", 1)], [image("00000", 1), image("10000", 2)]])
-def test_without_atoms_to_follow_nothing_is_said(images):
+def test_without_atoms_to_follow_there_is_no_survival(images):
     assert math.isnan(analysed(images, [])["survival"])
 
 

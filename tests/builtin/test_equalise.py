@@ -79,7 +79,7 @@ def found_in(shot: ShotRecord) -> dict[str, Any]:
     return {name.removeprefix(READINGS): value for name, value in shot.readings.items()}
 
 
-def test_rows_and_columns_become_even_and_the_record_says_how() -> None:
+def test_rows_and_columns_become_even_and_the_record_shows_it() -> None:
     meter = Meter()
     lab = lab_with(meter)
     found = found_in(run(lab))
@@ -322,7 +322,7 @@ def test_a_response_that_is_not_linear_takes_some_rounds_more(response: Any) -> 
     assert factors(array.power()).separable_spread < 0.0055
 
 
-def test_too_much_noise_ends_the_loop_and_says_how_many_averages_it_takes() -> None:
+def test_too_much_noise_ends_the_loop_and_names_the_averages_needed() -> None:
     array = Array(6, noise=0.1)
     with pytest.raises(
         DeviceError, match=r"too much noise: 20 averages leave .*; about \d+ averages"

@@ -120,7 +120,7 @@ def test_json_is_yaml(data: dict[str, Any]) -> None:
     assert json.dumps(Document.parse(text, "f.json").data) == json.dumps(data)
 
 
-def test_a_kept_text_stands_for_a_file_that_may_be_gone(tmp_path: Path) -> None:
+def test_a_stored_text_replaces_the_file(tmp_path: Path) -> None:
     path = tmp_path / "gone.yaml"
     document = Document.read(path, StoredText("\ufeffshots: 3\n", "copy/sequence.yaml"))
     assert (document.path, document.name, document.text) == (path, "copy/sequence.yaml", "shots: 3\n")

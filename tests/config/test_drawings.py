@@ -84,7 +84,7 @@ def test_a_wrong_text_is_an_error_with_its_line(content: str, message: str, tmp_
         read_drawing(tmp_path / "drawing.txt")
 
 
-def test_a_wrong_picture_says_what_is_wrong(tmp_path: Path) -> None:
+def test_a_wrong_picture_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "drawing.png"
     file.write_text("#.#\n")
     with pytest.raises(ConfigError, match=r"drawing\.png: this is not a readable PNG"):
@@ -153,7 +153,7 @@ def test_a_file_is_looked_for_beside_the_sequence(
     assert np.count_nonzero(target.fill | target.clear) == MASK.size
 
 
-def test_a_drawing_may_stand_in_the_sequence(tmp_path: Path) -> None:
+def test_a_drawing_may_be_part_of_the_sequence(tmp_path: Path) -> None:
     block = "\n  pattern: bitmap\n  sites: |\n    #.##\n    .#..\n    ###."
     sequence = tmp_path / "sequence.yaml"
     sequence.write_text(SEQUENCE.format(target=block))

@@ -144,7 +144,7 @@ def test_what_depends_on_an_override_is_worked_out_again() -> None:
     assert document.data["it"] == "0.04 s"
 
 
-def test_a_field_says_what_it_makes_of_the_result(tmp_path: Path) -> None:
+def test_a_field_checks_the_result(tmp_path: Path) -> None:
     text = (
         "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot:\n  - image: {}\nattempts: = 7 / 2\n"
     )

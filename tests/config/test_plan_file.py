@@ -35,7 +35,7 @@ def parse(change: Callable[[dict[str, Any]], object]) -> None:
     parse_plan(json.dumps(values).encode(), "plan.json")
 
 
-def test_a_plan_is_read_as_it_stands() -> None:
+def test_a_plan_is_read_as_it_was_written() -> None:
     file = parse_plan(json.dumps(document()).encode(), "plan.json")
     assert (file.planner, file.degree_of_parallelism, file.seed) == ("mine", 4, None)
     assert (file.grid.shape, file.grid.lattice, file.grid.spacing_m) == ((2, 3), "square", 4.49e-6)

@@ -88,7 +88,7 @@ def test_addresses_of_one_mapping_of_a_list_go_together() -> None:
     assert points(scan) == [["1 s", 7, 1], ["1 s", 7, 2], ["2 s", 8, 1], ["2 s", 8, 2]]
 
 
-def test_the_first_point_stands_in_the_document_and_shots_follow_from_the_scan(tmp_path: Path) -> None:
+def test_the_first_point_is_in_the_document_and_shots_follow_from_the_scan(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text(REST + "scan: {shot.sort.window: [1 ms, 2 ms]}\nrepeats: 3\n")
     document, spec, _ = load_sequence(path)

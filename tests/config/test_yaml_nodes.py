@@ -40,7 +40,7 @@ def test_scalars_are_of_yaml_1_2() -> None:
     assert plain("a: |\n  #.#\n  .#.\nb: >-\n  x\n  y\n") == {"a": "#.#\n.#.\n", "b": "x y"}
 
 
-def test_aliases_stand_for_values() -> None:
+def test_aliases_are_replaced_by_their_values() -> None:
     assert plain("a: &w [1, {x: 2}]\nb: *w\nc: &k word\nd: {*k : 3}") == {
         "a": [1, {"x": 2}],
         "b": [1, {"x": 2}],
@@ -254,7 +254,7 @@ def test_empty_values_are_behind_their_key() -> None:
     assert document.locate(("e", 0)) == (4, 2)
 
 
-def test_alias_is_where_it_stands_and_its_inside_where_it_is_written() -> None:
+def test_an_alias_has_its_own_place_and_its_items_that_of_the_anchor() -> None:
     document = Document.parse("a: &x\n  k: 1\nb: *x\n", "f.yaml")
     assert document.locate(("b",)) == (3, 4)
     assert document.locate(("b", "k")) == (2, 6)

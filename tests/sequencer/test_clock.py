@@ -61,7 +61,7 @@ def test_while_devices_are_made_safe_waits_finish():
         clock.check()
 
 
-def test_paced_time_takes_as_long_as_it_says():
+def test_paced_time_passes_in_real_time():
     clock = PacedClock(StopFlag())
     start = time.monotonic()
     clock.sleep(0.02)

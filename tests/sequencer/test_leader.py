@@ -86,7 +86,7 @@ def test_it_lasts_as_long_as_the_leader_needs_and_at_most_its_timeout() -> None:
     ]
 
 
-def test_the_leader_is_told_the_outcome_of_each_shot() -> None:
+def test_the_outcome_of_each_shot_is_reported() -> None:
     made = rig(occupancies=[np.ones((2, 2), bool), np.eye(2, dtype=bool)])
     made.run(2)
     assert leader_of(made).answers == [
@@ -138,7 +138,7 @@ def test_a_transient_failure_is_reported_after_the_devices_are_safe() -> None:
     assert names[told - 2 : told] == ["mobile_tweezers.safe_state", "camera.safe_state"]
 
 
-def test_a_failure_is_told_after_all_devices_are_safe_and_before_they_are_closed() -> None:
+def test_a_failure_is_reported_after_all_devices_are_safe_and_before_they_are_closed() -> None:
     made = rig(fail_on={"camera.read": OSError("cable")})
     with pytest.raises(DeviceError):
         made.run()

@@ -44,7 +44,7 @@ def is_on(spec: LineSpec, kind: str, t_s: float, begin_s: float, end_s: float, o
 
 @hypothesis.settings(max_examples=40)
 @hypothesis.given(specs(), st.sampled_from(KINDS[:3]), st.sampled_from([0.0, 5e-3, 0.5]))
-def test_each_line_is_on_when_the_rule_says_so(lines, kind, duration_s) -> None:
+def test_each_line_is_on_by_the_rule(lines, kind, duration_s) -> None:
     program = line_program(lines, kind, duration_s)
     end_s = program.begin_s + duration_s
     for t_s in np.concatenate([program.t_s + 1e-6, np.linspace(0, program.duration_s * 1.1, 23) + 1e-6]):

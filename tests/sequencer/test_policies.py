@@ -57,7 +57,7 @@ class Slow:
 
 
 @pytest.mark.parametrize("error", [LOST, LimitError("x", 2, 1), PlanError("no")])
-def test_a_shot_is_repeated_where_the_step_says_so(error: Exception) -> None:
+def test_a_shot_is_repeated_by_the_policy_of_its_step(error: Exception) -> None:
     made = Rig(policy=policy(AGAIN), fail_on={"camera.arm": [error]})
     made.run()
     assert [(shot.attempt, shot.status) for shot in made.sink.shots] == [(0, "failed"), (1, "complete")]
@@ -242,7 +242,7 @@ def test_a_step_that_never_ends_is_given_up_and_calls_nothing_any_more() -> None
         ("stop", ["failed"]),
     ],
 )
-def test_a_stage_over_its_budget_does_what_its_policy_says(then: Any, statuses: list[str]) -> None:
+def test_a_stage_over_its_budget_follows_its_policy(then: Any, statuses: list[str]) -> None:
     made = Rig(steps=(("slow", Slow(0.3, 0.1)),), policy=RunPolicy(steps=(StepPolicy(over_budget=then),)))
     if then == "stop":
         with pytest.raises(OverBudgetError, match="'step 0 slow' took 300 ms; its budget is 100 ms"):

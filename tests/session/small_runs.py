@@ -15,8 +15,7 @@ import labseq
 from labseq.errors import StopRequested
 from labseq.testing.fakes import RecordingObserver
 
-PROFILE = """
-labseq: 1
+PROFILE = """labseq: 1
 name: bench
 grid: {rows: 6, cols: 6, spacing: 4.49 um}
 camera: {use: virtual}
@@ -25,6 +24,7 @@ mobile_tweezers: {use: virtual}
 detector: {use: threshold}
 simulation: {use: virtual}
 """
+"""A virtual lab of 6 x 6 sites."""
 SEQUENCE = """
 labseq: 1
 name: small µ
@@ -38,6 +38,27 @@ shot:
   - rearrange: {cycles: 2, window: 60 ms, exposure: 45 ms}
   - image: {exposure: 45 ms}
 """
+OWN_DEVICE = """
+import labseq
+
+LABSEQ_API = 1
+
+
+class Mine:
+    def __init__(self, settings, context): pass
+    def open(self): pass
+    def close(self): pass
+    def safe_state(self): pass
+    def describe(self): return {}
+    def command(self, name, **arguments): pass
+    def read(self, name): pass
+
+
+@labseq.plugin.hookimpl
+def labseq_register(registry):
+    registry.device("mine", Mine)
+"""
+"""A plugin with a device that is not virtual."""
 SCANS = {
     "no scan": "shots: 6",
     "planner": "scan: {planner.degree_of_parallelism: [1, 4]}\nrepeats: 3\norder: shuffled",

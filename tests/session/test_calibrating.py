@@ -16,15 +16,7 @@ from labseq.motion import standing_on_sites
 from labseq.session.profile import open_store
 from labseq.testing.fakes import fake_calibration
 
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 4, cols: 5, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
-"""
+from .small_runs import PROFILE
 
 SEQUENCE = """labseq: 1
 name: look
@@ -37,7 +29,7 @@ record_frames: none
 shot: [{load: {}}, {image: {}}]
 """
 
-GRID = SiteGrid(4, 5)
+GRID = SiteGrid(6, 6)
 
 
 class Bench:
@@ -86,7 +78,7 @@ def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(
     frequencies = bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
     origin = {"calibrations": {"frequencies": frequencies.id}}
     bench.use("overlay", values={"offset_m": [1e-7, -2e-7]}, origin=origin)
-    expected = standing_on_sites(SiteGrid(4, 5, column_frequency_hz=shifted_hz(GRID)), [1e-7, -2e-7])
+    expected = standing_on_sites(SiteGrid(6, 6, column_frequency_hz=shifted_hz(GRID)), [1e-7, -2e-7])
     grid = bench.session().assembly.bench.grid
     assert np.array_equal(grid.column_frequency_hz, expected.column_frequency_hz)
     assert np.array_equal(grid.row_frequency_hz, expected.row_frequency_hz)
@@ -108,7 +100,7 @@ def test_thresholds_of_other_sites_are_used_with_a_warning(bench: Bench) -> None
     bench.use("thresholds")
     assert bench.session().assembly.warnings == ()
     bench.use(
-        "thresholds", values={"thresholds": np.full((4, 5), 1700.0)}, origin={"calibrations": {"sites": "x"}}
+        "thresholds", values={"thresholds": np.full((6, 6), 1700.0)}, origin={"calibrations": {"sites": "x"}}
     )
     assembly = bench.session().assembly
     assert {*assembly.bench.calibrations} == {"thresholds"}
@@ -168,8 +160,8 @@ def test_a_dry_run_of_a_real_lab_has_a_store_of_its_own(bench: Bench) -> None:
 
 
 def test_one_of_another_grid_is_refused(bench: Bench) -> None:
-    bench.use("overlay", SiteGrid(4, 6))
-    with pytest.raises(ConfigError, match=r"is of another grid: 4 x 6 sites.*; expected 4 x 5 sites"):
+    bench.use("overlay", SiteGrid(6, 7))
+    with pytest.raises(ConfigError, match=r"is of another grid: 6 x 7 sites.*; expected 6 x 6 sites"):
         bench.session()
 
 

@@ -34,7 +34,7 @@ def test_durations_span_from_no_cycle_to_all():
     assert always.shortest_shot_s == pytest.approx(0.5 + 2 * 0.045 + 10 * 0.045)
 
 
-def test_a_run_takes_as_long_as_the_check_says(tmp_path: Path):
+def test_a_run_takes_as_long_as_the_check_predicts(tmp_path: Path):
     report = checked()
     with labseq.Session.open(COMPACT, shots=3, seed=3, output=tmp_path) as session:
         run = session.run()

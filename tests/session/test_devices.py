@@ -16,6 +16,8 @@ from labseq.session import CheckedDevice, check_devices
 from labseq.session.safe import N_READINGS, check_each_device
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation
 
+from .small_runs import PROFILE
+
 TIMEOUTS = Timeouts(call_s=10.0, safe_state_s=10.0)
 SHORT = Timeouts(call_s=0.2, safe_state_s=10.0)
 
@@ -101,17 +103,6 @@ def test_the_simulation_is_opened_first_and_closed_last() -> None:
     assert (simulation_found.name, simulation_found.ok, one.ok) == ("simulation", True, False)
 
 
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 4, cols: 4, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
-devices: {shutter: {use: virtual}}
-timeouts: {call: 100 s}
-"""
 ORDER = ["simulation", "static_tweezers", "camera", "shutter", "mobile_tweezers"]
 
 
@@ -119,7 +110,9 @@ ORDER = ["simulation", "static_tweezers", "camera", "shutter", "mobile_tweezers"
 def profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "p.yaml"
-    path.write_text(PROFILE, encoding="utf-8")
+    path.write_text(
+        PROFILE + "devices: {shutter: {use: virtual}}\ntimeouts: {call: 100 s}\n", encoding="utf-8"
+    )
     return path
 
 

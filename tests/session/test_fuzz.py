@@ -47,7 +47,7 @@ def mutated(draw: st.DrawFn, text: str) -> str:
 @pytest.mark.parametrize("which", ["sequence", "profile"])
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_a_mutated_file_is_a_run_or_the_users_mistake(tmp_path: Path, which: str, data: st.DataObject):
+def test_a_mutated_file_opens_or_is_the_users_mistake(tmp_path: Path, which: str, data: st.DataObject):
     sequence, profile = SEQUENCE, PROFILE
     if which == "sequence":
         sequence = data.draw(mutated(SEQUENCE))

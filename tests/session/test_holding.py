@@ -17,37 +17,8 @@ from labseq.session import check_devices, make_profile_safe, resolve_profile
 from labseq.session.safe import lock_devices
 from labseq.testing.fakes import RecordingObserver
 
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 4, cols: 4, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
-plugin_folders: [plugins]
-devices: {shutter: {use: SHUTTER}}
-"""
-PLUGIN = """
-import labseq
+from .small_runs import OWN_DEVICE, PROFILE
 
-LABSEQ_API = 1
-
-
-class Mine:
-    def __init__(self, settings, context): pass
-    def open(self): pass
-    def close(self): pass
-    def safe_state(self): pass
-    def describe(self): return {}
-    def command(self, name, **arguments): pass
-    def read(self, name): pass
-
-
-@labseq.plugin.hookimpl
-def labseq_register(registry):
-    registry.device("mine", Mine)
-"""
 SEQUENCE = """
 labseq: 1
 name: look
@@ -64,13 +35,14 @@ shot:
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("plugins").mkdir()
-    Path("plugins/mine.py").write_text(PLUGIN, encoding="utf-8")
+    Path("plugins/mine.py").write_text(OWN_DEVICE, encoding="utf-8")
     Path("s.yaml").write_text(SEQUENCE, encoding="utf-8")
     write("mine")
 
 
 def write(shutter: str) -> None:
-    Path("p.yaml").write_text(PROFILE.replace("SHUTTER", shutter), encoding="utf-8")
+    own = f"plugin_folders: [plugins]\ndevices: {{shutter: {{use: {shutter}}}}}\n"
+    Path("p.yaml").write_text(PROFILE + own, encoding="utf-8")
 
 
 @pytest.fixture
@@ -98,7 +70,7 @@ def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
     with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
         pass
     Path("plugins/mine.py").write_text(
-        PLUGIN.replace("open(self): pass", "open(self): 1 / 0"), encoding="utf-8"
+        OWN_DEVICE.replace("open(self): pass", "open(self): 1 / 0"), encoding="utf-8"
     )
     with pytest.raises(DeviceError):
         run()
@@ -106,7 +78,7 @@ def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
         pass
 
 
-def test_a_run_holds_its_devices_and_says_which_run_it_is() -> None:
+def test_a_run_locks_its_devices_with_its_name() -> None:
     class Looking(RecordingObserver):
         told = ""
 

@@ -46,7 +46,7 @@ def test_a_plan_that_breaks_a_rule_is_refused_with_the_files_name() -> None:
         read(document)
 
 
-def test_more_tweezers_than_the_plan_says_are_refused() -> None:
+def test_more_tweezers_than_the_plan_allows_are_refused() -> None:
     document = planned(seed=1, degree_of_parallelism=5) | {"degree_of_parallelism": 1}
     with pytest.raises(ConfigError, match="breaks the rule 'parallelism'"):
         read(document)

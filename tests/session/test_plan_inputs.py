@@ -44,7 +44,7 @@ def first_site(found: PlanInputs) -> tuple[int, int]:
         ("my_pattern", ("my_pattern", {})),
     ],
 )
-def test_targets_in_words(text: str, expected: Any) -> None:
+def test_targets_as_text(text: str, expected: Any) -> None:
     assert parse_target(text) == expected
 
 
@@ -151,7 +151,7 @@ def test_a_damaged_profile_in_a_shot_is_refused(machine: Any) -> None:
 
 @settings(max_examples=12)
 @given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 6), st.integers(0, 6))
-def test_an_origin_is_where_it_says_or_refused(rows: int, cols: int, row: int, col: int) -> None:
+def test_a_target_is_at_its_origin_or_refused(rows: int, cols: int, row: int, col: int) -> None:
     fits = row + rows <= 6 and col + cols <= 6
     try:
         found = inputs(f"compact:{rows}x{cols}", "random:6x6@1", origin=f"{row},{col}")

@@ -11,6 +11,8 @@ from labseq.errors import ConfigError, LabseqError, PluginLoadError
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 
+from .small_runs import PROFILE
+
 SEQUENCE = """labseq: 1
 name: look
 profile: ./p.yaml
@@ -19,16 +21,6 @@ target: {pattern: mine}
 plugin_folders: [plugins]
 shot:
   - mine: {size: 5}
-"""
-
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 2, cols: 2, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual, image: {frame: [64, 64], centre_px: [31.5, 31.5]}}
 """
 
 PLUGIN = """

@@ -7,16 +7,9 @@ import numpy as np
 
 import labseq
 
-PROFILE = """
-labseq: 1
-name: shallow
-grid: {rows: 8, cols: 8, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual, loading: 75 %, depth_disorder: 4 %, lost_below_depth: 10 %}
-"""
+from .small_runs import PROFILE
+
+SIMULATION = "simulation: {use: virtual, loading: 75 %, depth_disorder: 4 %, lost_below_depth: 10 %}"
 SEQUENCE = """
 labseq: 1
 name: ramped
@@ -38,7 +31,10 @@ AGAIN = """
 
 
 def shots(folder: Path, depth: str, steps: str = AGAIN) -> list[Any]:
-    (folder / "shallow.yaml").write_text(PROFILE, encoding="utf-8")
+    (folder / "shallow.yaml").write_text(
+        PROFILE.replace("simulation: {use: virtual}", SIMULATION).replace("6, cols: 6", "8, cols: 8"),
+        encoding="utf-8",
+    )
     sequence = folder / "s.yaml"
     sequence.write_text(SEQUENCE.replace("DEPTH", depth).replace("STEPS", steps), encoding="utf-8")
     with labseq.Session.open(sequence, seed=5, output=folder / "data") as session:

@@ -13,40 +13,10 @@ from labseq.recording import find_dead_run, mark_active, marker_roots
 from labseq.session import SafeStateReport, make_profile_safe
 from labseq.testing.fakes import RecordingObserver
 
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 10, cols: 10, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
-plugin_folders: [plugins]
-devices:
-  shutter: SHUTTER
-"""
+from .small_runs import OWN_DEVICE, PROFILE as SMALL_PROFILE
+
+PROFILE = f"{SMALL_PROFILE}plugin_folders: [plugins]\ndevices:\n  shutter: SHUTTER\n"
 SAFE_ORDER = ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
-
-PLUGIN = """
-import labseq
-
-LABSEQ_API = 1
-
-
-class Mine:
-    def __init__(self, settings, context): pass
-    def open(self): pass
-    def close(self): pass
-    def safe_state(self): pass
-    def describe(self): return {}
-    def command(self, name, **arguments): pass
-    def read(self, name): pass
-
-
-@labseq.plugin.hookimpl
-def labseq_register(registry):
-    registry.device("mine", Mine)
-"""
 
 INIT = "def __init__(self, settings, context): "
 INIT_FAILS = f"{INIT}raise OSError('no card')"
@@ -67,7 +37,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def write(shutter: str, old: str = "", new: str = "", profile: str = PROFILE) -> None:
     Path("plugins").mkdir(exist_ok=True)
-    Path("plugins/mine.py").write_text(PLUGIN.replace(old, new, 1), encoding="utf-8")
+    Path("plugins/mine.py").write_text(OWN_DEVICE.replace(old, new, 1), encoding="utf-8")
     Path("p.yaml").write_text(profile.replace("SHUTTER", shutter), encoding="utf-8")
 
 
@@ -95,7 +65,7 @@ def test_one_broken_device_never_keeps_the_others_from_being_made_safe(what: str
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("spacing: 4.49 um", "spacing: 0", "p.yaml:3:37: spacing is 0"),
+        ("spacing: 4.49 um", "spacing: 0", "p.yaml:3:35: spacing is 0"),
         ("[plugins]", "[gone, plugins]", "there is no plugin folder 'gone'"),
     ],
 )

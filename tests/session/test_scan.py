@@ -50,7 +50,7 @@ def states(observer: RecordingObserver) -> list[str]:
     return [values["state"] for name, values in observer.events if name == "state"]
 
 
-def test_every_shot_is_taken_at_its_point_and_says_which(tmp_path: Path) -> None:
+def test_every_shot_is_taken_at_its_point_and_records_it(tmp_path: Path) -> None:
     text = "scan: {planner.degree_of_parallelism: [2, 5], shot.sort.window: [50 ms, 0.1 s]}\nrepeats: 2\n"
     done = run(tmp_path, text)
     assert done.status == "complete"

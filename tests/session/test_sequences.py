@@ -32,7 +32,7 @@ def test_it_is_accepted_without_a_warning_and_runs(sequence: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", FIGURE_6)
-def test_the_atoms_are_enough_for_it_and_some_are_left_to_mend_it(name: str) -> None:
+def test_the_atoms_are_enough_and_some_are_left_for_repairs(name: str) -> None:
     target = labseq.Session.open(ROOT / "sequences" / f"{name}.yaml").assembly.target
     n_loaded, five_sigma = 0.75 * target.fill.size, 5 * (0.75 * 0.25 * target.fill.size) ** 0.5
     assert target.n_atoms < n_loaded - five_sigma

@@ -90,7 +90,7 @@ def test_of_several_runs_one_must_be_named(data: Path) -> None:
     assert find_running(runs[1]) == runs[1]
 
 
-def test_without_a_run_that_is_said(data: Path) -> None:
+def test_without_a_run_there_is_nothing_to_stop(data: Path) -> None:
     with pytest.raises(ConfigError, match=r"^no run is in progress$"):
         find_running()
     interrupted(write(data.parent), "shot_started", 1)
