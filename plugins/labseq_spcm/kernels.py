@@ -61,12 +61,8 @@ CORES: Final = const("int64", 1)
 def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
     """Interleave the samples of both outputs, as the card stores them.
 
-    It writes whole frames of unsigned words, so that the processor can do many at a time.
-
-    Args:
-        first: uint16 (n,): the samples of output 0, their bits.
-        second: uint16 (n,): of output 1.
-        out: Result, uint32 (n,): the frames, output 0 in the low word.
+    It writes whole frames of unsigned words, so that the processor can do many at a time: uint32 (n,) from
+    the bits of the samples of each output, uint16 (n,), output 0 in the low word.
     """
     for i in range(len(out)):
         out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
@@ -124,19 +120,9 @@ def assign(
 ) -> bool:  # fmt: skip
     """Assign a core to each tone of an axis in a segment: the one that it had, or a free one.
 
-    Args:
-        offsets: Where each segment's tones start.
-        tones: All tones.
-        segment: The segment.
-        before_s: Duration of the segment before it.
-        first_core: The axis' cores start here in the list of cores.
-        last_core: And end before this.
-        core_of: For each tone the index of its core; filled in for the segment's tones.
-        set_phase: For each tone whether its phase must be set; likewise.
-        used: Scratch, for each core.
-
-    Returns:
-        Whether there are enough cores.
+    It fills in, for each of the segment's tones, the index of its core and whether its phase must be set.
+    The axis' cores are those from ``first_core`` to ``last_core``; ``before_s`` is the duration of the
+    segment before, and ``used`` scratch for each core. Returns whether there are enough cores.
     """
     first, last = offsets[segment], offsets[segment + 1]
     used[:] = False
@@ -215,26 +201,9 @@ def drive_tones(
 ) -> int:  # fmt: skip
     """Add the commands of some tones for one step of a segment.
 
-    Args:
-        tones: All tones.
-        first: The first of these.
-        last: The one after the last of these.
-        cores: All cores.
-        core_of: For each tone the index of its core.
-        set_phase: For each tone whether its phase must be set.
-        course: The segment's course.
-        begins: Whether this is the segment's first step.
-        u: Fraction of the segment at which the step starts on the card.
-        until: Fraction at which it ends on the card.
-        step_s: How long it takes on the card.
-        late_s: How much later than in the program it starts, because the card rounds times to ticks.
-        now: Present state of the cores, (4, n).
-        registers: The commands' registers.
-        values: Their values.
-        n: How many commands there are.
-
-    Returns:
-        How many commands there are now.
+    On the card the step lasts ``step_s``, from the fraction ``u`` of the segment to ``until``. It starts
+    ``late_s`` later than in the program, because the card rounds times to ticks. ``now`` is the present state
+    of the cores, (4, n). Returns how many commands there are then.
     """
     s0, s1 = course_at(course, u), course_at(course, until)
     for tone in range(first, last):
