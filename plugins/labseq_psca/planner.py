@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Annotated, Final, Literal
 
@@ -94,6 +95,7 @@ class PscaPlanner:
             min(dop, motion.max_row_tones, tones.row or dop),  # along a column
         )
         self._settings = settings
+        self._repair_below = settings.repair_below if settings.variant == "fewest" else 0.0
         self._eject_slots = motion.eject_slots
         self._order = _ORDERS[settings.row_order]
         self._grid = context.grid
@@ -104,7 +106,9 @@ class PscaPlanner:
         if self._settings.variant == "paper":
             from labseq_psca.kernels_paper import plan_as_in_paper as kernel
         else:
-            from labseq_psca.kernels import plan_best_way as kernel
+            from labseq_psca.kernels_fewest import plan_fewest as kernel
+        if self._repair_below > 0:
+            importlib.import_module("labseq_psca.kernels_repair")
         self._kernel = kernel
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
@@ -131,9 +135,9 @@ class PscaPlanner:
             raise PlanError(str(error), "psca") from error
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
         moves, offsets = self._sort_and_compress(occupied, fill, target.clear)
-        if self._settings.variant == "fewest" and self._settings.repair_below > 0:
+        if self._repair_below > 0:
             n_defects = int(np.count_nonzero(fill > occupied))
-            if 0 < n_defects <= self._settings.repair_below * target.n_atoms:
+            if 0 < n_defects <= self._repair_below * target.n_atoms:
                 repaired = self._repair(occupied, fill, target.clear)
                 moves, offsets = min((moves, offsets), repaired, key=_cost)
         moves.flags.writeable = offsets.flags.writeable = False  # otherwise Plan would copy them
@@ -151,7 +155,7 @@ class PscaPlanner:
         self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
         """Fill each defect from the side that takes fewest atoms; sort and compress for the rest."""
-        from labseq_psca.kernels import plan_repair
+        from labseq_psca.kernels_repair import plan_repair
 
         moves, offsets, atoms = plan_repair(occupied, fill, *self._limits)
         more_moves, more_offsets = self._sort_and_compress(atoms, fill, clear)
@@ -159,8 +163,8 @@ class PscaPlanner:
 
 
 def _cost(plan: tuple[NDArray[np.int16], NDArray[np.int32]]) -> int:
-    """Expected loss of a plan, in the units of the kernels' weights of moves and batches."""
-    from labseq_psca.kernels import ATOM_MOVE, BATCH
+    """Expected loss of atoms in a plan, in units of the weights of atom moves and batches."""
+    from labseq_psca.kernels_repair import ATOM_MOVE, BATCH
 
     moves, offsets = plan
     return ATOM_MOVE * len(moves) + BATCH * (len(offsets) - 1)

@@ -1,8 +1,10 @@
 """The kernels of planners that move one atom at a time: assignment, paths, moves.
 
 They work on a grid with a margin of one site on each side, flattened: a site is
-a number, its neighbours are 1 and ``width`` away, and the margin stands for the
-places where atoms are ejected. A path is a list of neighbouring sites.
+a number, its neighbours are 1 and ``width`` away (``width`` is the number of sites in
+a row, margins included), and the margin stands for the places where atoms are ejected.
+Masks of sites are bool (n_sites,): ``fill`` marks the sites that must hold an atom,
+``clear`` those that must be empty. A path is a list of neighbouring sites, its end first.
 """
 
 from __future__ import annotations
@@ -27,6 +29,10 @@ UNWANTED: Final = 1 << 39  # an end that is legal but not wanted; only for end c
 STEP: Final = 1 << 16
 TURN: Final = 1 << 2  # and up to 3 for the choice of an end, all else equal
 
+Board = tuple[Bools, Bools, int]
+"""Where atoms are, the sites that are no margin, and the width."""
+BOARD: Final = f"Tuple(({SITES}, {SITES}, int64))"
+
 NO_END: Final = -1
 N_DIRECTIONS: Final = 4
 
@@ -49,15 +55,11 @@ def sites_with_margin(sites: Ints, n_cols: int) -> Ints:
     return (sites // n_cols + 1) * (n_cols + 2) + sites % n_cols + 1
 
 
-@kernel("bool_[::1](int64, int64)")
-def grid_sites(n_rows: int, n_cols: int) -> Bools:
-    """Mark the sites that are no margin."""
-    width = n_cols + 2
-    inside = np.zeros((n_rows + 2) * width, np.bool_)
-    for row in range(n_rows):
-        for col in range(n_cols):
-            inside[(row + 1) * width + col + 1] = True
-    return inside
+@kernel(f"{BOARD}({GRID})")
+def board_of(occupied: Bools) -> Board:
+    """Put the atoms of a grid onto a board."""
+    inside = with_margin(np.ones(occupied.shape, np.bool_))
+    return with_margin(occupied), inside, occupied.shape[1] + 2
 
 
 @kernel("int64[::1](int64[::1], int64, int64)")
@@ -76,23 +78,23 @@ def trace(came_from: Ints, state: int, n_sites: int) -> Ints:
     return path
 
 
-@kernel(f"int64[::1]({SITES}, {SITES}, int64, {SITES}, int64[::1])")
-def cheapest_path(atoms: Bools, inside: Bools, width: int, starts: Bools, end_cost: Ints) -> Ints:
+@kernel(f"int64[::1]({BOARD}, {SITES}, int64[::1])")
+def cheapest_path(board: Board, starts: Bools, end_cost: Ints) -> Ints:
     """Find the path from a start to an end that crosses the fewest atoms; then the shortest and straightest.
 
-    Dijkstra's algorithm over sites and directions of arrival.
+    Dijkstra's algorithm over sites and directions of arrival. Atoms at the start and at
+    the end are not crossed; only ends may lie on the margin.
 
     Args:
-        atoms: bool (n_sites,), where atoms are. Those at the start and the end are not crossed.
-        inside: bool (n_sites,), sites that are no margin; only ends may lie on the margin.
-        width: Sites in a row, margins included.
+        board: The board.
         starts: bool (n_sites,), where the path may start.
         end_cost: int64 (n_sites,), what to add for a path that ends there, or ``NO_END``;
             no start is an end.
 
     Returns:
-        int64 (n,): the path's sites, its end first; empty if there is none.
+        int64 (n,); empty if there is none.
     """
+    atoms, inside, width = board
     n_sites = len(atoms)
     steps = (-width, -1, 1, width)
     finish = N_DIRECTIONS * n_sites  # states from here on: the path ends at this site
@@ -135,24 +137,19 @@ Moves = NDArray[np.int16]
 Growing = tuple[Moves, Bools, int]
 """A plan that grows: its batches of one atom move, whether each is linked, and how many there are."""
 
-GROWING: Final = "int16[:, ::1], bool_[::1], int64"
+GROWING: Final = "Tuple((int16[:, ::1], bool_[::1], int64))"
 
 
-@kernel(f"Tuple(({GROWING}))({GROWING}, int64, int64, int64, boolean)")
-def add_batch(
-    moves: Moves, linked: Bools, n: int, source: int, goal: int, width: int, goes_on: bool
-) -> Growing:
-    """Add a straight move of one atom to a growing plan.
+@kernel(f"{GROWING}(int64)")
+def empty_plan(n_sites: int) -> Growing:
+    """Make the arrays of a plan for a grid of ``n_sites``."""
+    return np.empty((n_sites, 4), np.int16), np.empty(n_sites, np.bool_), 0
 
-    Args:
-        moves: Of the growing plan, int16 (>= n, 4), as ``linked`` and ``n``.
-        linked: bool (>= n,).
-        n: Number of batches so far.
-        source: Site where the atom is.
-        goal: Site where it goes.
-        width: Sites in a row, margins included.
-        goes_on: Whether the tweezer holds the atom since the batch before.
-    """
+
+@kernel(f"{GROWING}({GROWING}, int64, int64, int64, boolean)")
+def add_batch(plan: Growing, source: int, goal: int, width: int, goes_on: bool) -> Growing:
+    """Add a straight move of one atom; ``goes_on`` if the tweezer holds it since the batch before."""
+    moves, linked, n = plan
     if n == len(moves):
         more_moves = np.empty((2 * n, 4), np.int16)
         more_linked = np.empty(2 * n, np.bool_)
@@ -167,85 +164,45 @@ def add_batch(
     return moves, linked, n + 1
 
 
-@kernel(f"Tuple(({GROWING}))({GROWING}, {SITES}, {SITES}, int64, int64[::1], int64, int64)")
-def carry(
-    moves: Moves,
-    linked: Bools,
-    n: int,
-    atoms: Bools,
-    inside: Bools,
-    width: int,
-    path: Ints,
-    start: int,
-    stop: int,
-) -> Growing:
-    """Carry the atom at one place of a path to an earlier one, by a batch for each straight piece.
+@kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1], int64, int64)")
+def carry(plan: Growing, board: Board, path: Ints, start: int, stop: int) -> Growing:
+    """Carry the atom at ``path[start]`` to ``path[stop]``, by a batch for each straight piece.
 
-    Args:
-        moves: Of the growing plan, as ``linked`` and ``n``.
-        linked: bool (>= n,).
-        n: Number of batches so far.
-        atoms: bool (n_sites,), updated; no atom between the two places.
-        inside: bool (n_sites,), sites that are no margin.
-        width: Sites in a row, margins included.
-        path: int64, neighbouring sites.
-        start: Where in the path the atom is.
-        stop: Where in the path it goes; before ``start``.
+    ``stop`` is before ``start``, and no atom stands between them.
     """
+    atoms, inside, width = board
     corner = start
     for at in range(start - 1, stop - 1, -1):
         if at == stop or path[at - 1] - path[at] != path[at] - path[at + 1]:
-            moves, linked, n = add_batch(moves, linked, n, path[corner], path[at], width, corner != start)
+            plan = add_batch(plan, path[corner], path[at], width, corner != start)
             corner = at
     atoms[path[start]] = False
     atoms[path[stop]] = inside[path[stop]]
-    return moves, linked, n
+    return plan
 
 
-@kernel(f"Tuple(({GROWING}))({GROWING}, {SITES}, {SITES}, int64, int64[::1])")
-def shift(
-    moves: Moves, linked: Bools, n: int, atoms: Bools, inside: Bools, width: int, path: Ints
-) -> Growing:
-    """Move every atom of a path on to the next free place towards the path's first site, which is free.
-
-    Arguments as for :func:`carry`.
-    """
+@kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1])")
+def shift(plan: Growing, board: Board, path: Ints) -> Growing:
+    """Move every atom of a path on to the next free place towards the path's first site, which is free."""
     free = 0
     for at in range(1, len(path)):
-        if atoms[path[at]]:
-            moves, linked, n = carry(moves, linked, n, atoms, inside, width, path, at, free)
+        if board[0][path[at]]:
+            plan = carry(plan, board, path, at, free)
             free = at
-    return moves, linked, n
+    return plan
 
 
-@kernel(f"Tuple(({GROWING}))({GROWING}, {SITES}, {SITES}, int64, {SITES}, {SITES}, boolean)")
+@kernel(f"{GROWING}({GROWING}, {BOARD}, {GRID}, {GRID}, boolean)")
 def clear_surplus(
-    moves: Moves,
-    linked: Bools,
-    n: int,
-    atoms: Bools,
-    inside: Bools,
-    width: int,
-    fill: Bools,
-    clear: Bools,
-    may_eject: bool,
+    plan: Growing, board: Board, fill_sites: Bools, clear_sites: Bools, may_eject: bool
 ) -> Growing:
-    """Bring the atoms on clear sites to free reservoir sites, or off the grid where there is none.
+    """Move the atoms on clear sites to free reservoir sites, or off the grid where there is none.
 
-    The atom with the cheapest way goes first. Atoms in its way go on to the next
-    place, so that the way costs one move more for each.
-
-    Args:
-        moves: Of the growing plan, as ``linked`` and ``n``.
-        linked: bool (>= n,).
-        n: Number of batches so far.
-        atoms: bool (n_sites,), updated.
-        inside: bool (n_sites,), sites that are no margin.
-        width: Sites in a row, margins included.
-        fill: bool (n_sites,), sites that must hold an atom.
-        clear: bool (n_sites,), sites that must be empty.
-        may_eject: Whether atoms can be ejected.
+    The atom with the cheapest path goes first. Atoms on its path go on to the next
+    place, so that the path costs one move more for each.
     """
+    atoms, inside, _ = board
+    fill, clear = with_margin(fill_sites), with_margin(clear_sites)
     surplus = clear & atoms
     end_cost = np.full(len(atoms), NO_END, np.int64)
     for site in range(len(atoms)):
@@ -254,17 +211,17 @@ def clear_surplus(
         elif not (atoms[site] or fill[site] or clear[site]):
             end_cost[site] = 0
     while surplus.any():
-        path = cheapest_path(atoms, inside, width, surplus, end_cost)
+        path = cheapest_path(board, surplus, end_cost)
         if len(path) == 0:
             break
-        moves, linked, n = shift(moves, linked, n, atoms, inside, width, path)
+        plan = shift(plan, board, path)
         surplus[path[-1]] = False
         if inside[path[0]]:
             end_cost[path[0]] = NO_END
-    return moves, linked, n
+    return plan
 
 
-@kernel(f"Tuple(({GROWING}))({GRID}, {GRID}, {GRID}, {const('int64', 1)}, boolean)")
+@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, {const('int64', 1)}, boolean)")
 def plan_compression(
     occupied: Bools, fill_sites: Bools, clear_sites: Bools, order: Ints, may_eject: bool
 ) -> Growing:
@@ -280,11 +237,10 @@ def plan_compression(
     Returns:
         moves, int16 (>= n, 4), and whether each is linked, bool (>= n,); their number n.
     """
-    n_rows, n_cols = occupied.shape
-    width = n_cols + 2
-    atoms, inside = with_margin(occupied), grid_sites(n_rows, n_cols)
+    n_cols = occupied.shape[1]
+    plan, board = empty_plan(occupied.size), board_of(occupied)
+    atoms = board[0]
     fill, clear = with_margin(fill_sites), with_margin(clear_sites)
-    moves, linked, n = np.empty((occupied.size, 4), np.int16), np.empty(occupied.size, np.bool_), 0
     end_cost = np.full(len(atoms), NO_END, np.int64)
     for site in range(len(atoms)):
         if atoms[site]:
@@ -293,27 +249,18 @@ def plan_compression(
     for site in sites_with_margin(order, n_cols):
         if not atoms[site]:
             hole[site] = True
-            path = cheapest_path(atoms, inside, width, hole, end_cost)
+            path = cheapest_path(board, hole, end_cost)
             hole[site] = False
             end_cost[path[0]] = NO_END
-            moves, linked, n = shift(moves, linked, n, atoms, inside, width, path[::-1].copy())
+            plan = shift(plan, board, path[::-1].copy())
         end_cost[site] = NO_END
-    return clear_surplus(moves, linked, n, atoms, inside, width, fill, clear, may_eject)
+    return clear_surplus(plan, board, fill_sites, clear_sites, may_eject)
 
 
-@kernel(f"int64[::1]({SITES}, {SITES}, {SITES}, int64)")
-def distance_in_the_open(starts: Bools, atoms: Bools, inside: Bools, width: int) -> Ints:
-    """Measure how far free sites are from the nearest start, along free sites.
-
-    Args:
-        starts: bool (n_sites,), sites to start from.
-        atoms: bool (n_sites,), where atoms are.
-        inside: bool (n_sites,), sites that are no margin.
-        width: Sites in a row, margins included.
-
-    Returns:
-        int64 (n_sites,); -1 where no way leads.
-    """
+@kernel(f"int64[::1]({BOARD}, {SITES})")
+def distance_in_the_open(board: Board, starts: Bools) -> Ints:
+    """Measure how far free sites are from the nearest start, along free sites; -1 where no path leads."""
+    atoms, inside, width = board
     distance = np.full(len(starts), -1, np.int64)
     queue = np.empty(len(starts), np.int64)
     n_seen = 0
@@ -345,38 +292,34 @@ def farthest(distance: Ints, sites: Bools) -> int:
     return found
 
 
-@kernel(f"int64[::1]({SITES}, {SITES}, int64, {SITES}, int64[::1])")
-def opening(atoms: Bools, inside: Bools, width: int, holes: Bools, distance: Ints) -> Ints:
-    """Find how an atom between a closed region and the open moves into the region's depth.
+@kernel(f"int64[::1]({BOARD}, {SITES}, int64[::1])")
+def opening(board: Board, holes: Bools, distance: Ints) -> Ints:
+    """Find the path of an atom between a closed region and the open into the region's depth, its goal first.
 
     Of the closed regions the one with the fewest atoms in the way is taken. The
     atom next to it goes to the hole that is farthest, so that the rest stays one
     region, with one atom less in the way.
 
     Args:
-        atoms: bool (n_sites,), where atoms are.
-        inside: bool (n_sites,), sites that are no margin.
-        width: Sites in a row, margins included.
+        board: The board.
         holes: bool (n_sites,), empty fill sites.
         distance: int64 (n_sites,), from the nearest atom to spare along free sites, or -1.
-
-    Returns:
-        The path of that atom, its goal first.
     """
+    atoms = board[0]
     closed = holes & (distance < 0)
-    way = cheapest_path(atoms, inside, width, closed, np.where(distance < 0, NO_END, 0))
+    way = cheapest_path(board, closed, np.where(distance < 0, NO_END, 0))
     at = len(way) - 1
     while not atoms[way[at]]:
         at -= 1
     obstacle = np.zeros(len(atoms), np.bool_)
     obstacle[way[at]] = True
-    goal = farthest(distance_in_the_open(obstacle, atoms, inside, width), closed)
+    goal = farthest(distance_in_the_open(board, obstacle), closed)
     end_cost = np.full(len(atoms), NO_END, np.int64)
     end_cost[goal] = 0
-    return cheapest_path(atoms, inside, width, obstacle, end_cost)
+    return cheapest_path(board, obstacle, end_cost)
 
 
-@kernel(f"Tuple(({GROWING}))({GRID}, {GRID}, {GRID}, boolean)")
+@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, boolean)")
 def plan_clusters(occupied: Bools, fill_sites: Bools, clear_sites: Bools, may_eject: bool) -> Growing:
     """Open the closed regions, fill the open ones from their depth, then clear what must be empty.
 
@@ -389,38 +332,28 @@ def plan_clusters(occupied: Bools, fill_sites: Bools, clear_sites: Bools, may_ej
     Returns:
         moves, int16 (>= n, 4), and whether each is linked, bool (>= n,); their number n.
     """
-    n_rows, n_cols = occupied.shape
-    width = n_cols + 2
-    atoms, inside = with_margin(occupied), grid_sites(n_rows, n_cols)
-    fill, clear = with_margin(fill_sites), with_margin(clear_sites)
-    moves, linked, n = np.empty((occupied.size, 4), np.int16), np.empty(occupied.size, np.bool_), 0
+    plan, board = empty_plan(occupied.size), board_of(occupied)
+    atoms, fill, clear = board[0], with_margin(fill_sites), with_margin(clear_sites)
     holes = fill & ~atoms
     while holes.any():
         spare = atoms & ~fill
-        distance = distance_in_the_open(spare, atoms, inside, width)
+        distance = distance_in_the_open(board, spare)
         if (holes & (distance < 0)).any():
-            path = opening(atoms, inside, width, holes, distance)
+            path = opening(board, holes, distance)
             holes[path[-1]] = True
         else:
             hole = np.zeros(len(atoms), np.bool_)
             hole[farthest(distance, holes)] = True
             end_cost = np.where(spare, np.where(clear, 0, UNWANTED), NO_END)
-            path = cheapest_path(atoms, inside, width, hole, end_cost)[::-1].copy()
+            path = cheapest_path(board, hole, end_cost)[::-1].copy()
         holes[path[0]] = False
-        moves, linked, n = shift(moves, linked, n, atoms, inside, width, path)
-    return clear_surplus(moves, linked, n, atoms, inside, width, fill, clear, may_eject)
+        plan = shift(plan, board, path)
+    return clear_surplus(plan, board, fill_sites, clear_sites, may_eject)
 
 
 @kernel("int64[::1](int64, int64, int64, boolean)")
 def l_shaped(source: int, goal: int, width: int, row_first: bool) -> Ints:
-    """List the sites of the L from a source to a goal, the goal first.
-
-    Args:
-        source: Site where the atom is.
-        goal: Site where it goes.
-        width: Sites in a row, margins included.
-        row_first: Whether it goes along its row first.
-    """
+    """List the sites of the L from a source to a goal, along the source's row first or last."""
     down = goal // width - source // width
     right = goal % width - source % width
     path = np.empty(abs(down) + abs(right) + 1, np.int64)
@@ -438,7 +371,7 @@ def l_shaped(source: int, goal: int, width: int, row_first: bool) -> Ints:
 
 @kernel(f"int64({SITES}, int64[::1])")
 def n_in_the_way(atoms: Bools, path: Ints) -> int:
-    """Count the atoms on a path, that on its goal included, that on its source not."""
+    """Count the atoms on a path, including that on its goal, but not that on its source."""
     n = 0
     for at in range(len(path) - 1):
         if atoms[path[at]]:
@@ -448,43 +381,28 @@ def n_in_the_way(atoms: Bools, path: Ints) -> int:
 
 @kernel(f"Tuple((int64, boolean))({SITES}, int64, int64, int64)")
 def better_l(atoms: Bools, source: int, goal: int, width: int) -> tuple[int, bool]:
-    """Count the atoms in the way on the better of the two L's; tell whether it goes along the row first."""
+    """Atoms in the way on the better of the two L's, and whether it goes along the row first."""
     n_row_first = n_in_the_way(atoms, l_shaped(source, goal, width, True))
     n_column_first = n_in_the_way(atoms, l_shaped(source, goal, width, False))
     return min(n_row_first, n_column_first), n_row_first <= n_column_first
 
 
-@kernel(f"Tuple(({GROWING}, int64))({GROWING}, {SITES}, {SITES}, int64, int64[::1], int64[::1], int64)")
-def carry_the_free(
-    moves: Moves,
-    linked: Bools,
-    n: int,
-    atoms: Bools,
-    inside: Bools,
-    width: int,
-    goal_of: Ints,
-    waiting: Ints,
-    n_waiting: int,
-) -> tuple[Moves, Bools, int, int]:
-    """Move every waiting atom that has a free way to its goal; go through the list once.
+@kernel(f"Tuple(({GROWING}, int64))({GROWING}, {BOARD}, int64[::1], int64[::1])")
+def carry_the_free(plan: Growing, board: Board, goal_of: Ints, waiting: Ints) -> tuple[Growing, int]:
+    """Move every waiting atom that has a free path to its goal; go through the list once.
 
     Args:
-        moves: Of the growing plan, as ``linked`` and ``n``.
-        linked: bool (>= n,).
-        n: Number of batches so far.
-        atoms: bool (n_sites,), updated.
-        inside: bool (n_sites,), sites that are no margin.
-        width: Sites in a row, margins included.
+        plan: The growing plan.
+        board: The board; updated.
         goal_of: int64 (n_sites,), where the atom on each site goes, -1 for nowhere; updated.
-        waiting: int64 (>= n_waiting,), sites of the atoms that have not moved; updated.
-        n_waiting: Their number.
+        waiting: int64 (n_waiting,), sites of the atoms that have not moved; updated.
 
     Returns:
         The growing plan, and how many atoms are still waiting.
     """
+    atoms, _, width = board
     n_left = 0
-    for i in range(n_waiting):
-        source = waiting[i]
+    for source in waiting:
         goal = int(goal_of[source])
         if goal < 0 or goal == source:
             continue
@@ -494,53 +412,42 @@ def carry_the_free(
             n_left += 1
             continue
         path = l_shaped(source, goal, width, row_first)
-        moves, linked, n = carry(moves, linked, n, atoms, inside, width, path, len(path) - 1, 0)
+        plan = carry(plan, board, path, len(path) - 1, 0)
         goal_of[source] = -1
         goal_of[goal] = goal
-    return moves, linked, n, n_left
+    return plan, n_left
 
 
-@kernel(f"Tuple(({GROWING}))({GROWING}, {SITES}, {SITES}, int64, int64[::1], int64[::1], int64)")
-def exchange(
-    moves: Moves,
-    linked: Bools,
-    n: int,
-    atoms: Bools,
-    inside: Bools,
-    width: int,
-    goal_of: Ints,
-    waiting: Ints,
-    n_waiting: int,
-) -> Growing:
+@kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1], int64[::1])")
+def exchange(plan: Growing, board: Board, goal_of: Ints, waiting: Ints) -> Growing:
     """Let the last atom in the way go on to the goal, and the one that was to go there take its part.
 
     Of the waiting atoms the one with the fewest atoms in its way is taken, and it
     takes over what that last one was to do: go to its goal, fill its place, or nothing. The
-    distance that is left to go does not grow by it, as both parts of the way
-    together are no longer than the whole.
-
-    Arguments as for :func:`carry_the_free`.
+    distance that is left to go does not grow by it, as both parts of the path
+    together are no longer than the whole. Arguments as for :func:`carry_the_free`.
     """
+    atoms, _, width = board
     least = np.iinfo(np.int64).max
     source, row_first = 0, True
-    for i in range(n_waiting):
-        n_atoms, is_row_first = better_l(atoms, waiting[i], int(goal_of[waiting[i]]), width)
+    for site in waiting:
+        n_atoms, is_row_first = better_l(atoms, site, int(goal_of[site]), width)
         if n_atoms < least:
-            least, source, row_first = n_atoms, waiting[i], is_row_first
+            least, source, row_first = n_atoms, site, is_row_first
     path = l_shaped(source, int(goal_of[source]), width, row_first)
     at = 0
     while not atoms[path[at]]:
         at += 1
     takes_over = goal_of[path[at]]
     if at > 0:
-        moves, linked, n = carry(moves, linked, n, atoms, inside, width, path, at, 0)
+        plan = carry(plan, board, path, at, 0)
         goal_of[path[at]] = -1
     goal_of[path[0]] = path[0]
     goal_of[source] = takes_over
-    return moves, linked, n
+    return plan
 
 
-@kernel(f"Tuple(({GROWING}))({GRID}, {GRID}, {GRID}, {const('int64', 1)}, {const('int64', 1)}, boolean)")
+@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, {const('int64', 1)}, {const('int64', 1)}, boolean)")
 def plan_assignment(
     occupied: Bools, fill_sites: Bools, clear_sites: Bools, sources: Ints, goals: Ints, may_eject: bool
 ) -> Growing:
@@ -561,20 +468,15 @@ def plan_assignment(
     Returns:
         moves, int16 (>= n, 4), and whether each is linked, bool (>= n,); their number n.
     """
-    n_rows, n_cols = occupied.shape
-    width = n_cols + 2
-    atoms, inside = with_margin(occupied), grid_sites(n_rows, n_cols)
-    moves, linked, n = np.empty((occupied.size, 4), np.int16), np.empty(occupied.size, np.bool_), 0
-    goal_of = np.full(len(atoms), -1, np.int64)
+    n_cols = occupied.shape[1]
+    plan, board = empty_plan(occupied.size), board_of(occupied)
+    goal_of = np.full(len(board[0]), -1, np.int64)
     waiting = sites_with_margin(sources, n_cols)
     goal_of[waiting] = sites_with_margin(goals, n_cols)
-    n_waiting = len(waiting)
-    while n_waiting > 0:
-        n_before = n
-        moves, linked, n, n_waiting = carry_the_free(
-            moves, linked, n, atoms, inside, width, goal_of, waiting, n_waiting
-        )
-        if n == n_before and n_waiting > 0:
-            moves, linked, n = exchange(moves, linked, n, atoms, inside, width, goal_of, waiting, n_waiting)
-    fill, clear = with_margin(fill_sites), with_margin(clear_sites)
-    return clear_surplus(moves, linked, n, atoms, inside, width, fill, clear, may_eject)
+    while len(waiting) > 0:
+        n_before = plan[2]
+        plan, n_waiting = carry_the_free(plan, board, goal_of, waiting)
+        waiting = waiting[:n_waiting]
+        if plan[2] == n_before and n_waiting > 0:
+            plan = exchange(plan, board, goal_of, waiting)
+    return clear_surplus(plan, board, fill_sites, clear_sites, may_eject)

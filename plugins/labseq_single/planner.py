@@ -22,7 +22,7 @@ class SingleTweezerPlanner(ABC):
 
     Args:
         settings: None; there is nothing to set.
-        context: Its grid settles which sites are nearest to the target's centre,
+        context: Its grid determines which sites are nearest to the target's centre,
             its motion whether atoms can be ejected.
 
     Attributes:
@@ -52,7 +52,7 @@ class SingleTweezerPlanner(ABC):
 
         Args:
             occupancy: bool (n_rows, n_cols), as detected.
-            target: What to end with, of the same shape.
+            target: The wanted pattern, of the same shape.
 
         Returns:
             Batches of one atom each; those after a turn are linked to the one before.

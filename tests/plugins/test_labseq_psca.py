@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels
+from labseq_psca import kernels_fewest, kernels_lines
 from labseq_psca.planner import PscaPlanner, PscaSettings, ToneLimits
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -209,23 +209,17 @@ def test_plans_of_the_papers_array_take_few_batches(dop: int, batches: float) ->
 
 def plans_of_both_ways(
     planner: PscaPlanner, atoms: Bools, target: TargetPattern
-) -> list[tuple[int, int, int, int]]:
-    """Batches, atom moves and distance, and the lower bound of the batches: rows first, columns first."""
-    found: list[tuple[int, int, int, int]] = []
-    row_limit, column_limit = planner._limits
-    for swapped in (False, True):
-        grids = (atoms, target.fill, target.clear)
-        after, fill, clear = (np.ascontiguousarray(grid.T if swapped else grid).copy() for grid in grids)
-        along, across = (column_limit, row_limit) if swapped else (row_limit, column_limit)
-        moves, offsets = kernels.empty_plan(after.size)
-        moves, offsets, n = kernels.sort_rows(
-            moves, offsets, 0, after, fill, clear, along, across, kernels.HALF_FILLED
-        )
-        bound = n + kernels.least_batches(after, fill, clear, across)
-        slots = planner._eject_slots
-        moves, offsets, n = kernels.compress_columns(moves, offsets, n, after, fill, clear, across, slots)
-        n_moves = int(offsets[n])
-        found.append((n, n_moves, kernels.distance(moves[:n_moves]), bound))
+) -> list[tuple[tuple[int, int, int], int]]:
+    """Costs of the plan, and the lower bound of its batches: rows first, columns first."""
+    found: list[tuple[tuple[int, int, int], int]] = []
+    along, across = planner._limits
+    for grids in ((atoms, target.fill, target.clear), (atoms.T, target.fill.T, target.clear.T)):
+        after, fill, clear = (np.array(grid, order="C") for grid in grids)
+        plan = kernels_fewest.sort_rows(kernels_lines.empty_plan(after.size), after, fill, clear, along, 0)
+        bound = plan[2] + kernels_fewest.least_batches(after, fill, clear, across)
+        plan = kernels_lines.compress_columns(plan, after, fill, clear, across, planner._eject_slots)
+        found.append((kernels_fewest.costs(plan), bound))
+        along, across = across, along
     return found
 
 
@@ -239,9 +233,9 @@ def test_the_search_stops_early_only_where_the_other_way_is_no_better(
     planner = PscaPlanner(PscaSettings(degree_of_parallelism=dop, repair_below=0), Context())
     plan = planner.plan(atoms, target)
     both = plans_of_both_ways(planner, atoms, target)
-    assert all(bound <= n_batches for n_batches, _, _, bound in both)
-    best = min(way[:3] for way in both)
-    assert (plan.n_batches, plan.n_atom_moves, kernels.distance(plan.moves.copy())) == best
+    assert all(bound <= costs[0] for costs, bound in both)
+    distance = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum()
+    assert (plan.n_batches, plan.n_atom_moves, distance) == min(costs for costs, _ in both)
 
 
 def test_repair_is_chosen_by_atom_moves_and_batches_together() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels, kernels_paper
+from labseq_psca import kernels_fewest, kernels_lines, kernels_paper, kernels_repair, kernels_rows
 from numpy.typing import NDArray
 
 Sites = list[int]
@@ -23,6 +23,15 @@ def ints(values: Sequence[int]) -> NDArray[np.int64]:
     return np.array(values, np.int64)
 
 
+def work(n: int, n_rows: int = 1) -> kernels_fewest.Work:
+    step, lists, rank = (
+        np.zeros((n, n + 1), np.int8),
+        np.zeros((3, n), np.int64),
+        np.zeros((n_rows, 2), np.int64),
+    )
+    return np.zeros(n + 1, np.int64), step, lists, rank
+
+
 class TestCompress:
     """The goals of a line's atoms, against trying all there are."""
 
@@ -31,11 +40,9 @@ class TestCompress:
         n = len(fill)
         goal = np.zeros(n, np.int64)
         cost, step = np.zeros((n, 2 * n + 1), np.int64), np.zeros((n, 2 * n + 1), np.int16)
-        padded = ints(source + [0] * (n - len(source)))
-        assert kernels.compress(
-            padded, len(source), bools(fill), bools(clear), limit, slots, cost, step, goal
-        )
-        return goal[: len(source)].tolist()
+        goal = goal[: len(source)]
+        assert kernels_lines.compress(ints(source), bools(fill), bools(clear), limit, slots, cost, step, goal)
+        return goal.tolist()
 
     @staticmethod
     def cost(source: Sites, goal: Sites, clear: Sequence[bool], limit: int) -> tuple[int, int, int, int]:
@@ -69,14 +76,14 @@ class TestCompress:
         assert goal == sorted(set(goal))
         assert self.cost(source, goal, clear, limit) == min(costs)
 
-    def test_ejections_are_shared_out_to_both_sides(self) -> None:
+    def test_ejections_are_distributed_over_both_sides(self) -> None:
         goal = self.kernel([0, 1, 2, 3], [False] * 4, [True] * 4, 4, 1)
         assert [site < 0 for site in goal] == [True, True, False, False]
 
     def test_too_few_atoms_for_the_fill_sites(self) -> None:
         cost, step = np.zeros((2, 5), np.int64), np.zeros((2, 5), np.int16)
         fill, clear = bools([True, True]), bools([False, False])
-        assert not kernels.compress(ints([0, 0]), 1, fill, clear, 1, 1, cost, step, ints([0, 0]))
+        assert not kernels_lines.compress(ints([0]), fill, clear, 1, 1, cost, step, ints([0]))
 
 
 class TestFillBatch:
@@ -98,7 +105,7 @@ class TestFillBatch:
         batch = 0
         while 0 in turn:
             batch += 1
-            chosen = kernels.fill_batch(ints(source), ints(goal), len(source), n, limit, slots, turn, batch)
+            chosen = kernels_lines.fill_batch(ints(source), ints(goal), n, limit, slots, turn, batch)
             going = [i for i in place if turn[i] == batch]
             assert 0 < len(going) == chosen <= limit
             assert sum(goal[i] < 0 for i in going) <= slots
@@ -145,26 +152,20 @@ class TestBestExchange:
         gain = data.draw(st.lists(st.integers(0, 12), min_size=n, max_size=n), "gain")
         cost = data.draw(st.lists(st.integers(-1, 5), min_size=n, max_size=n), "cost")
         change = np.zeros(n, np.int64)
-        found = kernels.best_exchange(
-            bools(atoms),
-            ints(gain),
-            ints(cost),
-            np.zeros(n + 1, np.int64),
-            np.zeros((n, n + 1), np.int8),
-            change,
-        )
+        found = kernels_fewest.best_exchange(bools(atoms), ints(gain), ints(cost), work(n), change)
         worths = [self.worth(atoms, gain, cost, c) for c in product((-1, 0, 1), repeat=n)]
         assert found == max(worth for worth in worths if worth is not None)
         assert self.worth(atoms, gain, cost, change.tolist()) == found
 
-        row = bools(atoms)
+        row, count = bools([atoms]), np.zeros(n, np.int64)
         before = np.flatnonzero(row)
-        source, goal = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        n_moved = kernels.n_moved(row, change)
-        n_atoms = kernels.exchange(row, change, source, goal)
-        assert source[:n_atoms].tolist() == before.tolist()
-        assert goal[:n_atoms].tolist() == np.flatnonzero(row).tolist()
-        assert n_moved == np.count_nonzero(source[:n_atoms] != goal[:n_atoms])
+        n_moved = kernels_fewest.n_moved(row[0], change)
+        lines = np.zeros((2, n), np.int64)
+        plan = kernels_rows.sort_row(kernels_lines.empty_plan(n), row, 0, change, count, lines, n)
+        moves = [[0, a, 0, b] for a, b in zip(before, np.flatnonzero(row), strict=True) if a != b]
+        assert sorted(plan[0][: plan[1][plan[2]]].tolist()) == moves
+        assert n_moved == len(moves)
+        assert count.tolist() == change.tolist()
 
 
 class TestChooseRow:
@@ -175,20 +176,19 @@ class TestChooseRow:
         leave: Sites,
         fill: Any = None,
         limit: int = 9,
-        order: int = kernels.HALF_FILLED,
+        order: int = kernels_rows.HALF_FILLED,
     ) -> tuple[int, Sites]:
         grid = bools(atoms)
         n = grid.shape[1]
         change = np.zeros(n, np.int64)
-        row = kernels.choose_row(
+        row = kernels_fewest.choose_row(
             grid,
             np.zeros_like(grid) if fill is None else bools(fill),
             ints(weight),
             ints(leave),
             limit,
             order,
-            np.zeros(n + 1, np.int64),
-            np.zeros((n, n + 1), np.int8),
+            work(n, len(grid)),
             change,
         )
         return row, change.tolist()
@@ -207,7 +207,7 @@ class TestChooseRow:
     @pytest.mark.parametrize(("order", "row"), [("HALF_FILLED", 1), ("FULLEST", 0), ("EMPTIEST", 2)])
     def test_of_equals_takes_the_first_in_the_order(self, order: str, row: int) -> None:
         atoms = [[1, 0, 1, 1], [1, 0, 0, 1], [1, 0, 0, 0]]
-        chosen, _ = self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1], order=getattr(kernels, order))
+        chosen, _ = self.choose(atoms, [0, 90, 0, 0], [0, -1, -1, -1], order=getattr(kernels_rows, order))
         assert chosen == row
 
     def test_prefers_to_land_on_fill_sites(self) -> None:
@@ -221,24 +221,25 @@ class TestChooseRow:
 def test_weights_of_columns() -> None:
     weight, leave = np.zeros(4, np.int64), np.zeros(4, np.int64)
     need, room, count = ints([3, 2, 0, 1]), ints([5, 5, 5, 2]), ints([1, 4, 1, 3])
-    assert kernels.weigh_columns(need, room, count, weight, leave) == 2
+    assert kernels_rows.weigh_columns(need, room, count, weight, leave) == 2
     assert weight.tolist() == [2 * (80 + 4), 0, 0, 0]
     assert leave.tolist() == [-1, 20, 0, 0]  # the last has more atoms than room
 
 
 def test_unlocking_moves_the_nearest_atom_within_its_column() -> None:
     atoms = bools([[1, 1], [1, 1], [0, 0], [0, 0]])
-    assert kernels.choose_unlocking(atoms, ints([0, 90]), ints([0, -1])) == (0, 1, 2)
-    assert kernels.choose_unlocking(atoms, ints([0, 90]), ints([-1, -1]))[0] == -1
+    moves, _, n = kernels_rows.unlock_row(kernels_lines.empty_plan(8), atoms, ints([0, 90]), ints([0, -1]))
+    assert (n, moves[0].tolist()) == (1, [1, 0, 2, 0])
+    assert atoms.tolist() == [[True, True], [False, True], [True, False], [False, False]]
+    assert kernels_rows.unlock_row(kernels_lines.empty_plan(8), atoms, ints([0, 90]), ints([-1, -1]))[2] == 0
 
 
 def test_a_growing_plan_is_lengthened() -> None:
-    moves, offsets = np.zeros((1, 4), np.int16), np.zeros(2, np.int32)
-    n_batches = 0
+    plan = kernels_lines.empty_plan(0)
     for line in range(4):
-        moves, offsets, n_batches = kernels.add_line(
-            moves, offsets, n_batches, ints([0, 1]), ints([1, 2]), 2, 3, line, line % 2 == 0, 1, 0
-        )
+        is_row = line % 2 == 0
+        plan = kernels_lines.add_line(plan, ints([0, 1]), ints([1, 2]), 3, line, is_row, 1, 0)
+    moves, offsets, n_batches = plan
     assert n_batches == 8
     assert offsets[:9].tolist() == list(range(9))
     assert moves[:4].tolist() == [[0, 1, 0, 2], [0, 0, 0, 1], [1, 1, 2, 1], [0, 1, 1, 1]]
@@ -246,18 +247,8 @@ def test_a_growing_plan_is_lengthened() -> None:
 
 @pytest.mark.parametrize("slots", [1, 2])
 def test_ejection_slots_are_used_from_the_outermost_atom_on(slots: int) -> None:
-    moves, offsets, n_batches = kernels.add_line(
-        np.zeros((9, 4), np.int16),
-        np.zeros(10, np.int32),
-        0,
-        ints([0, 1, 3, 4]),
-        ints([-2, -1, 5, 6]),
-        4,
-        5,
-        7,
-        True,
-        4,
-        slots,
+    moves, offsets, n_batches = kernels_lines.add_line(
+        kernels_lines.empty_plan(9), ints([0, 1, 3, 4]), ints([-2, -1, 5, 6]), 5, 7, True, 4, slots
     )
     batches = [moves[offsets[i] : offsets[i + 1]].tolist() for i in range(n_batches)]
     if slots == 1:
@@ -293,7 +284,7 @@ class TestRepair:
 
     @staticmethod
     def repair(atoms: Any, fill: Any) -> tuple[list[list[Sites]], NDArray[np.bool_]]:
-        moves, offsets, after = kernels.plan_repair(bools(atoms), bools(fill), 9, 9)
+        moves, offsets, after = kernels_repair.plan_repair(bools(atoms), bools(fill), 9, 9)
         return [moves[a:b].tolist() for a, b in pairwise(offsets.tolist())], after
 
     def test_the_nearest_of_the_four_sides(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_scans import kernels
+from labseq_scans import kernels_lines as kernels
 from labseq_scans.planners import as_plan
 from numpy.typing import NDArray
 
@@ -21,9 +21,8 @@ def bools(values: Any) -> NDArray[np.bool_]:
 
 
 def settled(atoms: Line, fill: Line, clear: Line, low: bool, high: bool) -> tuple[list[int], list[int]]:
-    source, goal = np.zeros(len(atoms), np.int64), np.zeros(len(atoms), np.int64)
-    n = kernels.settle(bools(atoms), bools(fill), bools(clear), low, high, source, goal)
-    return source[:n].tolist(), goal[:n].tolist()
+    source, goal = kernels.settle(bools(atoms), bools(fill), bools(clear), low, high)
+    return source.tolist(), goal.tolist()
 
 
 def cost(source: list[int], goal: list[int], fill: Line, clear: Line) -> tuple[int, int, int, int, int]:
@@ -72,7 +71,7 @@ class TestSettle:
         )
         assert cost(source, goal, fill, clear) == best
 
-    def test_surplus_atoms_are_shared_out_to_both_ends(self) -> None:
+    def test_surplus_atoms_are_distributed_over_both_ends(self) -> None:
         full = [True] * 4
         assert settled(full, [False] * 4, full, low=True, high=True)[1] == [-2, -1, 4, 5]
         assert settled(full, [False] * 4, full, low=False, high=True)[1] == [4, 5, 6, 7]
@@ -90,21 +89,8 @@ class TestAddLine:
         atoms, fill, clear = line
         n = len(atoms)
         source, goal = settled(atoms, fill, clear, low=True, high=True)
-        log = np.zeros((0, 5), np.int32)
-        made = kernels.add_line(
-            log,
-            0,
-            0,
-            np.array([*source, 0], np.int64),
-            np.array([*goal, 0], np.int64),
-            len(source),
-            n,
-            0,
-            is_row,
-            limit,
-            slots,
-        )
-        plan = as_plan(*made)
+        lists = np.array(source, np.int64), np.array(goal, np.int64)
+        plan = as_plan(kernels.add_line(kernels.empty_plan(0), *lists, n, 0, is_row, limit, slots))
         shape = (1, n) if is_row else (n, 1)
         target = TargetPattern(bools(fill).reshape(shape), bools(clear).reshape(shape))
         before = bools(atoms).reshape(shape)
@@ -127,9 +113,9 @@ class TestSupplyColumns:
         assume(need.sum() <= np.count_nonzero(atoms))
         limit = data.draw(st.integers(1, 4), "limit")
         after, spare = atoms.copy(), atoms.sum(axis=0).astype(np.int64) - need
-        made = kernels.supply_columns(np.zeros((1, 5), np.int32), 0, 0, after, spare, limit)
+        made = kernels.supply_columns(kernels.empty_plan(0), after, spare, limit)
         nothing = np.zeros(atoms.shape, np.bool_)
-        report = check_plan(as_plan(*made), atoms, TargetPattern(nothing, nothing), limit)
+        report = check_plan(as_plan(made), atoms, TargetPattern(nothing, nothing), limit)
         assert np.array_equal(report.predicted, after)
         assert (after.sum(axis=0) >= need).all()
         assert np.array_equal(spare, after.sum(axis=0) - need)
@@ -137,7 +123,7 @@ class TestSupplyColumns:
     def test_all_exchanges_of_a_row_are_made_at_once(self) -> None:
         atoms = bools([[1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1]])
         spare = np.array([1, 1, 0, 0, -1, -1], np.int64)
-        log, n_moves, n_batches = kernels.supply_columns(np.zeros((1, 5), np.int32), 0, 0, atoms, spare, 4)
+        log, n_moves, n_batches = kernels.supply_columns(kernels.empty_plan(1), atoms, spare, 4)
         assert n_batches == 1
         assert log[:n_moves, [2, 4]].tolist() == [[0, 2], [1, 3], [2, 4], [3, 5]]
         assert spare.tolist() == [0] * 6
@@ -148,6 +134,6 @@ class TestSupplyColumns:
         if upwards:
             atoms = atoms[::-1].copy()
         spare = np.array([1, -1], np.int64)
-        log, n_moves, _ = kernels.supply_columns(np.zeros((9, 5), np.int32), 0, 0, atoms, spare, 1)
+        log, n_moves, _ = kernels.supply_columns(kernels.empty_plan(1), atoms, spare, 1)
         start, end = (1, 0) if upwards else (0, 1)
         assert log[:n_moves, 1:].tolist() == [[start, 0, end, 0], [end, 0, end, 1]]

@@ -51,7 +51,10 @@ def all_paths(start: int, inside: Bools, width: int, end_cost: Ints) -> list[lis
 def test_the_margin_is_empty_and_outside(shape: tuple[int, int]) -> None:
     full = np.ones(shape, np.bool_)
     assert kernels.with_margin(full).tolist() == padded(full).tolist()
-    assert kernels.grid_sites(*shape).tolist() == padded(full).tolist()
+    atoms, inside, width = kernels.board_of(~full)
+    assert not atoms.any()
+    assert inside.tolist() == padded(full).tolist()
+    assert width == shape[1] + 2
     numbers = kernels.sites_with_margin(np.arange(full.size), shape[1])
     assert numbers.tolist() == np.flatnonzero(padded(full)).tolist()
 
@@ -66,7 +69,7 @@ def test_the_cheapest_path_is_found(data: st.DataObject) -> None:
     if data.draw(st.booleans(), "ends outside"):
         end_cost[~inside] = UNWANTED
     paths = [p for start in np.flatnonzero(starts) for p in all_paths(int(start), inside, width, end_cost)]
-    path = kernels.cheapest_path(atoms, inside, width, starts, end_cost).tolist()
+    path = kernels.cheapest_path((atoms, inside, width), starts, end_cost).tolist()
     if not paths:
         assert path == []
         return
@@ -86,7 +89,7 @@ def test_distances_in_the_open_are_those_of_paths_over_free_sites(data: st.DataO
         for site in np.flatnonzero(inside & ~atoms & (expected < 0)):
             if any(expected[site + step] == length - 1 for step in (-width, -1, 1, width)):
                 expected[site] = length
-    distance = kernels.distance_in_the_open(starts, atoms, inside, width)
+    distance = kernels.distance_in_the_open((atoms, inside, width), starts)
     assert distance.tolist() == expected.tolist()
 
 
@@ -108,9 +111,7 @@ def test_every_atom_on_a_path_goes_on_to_the_next_free_place() -> None:
     width = 7
     atoms, inside = padded([[0, 1, 0, 1, 0], [0, 0, 0, 1, 1]]), padded(np.ones((2, 5)))
     path = np.array([8, 9, 10, 11, 18, 19], np.int64)
-    moves, linked, n = kernels.shift(
-        np.zeros((1, 4), np.int16), np.zeros(1, np.bool_), 0, atoms, inside, width, path
-    )
+    moves, linked, n = kernels.shift(kernels.empty_plan(1), (atoms, inside, width), path)
     assert n == 4
     assert moves[:n].tolist() == [[0, 1, 0, 0], [0, 3, 0, 1], [1, 3, 0, 3], [1, 4, 1, 3]]
     assert not linked[:n].any()
@@ -121,9 +122,7 @@ def test_an_atom_carried_off_the_grid_is_gone_and_its_turns_are_linked() -> None
     width = 5
     atoms, inside = padded([[0, 0, 0], [0, 1, 0]]), padded(np.ones((2, 3)))
     path = np.array([5, 6, 7, 12], np.int64)
-    moves, linked, n = kernels.shift(
-        np.zeros((4, 4), np.int16), np.zeros(4, np.bool_), 0, atoms, inside, width, path
-    )
+    moves, linked, n = kernels.shift(kernels.empty_plan(4), (atoms, inside, width), path)
     assert moves[:n].tolist() == [[1, 1, 0, 1], [0, 1, 0, -1]]
     assert linked[:n].tolist() == [False, True]
     assert not atoms.any()

@@ -1,0 +1,286 @@
+"""Kernels of the variant with fewest batches: row sorts that help all columns, both orientations compared.
+
+Everything is written for row sorting and then column compression; the other
+orientation is the same on the transposed grid. The vocabulary is that of
+:mod:`labseq_psca.kernels_lines` and :mod:`labseq_psca.kernels_rows`.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import kernel
+from labseq_psca.kernels_lines import (
+    FINISHED,
+    GRID,
+    GROWING,
+    IMPOSSIBLE,
+    LINE,
+    Bools,
+    Finished,
+    Growing,
+    Ints,
+    compress_columns,
+    empty_plan,
+    finished,
+)
+from labseq_psca.kernels_rows import count_columns, place_in_order, sort_row, unlock_row, weigh_columns
+
+# What changes are worth, in units of one atom moved, beside those of kernels_rows: README, "Choices".
+ON_TARGET: Final = 10  # more for an atom that lands on a fill site, less for one that leaves it
+EFFORT: Final = 240  # columns looked at closely for each choice, but no fewer than
+ROWS_TRIED: Final = 3  # so many rows; more hardly helps
+PER_BATCH: Final = 1000  # worth per batch is compared in integers, in thousandths
+
+Work = tuple[Ints, NDArray[np.int8], Ints, Ints]
+"""int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange; int64 (3, n_cols) and (n_rows, 2)."""
+WORK: Final = "Tuple((int64[::1], int8[:, ::1], int64[:, ::1], int64[:, ::1]))"
+
+
+@kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[:, ::1])")
+def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, rank: Ints) -> None:
+    """Bound from above what sorting each row is worth per batch.
+
+    The result, int64 (n_rows, 2), holds the bound, and the place in the order;
+    ``weight`` and ``leave`` are those of :func:`weigh_columns`.
+    """
+    n_rows, n_cols = atoms.shape
+    for row in range(n_rows):
+        n_atoms = n_leavers = n_vacancies = total = 0
+        least = IMPOSSIBLE
+        for col in range(n_cols):  # without branches, which would be mispredicted
+            atom = atoms[row, col]
+            wanted = (weight[col] > 0) & (not atom)
+            n_atoms += atom
+            n_leavers += atom & (leave[col] >= 0)
+            n_vacancies += wanted
+            total += weight[col] if wanted else 0
+            least = min(least, weight[col] if wanted else IMPOSSIBLE)
+        n_most = min(n_leavers, n_vacancies)
+        rank[row, 0] = 0
+        rank[row, 1] = place_in_order(n_atoms, n_cols, order)
+        if n_most > 0:
+            worth = total - (n_vacancies - n_most) * least + (ON_TARGET - 1) * n_most
+            rank[row, 0] = worth * PER_BATCH // ((n_most + limit - 1) // limit)
+
+
+@kernel(f"int64({LINE}, int64[::1], int64[::1], {WORK}, int64[::1])")
+def best_exchange(atoms: Bools, gain: Ints, cost: Ints, work: Work, change: Ints) -> int:
+    """Find the atoms of a row that had best leave their columns, and the vacancies to fill.
+
+    The order is kept, so atoms between a leaver and a filled vacancy shift by one
+    place each: atoms move that leave, or whose balance (leavers minus filled
+    vacancies to their left) is not zero. A dynamic programme over columns and
+    balances finds the exchange that is worth most; it looks only at balances that
+    can come about and can be evened out again.
+
+    Args:
+        atoms: bool (n,), the row.
+        gain: int64 (n,), worth of filling a vacancy; 0 where it is not wanted.
+        cost: int64 (n,), cost of an atom's leaving; -1 where it must stay.
+        work: The work space.
+        change: Result, int64 (n,), the exchange.
+
+    Returns:
+        Gains minus costs minus one for each atom moved.
+    """
+    worth, step, _, _ = work
+    n = len(atoms)
+    leavers_left = vacancies_left = 0
+    for col in range(n):
+        change[col] = 0
+        leavers_left += atoms[col] and cost[col] >= 0
+        vacancies_left += not atoms[col] and gain[col] > 0
+    even = min(leavers_left, vacancies_left)
+    if even == 0:
+        return 0
+    for i in range(2 * even + 1):
+        worth[i] = -IMPOSSIBLE
+    worth[even] = 0
+    low = high = even
+    leavers = vacancies = 0
+    for col in range(n):
+        can_leave = atoms[col] and cost[col] >= 0
+        can_fill = not atoms[col] and gain[col] > 0
+        leavers += can_leave
+        leavers_left -= can_leave
+        vacancies += can_fill
+        vacancies_left -= can_fill
+        low, high = even - min(vacancies, leavers_left), even + min(leavers, vacancies_left)
+        if can_fill:
+            for i in range(low, high + 1):
+                filling = worth[i + 1] + gain[col] if i < 2 * even else -IMPOSSIBLE
+                step[col, i] = filling > worth[i]
+                worth[i] = max(filling, worth[i])
+        elif can_leave:
+            for i in range(high, low - 1, -1):
+                leaving = worth[i - 1] - cost[col] - 1 if i > 0 else -IMPOSSIBLE
+                staying = worth[i] - (i != even)
+                step[col, i] = -1 if leaving > staying else 0
+                worth[i] = max(leaving, staying)
+        elif atoms[col]:
+            for i in range(low, high + 1):
+                worth[i] -= i != even
+    i = even
+    for col in range(n - 1, -1, -1):
+        if (atoms[col] and cost[col] >= 0) or (not atoms[col] and gain[col] > 0):
+            change[col] = step[col, i]
+            i += step[col, i]
+    return int(worth[even])
+
+
+@kernel(f"int64({LINE}, int64[::1])")
+def n_moved(atoms: Bools, change: Ints) -> int:
+    """Count the atoms of a row that an exchange moves."""
+    n = balance = 0
+    for col in range(len(atoms)):
+        balance -= change[col]
+        if atoms[col] and (balance != 0 or change[col] != 0):
+            n += 1
+    return n
+
+
+@kernel(f"int64({GRID}, {GRID}, int64[::1], int64[::1], int64, int64, {WORK}, int64[::1])")
+def choose_row(
+    atoms: Bools, fill: Bools, weight: Ints, leave: Ints, limit: int, order: int, work: Work, change: Ints
+) -> int:
+    """Choose the row whose sorting helps most per batch, and find its exchange.
+
+    Rows are looked at closely in the order of their bounds, until no bound is above the best worth.
+
+    Returns:
+        The row, or -1 if no row helps.
+    """
+    n_rows, n_cols = atoms.shape
+    _, _, lists, rank = work
+    gain, cost, trial = lists[0], lists[1], lists[2]
+    rank_rows(atoms, weight, leave, limit, order, rank)
+    best = 0
+    best_row = -1
+    for _ in range(max(ROWS_TRIED, EFFORT // n_cols)):
+        row = -1
+        for r in range(n_rows):
+            if rank[r, 0] > best and (
+                row < 0
+                or rank[r, 0] > rank[row, 0]
+                or (rank[r, 0] == rank[row, 0] and rank[r, 1] < rank[row, 1])
+            ):
+                row = r
+        if row < 0:
+            break
+        for col in range(n_cols):
+            on_target = ON_TARGET if fill[row, col] else 0
+            gain[col] = weight[col] + on_target if weight[col] > 0 else 0
+            cost[col] = leave[col] + on_target if leave[col] >= 0 else -1
+        total = best_exchange(atoms[row], gain, cost, work, trial)
+        n_batches = (n_moved(atoms[row], trial) + limit - 1) // limit
+        if total * PER_BATCH > best * n_batches:
+            best = total * PER_BATCH // n_batches
+            best_row = row
+            for col in range(n_cols):
+                change[col] = trial[col]
+        rank[row, 0] = 0
+    return best_row
+
+
+@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
+def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int) -> Growing:
+    """Sort rows until every column holds at least as many atoms as it has fill sites; updates ``atoms``."""
+    n_rows, n_cols = atoms.shape
+    need, room, count = count_columns(atoms, fill, clear)
+    weight = np.empty(n_cols, np.int64)
+    leave = np.empty(n_cols, np.int64)
+    change = np.empty(n_cols, np.int64)
+    line = np.empty((2, n_cols), np.int64)
+    work = (
+        np.empty(n_cols + 1, np.int64),
+        np.empty((n_cols, n_cols + 1), np.int8),
+        np.empty((3, n_cols), np.int64),
+        np.empty((n_rows, 2), np.int64),
+    )
+    while weigh_columns(need, room, count, weight, leave) > 0:
+        row = choose_row(atoms, fill, weight, leave, limit, order, work, change)
+        n_batches = plan[2]
+        if row >= 0:
+            plan = sort_row(plan, atoms, row, change, count, line, limit)
+        else:
+            plan = unlock_row(plan, atoms, weight, leave)
+        if plan[2] == n_batches:
+            break
+    return plan
+
+
+@kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
+def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
+    """Count the batches that the compression of all columns takes at least, after row sorting."""
+    n_rows, n_cols = atoms.shape
+    vacant = np.zeros(n_cols, np.int64)
+    surplus = np.zeros(n_cols, np.int64)
+    for row in range(n_rows):
+        for col in range(n_cols):
+            vacant[col] += fill[row, col] and not atoms[row, col]
+            surplus[col] += clear[row, col] and atoms[row, col]
+    n = 0
+    for col in range(n_cols):
+        n += (max(vacant[col], surplus[col]) + limit - 1) // limit
+    return n
+
+
+@kernel(f"boolean[:, ::1]({GRID})")
+def transposed(sites: Bools) -> Bools:
+    """Swap rows and columns, into a contiguous array."""
+    n_rows, n_cols = sites.shape
+    swapped = np.empty((n_cols, n_rows), np.bool_)
+    for row in range(n_rows):
+        for col in range(n_cols):
+            swapped[col, row] = sites[row, col]
+    return swapped
+
+
+@kernel(f"UniTuple(int64, 3)({GROWING})")
+def costs(plan: Growing) -> tuple[int, int, int]:
+    """Number of batches, number of atom moves, and total distance in sites."""
+    moves, offsets, n_batches = plan
+    n_moves, distance = int(offsets[n_batches]), 0
+    for i in range(n_moves):
+        distance += int(abs(moves[i, 2] - moves[i, 0])) + int(abs(moves[i, 3] - moves[i, 1]))
+    return n_batches, n_moves, distance
+
+
+@kernel(f"{FINISHED}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
+def plan_fewest(
+    occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int, order: int
+) -> Finished:
+    """Plan both orientations and keep the plan of fewer batches, then atom moves, then distance.
+
+    The orientation that promises fewer batches after sorting is completed first; the
+    other one only if it can still be as good.
+
+    Args:
+        occupied: bool (n_rows, n_cols), no fewer atoms than fill sites.
+        fill: bool (n_rows, n_cols), sites that must hold an atom.
+        clear: bool (n_rows, n_cols), sites that must be empty.
+        row_limit: Maximum number of atoms in a batch that moves along a row.
+        column_limit: Maximum number of atoms in a batch that moves along a column.
+        slots: Ejection slots on each side.
+        order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
+    """
+    atoms, other_atoms = occupied.copy(), transposed(occupied)
+    other_fill, other_clear = transposed(fill), transposed(clear)
+    plan = sort_rows(empty_plan(atoms.size), atoms, fill, clear, row_limit, order)
+    other = sort_rows(empty_plan(atoms.size), other_atoms, other_fill, other_clear, column_limit, order)
+    least = plan[2] + least_batches(atoms, fill, clear, column_limit)
+    other_least = other[2] + least_batches(other_atoms, other_fill, other_clear, row_limit)
+    if least <= other_least:
+        plan = compress_columns(plan, atoms, fill, clear, column_limit, slots)
+        if plan[2] < other_least:
+            return finished(plan, False)
+    other = compress_columns(other, other_atoms, other_fill, other_clear, row_limit, slots)
+    if least > other_least:
+        if other[2] < least:
+            return finished(other, True)
+        plan = compress_columns(plan, atoms, fill, clear, column_limit, slots)
+    return finished(plan, False) if costs(plan) <= costs(other) else finished(other, True)
