@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import pytest
 from labseq_andor.library import load_pylablib
 from labseq_frames.files import BadFramesError, load
@@ -20,12 +21,19 @@ from labseq.errors import LabseqError
 from labseq.model import ScanSpace
 from labseq.pictures.figures import check_place
 from labseq.recording.export import check_export
-from labseq.recording.hdf5 import bitshuffle
+from labseq.recording.hdf5 import load_filter
 
 ROOT = Path(__file__).parents[1]
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
     "optional-dependencies"
 ]
+
+
+def compressed() -> h5py.Dataset:
+    file = h5py.File("a.h5", "w", driver="core", backing_store=False)
+    return file.create_dataset("images", data=[0], chunks=True, compression="gzip")
+
+
 NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     # extra, distribution, module that is not there -> what needs it
     ("analysis", "pandas", "pandas"): lambda: check_export("parquet", Path("a.parquet")),
@@ -33,7 +41,7 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("analysis", "xarray", "xarray"): lambda: check_export("netcdf", Path("a.nc")),
     ("analysis", "h5netcdf", "h5netcdf"): lambda: check_export("netcdf", Path("a.nc")),
     ("andor", "pylablib", "pylablib.devices.Andor.AndorSDK2"): lambda: load_pylablib("camera"),
-    ("compress", "hdf5plugin", "hdf5plugin"): bitshuffle,
+    ("compress", "hdf5plugin", "hdf5plugin"): lambda: load_filter(Path("shot.h5"), compressed()),
     ("frames", "tifffile", "tifffile"): lambda: load("tifffile", "tifffile", Path("a.tif")),
     ("frames", "pillow", "PIL.Image"): lambda: load("PIL.Image", "Pillow", Path("a.png")),
     ("optuna", "optuna", "optuna"): lambda: OptunaScanner(OptunaSettings(), ScanSpace((), 1)),

@@ -27,11 +27,6 @@ STOP_FILE: Final = "STOP"
 """Exists while a request to end the run after the current shot is pending."""
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
-OWN_NAMES: Final = frozenset(
-    {RUN_FILE, STATE_FILE, INDEX_FILE, EVENTS_FILE, SEQUENCE_FILE, PROFILE_FILE, STOP_FILE}
-    | {SKIPPED_FILE}
-    | {SHOTS_FOLDER, RESULTS_FOLDER}
-)
 
 _COUNTER = re.compile(r"\.?(\d{4,})[_.]")
 _MAX_SLUG: Final = 60

@@ -145,17 +145,3 @@ def load_filter(path: Path, dataset: Any) -> None:
             "holds compressed frames, and to read them hdf5plugin is needed; pip install 'labseq[compress]'"
         )
         raise RecordingError(path, text) from error
-
-
-def bitshuffle() -> Mapping[str, Any]:
-    """Options of a dataset that is compressed with bitshuffle and LZ4.
-
-    Raises:
-        RecordingError: The package for it is missing.
-    """
-    try:
-        import hdf5plugin
-    except ImportError as error:
-        missing = "compressed frames need hdf5plugin, which is not installed"
-        raise RecordingError(Path("compress"), f"{missing}; pip install 'labseq[compress]'") from error
-    return hdf5plugin.Bitshuffle(cname="lz4")

@@ -38,12 +38,11 @@ class RunWriter:
         last_row: The line in the index of the attempt that was written last; empty before the first.
     """
 
-    def __init__(self, run_dir: Path, run: RunRecord, *, compress: bool = False) -> None:
+    def __init__(self, run_dir: Path, run: RunRecord) -> None:
         self.run_dir = run_dir
         self.n_written = 0
         self.last_row: Mapping[str, Any] = {}
         self._run = run
-        self._compress = compress
         self._encoder = self._make_encoder()
         self._index = LineLog(run_dir / folders.INDEX_FILE)
         self._events = LineLog(run_dir / folders.EVENTS_FILE)
@@ -54,12 +53,7 @@ class RunWriter:
 
     @classmethod
     def create(
-        cls,
-        root: Path,
-        run: RunRecord,
-        extra_files: Mapping[str, str | bytes] | None = None,
-        *,
-        compress: bool = False,
+        cls, root: Path, run: RunRecord, extra_files: Mapping[str, str | bytes] | None = None
     ) -> RunWriter:
         """Create ``<root>/<local date>/<counter>_<name>/`` and write the files that a run starts with.
 
@@ -69,41 +63,35 @@ class RunWriter:
             root: Data root; created if it does not exist.
             run: The record of the run before its devices are open.
             extra_files: Further files for the folder: name -> content.
-            compress: Whether frames are compressed; needs ``labseq[compress]``.
 
         Raises:
-            RecordingError: The folder cannot be written to, the disk is full, or
-                the package for compression is missing.
+            RecordingError: The folder cannot be written to, or the disk is full.
         """
         started = datetime.fromisoformat(run.t_start_utc)
         run_dir = folders.make_run_folder(root, run.name, started)
         try:
-            return cls._fill(run_dir, run, extra_files or {}, compress=compress)
+            return cls._fill(run_dir, run, extra_files or {})
         except BaseException:
             shutil.rmtree(run_dir, ignore_errors=True)  # it holds no shots yet
             raise
 
     @classmethod
-    def _fill(
-        cls, run_dir: Path, run: RunRecord, extra_files: Mapping[str, str | bytes], *, compress: bool
-    ) -> RunWriter:
+    def _fill(cls, run_dir: Path, run: RunRecord, extra_files: Mapping[str, str | bytes]) -> RunWriter:
         with explained(run_dir):
             (run_dir / folders.SHOTS_FOLDER).mkdir()
         write_file(run_dir / folders.STATE_FILE, encode_state("running"))
         write_file(run_dir / folders.SEQUENCE_FILE, encode_text(run.sequence_text))
         write_file(run_dir / folders.PROFILE_FILE, encode_text(run.profile_text))
         for name, content in extra_files.items():
-            if Path(name).name != name or name.startswith(".") or not name or name in folders.OWN_NAMES:
-                raise RecordingError(run_dir / name, "cannot be an extra file: expected a plain, unused name")
             write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
-        writer = cls(run_dir, run, compress=compress)
+        writer = cls(run_dir, run)
         write_file(run_dir / folders.RUN_FILE, encode_run(run, _run_id(run_dir)))
         with explained(run_dir):
             sync_folder(run_dir)
         return writer
 
     @classmethod
-    def reopen(cls, run_dir: Path, run: RunRecord, *, n_written: int, compress: bool = False) -> RunWriter:
+    def reopen(cls, run_dir: Path, run: RunRecord, *, n_written: int) -> RunWriter:
         """Resume a run that ended before its last shot; no other process may write to it.
 
         Args:
@@ -117,7 +105,7 @@ class RunWriter:
         with explained(run_dir):
             (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
             kept = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
-        writer = cls(run_dir, run, compress=compress)
+        writer = cls(run_dir, run)
         writer.n_written, writer._before, writer._kept = n_written, before, kept
         write_file(run_dir / folders.RUN_FILE, dumps(before, indent=1).encode() + b"\n")
         write_file(run_dir / folders.STATE_FILE, encode_state("running"))
@@ -140,7 +128,7 @@ class RunWriter:
     def _make_encoder(self) -> ShotEncoder:
         from labseq.recording.shot_file import ShotEncoder  # h5py takes 0.1 s to import
 
-        return ShotEncoder(self._run, _run_id(self.run_dir), compress=self._compress)
+        return ShotEncoder(self._run, _run_id(self.run_dir))
 
     def write_shot(self, shot: ShotRecord) -> Path:
         """Write an attempt at a shot; it counts if it is complete.

@@ -81,12 +81,9 @@ def a_shot(index: int, frames: np.ndarray[tuple[int, ...], np.dtype[np.uint16]])
     )
 
 
-@pytest.mark.parametrize("compress", [False, True], ids=["plain", "compressed"])
-def test_write_shot_of_twelve_frames(benchmark: BenchmarkFixture, tmp_path: Path, compress: bool) -> None:
-    if compress:
-        pytest.importorskip("hdf5plugin")
+def test_write_shot_of_twelve_frames(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
     frames = np.random.default_rng(0).poisson(100, (12, 512, 512)).astype(np.uint16)
-    writer = RunWriter.create(tmp_path, a_run(), compress=compress)
+    writer = RunWriter.create(tmp_path, a_run())
     indices = itertools.count()
     benchmark.pedantic(
         writer.write_shot,

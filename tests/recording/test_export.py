@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -180,17 +178,6 @@ def test_an_archive_keeps_what_differs_after_a_resume(tmp_path: Path) -> None:
     with h5py.File(exported(open_run(run_dir), "archive", tmp_path)) as archive:
         texts: list[Any] = [archive[f"shots/shot_{i:06d}/run/provenance"] for i in (0, 1)]
         assert [json.loads(text[()])["labseq"] for text in texts] == ["0.1.0", "later"]
-
-
-def test_an_archive_of_compressed_frames_is_plain(tmp_path: Path) -> None:
-    pytest.importorskip("hdf5plugin")
-    writer = RunWriter.create(tmp_path, make_run(), compress=True)
-    writer.write_shot(make_shot())
-    path = exported(open_run(writer.run_dir), "archive", tmp_path, frames=True)
-    code = "import sys, h5py; print(h5py.File(sys.argv[1])['shots/shot_000000/images_view/images'][()].sum())"
-    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
-    frames = [image.frame for image in make_shot().images]
-    assert int(done.stdout) == sum(int(frame.image.sum()) for frame in frames if frame is not None)
 
 
 def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> None:

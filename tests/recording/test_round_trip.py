@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
@@ -189,12 +190,15 @@ def test_frames_that_are_not_kept_are_none(tmp_path: Path, record_frames: str, k
     assert len(found.frames) == len(kept)
 
 
-def test_compressed_frames_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("hdf5plugin")
+def test_frames_that_were_compressed_later_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    filters = pytest.importorskip("hdf5plugin")
     shot = make_shot()
-    writer = RunWriter.create(tmp_path, make_run(), compress=True)
-    writer.write_shot(shot)
-    (found,) = open_run(writer.run_dir).shots
+    (found,) = write(tmp_path, shot).shots
+    with h5py.File(found.file, "r+") as file:
+        camera: Any = file["entry/camera/camera"]
+        frames = camera["images"][()]
+        del camera["images"]
+        camera.create_dataset("images", data=frames, **filters.Bitshuffle(cname="lz4"))
     assert_same(found.record(), shot)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     with pytest.raises(RecordingError, match=r"hdf5plugin is needed; pip install 'labseq\[compress\]'"):
