@@ -18,18 +18,8 @@ SHAPE = (3, 4)
 class TinyCamera(CameraDriver):
     """Each trigger makes a frame, which is ready after exposure and read-out.
 
-    Args:
-        context: Name and clock.
-        facts: What it says of itself.
-        lose: Number of a frame -> what the camera reports of it; "": it is lost without a word.
-
-    Attributes:
-        log: The methods that the base called, in order.
-        series: What it was armed for, each time.
-        broken: Names of methods that raise.
-        tells: What it tells of its frames.
-        shape: (height, width) of its frames.
-        coming: When each frame is ready, and the frame.
+    ``lose`` names frames that are lost, with what the camera reports of them; "" is a gap. ``log`` has the
+    methods that the base called, ``broken`` those that raise; ``tells`` are further values of its frames.
     """
 
     def __init__(self, context: Context, facts: CameraFacts, lose: Mapping[int, str] | None = None) -> None:
@@ -46,11 +36,9 @@ class TinyCamera(CameraDriver):
 
     @property
     def facts(self) -> CameraFacts:
-        """What the test says."""
         return self._facts
 
     def describe(self) -> Mapping[str, Any]:
-        """Nothing but a name."""
         return {"model": "tiny"}
 
     def _connect(self) -> None:
@@ -110,7 +98,6 @@ class Bench:
         self.camera.log.clear()
 
     def fire(self, n_frames: int, exposure_s: float = 0.01) -> None:
-        """Arm, and trigger each frame."""
         self.camera.arm(n_frames, exposure_s, "software")
         for _ in range(n_frames):
             self.camera.trigger()

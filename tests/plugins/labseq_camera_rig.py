@@ -34,13 +34,7 @@ DRIVERS: dict[str, tuple[Any, Any, Callable[[], object]]] = {
 
 
 class NoisyWorld(RecordingSimulation):
-    """Every frame is noise over the whole range of 16 bits; a line can be connected to the camera.
-
-    Attributes:
-        shown: The frames, in order.
-        modes: How the sensor was exposed for each.
-        edge: Sends an edge of the camera's line, at a time.
-    """
+    """Every frame is noise over the whole range of 16 bits; a line can be connected to the camera."""
 
     def __init__(self, clock: Clock, sensor_shape: tuple[int, int]) -> None:
         super().__init__(Calls(clock), sensor_shape)
@@ -61,15 +55,9 @@ class NoisyWorld(RecordingSimulation):
 
 
 class Rig:
-    """A driver in a noisy simulation; not open.
+    """A driver in a noisy simulation, on a virtual clock unless another is given; not open.
 
-    Args:
-        driver: One of :data:`DRIVERS`.
-        camera: The setting `camera`.
-        sensor_shape: (height, width) of the simulated sensor.
-        clock: The session's clock; None for a virtual one.
-        is_wired: Whether a line is connected to the camera's trigger input.
-        settings: Further settings of the camera.
+    With ``is_wired`` a line is connected to the camera's trigger input.
     """
 
     def __init__(

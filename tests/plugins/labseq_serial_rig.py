@@ -59,11 +59,7 @@ def settings(text: str = PROFILE, **more: Any) -> SerialSettings:
 
 
 class Counterpart:
-    """An instrument on a pty, in a process of its own.
-
-    Attributes:
-        port: Its port.
-    """
+    """An instrument on a pty, in a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.port = str(folder / "port")

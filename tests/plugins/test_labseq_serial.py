@@ -165,25 +165,6 @@ def test_a_simulated_line_takes_its_time() -> None:
         assert clock.now() - before_s == pytest.approx(30e-3 + n_bytes * 10 / 1200)
 
 
-def test_an_instrument_that_echoes_and_prompts_is_read() -> None:
-    text = r"""
-  port: simulated
-  write_ends_with: "\r"
-  read_ends_with: "> "
-  echo: true
-  commands:
-    manual: {send: mode=1, reply: ""}
-    time: {send: "open={duration:.0f}", reply: "", arguments: {duration: {unit: ms, min: 1 ms, max: 10 s}}}
-  values: {mode: {ask: "mode?", type: int}, duration: {ask: "open?", unit: ms}}
-"""
-    device = SerialDevice(settings(text), Context("shutter", clock=FakeClock()))
-    device.open()
-    device.command("manual")
-    device.command("time", duration="45 ms")
-    assert device.read("duration") == pytest.approx(45e-3)
-    device.close()
-
-
 class Answering(socketserver.StreamRequestHandler):
     """An instrument on the network; it hangs up when told so."""
 
@@ -270,11 +251,7 @@ def run(sequence: Path, **options: Any) -> Run:
 
 
 class Observer:
-    """Notes what becomes of each attempt at a shot; unplugs an instrument when the first one begins.
-
-    Attributes:
-        ends: How each attempt ended, and its error.
-    """
+    """Notes how each attempt at a shot ends; unplugs an instrument when the first one begins."""
 
     def __init__(self, unplugged: Counterpart | None = None) -> None:
         self.ends: list[tuple[str, str]] = []

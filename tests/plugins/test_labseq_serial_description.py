@@ -182,21 +182,18 @@ def test_what_is_no_number_in_the_unit_is_refused(given_as: object) -> None:
         Unit.of("mA").read(given_as)
 
 
-@pytest.mark.parametrize(
-    "pattern",
-    [
-        "OK",
-        "",
-        "THORLABS SC10.*",
-        r"(?P<model>THORLABS \w+) VERSION (?P<firmware>.*)",
-        r"[+]?0,.*",
-        r"^\d{4}-\d{2}$",
-        r"(?:A|B(C|D))+[^x-z\]]?x{2,}",
-        r"\x41\u00b0\.\s\S",
-        r"a{b",
-        r"[]a]+",
-    ],
-)
+PATTERNS = r"""OK
+THORLABS SC10.*
+(?P<model>THORLABS \w+) VERSION (?P<firmware>.*)
+[+]?0,.*
+^\d{4}-\d{2}$
+(?:A|B(C|D))+[^x-z\]]?x{2,}
+\x41\u00b0\.\s\S
+a{b
+[]a]+"""
+
+
+@pytest.mark.parametrize("pattern", ["", *PATTERNS.splitlines()])
 def test_a_reply_is_made_up_for_a_pattern(pattern: str) -> None:
     reply = example_of(pattern)
     assert reply is not None
