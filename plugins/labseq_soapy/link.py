@@ -43,6 +43,7 @@ class Link:
     Attributes:
         pid: Number of the process.
         facts: What the radio reported; None until it is open.
+        status: "underflows": how often the radio has run out of samples; "dark": while the array was on.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Link:
         self._sending = threading.Lock()
         self._ended = ""
         self._n_done = self._n_tasks = 0
-        self._status = {"underflows": 0, "dark": 0}
+        self.status: Mapping[str, int] = {"underflows": 0, "dark": 0}
         self._received_s = time.monotonic()
         self._closing = threading.Event()
         self.facts: Facts | None = None
@@ -79,16 +80,6 @@ class Link:
             self._send(asdict(setup))
         for thread in self._threads:
             thread.start()
-
-    @property
-    def underflows(self) -> int:
-        """How often the radio has run out of samples."""
-        return self._status["underflows"]
-
-    @property
-    def dark(self) -> int:
-        """How often it has while the array was on."""
-        return self._status["dark"]
 
     @property
     def hangs(self) -> bool:
@@ -176,7 +167,7 @@ class Link:
                 self._received_s = time.monotonic()
                 if facts := message.get("facts"):
                     self.facts = Facts(**facts)
-                self._status = message.get("status", self._status)
+                self.status = message.get("status", self.status)
                 self._n_done = max(self._n_done, message.get("done", 0))
                 why = message.get("failed") or message.get("ended") or why
                 self._news.notify_all()

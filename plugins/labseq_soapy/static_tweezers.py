@@ -180,7 +180,7 @@ class SoapyStaticTweezers(StaticTweezers):
             "serial_number": self._facts.radio.get("serial", ""),
             "loop_samples": self._tones.loops[0].n_samples,
             "crest_factor": list(self._tones.crest_factor),
-            "underflows": self._link.underflows,
+            "underflows": self._link.status["underflows"],
         }
 
     def _connect(self) -> Link:
@@ -230,7 +230,7 @@ class SoapyStaticTweezers(StaticTweezers):
         """The link, if its stream is alive and did not run dry since the last call."""
         link = self._opened()
         link.check()
-        dark, self._dark = link.dark - self._dark, link.dark
+        dark, self._dark = link.status["dark"] - self._dark, link.status["dark"]
         if dark:
             text = f"the radio ran out of samples {dark} time(s) while the array was on: atoms may be lost"
             raise TransientError(text, self._name)

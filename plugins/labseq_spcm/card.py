@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import mmap
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
@@ -182,11 +182,26 @@ class AwgCard:
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
         limit_s = frames.nbytes / SLOW_BUS + TRANSFER_TIMEOUT_S
+        text = f"{frames.nbytes} bytes were not uploaded"
+        self.wait_until(lambda: bool(self.status & self.spcm.M2STAT_DATA_END), text, limit_s)
+
+    def wait_until(
+        self,
+        is_done: Callable[[], bool],
+        text: str,
+        limit_s: float = TRANSFER_TIMEOUT_S,
+        poll_s: float = POLL_S,
+    ) -> None:
+        """Wait for something that the card does by itself.
+
+        Raises:
+            DeviceTimeoutError: It takes too long; with this text.
+        """
         deadline_s = self.clock.now() + limit_s
-        while not self.status & self.spcm.M2STAT_DATA_END:
+        while not is_done():
             if self.clock.now() > deadline_s:
-                raise DeviceTimeoutError(self.name, f"{frames.nbytes} bytes were not uploaded", limit_s)
-            self.clock.sleep(POLL_S)
+                raise DeviceTimeoutError(self.name, text, limit_s)
+            self.clock.sleep(poll_s)
 
     def stop(self) -> None:
         """Stop playing and transferring; no effect if it does neither."""

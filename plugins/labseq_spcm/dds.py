@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from labseq.plugin import (
     AxisTones,
     ConfigError,
-    DeviceTimeoutError,
     LimitError,
     MotionSpec,
     ToneProgram,
     TransientError,
 )
 from labseq_spcm import limits
-from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard
+from labseq_spcm.card import POLL_S, AwgCard
 from labseq_spcm.settings import SpcmSettings
 
 ENTRY: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<i8")])
@@ -205,19 +204,13 @@ class Dds:
 
     def prepare(self, program: ToneProgram) -> float:
         """Compile a program, and queue as much as there is room for; returns its playing time in seconds."""
-        clock = self._card.clock
         start_s = time.perf_counter()
         self._commands = compile_commands(self._card.name, program, self._cores)
         self.render_s = time.perf_counter() - start_s
         self._n_sent = 0
         self._reset()
-        deadline_s = clock.now() + TRANSFER_TIMEOUT_S
-        while not self._feed():
-            if clock.now() > deadline_s:
-                text = "the DDS takes no commands: its queue stays full"
-                raise DeviceTimeoutError(self._card.name, text, TRANSFER_TIMEOUT_S)
-            clock.sleep(POLL_S)
-        clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
+        self._card.wait_until(self._feed, "the DDS takes no commands: its queue stays full")
+        self._card.clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
         return program.total_duration_s
 
     def start(self, command: int) -> None:
@@ -225,12 +218,11 @@ class Dds:
         card, spcm = self._card, self._card.spcm
         self._n_events = card.read(spcm.SPC_DDS_TRG_COUNT)
         card.command(spcm.M2CMD_CARD_START, "start")
-        deadline_s = card.clock.now() + TRANSFER_TIMEOUT_S
-        while not card.read(spcm.SPC_DDS_STATUS) & spcm.SPCM_DDS_STAT_WAITING_FOR_TRG:
-            if card.clock.now() > deadline_s:
-                text = "the DDS waits for no trigger: its first commands have not arrived"
-                raise DeviceTimeoutError(card.name, text, TRANSFER_TIMEOUT_S)
-            card.clock.sleep(ARRIVAL_S)
+        card.wait_until(
+            lambda: bool(card.read(spcm.SPC_DDS_STATUS) & spcm.SPCM_DDS_STAT_WAITING_FOR_TRG),
+            "the DDS waits for no trigger: its first commands have not arrived",
+            poll_s=ARRIVAL_S,
+        )
         card.command(command & ~spcm.M2CMD_CARD_START, "trigger")
 
     def finished(self) -> bool:
