@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -125,41 +125,23 @@ def hops(
 Axis = Literal["row", "column"]
 
 
-@dataclass(frozen=True, slots=True)
-class BatchSummary:
-    """A batch in a few numbers.
-
-    Attributes:
-        axis: Whether its atoms move along rows or along columns.
-        lines: The rows, or the columns, that they move along; sorted.
-        n_atoms: How many atoms move.
-        n_ejected: How many of them leave the grid.
-        n_sites: The longest way, in sites.
-    """
-
-    axis: Axis
-    lines: tuple[int, ...]
-    n_atoms: int
-    n_ejected: int
-    n_sites: int
+Lines = tuple[Axis, tuple[int, ...]]
+"""Rows or columns, sorted."""
 
 
-def summarise_batches(plan: Plan, shape: tuple[int, int]) -> list[BatchSummary]:
-    """Sum up each batch of a checked plan, on a grid with (n_rows, n_cols) sites.
+def batch_lines(plan: Plan) -> list[Lines]:
+    """The rows or the columns along which the atoms of each batch of a checked plan move.
 
     Example:
-        >>> summarise_batches(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]), (5, 4))
-        [BatchSummary(axis='row', lines=(2,), n_atoms=2, n_ejected=1, n_sites=3)]
+        >>> batch_lines(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]))
+        [('row', (2,))]
     """
-    return [_summarise(batch, shape) for batch in plan.batches]
+    return [_lines_of(batch) for batch in plan.batches]
 
 
-def _summarise(batch: Batch, shape: tuple[int, int]) -> BatchSummary:
-    way = batch.to_sites - batch.from_sites
-    axis: Axis = "column" if way[:, 0].any() else "row"
-    lines = np.unique(batch.from_sites[:, 1 if axis == "column" else 0])
-    n_ejected = int(np.count_nonzero(~on_grid(batch.to_sites, shape)))
-    return BatchSummary(axis, tuple(lines.tolist()), len(batch), n_ejected, int(np.abs(way).max(initial=0)))
+def _lines_of(batch: Batch) -> Lines:
+    axis: Axis = "column" if (batch.to_sites != batch.from_sites)[:, 0].any() else "row"
+    return axis, tuple(np.unique(batch.from_sites[:, 1 if axis == "column" else 0]).tolist())
 
 
 def on_grid(sites: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -305,12 +287,12 @@ class Panel:
     Attributes:
         first: Index of the first batch.
         last: Index of the last one.
-        moves_along: Axis and sorted lines, one pair for each axis.
+        moves_along: Their rows, their columns, or both.
     """
 
     first: int
     last: int
-    moves_along: tuple[tuple[Axis, tuple[int, ...]], ...]
+    moves_along: tuple[Lines, ...]
 
     @property
     def n_batches(self) -> int:
@@ -330,7 +312,7 @@ class Panel:
         return f"{numbers}: " + "; ".join(_words(axis, lines) for axis, lines in self.moves_along)
 
 
-def make_panels(summaries: Sequence[BatchSummary], max_panels: int = MAX_PANELS) -> list[Panel]:
+def make_panels(batches: Sequence[Lines], max_panels: int = MAX_PANELS) -> list[Panel]:
     """Distribute batches among panels, in order.
 
     Each batch has its own panel if there are enough. If not, successive batches along
@@ -338,23 +320,22 @@ def make_panels(summaries: Sequence[BatchSummary], max_panels: int = MAX_PANELS)
     if the axis changes too often, any successive batches.
 
     Args:
-        summaries: The batches.
+        batches: The lines of each batch, from :func:`batch_lines`.
         max_panels: Maximum number of panels, at least 1.
 
     Example:
-        >>> rows = [BatchSummary("row", (i // 2,), 3, 0, 5) for i in range(8)]
-        >>> [(panel.first, panel.last) for panel in make_panels(rows, 4)]
+        >>> [(panel.first, panel.last) for panel in make_panels([("row", (i // 2,)) for i in range(8)], 4)]
         [(0, 1), (2, 3), (4, 5), (6, 7)]
     """
-    groups = [[i] for i in range(len(summaries))]
+    groups = [[i] for i in range(len(batches))]
     if len(groups) > max_panels:
-        groups = _together(summaries, lambda summary: (summary.axis, summary.lines))
+        groups = _runs(batches)
     if len(groups) > max_panels:
-        phases = _together(summaries, lambda summary: summary.axis)
+        phases = _runs([axis for axis, _ in batches])
         if len(phases) > max_panels:
-            phases = [list(range(len(summaries)))]
+            phases = [list(range(len(batches)))]
         groups = _evenly(phases, max_panels)
-    return [_panel(summaries, group) for group in groups]
+    return [_panel(batches, group) for group in groups]
 
 
 def _words(axis: Axis, lines: tuple[int, ...]) -> str:
@@ -362,9 +343,9 @@ def _words(axis: Axis, lines: tuple[int, ...]) -> str:
     return words if len(words) <= MAX_WORDS else f"{len(lines)} {axis}s"
 
 
-def _together(summaries: Sequence[BatchSummary], key: Callable[[BatchSummary], Any]) -> list[list[int]]:
-    runs = groupby(range(len(summaries)), lambda i: key(summaries[i]))
-    return [list(run) for _, run in runs]
+def _runs(values: Sequence[object]) -> list[list[int]]:
+    """Indices of equal values that follow one another."""
+    return [list(run) for _, run in groupby(range(len(values)), values.__getitem__)]
 
 
 def _evenly(phases: list[list[int]], max_panels: int) -> list[list[int]]:
@@ -380,11 +361,11 @@ def _evenly(phases: list[list[int]], max_panels: int) -> list[list[int]]:
     return pieces
 
 
-def _panel(summaries: Sequence[BatchSummary], group: list[int]) -> Panel:
-    lines: dict[Axis, set[int]] = {}
-    for i in group:
-        lines.setdefault(summaries[i].axis, set()).update(summaries[i].lines)
-    return Panel(group[0], group[-1], tuple((axis, tuple(sorted(found))) for axis, found in lines.items()))
+def _panel(batches: Sequence[Lines], group: list[int]) -> Panel:
+    found: dict[Axis, set[int]] = {}
+    for axis, lines in (batches[i] for i in group):
+        found.setdefault(axis, set()).update(lines)
+    return Panel(group[0], group[-1], tuple((axis, tuple(sorted(lines))) for axis, lines in found.items()))
 
 
 DPI: Final = 150
@@ -432,7 +413,7 @@ def save_plan(path: Path, drawing: PlanDrawing) -> None:
 
 def _draw(drawing: PlanDrawing) -> Figure:
     plan, grid = drawing.plan, drawing.grid
-    panels = make_panels(summarise_batches(plan, grid.shape))
+    panels = make_panels(batch_lines(plan))
     sheet = lay_out(extent_of(plan, grid), len(panels) + 2)
     figure = make_figure(sheet.width_in, sheet.height_in)
     looks = _fill(figure, sheet, drawing, panels)
