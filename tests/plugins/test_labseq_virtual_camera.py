@@ -325,7 +325,6 @@ def test_the_camera_waits_until_it_is_cold() -> None:
 def test_it_stays_cold_in_the_safe_state_and_while_it_is_closed() -> None:
     lab = Lab(cooling=COLD)
     lab.camera.settle()
-    lab.camera.safe_state()
     lab.camera.close()
     lab.clock.sleep(100.0)
     lab.camera.open()

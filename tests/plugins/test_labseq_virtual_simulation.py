@@ -201,25 +201,6 @@ def test_events_in_the_past_are_refused() -> None:
     simulation.expose(1.5, 45e-3)
 
 
-def test_a_role_that_cannot_play_tones_is_named() -> None:
-    with pytest.raises(DeviceError, match="'static_tweezers' played a ToneProgram"):
-        new_simulation().play("static_tweezers", SILENCE, 0.0)
-
-
-def test_a_simulation_that_is_not_open_raises() -> None:
-    simulation = VirtualSimulation(SimulationSettings(), Context("simulation"))
-    with pytest.raises(DeviceError, match="not open"):
-        simulation.begin_shot()
-    simulation.close()
-    with pytest.raises(DeviceError, match="not open"):
-        simulation.expose(0.0, 1.0)
-
-
-def test_an_exposure_takes_time() -> None:
-    with pytest.raises(LimitError, match="exposure"):
-        new_simulation().expose(0.0, float("nan"))
-
-
 def test_the_same_seed_gives_the_same_shot_whatever_came_before() -> None:
     def shot(seed: int, indices: list[tuple[int, int]]) -> tuple[bytes, bytes]:
         random = RandomStream(seed)
