@@ -58,13 +58,17 @@ def dark() -> DarkLab:
 
 
 def test_a_frame_takes_exposure_and_read_out(dark: DarkLab) -> None:
-    dark.clock.sleep(1.0)
+    dark.camera.close()
+    dark.clock.sleep(0.75)
+    dark.camera.open()
+    dark.clock.sleep(0.25)
     dark.camera.arm(1, 45e-3, "software")
     dark.camera.trigger()
     assert dark.clock.now() == 1.0
     frame = dark.camera.read(1.0)
     assert dark.clock.now() == pytest.approx(1.05)
     assert (frame.camera, frame.exposure_s, frame.t_start_s, frame.number) == ("camera", 45e-3, 1.0, 0)
+    assert frame.device_time_s == 0.25  # since it was opened
 
 
 def test_with_the_internal_trigger_exposures_follow_one_another_and_begin_when_read(dark: DarkLab) -> None:

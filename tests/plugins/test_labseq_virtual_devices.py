@@ -50,7 +50,7 @@ from labseq.testing import (
     SimulationContract,
     StaticTweezersContract,
 )
-from labseq.testing.fakes import FakeClock
+from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 
 class TestVirtualCamera(CameraContract):
@@ -344,6 +344,20 @@ class TestVirtualLines(LinesContract):
     @pytest.fixture
     def factory(self):
         return partial(VirtualLines, LinesSettings())
+
+
+def test_lines_are_not_fired_during_a_program() -> None:
+    context = Context("lines", clock=FakeClock(), simulation=RecordingSimulation(), lines=SPECS)
+    lines = VirtualLines(LinesSettings(), context)
+    lines.open()
+    lines.compile(line_program(SPECS, "load", 0.1))
+    lines.arm()
+    lines.fire()
+    lines.arm()
+    with pytest.raises(DeviceError, match="fired during a program that ends at"):
+        lines.fire()
+    lines.wait(1.0)
+    lines.fire()
 
 
 def fire(lights: Lights, kind: str, duration_s: float, t_s: float) -> LineProgram:

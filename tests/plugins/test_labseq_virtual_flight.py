@@ -180,7 +180,10 @@ SURE = SimulationSettings(transport_loss=0.0)
 
 
 def fly(
-    program: ToneProgram, atoms: list[tuple[int, int]], settings: SimulationSettings = SURE
+    program: ToneProgram,
+    atoms: list[tuple[int, int]],
+    settings: SimulationSettings = SURE,
+    loss_factor: float = 1.0,
 ) -> tuple[set[tuple[int, int]], NDArray[Any], NDArray[Any]]:
     """The sites that hold atoms afterwards, and the tables of flights and jumps."""
     flight = RfTransport(GRID, spec(), settings)
@@ -189,7 +192,7 @@ def fly(
         occupied[site] = True
     rng = np.random.default_rng(1)
     for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 10.0):
-        flight.carry(occupied, pulse, np.ones(GRID.shape), rng, 1.0)
+        flight.carry(occupied, pulse, np.ones(GRID.shape), rng, loss_factor)
     tables = flight.tables(START_S)
     return {(int(row), int(col)) for row, col in np.argwhere(occupied)}, tables["flights"], tables["jumps"]
 
@@ -233,8 +236,8 @@ def test_an_atom_that_leaves_the_grid_is_ejected() -> None:
 
 
 def test_the_transport_loss_is_drawn_for_held_atoms() -> None:
-    settings = SimulationSettings(transport_loss=1.0)
-    sites, flights, _ = fly(program_of(batch(((5, 2), (5, 4)))), [(5, 2), (9, 9)], settings)
+    settings = SimulationSettings(transport_loss=0.1)
+    sites, flights, _ = fly(program_of(batch(((5, 2), (5, 4)))), [(5, 2), (9, 9)], settings, loss_factor=10)
     assert sites == {(9, 9)}
     assert flights["fate"].tolist() == [b"hand_over"]
 

@@ -142,6 +142,16 @@ def test_an_exposure_loses_what_the_paper_says(exposure_s: float) -> None:
     assert within_four_sigma(survived, total, (0.9 * np.exp(-45e-3)) ** n_exposures)
 
 
+def test_atoms_shine_until_they_are_lost() -> None:
+    light, dark = list[float](), {"background": 0.0, "clock_induced_charge": 0.0}
+    for lifetime in (2e6, 5e-3):
+        simulation = new_simulation(loading=1.0, lifetime=lifetime, image=dark)
+        simulation.load(0.0, 0.5)
+        simulation._occupied[...] = True
+        light.append(float(simulation.expose(0.5, 45e-3).image.astype(float).sum() - 500 * 512**2))
+    assert light[1] / light[0] == pytest.approx(5 / 45, rel=0.25)
+
+
 def test_a_program_carries_atoms_and_takes_its_time() -> None:
     simulation = new_simulation(loading=1.0)
     simulation.load(0.0, 0.5)
