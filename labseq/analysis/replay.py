@@ -366,17 +366,17 @@ class _Replayer:
     _points: list[Point] = field(default_factory=list[Point])  # kept alive, so that no id is used twice
 
     def at(self, point: Point) -> _Pipeline:
-        key = id(point.planner), id(point.bench)
+        key = id(point.planner), id(point.hardware)
         if key not in self._crews:
             self._points.append(point)
             self._crews[key] = self._make(point)
         return self._crews[key]
 
     def _make(self, point: Point) -> _Pipeline:
-        own = {"planner": point.planner, "detector": point.bench.chosen["detector"]}
+        own = {"planner": point.planner, "detector": point.hardware.chosen["detector"]}
         names = self.changes or own
         chosen = {kind: self._changed(kind, one) for kind, one in own.items() if kind in names}
-        motion = point.bench.profile.motion
+        motion = point.hardware.profile.motion
         made, streams = construct(
             chosen, Context(grid=self.grid, motion=motion, calibrations=self.calibrations), self.run.seed
         )
@@ -404,7 +404,7 @@ class _Replayer:
         assert own.document is not None
         document = own.document.override_all(options, may_add=(kind,))
         choice = document.validate(Choice, (kind,)).placed(kind)
-        return resolve(self.assembly.bench.host, document, kind, choice)
+        return resolve(self.assembly.hardware.host, document, kind, choice)
 
 
 def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] = lambda _: None) -> Replay:

@@ -313,7 +313,7 @@ def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
 
 def _sample_rate_hz(session: Session, lab: Lab) -> float:
     """The sample rate that the profile sets, if its device has one, else one that suits its tones."""
-    settings = session.assembly.bench.chosen["mobile_tweezers"].settings
+    settings = session.assembly.hardware.chosen["mobile_tweezers"].settings
     given = getattr(settings, "sample_rate", None)
     if isinstance(given, float):
         return given
@@ -344,7 +344,7 @@ def _report(
     return LatencyReport(
         n_loadings=request.n_loadings,
         seed=request.seed,
-        profile=session.assembly.bench.profile.name,
+        profile=session.assembly.hardware.profile.name,
         planner=lab.planner_name,
         degree_of_parallelism=lab.degree_of_parallelism,
         n_batches=float(n_batches),
@@ -361,7 +361,7 @@ def _report(
         planned=Stage.of("frame to tone program", total_s - rendered_s),
         n_cores=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        warnings=session.assembly.bench.warnings,
+        warnings=session.assembly.hardware.warnings,
     )
 
 

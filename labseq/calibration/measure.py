@@ -114,24 +114,24 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
     """
     document, spec = load_profile(request.profile, beside=Path(), overrides=_of_profile(request.overrides))
     ignoring = _ignoring(store_of(document, spec).folder, spec, method)
-    bench = resolve_profile(
+    hardware = resolve_profile(
         request.profile, Path(), _of_profile([*request.overrides, ignoring]), request.dry_run
     )
-    run, result = _analysed(method, request, bench, ignoring, observer)
+    run, result = _analysed(method, request, hardware, ignoring, observer)
     entry = CalibrationEntry(
         kind=method.kind,
         values={name: np.asarray(value) for name, value in result.values.items()},
         quality=result.quality,
-        grid=grid_facts(bench.grid),
-        origin={**_origin(method, request, bench, run), **result.origin},
+        grid=grid_facts(hardware.grid),
+        origin={**_origin(method, request, hardware, run), **result.origin},
         taken_utc=_now() if run is None else str(run.record["t_start_utc"]),
     )
     store = store_of(document, spec, request.dry_run)
     before, (picture, warnings) = _in_use(store, entry), _picture(result)
     stored = store.add(entry, picture)
-    refused = "" if request.force else why_left_out(entry, bench.calibrations) or store.why_worse(entry)
+    refused = "" if request.force else why_left_out(entry, hardware.calibrations) or store.why_worse(entry)
     if not refused:
-        store.use(stored, bench.grid, force=True)
+        store.use(stored, hardware.grid, force=True)
         overlay = store.active().get("overlay")
         if entry.kind == "frequencies" and overlay is not None:
             store.use_none("overlay")
@@ -146,7 +146,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
 def _analysed(
     method: Method,
     request: CalibrationRequest,
-    bench: ResolvedProfile,
+    hardware: ResolvedProfile,
     ignoring: str,
     observer: RunObserver | None,
 ) -> tuple[Run | None, AnalysisResult]:
@@ -156,10 +156,12 @@ def _analysed(
         if method.read is None:
             what = f"a calibration of {method.kind} cannot be made from a file"
             raise ConfigError(Problem(what, str(source), expected="a run's folder"))
-        return None, method.read(source, bench)
-    run = _measure(method, request, ignoring, observer) if source is None else _open(source, request, bench)
+        return None, method.read(source, hardware)
+    run = (
+        _measure(method, request, ignoring, observer) if source is None else _open(source, request, hardware)
+    )
     try:
-        return run, method.analyse(CalibrationData(run, bench))
+        return run, method.analyse(CalibrationData(run, hardware))
     except LabseqError:
         if observer is not None:
             again = f"analyse the run again with --from {run.path}"
@@ -186,7 +188,7 @@ def _measure(method: Method, request: CalibrationRequest, ignoring: str, observe
         return session.run()
 
 
-def _open(source: Path, request: CalibrationRequest, bench: ResolvedProfile) -> Run:
+def _open(source: Path, request: CalibrationRequest, hardware: ResolvedProfile) -> Run:
     """Open a run of the profile's sites and devices.
 
     Raises:
@@ -196,15 +198,15 @@ def _open(source: Path, request: CalibrationRequest, bench: ResolvedProfile) -> 
         run = open_run(source)
     except RecordingError as error:
         raise ConfigError(Problem(str(error), "--from")) from error
-    if run.target.shape != bench.grid.shape:
+    if run.target.shape != hardware.grid.shape:
         came = " x ".join(map(str, run.target.shape))
-        expected = f"{bench.grid.n_rows} x {bench.grid.n_cols}, as in the profile"
+        expected = f"{hardware.grid.n_rows} x {hardware.grid.n_cols}, as in the profile"
         raise ConfigError(Problem(f"the run has a grid of {came} sites", str(source), expected=expected))
     taken_on = grid_facts(recorded_machine(run.record["resolved"]["profile"], "the profile of the run").grid)
-    if not same_grid(taken_on, own := grid_facts(bench.grid)):
+    if not same_grid(taken_on, own := grid_facts(hardware.grid)):
         what = f"the run has a grid of {grid_text(taken_on)}"
         raise ConfigError(Problem(what, str(source), expected=f"{grid_text(own)}, as in the profile"))
-    if run.simulated != (request.dry_run != "off" or bench.virtual_time):
+    if run.simulated != (request.dry_run != "off" or hardware.virtual_time):
         what = f"the run was {'simulated' if run.simulated else 'taken with real devices'}"
         expected = (
             f"one {'with real devices' if run.simulated else 'that was simulated'}, as the profile's are"
@@ -230,14 +232,14 @@ def _of_profile(overrides: Sequence[str]) -> list[Override]:
 
 
 def _origin(
-    method: Method, request: CalibrationRequest, bench: ResolvedProfile, run: Run | None
+    method: Method, request: CalibrationRequest, hardware: ResolvedProfile, run: Run | None
 ) -> dict[str, Any]:
     origin: dict[str, Any] = {
         "command": f"labseq calibrate {method.kind}",
-        "profile": bench.profile.name,
+        "profile": hardware.profile.name,
         "labseq": labseq.__version__,
-        "simulated": request.dry_run != "off" or bench.virtual_time,
-        "calibrations": {kind: entry.id for kind, entry in bench.calibrations.items()},
+        "simulated": request.dry_run != "off" or hardware.virtual_time,
+        "calibrations": {kind: entry.id for kind, entry in hardware.calibrations.items()},
     }
     if run is None:
         return {**origin, "file": str(request.source)}

@@ -57,11 +57,11 @@ class CalibrationData:
 
     Attributes:
         run: The run.
-        bench: The profile, with the calibrations that the analysis uses.
+        hardware: The profile, with the calibrations that the analysis uses.
     """
 
     run: Run
-    bench: ResolvedProfile
+    hardware: ResolvedProfile
 
     def frames(self) -> Iterator[Frame]:
         """The first frame of each shot: randomly loaded atoms, before any move.
@@ -86,16 +86,16 @@ class CalibrationData:
                 sizes = f"{shape} and {frame.image.shape}"
                 raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
             n_saturated = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
-            if n_saturated > max(MIN_SATURATED, self.bench.grid.n_rows * self.bench.grid.n_cols // 20):
+            if n_saturated > max(MIN_SATURATED, self.hardware.grid.n_rows * self.hardware.grid.n_cols // 20):
                 what = f"{n_saturated} pixels of the first frame of shot {shot.index + 1} are saturated"
                 raise DeviceError(frame.camera, f"{what}; use less light, gain or exposure")
             yield frame
 
     def detector(self) -> Detector:
         """The profile's detector, with the calibrations that the analysis uses."""
-        bench = self.bench
+        hardware = self.hardware
         clock = VirtualClock(StopFlag())
-        made, _ = construct({"detector": bench.chosen["detector"]}, bench.context(clock), 0)
+        made, _ = construct({"detector": hardware.chosen["detector"]}, hardware.context(clock), 0)
         return made["detector"]
 
 

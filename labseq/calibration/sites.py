@@ -27,7 +27,7 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     for frame in data.frames():
         total, n_frames = total + frame.image, n_frames + 1
     mean = total / n_frames
-    found = find_lattice(mean, data.bench.grid)
+    found = find_lattice(mean, data.hardware.grid)
     quality = {
         "residual_px": found.residual_px,
         "n_sites_found": float(found.n_sites_found),
@@ -45,18 +45,18 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     )
 
 
-def read_site_file(path: Path, bench: ResolvedProfile) -> AnalysisResult:
+def read_site_file(path: Path, hardware: ResolvedProfile) -> AnalysisResult:
     """Read the positions of the sites from a file, on frames of the size in the detector's settings.
 
     Raises:
         ConfigError: The file has an error, or the detector has no setting for the size of its frames.
     """
-    settings: Any = bench.chosen["detector"].settings
+    settings: Any = hardware.chosen["detector"].settings
     frame = getattr(settings, "frame", None)
     if frame is None:
         what = "the detector does not say how large the frames are that the sites are on"
         raise ConfigError(Problem(what, expected="a detector with the setting 'frame'"))
-    positions = read_sites(path, bench.grid.shape)
+    positions = read_sites(path, hardware.grid.shape)
     if np.any((positions < 0) | (positions > np.array(frame) - 1)):
         what = f"some of the sites are outside of the frame of {frame[0]} x {frame[1]} pixels"
         raise ConfigError(Problem(what, str(path), expected="(y, x) of each site on the frame"))

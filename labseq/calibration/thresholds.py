@@ -368,7 +368,7 @@ def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
         LimitError: There are too few frames.
         ConfigError: The detector does not report its signals, or the run has no frames.
     """
-    detector, chosen = data.detector(), data.bench.chosen["detector"]
+    detector, chosen = data.detector(), data.hardware.chosen["detector"]
     if not isinstance(detector, ReportsSignals):
         what = f"the detector '{chosen.entry.name}' does not report the signals that it compares"
         raise ConfigError(Problem(what, expected="'threshold', 'weighted', or another that does"))

@@ -24,7 +24,7 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
         np.array(found[name], np.float64)
         for name in ("row_amplitudes", "column_amplitudes", "power_before", "power_after")
     )
-    if (len(rows), len(cols)) != data.bench.grid.shape:
+    if (len(rows), len(cols)) != data.hardware.grid.shape:
         raise _wrong_run(data.run, f"it equalised {len(rows)} x {len(cols)} tweezers")
     names = ("separable_spread", "residual_spread", "noise", "n_measured")
     quality = {name: float(found[name]) for name in names}

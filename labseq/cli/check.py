@@ -174,7 +174,7 @@ def _as_values(assembly: Assembly, checked: CheckReport) -> dict[str, Any]:
         "first_cycle_s": None if rehearsal is None else _quantiles(rehearsal),
         "calibrations": [
             {"kind": entry.kind, "id": entry.id, "taken_utc": entry.taken_utc, "age_s": age_s(entry)}
-            for entry in assembly.bench.calibrations.values()
+            for entry in assembly.hardware.calibrations.values()
         ],
     }
 
@@ -186,13 +186,13 @@ def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
 
 def _subject(assembly: Assembly) -> list[tuple[str, str]]:
     target, spec = assembly.target, assembly.sequence
-    grid, document = assembly.bench.grid, assembly.bench.document
+    grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
     n_clear = int(target.clear.sum())
     simulated = ", dry run" if assembly.dry_run != "off" else ", simulated" * assembly.virtual_time
     return [
         ("sequence", f"{spec.name} ({assembly.document.path})"),
-        ("profile", f"{assembly.bench.profile.name} ({document.path}){simulated}"),
+        ("profile", f"{assembly.hardware.profile.name} ({document.path}){simulated}"),
         (
             "grid",
             f"{grid.n_rows} x {grid.n_cols}, {grid.lattice}, {format_quantity(grid.spacing_m, 'length')}",
@@ -201,7 +201,7 @@ def _subject(assembly: Assembly) -> list[tuple[str, str]]:
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
         *(
             ("calibration", f"{one.kind} {one.id}, {age_text(age_s(one))} old, {quality_text(one)}")
-            for one in assembly.bench.calibrations.values()
+            for one in assembly.hardware.calibrations.values()
         ),
         *(("scan", text) for text in _scanned(assembly)),
     ]
@@ -267,7 +267,7 @@ def _rehearsed(checked: CheckReport) -> list[tuple[str, str]]:
 
 
 def _limits(assembly: Assembly) -> list[tuple[str, str]]:
-    profile, spec = assembly.bench.profile, assembly.sequence
+    profile, spec = assembly.hardware.profile, assembly.sequence
     motion, timeouts = profile.motion, profile.timeouts
     tones = f"{motion.max_row_tones} x {motion.max_column_tones} tones"
     dop = assembly.planner.dump().get("degree_of_parallelism")

@@ -156,7 +156,7 @@ def run_demo(shots: int | None, output: Path | None) -> None:
 def beginning(session: Session) -> list[str]:
     """The explanation printed before the run."""
     assembly = session.assembly
-    target, grid = assembly.target.fill, assembly.bench.grid
+    target, grid = assembly.target.fill, assembly.hardware.grid
     steps: list[Any] = [step for _, step in assembly.steps]
     cycles = max(getattr(getattr(step, "settings", None), "cycles", 0) for step in steps)
     rows, cols = (int(target.any(axis=axis).sum()) for axis in (1, 0))

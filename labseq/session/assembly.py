@@ -45,7 +45,7 @@ class Assembly:
     Attributes:
         document: The sequence's file.
         sequence: Its content.
-        bench: The profile.
+        hardware: The profile.
         target: The target pattern.
         planner: The planner and its settings.
         steps: Name and step, in order.
@@ -59,7 +59,7 @@ class Assembly:
 
     document: Document
     sequence: SequenceSpec
-    bench: ResolvedProfile
+    hardware: ResolvedProfile
     target: TargetPattern
     planner: ChosenPlugin
     steps: tuple[tuple[str, Step], ...]
@@ -72,24 +72,24 @@ class Assembly:
     @property
     def virtual_time(self) -> bool:
         """Whether the run's clock is virtual, without real waiting times."""
-        return self.dry_run != "off" or self.bench.virtual_time
+        return self.dry_run != "off" or self.hardware.virtual_time
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for the user."""
         notes = () if self.scanned is None else self.scanned.scan.notes
-        return (*self.bench.warnings, *notes)
+        return (*self.hardware.warnings, *notes)
 
     @property
     def begun(self) -> Point:
         """The settings of the first point of a scan; those of the files if no point is known yet."""
         alone = self.scanned is None or self.search is not None
-        return Point(self.planner, self.steps, self.bench, {}) if alone else self.at(0)
+        return Point(self.planner, self.steps, self.hardware, {}) if alone else self.at(0)
 
     def at(self, point: int) -> Point:
         """The settings of a point of the scan."""
         if self.scanned is None:
-            return Point(self.planner, self.steps, self.bench, {})
+            return Point(self.planner, self.steps, self.hardware, {})
         return self.scanned.at(point)
 
 
@@ -127,7 +127,7 @@ def assemble(
         raise found.stop(error) from None
     scan = None if found.problems else scan
     try:
-        bench = resolve_profile(
+        hardware = resolve_profile(
             sequence.profile if profile is None else profile,
             sequence_path.parent if profile is None else Path(),
             for_profile,
@@ -141,13 +141,13 @@ def assemble(
     except ConfigError as error:
         _check_alone(document, sequence, found)
         raise _explained(found.stop(error), scan) from None
-    return _assembled(document, sequence, bench, scan, found, dry_run)
+    return _assembled(document, sequence, hardware, scan, found, dry_run)
 
 
 def _assembled(
     document: Document,
     sequence: SequenceSpec,
-    bench: ResolvedProfile,
+    hardware: ResolvedProfile,
     scan: Scan | None,
     found: ProblemCollector,
     dry_run: DryRun,
@@ -156,18 +156,18 @@ def _assembled(
     is_whole = not found.problems
     made: dict[str, Any] = {}
     with found:
-        made["target"], made["target_dump"] = make_target(bench, document, sequence)
+        made["target"], made["target_dump"] = make_target(hardware, document, sequence)
     with found:
-        made["planner"] = resolve(bench.host, document, "planner", sequence.planner)
-    steps, step_dumps = make_steps(bench, document, sequence, found)
+        made["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
+    steps, step_dumps = make_steps(hardware, document, sequence, found)
     policy = make_policy(document, sequence, steps, found)
-    analyses = make_analyses(bench, document, sequence, found)
+    analyses = make_analyses(hardware, document, sequence, found)
     scanned: ScanPoints | None = None
     search: Search | None = None
     try:
         if scan is not None and is_whole:
-            bound, planner = scan.bound(bench.document), made.get("planner")
-            scanned = ScanPoints(bound, document, sequence, bench, dry_run, planner, tuple(steps))
+            bound, planner = scan.bound(hardware.document), made.get("planner")
+            scanned = ScanPoints(bound, document, sequence, hardware, dry_run, planner, tuple(steps))
             scanned.check(found)
             if not found.problems:
                 search = make_search(scanned, steps, found)
@@ -181,11 +181,11 @@ def _assembled(
         "planner": planner.dump(),
         "shot": with_policies(document, sequence, step_dumps),
         "analysis": analyses,
-        "profile": _profile_dump(bench),
+        "profile": _profile_dump(hardware),
     }
-    if texts := _expressions(document, bench.document):
+    if texts := _expressions(document, hardware.document):
         resolved["expressions"] = texts
-    parts = (document, sequence, bench, target, planner, tuple(steps), dry_run, resolved)
+    parts = (document, sequence, hardware, target, planner, tuple(steps), dry_run, resolved)
     return Assembly(*parts, scanned, policy=policy, search=search)
 
 
@@ -219,18 +219,18 @@ def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
     return texts
 
 
-def _profile_dump(bench: ResolvedProfile) -> dict[str, Any]:
-    spec = bench.profile
+def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
+    spec = hardware.profile
     core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
-    roles = {role: chosen.dump() for role, chosen in bench.chosen.items() if role in ROLES}
+    roles = {role: chosen.dump() for role, chosen in hardware.chosen.items() if role in ROLES}
     roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
-    devices = {name: bench.chosen[name].dump() for name in spec.devices}
-    grid = with_tones(core["grid"], bench.grid, spec.grid_model())
+    devices = {name: hardware.chosen[name].dump() for name in spec.devices}
+    grid = with_tones(core["grid"], hardware.grid, spec.grid_model())
     return {**core, "grid": grid, **roles, "devices": devices}
 
 
 def make_target(
-    bench: ResolvedProfile, document: Document, sequence: SequenceSpec
+    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec
 ) -> tuple[TargetPattern, dict[str, Any]]:
     """The target of a sequence, and its settings for the record.
 
@@ -238,25 +238,25 @@ def make_target(
         ConfigError: The pattern is unknown, its settings are invalid, or it does not fit on the grid.
         PluginLoadError: The pattern's plugin failed; names it.
     """
-    choice, grid = sequence.target, bench.grid
-    chosen = resolve(bench.host, document, "pattern", choice)
+    choice, grid = sequence.target, hardware.grid
+    chosen = resolve(hardware.host, document, "pattern", choice)
     try:
         target = construct_target(chosen, grid)
     except PluginLoadError:
         raise
     except LabseqError as error:
         problem = document.problem(choice.loc, str(error))
-        raise ConfigError(replace(problem, notes=(_grid_note(bench),))) from error
+        raise ConfigError(replace(problem, notes=(_grid_note(hardware),))) from error
     return target, {"pattern": chosen.entry.name, **dump(chosen.entry, chosen.settings)}
 
 
 def make_steps(
-    bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
+    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
 ) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
     """Name and step, in order, and the settings of each for the record.
 
     Args:
-        bench: The profile.
+        hardware: The profile.
         document: The sequence's file.
         sequence: Its content.
         found: Receives the problems.
@@ -267,7 +267,7 @@ def make_steps(
     for spec in sequence.shot:
         step: Step | None = None
         with found:
-            step, dumped = make_step(bench, document, spec)
+            step, dumped = make_step(hardware, document, spec)
             steps.append((spec.name or spec.kind, step))
             dumps.append({spec.kind: dumped, **({"name": spec.name} if spec.name else {})})
             if step.needs_image and not image_seen:
@@ -279,14 +279,14 @@ def make_steps(
 
 
 def make_analyses(
-    bench: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
+    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
 ) -> list[dict[str, Any]]:
     """The settings of each analysis of the sequence, for the record.
 
     Each is constructed once, to check that it can be; during the run they have their own processes.
 
     Args:
-        bench: The profile.
+        hardware: The profile.
         document: The sequence's file.
         sequence: Its content.
         found: Receives the problems.
@@ -294,16 +294,18 @@ def make_analyses(
     dumps: list[dict[str, Any]] = []
     for choice in sequence.analysis:
         with found:
-            chosen = resolve(bench.host, document, "analysis", choice)
-            context = Context(choice.use, bench.grid, bench.profile.motion, calibrations=bench.calibrations)
+            chosen = resolve(hardware.host, document, "analysis", choice)
+            context = Context(
+                choice.use, hardware.grid, hardware.profile.motion, calibrations=hardware.calibrations
+            )
             construct_one(chosen, context)
             dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
     return dumps
 
 
-def _grid_note(bench: ResolvedProfile) -> str:
-    grid = bench.grid
-    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(bench.document, 'grid')}"
+def _grid_note(hardware: ResolvedProfile) -> str:
+    grid = hardware.grid
+    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(hardware.document, 'grid')}"
 
 
 CLIMBED: Final = "to climb on"
@@ -393,7 +395,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
         check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps)
     chosen: ChosenPlugin | None = None
     with found:
-        chosen = resolve(scanned.bench.host, document, "scanner", adaptive.choice)
+        chosen = resolve(scanned.hardware.host, document, "scanner", adaptive.choice)
     low = scanned.at(0).parameters
     high = scanned.at(math.prod(scanned.scan.shape) - 1).parameters
     ranges: list[ScanRange] = []

@@ -44,7 +44,7 @@ def check_steps(assembly: Assembly, points: Iterable[Point], build: Callable[[Po
     problems: dict[str, Problem] = {}
     guard = Guard()
     for point in points:
-        lab = labs.get(id(point.bench)) or labs.setdefault(id(point.bench), build(point))
+        lab = labs.get(id(point.hardware)) or labs.setdefault(id(point.hardware), build(point))
         devices = dict(lab.hardware())
         for spec, (name, step) in zip(assembly.sequence.shot, point.steps, strict=True):
             if offers(step, "check_devices"):
@@ -180,7 +180,7 @@ def check(session: Session) -> CheckReport:
     warnings += timeout_warnings(assembly, timeline)
     for point in session.scan_run.representative_labs():
         session.build_lab(point)  # whether the constructors accept the settings
-    warnings += [Problem(text) for text in assembly.bench.host.notes]
+    warnings += [Problem(text) for text in assembly.hardware.host.notes]
     return CheckReport(
         timeline,
         assembly.sequence.shots,
@@ -198,7 +198,7 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     guard = Guard()
     min_duration_s, most_s = list[float](), list[float]()
     for point, n in session.scan_run.counted():
-        context = replace(lab.step_context, motion=point.bench.profile.motion)
+        context = replace(lab.step_context, motion=point.hardware.profile.motion)
         bars = [bar for bars in lay_out(lab, guard, point.steps, context) for bar in bars]
         min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
@@ -299,7 +299,7 @@ def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list
 def _parallelism_warnings(session: Session) -> list[Problem]:
     assembly = session.assembly
     asked = getattr(assembly.planner.settings, "degree_of_parallelism", None)
-    limit = assembly.bench.profile.motion.max_tweezers
+    limit = assembly.hardware.profile.motion.max_tweezers
     if not isinstance(asked, int) or asked <= limit:
         return []
     loc = (*assembly.sequence.planner.loc, "degree_of_parallelism")

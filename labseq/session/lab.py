@@ -48,12 +48,12 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
     Raises:
         ConfigError: A constructor refuses its settings, or the lines conflict with the devices.
     """
-    bench = point.bench
-    profile, motion = bench.profile, bench.profile.motion
-    chosen = {**bench.chosen, "planner": point.planner}
-    made, streams = construct(chosen, bench.context(clock), seed, true_grid=profile.grid_model())
+    hardware = point.hardware
+    profile, motion = hardware.profile, hardware.profile.motion
+    chosen = {**hardware.chosen, "planner": point.planner}
+    made, streams = construct(chosen, hardware.context(clock), seed, true_grid=profile.grid_model())
     lab = Lab(
-        grid=bench.grid,
+        grid=hardware.grid,
         motion=motion,
         target=target,
         clock=clock,
@@ -68,13 +68,13 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         simulation=made.get("simulation"),
         random_streams=streams,
         timeouts=timeouts_of(profile),
-        calibrations=bench.calibrations,
+        calibrations=hardware.calibrations,
         blinding=_blinding(profile),
         lines=made.get("lines"),
         line_specs=profile.line_specs,
         budgets=profile.budgets.model_dump(),
     )
-    refuse_wrong_wiring(bench.document, lab)
+    refuse_wrong_wiring(hardware.document, lab)
     return lab
 
 
@@ -141,17 +141,17 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     Returns:
         The lab, and the names of the devices that must be reopened, "simulation" among them.
     """
-    reopened = _reopened(lab, before.bench, after.bench)
-    motion = after.bench.profile.motion
+    reopened = _reopened(lab, before.hardware, after.hardware)
+    motion = after.hardware.profile.motion
     names = {*reopened, "planner"}
-    if _differs(before.bench, after.bench, "detector"):
+    if _differs(before.hardware, after.hardware, "detector"):
         names.add("detector")
-    chosen = {**after.bench.chosen, "planner": after.planner}
+    chosen = {**after.hardware.chosen, "planner": after.planner}
     made, streams = construct(
         {name: chosen[name] for name in chosen if name in names},
-        replace(after.bench.context(lab.clock), simulation=lab.simulation),
+        replace(after.hardware.context(lab.clock), simulation=lab.simulation),
         seed,
-        true_grid=after.bench.profile.grid_model(),
+        true_grid=after.hardware.profile.grid_model(),
     )
     roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
     return replace(

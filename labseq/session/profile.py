@@ -158,10 +158,10 @@ def resolve_profile(
     host = load_plugins(folders, max_wait_s=spec.timeouts.load)
     problems = ProblemCollector() if found is None else found
     pins = None if again is None else again.calibrations
-    bench = choose_plugins(document, spec, host, dry_run, problems, pins)
+    hardware = choose_plugins(document, spec, host, dry_run, problems, pins)
     if found is None:
         problems.raise_any()
-    return bench
+    return hardware
 
 
 def choose_plugins(

@@ -115,7 +115,7 @@ def run_record(
         scan: Its scan, see :meth:`labseq.session.scan_run.ScanRun.record`.
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """
-    spec, bench = assembly.sequence, assembly.bench
+    spec, hardware = assembly.sequence, assembly.hardware
     return RunRecord(
         name=spec.name,
         n_shots=spec.shots,
@@ -124,19 +124,19 @@ def run_record(
         t_start_utc=now_utc(),
         target=assembly.target,
         sequence_text=assembly.document.text,
-        profile_text=bench.document.text,
+        profile_text=hardware.document.text,
         sequence_path=str(folder / assembly.document.path),
-        profile_path=str(folder / bench.document.path),
+        profile_path=str(folder / hardware.document.path),
         resolved=assembly.resolved,
         overrides=changes,
         devices={},
         plugins=plugins_of(assembly),
         provenance=gather_provenance((folder / assembly.document.path).parent) | {"folder": str(folder)},
         record_frames=spec.record_frames,
-        grid_spacing_m=bench.grid.spacing_m,
-        lattice=bench.grid.lattice,
+        grid_spacing_m=hardware.grid.spacing_m,
+        lattice=hardware.grid.lattice,
         scan=scan,
-        calibrations={kind: entry.id for kind, entry in bench.calibrations.items()},
+        calibrations={kind: entry.id for kind, entry in hardware.calibrations.items()},
     )
 
 
@@ -157,12 +157,12 @@ def ending(error: BaseException | None) -> tuple[RunStatus, str]:
 
 def plugins_of(assembly: Assembly) -> tuple[dict[str, str], ...]:
     """Name, origin and version of each plugin that a run uses."""
-    used = [*assembly.bench.chosen.values(), assembly.planner]
+    used = [*assembly.hardware.chosen.values(), assembly.planner]
     used += [] if assembly.search is None else [assembly.search.chosen]
     origins = {item.entry.origin for item in used}
     return tuple(
         {"name": info.name, "origin": info.origin, "version": info.version}
-        for info in assembly.bench.host.infos
+        for info in assembly.hardware.host.infos
         if info.name in origins
     )
 

@@ -34,7 +34,7 @@ from labseq.session.profile import ResolvedProfile, choose_plugins, resolve_prof
 
 @contextmanager
 def lock_devices(
-    bench: ResolvedProfile,
+    hardware: ResolvedProfile,
     roots: Sequence[Path],
     what: str,
     warn: Callable[[str], object],
@@ -47,7 +47,7 @@ def lock_devices(
     state folder, like the markers of runs, so that they hold whatever ``--output`` says.
 
     Args:
-        bench: The profile.
+        hardware: The profile.
         roots: See :func:`labseq.recording.marker_roots`; those that do not exist are skipped, except
             the user's own.
         what: The use of the devices, shown to other users while they are locked.
@@ -63,7 +63,7 @@ def lock_devices(
     standing = [root for root in roots if root.is_dir() or root not in roots[:1]]
     locks: list[Lock] = []
     with ExitStack() as stack:
-        for file in lock_files(standing, bench.hardware_key):
+        for file in lock_files(standing, hardware.hardware_key):
             lock = Lock(file, what)
             try:
                 holder = lock.take()
@@ -79,7 +79,7 @@ def lock_devices(
                 warn(f"its devices are in use by {holder}")
                 break
             else:
-                raise DeviceError(bench.profile.name, _refusal(holder))
+                raise DeviceError(hardware.profile.name, _refusal(holder))
         else:
             if not locks:
                 warn("no lock could be had: nothing keeps another run from the same devices")
@@ -164,41 +164,43 @@ def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], None
     return None
 
 
-def construct_hardware(bench: ResolvedProfile, clock: Clock) -> tuple[dict[str, Any], dict[str, LabseqError]]:
+def construct_hardware(
+    hardware: ResolvedProfile, clock: Clock
+) -> tuple[dict[str, Any], dict[str, LabseqError]]:
     """Construct the devices of a profile, and the simulation if there is one; nothing is opened.
 
     Args:
-        bench: The profile.
+        hardware: The profile.
         clock: The clock that they use.
 
     Returns:
         Role or device name -> object; and name -> why it could not be constructed, with its place.
     """
-    chosen = {role: c for role, c in bench.chosen.items() if c.entry.kind in _NEEDED_KINDS}
+    chosen = {role: c for role, c in hardware.chosen.items() if c.entry.kind in _NEEDED_KINDS}
     failures: dict[str, LabseqError] = {}
-    true_grid = bench.profile.grid_model()
-    made, _ = construct(chosen, bench.context(clock), 0, true_grid=true_grid, refused=failures)
+    true_grid = hardware.profile.grid_model()
+    made, _ = construct(chosen, hardware.context(clock), 0, true_grid=true_grid, refused=failures)
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
 
 def make_profile_devices_safe(
-    bench: ResolvedProfile, stop: StopFlag, observer: RunObserver | None = None
+    hardware: ResolvedProfile, stop: StopFlag, observer: RunObserver | None = None
 ) -> SafeStateReport:
     """Construct each device of a profile, open it, make it safe and close it.
 
     A device that cannot be constructed does not affect the others; it is reported at the end.
 
     Args:
-        bench: The profile.
+        hardware: The profile.
         stop: The request to stop; not obeyed here.
         observer: Receives each device's outcome.
     """
-    clock = VirtualClock(stop) if bench.virtual_time else RealClock(stop)
-    made, failures = construct_hardware(bench, clock)
+    clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
+    made, failures = construct_hardware(hardware, clock)
     simulation = made.pop("simulation", None)
     with stop.held():
-        attempted = make_each_safe(in_safe_order(made), timeouts_of(bench.profile), simulation, observer)
-    refused: dict[str, LabseqError] = {role: e for role, e in bench.refused.items() if role != "detector"}
+        attempted = make_each_safe(in_safe_order(made), timeouts_of(hardware.profile), simulation, observer)
+    refused: dict[str, LabseqError] = {role: e for role, e in hardware.refused.items() if role != "detector"}
     refused |= failures
     if observer is not None:
         for role, error in refused.items():
@@ -207,14 +209,14 @@ def make_profile_devices_safe(
 
 
 def make_safe_after_crash(
-    bench: ResolvedProfile, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
+    hardware: ResolvedProfile, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
 ) -> None:
     """Make the devices of a profile safe if the process of its last run died, because they may still be on.
 
     This comes first, because constructing and compiling may fail.
 
     Args:
-        bench: The profile.
+        hardware: The profile.
         roots: See :func:`labseq.recording.marker_roots`.
         key: Identifies its hardware.
         stop: The request to stop; obeyed once every device has been tried.
@@ -229,7 +231,7 @@ def make_safe_after_crash(
         return
     text = f"the last run on this profile ({dead}) died; its devices are made safe first"
     observer.event("warning", {"text": text})
-    failures = make_profile_devices_safe(bench, stop, observer).failures
+    failures = make_profile_devices_safe(hardware, stop, observer).failures
     if failures:
         raise failures[0]
     try:
@@ -258,19 +260,19 @@ def make_profile_safe(
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
     found, roots = ProblemCollector(), marker_roots(data_root())  # now: vendors' libraries change the folder
-    bench = _read(profile, overrides, found)
-    key, stop = bench.hardware_key, StopFlag()
+    hardware = _read(profile, overrides, found)
+    key, stop = hardware.hardware_key, StopFlag()
 
     def warn(text: str) -> None:
         if observer is not None:
             observer.event("warning", {"text": text})
 
     with ExitStack() as stack:
-        if not bench.virtual_time:
-            stack.enter_context(lock_devices(bench, roots, "labseq safe", warn, in_spite=True))
+        if not hardware.virtual_time:
+            stack.enter_context(lock_devices(hardware, roots, "labseq safe", warn, in_spite=True))
         stack.enter_context(stop_on_signals(stop))
-        secured = make_profile_devices_safe(bench, stop, observer)
-    refused = [problem for error in bench.refused.values() for problem in error.problems]
+        secured = make_profile_devices_safe(hardware, stop, observer)
+    refused = [problem for error in hardware.refused.values() for problem in error.problems]
     others = [problem for problem in found.problems if problem not in refused]
     # a problem or an override may have left out or replaced a device
     if not (secured.failures or others or overrides):
@@ -367,23 +369,23 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     """
     check_dry_run(dry_run)
     roots = marker_roots(data_root())
-    bench = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
+    hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
     stop = StopFlag()
-    is_virtual = dry_run != "off" or bench.virtual_time
+    is_virtual = dry_run != "off" or hardware.virtual_time
     clock = VirtualClock(stop) if is_virtual else RealClock(stop)
-    warnings = [*bench.warnings]
+    warnings = [*hardware.warnings]
     with ExitStack() as stack:
         if not is_virtual:
-            stack.enter_context(lock_devices(bench, roots, "labseq devices", warnings.append))
+            stack.enter_context(lock_devices(hardware, roots, "labseq devices", warnings.append))
         stack.enter_context(stop_on_signals(stop))
-        made, refused = construct_hardware(bench, clock)
+        made, refused = construct_hardware(hardware, clock)
         simulation = made.pop("simulation", None)
         in_order = sorted(made.items(), key=lambda item: _OPENING.get(item[0], 2))
-        devices = check_each_device(in_order, timeouts_of(bench.profile), stop, simulation)
+        devices = check_each_device(in_order, timeouts_of(hardware.profile), stop, simulation)
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
-    plugins = {name: chosen.entry.name for name, chosen in bench.chosen.items()}
+    plugins = {name: chosen.entry.name for name, chosen in hardware.chosen.items()}
     stopped = StopRequested(stop.signal_number) if stop.is_set else None
-    return DevicesReport(devices, plugins, [*warnings, *bench.host.notes], stopped)
+    return DevicesReport(devices, plugins, [*warnings, *hardware.host.notes], stopped)
 
 
 def check_each_device(

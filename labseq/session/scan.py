@@ -69,13 +69,13 @@ class Point:
     Attributes:
         planner: The planner and its settings.
         steps: Name and step, in order.
-        bench: The profile.
+        hardware: The profile.
         parameters: Scanned address -> value, SI, JSON-ready.
     """
 
     planner: ChosenPlugin
     steps: tuple[tuple[str, Step], ...]
-    bench: ResolvedProfile
+    hardware: ResolvedProfile
     parameters: Mapping[str, Any]
 
 
@@ -87,7 +87,7 @@ class ScanPoints:
         scan: The scan, its axes bound to the profile.
         document: The sequence's file.
         sequence: Its content.
-        bench: The profile.
+        hardware: The profile.
         dry_run: "off", "full" or "fast".
         planner: The planner if no axis changes it; None if it has an error.
         steps: Name and step, in order, if no axis changes them.
@@ -96,7 +96,7 @@ class ScanPoints:
     scan: Scan
     document: Document
     sequence: SequenceSpec
-    bench: ResolvedProfile
+    hardware: ResolvedProfile
     dry_run: DryRun
     planner: ChosenPlugin | None
     steps: tuple[tuple[str, Step], ...]
@@ -157,7 +157,7 @@ class ScanPoints:
 
     def present(self, axis: Axis) -> Any:
         """The value of an axis in the files, SI; None if it is missing or invalid."""
-        document = self.bench.document if axis.of_profile else self.document
+        document = self.hardware.document if axis.of_profile else self.document
         if axis.loc[0] == VARIABLES:
             return _si(document.get(axis.loc))
         part = _part_of(axis.of_profile, axis.loc)
@@ -183,7 +183,7 @@ class ScanPoints:
 
     def _dependents(self, axis: Axis) -> list[Loc]:
         """The settings with an expression that depends on an axis."""
-        expressions = (self.bench.document if axis.of_profile else self.document).expressions
+        expressions = (self.hardware.document if axis.of_profile else self.document).expressions
         found = [] if expressions is None else expressions.following(axis.loc)
         return [loc for loc in found if loc[0] != VARIABLES]
 
@@ -206,7 +206,7 @@ class ScanPoints:
         positions = self.scan.positions(point)
         key = in_profile, tuple(positions[group] for group in self.scan.groups_in(in_profile))
         if key not in self._documents:
-            document = self.bench.document if in_profile else self.document
+            document = self.hardware.document if in_profile else self.document
             self._documents[key] = self.scan.put(document, point, profile=in_profile)
         return self._documents[key]
 
@@ -223,21 +223,21 @@ class ScanPoints:
             return self._make_role(document, loc)
         if loc == ("planner",):
             choice = document.validate(Choice, loc).placed("planner")
-            chosen = resolve(self.bench.host, document, "planner", choice)
+            chosen = resolve(self.hardware.host, document, "planner", choice)
             return PartSettings(chosen, None, None, chosen.dump())
-        step, dumped = make_step(self.bench, document, self.sequence.shot[int(loc[1])])
+        step, dumped = make_step(self.hardware, document, self.sequence.shot[int(loc[1])])
         return PartSettings(None, step, None, dumped)
 
     def _make_role(self, document: Document, loc: Loc) -> PartSettings:
         role = str(loc[-1])
         kind = role if loc[0] in ROLES else "device"
-        own = {**self.bench.profile.choices, **self.bench.profile.devices}[role]
+        own = {**self.hardware.profile.choices, **self.hardware.profile.devices}[role]
         choice = document.validate(type(own), loc).placed(*map(str, loc))
-        if kind in HARDWARE_KINDS and choice.use != self.bench.document.get((*loc, "use")):
+        if kind in HARDWARE_KINDS and choice.use != self.hardware.document.get((*loc, "use")):
             what = f"a scan cannot change the driver of {role}"
             raise document.error((*loc, "use"), what, "one driver for the whole run")
-        chosen, _ = choose(self.bench.host, document, kind, choice, self.dry_run)
-        if kind in HARDWARE_KINDS and chosen.virtual_time != self.bench.chosen[role].virtual_time:
+        chosen, _ = choose(self.hardware.host, document, kind, choice, self.dry_run)
+        if kind in HARDWARE_KINDS and chosen.virtual_time != self.hardware.chosen[role].virtual_time:
             what = f"the scan would change whether {role} is simulated"
             raise document.error(loc, what, "all points simulated, or none")
         dumped = chosen.dump()
@@ -250,14 +250,14 @@ class ScanPoints:
         changed = {str(loc[-1]): made for (in_profile, loc), made in parts.items() if in_profile}
         key = tuple(map(id, changed.values()))
         if key not in self._benches:
-            chosen, profile = dict(self.bench.chosen), self.bench.profile
+            chosen, profile = dict(self.hardware.chosen), self.hardware.profile
             for name, made in changed.items():
                 assert made.chosen is not None
                 chosen[name] = made.chosen
                 if isinstance(made.choice, MobileTweezersChoice):
                     profile = profile.model_copy(update={"mobile_tweezers": made.choice})
-            bench = replace(self.bench, profile=profile, chosen=chosen) if changed else self.bench
-            self._benches[key] = bench
+            hardware = replace(self.hardware, profile=profile, chosen=chosen) if changed else self.hardware
+            self._benches[key] = hardware
         return self._benches[key]
 
 
@@ -303,25 +303,25 @@ def _si(value: Any) -> Any:
     return parse_any(value)[0] if isinstance(value, str) else value
 
 
-def make_step(bench: ResolvedProfile, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
+def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
     """A step of a sequence, and its settings for the record.
 
     Raises:
         ConfigError: The step is unknown, its settings are invalid, or the profile lacks the device that it
             names; with their place.
     """
-    entry = named(bench.host, document, "step", spec.kind, spec.loc, key=True)
+    entry = named(hardware.host, document, "step", spec.kind, spec.loc, key=True)
     settings = validate(document, entry, spec.loc)
     try:
         step, dumped = construct_role(entry, settings), dump(entry, settings)
     except (ConfigError, PluginLoadError) as error:
         raise document.error(spec.loc, str(error)) from error
-    key, devices = getattr(step, "device_setting", ""), bench.profile.devices
+    key, devices = getattr(step, "device_setting", ""), hardware.profile.devices
     name = getattr(settings, key, None) if key else None
     if name is not None and name not in devices:
-        what = f"the profile '{bench.profile.name}' has no device '{name}'"
+        what = f"the profile '{hardware.profile.name}' has no device '{name}'"
         problem = document.problem((*spec.loc, key), what, one_of(sorted(devices)))
-        raise ConfigError(replace(problem, notes=(place_note(bench.document, "devices"),)))
+        raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
     return step, dumped
 
 

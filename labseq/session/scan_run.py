@@ -82,7 +82,7 @@ class ScanRun:
         """One point for each combination of planner and profile; that of the first shot comes first."""
         seen: set[tuple[int, int]] = set()
         for point in self.each():
-            key = id(point.planner), id(point.bench)
+            key = id(point.planner), id(point.hardware)
             if key not in seen:
                 seen.add(key)
                 yield point
@@ -461,7 +461,7 @@ class ScannerCall:
     def __init__(self, search: Search, seed: int, stop: StopFlag) -> None:
         self._search = search
         self._stop = stop
-        self._timeout_s = search.scanned.bench.profile.timeouts.call
+        self._timeout_s = search.scanned.hardware.profile.timeouts.call
         self._scanner: Scanner = construct_one(search.chosen, search.space(seed))
 
     def choose(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:

@@ -61,12 +61,12 @@ class Session:
         self.run_dir: Path | None = None
         self._folder = Path.cwd()  # before devices are opened: some vendors' libraries change it
         # Identifies the hardware; a dry run touches none, so it has a separate key.
-        profile = assembly.bench.hardware_key
+        profile = assembly.hardware.hardware_key
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
         self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done)
-        self._observers = Observers(assembly.bench.host, observer)
+        self._observers = Observers(assembly.hardware.host, observer)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
 
@@ -183,9 +183,11 @@ class Session:
             stack.enter_context(stop_on_signals(self.stop_flag))
             if not self.assembly.virtual_time:
                 what = f"a run of {self.assembly.sequence.name}"
-                self._hold = stack.enter_context(lock_devices(self.assembly.bench, roots, what, self._warn))
-            bench, key = self.assembly.bench, self._profile_key
-            make_safe_after_crash(bench, roots, key, self.stop_flag, self._observers)
+                self._hold = stack.enter_context(
+                    lock_devices(self.assembly.hardware, roots, what, self._warn)
+                )
+            hardware, key = self.assembly.hardware, self._profile_key
+            make_safe_after_crash(hardware, roots, key, self.stop_flag, self._observers)
             if not self.scan_run.shots:  # its process died between the last shot and the end of the run
                 _, writer = self._begin(roots[0])
                 writer.finish("complete")
@@ -262,7 +264,7 @@ class Session:
         changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
         record = run_record(self.assembly, self.seed, changes, scan, self._folder)
         if earlier is None:
-            writer = RunWriter.create(root, record, copies(self.assembly.bench.calibrations))
+            writer = RunWriter.create(root, record, copies(self.assembly.hardware.calibrations))
         else:
             writer = earlier.reopen(record, next(iter(self.scan_run.shots), None))
         self.run_dir = writer.run_dir

@@ -79,7 +79,7 @@ def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(
     origin = {"calibrations": {"frequencies": frequencies.id}}
     bench.use("overlay", values={"offset_m": [1e-7, -2e-7]}, origin=origin)
     expected = standing_on_sites(SiteGrid(6, 6, column_frequency_hz=shifted_hz(GRID)), [1e-7, -2e-7])
-    grid = bench.session().assembly.bench.grid
+    grid = bench.session().assembly.hardware.grid
     assert np.array_equal(grid.column_frequency_hz, expected.column_frequency_hz)
     assert np.array_equal(grid.row_frequency_hz, expected.row_frequency_hz)
 
@@ -88,12 +88,12 @@ def test_an_overlay_of_other_frequencies_is_left_out_with_a_warning(bench: Bench
     overlay = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     bench.use("frequencies")
     assembly = bench.session().assembly
-    assert {*assembly.bench.calibrations} == {"frequencies"}
+    assert {*assembly.hardware.calibrations} == {"frequencies"}
     assert (
         f"calibration overlay {overlay.id} is not used: it was measured with other frequencies"
         in assembly.warnings[0]
     )
-    assert np.array_equal(assembly.bench.grid.column_frequency_hz, GRID.column_frequency_hz)
+    assert np.array_equal(assembly.hardware.grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
 def test_thresholds_of_other_sites_are_used_with_a_warning(bench: Bench) -> None:
@@ -103,7 +103,7 @@ def test_thresholds_of_other_sites_are_used_with_a_warning(bench: Bench) -> None
         "thresholds", values={"thresholds": np.full((6, 6), 1700.0)}, origin={"calibrations": {"sites": "x"}}
     )
     assembly = bench.session().assembly
-    assert {*assembly.bench.calibrations} == {"thresholds"}
+    assert {*assembly.hardware.calibrations} == {"thresholds"}
     assert "was measured with other sites" in assembly.warnings[0]
 
 
@@ -129,21 +129,21 @@ def test_what_is_put_to_use_during_a_run_does_not_change_it(bench: Bench) -> Non
 
     run = bench.session(observer=Meddler()).run()
     assert [shot.calibrations["overlay"] for shot in run.shots] == [old.id] * 2
-    assert bench.session().assembly.bench.calibrations["overlay"].id != old.id
+    assert bench.session().assembly.hardware.calibrations["overlay"].id != old.id
 
 
 def test_calibrations_may_be_put_aside(bench: Bench) -> None:
     bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     assembly = bench.session("profile.calibrations.use.overlay=off").assembly
-    assert not assembly.bench.calibrations
-    assert np.array_equal(assembly.bench.grid.column_frequency_hz, GRID.column_frequency_hz)
+    assert not assembly.hardware.calibrations
+    assert np.array_equal(assembly.hardware.grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
 def test_another_one_than_that_in_use_may_be_chosen(bench: Bench) -> None:
     old = bench.use("overlay", values={"offset_m": [1e-7, 0.0]})
     bench.use("overlay", values={"offset_m": [2e-7, 0.0]})
     bench.write(f"calibrations: {{use: {{overlay: {old.id[:6]}}}}}\n")
-    assert bench.session().assembly.bench.calibrations["overlay"].id == old.id
+    assert bench.session().assembly.hardware.calibrations["overlay"].id == old.id
     bench.write("calibrations: {use: {overlay: abc}}\n")
     with pytest.raises(ConfigError, match="there is no calibration of overlay 'abc'") as caught:
         bench.session()

@@ -165,7 +165,7 @@ def test_without_a_simulation_only_what_changes_is_reopened(tmp_path: Path) -> N
     assert after.mobile_tweezers is lab.mobile_tweezers
     assert after.planner is not lab.planner
     assert len(after.random_streams) == len(lab.random_streams)
-    assert _reopened(lab, points[1].bench, points[2].bench) == {"mobile_tweezers"}
+    assert _reopened(lab, points[1].hardware, points[2].hardware) == {"mobile_tweezers"}
 
 
 def test_a_large_product_is_checked_part_by_part(tmp_path: Path) -> None:
