@@ -87,81 +87,53 @@ def construct(host: PluginHost) -> Any:
 
 REGISTER = 'registry.planner("mine", Mine)  # registration'
 HOOK = "@hookimpl\ndef labseq_register(registry):"
-AT_LOADING: dict[str, tuple[str, str, str]] = {
-    # name -> what in the good plugin is replaced, by what, and the reason that is given
-    "sdk is missing": ("# at the top", "import no_such_sdk", "ModuleNotFoundError: No module named 'no_such"),
-    "leaves Python": ("# at the top", "raise SystemExit(0)", "SystemExit: 0 ("),
-    "imitates Ctrl-C": ("# at the top", "raise KeyboardInterrupt", "KeyboardInterrupt ("),
-    "recursion": ("# at the top", "def f(): f()\nf()", "RecursionError: maximum recursion depth"),
-    "error without text": (
-        "# at the top",
+TOP, CONSTRUCTOR = "# at the top", "pass  # constructor"
+AT_LOADING = [
+    # what in the good plugin is replaced, by what, and the reason that is given
+    (TOP, "import no_such_sdk", "ModuleNotFoundError: No module named 'no_such"),
+    (TOP, "raise SystemExit(0)", "SystemExit: 0 ("),
+    (TOP, "raise KeyboardInterrupt", "KeyboardInterrupt ("),
+    (TOP, "def f(): f()\nf()", "RecursionError: maximum recursion depth"),
+    (
+        TOP,
         "class Odd(Exception):\n    def __str__(self): raise KeyError\nraise Odd",
         "Odd: (its text cannot be had: KeyError)",
     ),
-    "error of labseq's": (
-        "# at the top",
-        "import labseq\nraise labseq.DeviceError('camera', 'no cable')",
-        "DeviceError: camera: no cable (",
-    ),
-    "sets a signal handler": (
-        "# at the top",
+    (TOP, "import labseq\nraise labseq.DeviceError('camera', 'no cable')", "DeviceError: camera: no cable ("),
+    (
+        TOP,
         "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)",
         "ValueError: signal only works in main thread",
     ),
-    "newer interface": (
-        "LABSEQ_API = 1",
-        "LABSEQ_API = 2",
-        "LABSEQ_API 2; this labseq has LABSEQ_API = 1; up",
-    ),
-    "no interface": (
-        "LABSEQ_API = 1",
-        "",
-        "does not state LABSEQ_API; this labseq has LABSEQ_API = 1",
-    ),
-    "interface as text": ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is no whole number"),
-    "hook is misspelled": (
-        "def labseq_register",
-        "def labseq_regster",
-        "unknown hook 'labseq_regster'",
-    ),
-    "hook is not marked": (
-        "# at the top",
+    ("LABSEQ_API = 1", "LABSEQ_API = 2", "LABSEQ_API 2; this labseq has LABSEQ_API = 1; up"),
+    ("LABSEQ_API = 1", "", "does not state LABSEQ_API; this labseq has LABSEQ_API = 1"),
+    ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is no whole number"),
+    ("def labseq_register", "def labseq_regster", "unknown hook 'labseq_regster'"),
+    (
+        TOP,
         "def labseq_shot_finished(shot): pass",
         "its labseq_shot_finished would not be called; write '@hookimpl' above it",
     ),
-    "wrong argument": ("(registry):", "(register):", "an argument 'register'; expected 'registry'"),
-    "no argument": ("(registry):", "():", "has no argument; expected 'registry'"),
-    "hook is async": (
-        "def labseq_register",
-        "async def labseq_register",
-        "is an 'async' function",
-    ),
-    "hook is a generator": (REGISTER, "yield", "is a generator and would never run"),
-    "hook is a wrapper": ("@hookimpl", "@hookimpl(wrapper=True)", "its labseq_register is a wrapper"),
-    "registration fails": (REGISTER, "1 / 0", "ZeroDivisionError: division by zero"),
-    "unknown kind": (
-        "registry.planner",
-        "registry.planer",
-        "has no attribute 'planer'",
-    ),
-    "nothing to call": ('"mine", Mine', '"mine", "Mine"', "the factory of planner 'mine' cannot be called"),
-    "registers twice": (REGISTER, f"{REGISTER}\n    {REGISTER}", "is offered by 'mine' already"),
-    "settings that cannot be made": (
-        "# at the top",
+    ("(registry):", "(register):", "an argument 'register'; expected 'registry'"),
+    ("(registry):", "():", "has no argument; expected 'registry'"),
+    ("def labseq_register", "async def labseq_register", "is an 'async' function"),
+    (REGISTER, "yield", "is a generator and would never run"),
+    ("@hookimpl", "@hookimpl(wrapper=True)", "its labseq_register is a wrapper"),
+    (REGISTER, "1 / 0", "ZeroDivisionError: division by zero"),
+    ("registry.planner", "registry.planer", "has no attribute 'planer'"),
+    ('"mine", Mine', '"mine", "Mine"', "the factory of planner 'mine' cannot be called"),
+    (REGISTER, f"{REGISTER}\n    {REGISTER}", "is offered by 'mine' already"),
+    (
+        TOP,
         "class Bad(Settings):\n    size: 'NoSuchType' = None\n    model_config = {'frozen': 3}\nBad(size=1)",
         "PydanticUserError",
     ),
-    "LABSEQ_API raises": (
-        "LABSEQ_API = 1",
-        "def __getattr__(name): raise OSError(name)",
-        "OSError: LABSEQ_API",
-    ),
-}
+    ("LABSEQ_API = 1", "def __getattr__(name): raise OSError(name)", "OSError: LABSEQ_API"),
+]
 
 
-@pytest.mark.parametrize("trouble", AT_LOADING)
-def test_a_plugin_that_fails_to_load_is_contained(trouble: str, tmp_path: Path) -> None:
-    old, new, reason = AT_LOADING[trouble]
+@pytest.mark.parametrize(("old", "new", "reason"), AT_LOADING)
+def test_a_plugin_that_fails_to_load_is_contained(tmp_path: Path, old: str, new: str, reason: str) -> None:
     assert old in GOOD
     host, info = loaded(tmp_path, GOOD.replace(old, new))
     assert info.state == "failed"
@@ -209,40 +181,27 @@ class TestHanging:
             construct_one(ChosenPlugin(impatient(host), None), Context("planner"))
 
 
-IN_THE_CONSTRUCTOR: dict[str, tuple[str, str, str]] = {
-    "raises": (
-        "pass  # constructor",
-        "raise OSError('no port')",
-        "constructor of planner 'mine' raised OSErr",
-    ),
-    "leaves Python": ("pass  # constructor", "raise SystemExit(0)", "raised SystemExit: 0 ("),
-    "too few arguments": (
-        "(self, settings, context)",
-        "(self, settings)",
-        "takes 2 positional argum",
-    ),
-    "makes nothing": (
-        REGISTER,
-        'registry.planner("mine", lambda s, c: None)',
-        "made None; expected",
-    ),
-    "has no method": ("def plan(", "def plann(", "planner 'mine' has no plan; see labseq.plugin.Planner"),
-    "method cannot be had": (
+IN_THE_CONSTRUCTOR = [
+    (CONSTRUCTOR, "raise OSError('no port')", "constructor of planner 'mine' raised OSErr"),
+    (CONSTRUCTOR, "raise SystemExit(0)", "raised SystemExit: 0 ("),
+    ("(self, settings, context)", "(self, settings)", "takes 2 positional argum"),
+    (REGISTER, 'registry.planner("mine", lambda s, c: None)', "made None; expected"),
+    ("def plan(", "def plann(", "planner 'mine' has no plan; see labseq.plugin.Planner"),
+    (
         "    def plan(",
         "    @property\n    def plan(self): raise KeyError('x')\n    def _(",
         "the constructor of planner 'mine' raised KeyError: 'x'",
     ),
-    "registers later": (
+    (
         REGISTER,
         "global kept; kept = registry; registry.planner('mine', lambda s, c: kept.planner('more', Mine))",
         "it registers planner 'more' after its labseq_register has returned; register everything there",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("trouble", IN_THE_CONSTRUCTOR)
-def test_a_plugin_whose_constructor_fails_is_named(trouble: str, tmp_path: Path) -> None:
-    old, new, reason = IN_THE_CONSTRUCTOR[trouble]
+@pytest.mark.parametrize(("old", "new", "reason"), IN_THE_CONSTRUCTOR)
+def test_a_plugin_whose_constructor_fails_is_named(tmp_path: Path, old: str, new: str, reason: str) -> None:
     assert old in GOOD
     host, info = loaded(tmp_path, GOOD.replace(old, new))
     assert info.state == "loaded", info.reason

@@ -121,11 +121,6 @@ def test_sites_that_the_meter_cannot_measure_are_left_out() -> None:
     assert factors(np.where(missing, np.nan, meter.powers())).separable_spread < 0.006
 
 
-def dead(power: Floats) -> Floats:
-    power[3] = 0.0
-    return power
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -138,8 +133,6 @@ def dead(power: Floats) -> Floats:
             "trap_camera: its value 'spot_powers' is str; expected the power of each",
         ),
         (lambda _power: [[1.0, 2.0], [3.0]], "trap_camera: its value 'spot_powers' is list; expected"),
-        (lambda power: power * np.nan, "static_tweezers: no light on row 0, 1, 2, 3, 4, ...: is its tone on"),
-        (dead, "static_tweezers: no light on row 3: is its tone on"),
     ],
 )
 def test_nonsense_from_the_meter_is_refused_and_everything_is_made_safe(
@@ -207,17 +200,6 @@ def test_factors_of_rows_and_columns_are_found(
     assert found.residual_spread < 1e-9
 
 
-def test_a_few_sites_may_be_missing() -> None:
-    rng = np.random.default_rng(1)
-    row, col = rng.normal(0, 0.1, 20), rng.normal(0, 0.1, 20)
-    power = np.exp(row[:, None] + col)
-    power[rng.random((20, 20)) < 0.2] = np.nan
-    power[3, 4] = 0.0
-    found = factors(power)
-    assert found.row - found.row.mean() == pytest.approx(row - row.mean(), abs=1e-9)
-    assert np.isnan(found.residual[3, 4])
-
-
 def test_what_is_not_separable_is_the_residual() -> None:
     rng = np.random.default_rng(2)
     power = np.exp(rng.normal(0, 0.04, (20, 20)) + rng.normal(0, 0.1, (20, 1)))
@@ -240,14 +222,6 @@ def test_one_step_makes_powers_of_squared_amplitudes_even(shape: tuple[int, int]
     assert even == pytest.approx(np.full(shape, even[0, 0]), rel=1e-9)
     assert step.row_amplitudes.sum() == pytest.approx(rows.sum())
     assert step.column_amplitudes.sum() == pytest.approx(cols.sum())
-
-
-def test_amplitudes_stay_within_full_scale() -> None:
-    rows, cols = np.full(4, 0.4), np.full(4, 0.25)
-    step = equalise(np.ones((4, 4)), rows, cols, max_sum=1.0)
-    assert step.row_amplitudes == pytest.approx(np.full(4, 0.25))
-    weak = equalise(np.outer([1.0, 1e-1], [1.0, 1.0]), np.full(2, 0.8), np.full(2, 0.8), max_sum=2.0)
-    assert weak.row_amplitudes.max() == 1.0
 
 
 @pytest.mark.parametrize("light", [1e-3, -0.01, np.nan])
@@ -312,10 +286,7 @@ def test_the_separable_part_is_made_even_and_the_rest_is_left_alone(
     assert result.spreads[0] > 10 * result.spreads[-1]
 
 
-@pytest.mark.parametrize(
-    "response",
-    [lambda p: np.sin(np.minimum(p, 2.0) * 0.7) ** 2, lambda p: p**1.5],
-)
+@pytest.mark.parametrize("response", [lambda p: np.sin(np.minimum(p, 2.0) * 0.7) ** 2, lambda p: p**1.5])
 def test_a_response_that_is_not_linear_takes_some_rounds_more(response: Any) -> None:
     array = Array(3, response=response)
     begin(array)
@@ -342,6 +313,8 @@ def test_a_row_that_does_not_follow_its_tone_is_named() -> None:
     array.apply = lambda rows, cols: apply(np.where(np.arange(20) == 5, 0.7 * np.median(rows), rows), cols)
     with pytest.raises(DeviceError, match=r"spread stays at .*; the spots of row 5 have 0\.\d+ times the"):
         begin(array)
+    with pytest.raises(DeviceError, match="after 3 rounds"):
+        begin(Array(10), EqualiseSettings(gain=0.1, max_rounds=3))
 
 
 def test_amplitudes_beyond_full_scale_bring_the_others_down() -> None:
@@ -351,9 +324,3 @@ def test_amplitudes_beyond_full_scale_bring_the_others_down() -> None:
     limits = EqualiseSettings(max_sum=2.0)
     result = equalise_loop(array.measure, array.apply, np.ones(2), np.full(3, 1 / 3), limits)
     assert result.equalised.row_amplitudes == pytest.approx([0.1**0.5, 1.0], rel=0.02)
-
-
-def test_slow_progress_ends_after_all_rounds() -> None:
-    array = Array(10)
-    with pytest.raises(DeviceError, match="after 3 rounds"):
-        begin(array, EqualiseSettings(gain=0.1, max_rounds=3))

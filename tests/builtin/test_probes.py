@@ -43,10 +43,7 @@ def held(program: ToneProgram) -> dict[tuple[int, int], tuple[float, float]]:
     for segment in np.flatnonzero(program.kind == SegmentKind.TRANSPORT):
         rows, cols = (
             (axis.start_hz[slice(*axis.offsets[segment : segment + 2])] - hz[0]) / 1.6e6
-            for axis, hz in (
-                (program.row, GRID.row_frequency_hz),
-                (program.column, GRID.column_frequency_hz),
-            )
+            for axis, hz in ((program.row, GRID.row_frequency_hz), (program.column, GRID.column_frequency_hz))
         )
         for row in rows:
             for col in cols:

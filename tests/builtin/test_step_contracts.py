@@ -32,9 +32,7 @@ from labseq.builtin.steps import (
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import SiteGrid
 from labseq.plugin import Context
-from labseq.testing import (
-    StepContract,
-)
+from labseq.testing import StepContract
 from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory = Callable[..., Any]

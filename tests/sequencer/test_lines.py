@@ -91,10 +91,7 @@ def test_the_spans_of_a_shot_are_those_of_its_steps() -> None:
         TimelineEntry("device", 0.1, 0.1),
     ]
     spans = spans_on(lines, bars)
-    assert list(spans["cooling"]) == [
-        (0.0, 0.5),
-        (pytest.approx(0.555), pytest.approx(0.66)),
-    ]
+    assert list(spans["cooling"]) == [(0.0, 0.5), (pytest.approx(0.555), pytest.approx(0.66))]
     assert spans["imaging"] == [(pytest.approx(0.5), pytest.approx(0.555))]
 
 

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from labseq.builtin.steps import DeviceStep, WaitStep
-from labseq.errors import (
-    DeviceError,
-    DeviceTimeoutError,
-    LabseqError,
-    StopRequested,
-    TransientError,
-)
+from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
 from labseq.sequencer.lab import Timeouts
 from labseq.sequencer.run import TRANSITIONS, State
 from labseq.testing.fakes import ListSink
@@ -280,8 +274,7 @@ def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "call",
-    ["camera.arm", "camera.read", "static_tweezers.open", "mobile_tweezers.open"],
+    "call", ["camera.arm", "camera.read", "static_tweezers.open", "mobile_tweezers.open"]
 )
 def test_any_error_leaves_every_device_safe(call):
     rig = Rig(fail_on={call: RuntimeError("cable")})

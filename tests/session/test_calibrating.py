@@ -72,9 +72,7 @@ def test_frequencies_reach_every_role_but_the_simulation(bench: Bench) -> None:
     assert np.array_equal(simulation._grid.column_frequency_hz, GRID.column_frequency_hz)
 
 
-def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(
-    bench: Bench,
-) -> None:
+def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(bench: Bench) -> None:
     frequencies = bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
     origin = {"calibrations": {"frequencies": frequencies.id}}
     bench.use("overlay", values={"offset_m": [1e-7, -2e-7]}, origin=origin)

@@ -25,10 +25,7 @@ CHANGES: dict[str, tuple[Any, str]] = {
         lambda r: r["provenance"].update(git={"code": {"commit": "a" * 40, "dirty": False}}),
         r"labseq's commit was a+, is null",
     ),
-    "plugin": (
-        lambda r: r["plugins"][0].update(version="7"),
-        r"plugin .*: version was 7, is ",
-    ),
+    "plugin": (lambda r: r["plugins"][0].update(version="7"), r"plugin .*: version was 7, is "),
     "setting": (
         lambda r: r["resolved"]["planner"].update(degree_of_parallelism=3),
         r"planner\.degree_of_parallelism was 3, is 7",

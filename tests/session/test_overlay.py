@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.errors import ConfigError, DeviceError
+from labseq.errors import ConfigError
 from labseq.model import SiteGrid
 from labseq.motion import fit_overlay, overlay_offset
 from labseq.testing.fakes import RecordingObserver
@@ -66,12 +66,6 @@ def test_a_check_of_the_overlay_finds_a_shift(tmp_path: Path, offset_um: tuple[f
         assert found == pytest.approx(np.array(offset_um) * 1e-6, abs=4 * readings["overlay.error_m"])
     warned = [w for w in observer.of("warning") if "calibrate overlay" in w["text"]]
     assert len(warned) == (2 if any(offset_um) else 0)
-
-
-def test_a_check_that_stops_ends_the_run_with_the_shift(tmp_path: Path) -> None:
-    text = f"shots: 2\n{SHOT}  - check_overlay: {{every: 1, exceeded: stop}}\n"
-    with pytest.raises(DeviceError, match=r"the mobile tweezers are .* run `labseq calibrate overlay`"):
-        run(tmp_path, text, (0.0, -0.3))
 
 
 def test_sites_are_checked_on_the_frames_of_the_run(tmp_path: Path) -> None:

@@ -168,19 +168,6 @@ def test_without_a_simulation_only_what_changes_is_reopened(tmp_path: Path) -> N
     assert _reopened(lab, points[1].hardware, points[2].hardware) == {"mobile_tweezers"}
 
 
-def test_a_large_product_is_checked_part_by_part(tmp_path: Path) -> None:
-    text = """scan:
-  planner.degree_of_parallelism: {range: [1, 20, 1]}
-  profile.mobile_tweezers.speed: {linspace: [50 um/ms, 200 um/ms, 20]}
-  shot.sort.window: {linspace: [50 ms, 100 ms, 25]}
-"""
-    session = open_scan(tmp_path, text)
-    scanned = session.assembly.scanned
-    assert scanned is not None
-    assert (scanned.scan.n_points, session.assembly.sequence.shots) == (10_000, 10_000)
-    assert len(scanned._made) == 20 + 20 + 25
-
-
 def test_the_check_shows_points_and_the_time_of_all_of_them(tmp_path: Path) -> None:
     report = check(open_scan(tmp_path, "scan: {shot.0.load.duration: [1 s, 3 s]}\nrepeats: 2\n"))
     assert (report.n_points, report.n_shots) == (2, 4)

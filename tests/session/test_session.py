@@ -3,7 +3,6 @@
 from typing import Any
 
 import h5py
-import numpy as np
 import pytest
 
 import labseq
@@ -126,24 +125,6 @@ def test_a_rehearsed_loss_of_frames_repeats_shots(tmp_path):
     assert [s.index for s in done.shots] == [0, 1, 2, 3]
     assert done.attempts
     assert all("TransientError" in attempt.row["error"] for attempt in done.attempts)
-
-
-def test_too_few_atoms_fill_what_can_be_filled_from_the_centre(tmp_path):
-    options: dict[str, Any] = {
-        "overrides": ["profile.simulation.loading=0.3", "shot.2.rearrange.window=500 ms"]
-    }
-    done = run(tmp_path, shots=1, seed=2, **options)
-    shot = done.shots[0]
-    loaded = shot.occupancies[0].sum()
-    assert loaded < 225
-    assert shot.row["n_missing_atoms"] == 225 - loaded
-    first = shot.cycles[0]
-    assert first.report.n_defects == 225 - loaded
-    sites_m = labseq.SiteGrid().positions_m
-    fill = done.target.fill
-    from_centre_m = np.linalg.norm(sites_m - sites_m[fill].mean(axis=0), axis=-1)
-    filled = fill & first.report.predicted
-    assert from_centre_m[filled].max() <= from_centre_m[fill & ~filled].min() + 1e-9
 
 
 def test_an_unwritable_place_is_named_before_anything_opens(tmp_path):

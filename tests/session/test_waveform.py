@@ -122,22 +122,6 @@ def test_one_tone_has_the_numbers_of_a_sine() -> None:
     assert row.amplitude_sum == pytest.approx(0.05)
 
 
-def test_tones_moved_onto_a_comb_are_reported(tmp_path: Path) -> None:
-    table = [99.2, 100.804, 102.4, 104.0, 105.6, 107.2]
-    profile = Path("hardware_profiles/virtual.yaml")
-    text = (Path(__file__).parents[2] / profile).read_text("utf-8")
-    text = text.replace("rows: 20 ", "rows: 6 ").replace("cols: 20 ", "cols: 6 ")
-    path = tmp_path / "mine.yaml"
-    path.write_text(text, "utf-8")
-    overrides = [f"profile.grid.row_frequency.table={[hz * 1e6 for hz in table]}"]
-    made = waveform(
-        PlanRequest(REQUEST.occupancy, REQUEST.target, seed=3, profile=str(path), overrides=overrides)
-    )
-    row, column = made.statistics()
-    assert 5e-9 < row.snapped_m < 20e-9
-    assert column.snapped_m == 0.0
-
-
 @settings(max_examples=30)
 @given(st.lists(st.booleans(), min_size=1, max_size=6), st.integers(1, 6), st.integers(1, 6))
 def test_a_range_of_batches_never_cuts_a_chain(linked: list[bool], first: int, last: int) -> None:
