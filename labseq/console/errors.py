@@ -40,7 +40,7 @@ def excerpt(problem: Problem) -> list[str]:
     word = _WORD.match(line, start)
     end = max(start + 1, word.end() if word else 0)
     shift = min(start, max(0, end + _MARGIN - widest)) if len(line) > widest else 0
-    while cell_len(line[shift:start]) >= widest:
+    while shift < start and cell_len(line[shift:end]) > widest:
         shift += 1
     shown = line[shift : shift + widest].rstrip()
     while cell_len(shown) > widest:

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, strategies as st
+from rich.cells import cell_len
 
 from labseq.console.errors import excerpt
 from labseq.errors import Problem
@@ -37,11 +38,14 @@ def test_a_colon_inside_of_a_word_belongs_to_it(tmp_path: Path):
     assert shown(tmp_path, "{time: 10:30, b: 1}\n", 1, 8)[1] == "      |        ^^^^^"
 
 
-def test_a_narrow_terminal_gets_a_narrow_excerpt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("before", ["x", "東"])
+def test_a_narrow_terminal_gets_a_narrow_excerpt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str
+):
     monkeypatch.setenv("COLUMNS", "40")
-    line, carets = shown(tmp_path, "x" * 60 + " wrong: 1 " + "東" * 60, 1, 62)
-    assert len(line) <= 40
-    assert line[carets.index("^") :].startswith("wrong")
+    line, carets = shown(tmp_path, before * 60 + " wrong: 1 " + "東" * 60, 1, 62)
+    assert cell_len(line) <= 40
+    assert cell_len(line[: line.index("wrong")]) == carets.index("^")
 
 
 def test_a_file_in_utf_16_is_not_shown(tmp_path: Path):
