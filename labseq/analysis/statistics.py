@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from itertools import accumulate
 from typing import Any, Final, TypeAlias
 
@@ -146,7 +146,7 @@ class Statistics:
 
     def as_dict(self) -> dict[str, Any]:
         """All statistics, JSON-ready: rates and means with their errors; None for unknown values."""
-        return to_plain(_named(self))
+        return to_plain(as_mapping(self))
 
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
@@ -258,8 +258,8 @@ def _losses(summaries: Sequence[ShotSummary]) -> dict[str, Estimate]:
     }
 
 
-def _named(value: Any) -> Any:
-    """Convert dataclasses to mappings, each rate with its interval."""
+def as_mapping(value: Any) -> Any:
+    """Convert dataclasses to mappings: a rate with its interval, an estimate as "mean" and "error"."""
     match value:
         case Rate():
             return {
@@ -270,11 +270,11 @@ def _named(value: Any) -> Any:
             }
         case Estimate():
             return {"mean": value.value, "error": value.error}
-        case Statistics() | CycleStatistics():
-            return {name: _named(getattr(value, name)) for name in value.__slots__}
         case Mapping():
-            return {name: _named(one) for name, one in value.items()}
+            return {name: as_mapping(one) for name, one in value.items()}
         case tuple():
-            return [_named(one) for one in value]
+            return [as_mapping(one) for one in value]
+        case _ if is_dataclass(value):
+            return {field.name: as_mapping(getattr(value, field.name)) for field in fields(value)}
         case _:
             return value

@@ -11,15 +11,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.analysis.overview import CHOICES, overview, picture_of
+from labseq.analysis.overview import overview, picture_of
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.shot import save_shot, shot_picture
+from labseq.analysis.statistics import as_mapping
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document
 from labseq.console.output import as_line, json_writer, report_compiling, say, stdout_to_stderr
 from labseq.console.runs import chosen_run
 from labseq.console.text import columns, count_of, percent, plural, settings_text
-from labseq.errors import ConfigError, Problem, one_of
+from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import check_place
@@ -223,19 +224,11 @@ def as_values(found: Replay) -> dict[str, Any]:
 def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
     made = [plan.replayed for plan in plans if plan.replayed is not None]
     return {
-        "recorded": _means_values(MeanCounts.over([plan.recorded for plan in plans])),
-        "replayed": _means_values(MeanCounts.over(made)),
+        "recorded": as_mapping(MeanCounts.over([plan.recorded for plan in plans])),
+        "replayed": as_mapping(MeanCounts.over(made)),
         "n_same": sum(plan.same for plan in plans),
         "n_invalid": sum(bool(plan.failure) for plan in plans),
         "plans": [asdict(plan) for plan in plans],
-    }
-
-
-def _means_values(means: MeanCounts) -> dict[str, Any]:
-    named = {name: getattr(means, name) for name in means.__slots__}
-    return {
-        name: {"mean": value.value, "error": value.error} if isinstance(value, Estimate) else value
-        for name, value in named.items()
     }
 
 
@@ -312,9 +305,6 @@ class PlotRequest:
             raise ConfigError(Problem(what, "--what and --shot", expected="one of them"))
         if self.cycle is not None and self.shot is None:
             raise ConfigError(Problem("a cycle belongs to a shot", "--cycle", expected="--shot as well"))
-        if self.what is not None and self.what not in CHOICES:
-            what = f"there is no picture '{clean(self.what)}' of a run"
-            raise ConfigError(Problem(what, "--what", expected=one_of(sorted(CHOICES))))
 
     @property
     def name(self) -> str:

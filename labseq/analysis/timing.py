@@ -71,24 +71,10 @@ class RunTiming:
 
 
 @dataclass(slots=True)
-class _Durations:
-    session_s: list[float] = field(default_factory=list[float])
-    host_s: list[float] = field(default_factory=list[float])
-    budget_s: list[float] = field(default_factory=list[float])
-    n_over: int = 0
-
-    def add(self, timing: StageTiming) -> None:
-        self.session_s.append(timing.duration_s)
-        self.host_s.append(timing.host_s)
-        self.budget_s.append(timing.budget_s)
-        self.n_over += timing.over_budget
-
-
-@dataclass(slots=True)
 class StageTotals:
     """Adds up the stages of shots."""
 
-    _found: dict[str, _Durations] = field(default_factory=dict[str, _Durations])
+    _found: dict[str, list[StageTiming]] = field(default_factory=dict[str, list[StageTiming]])
     _shot_s: list[float] = field(default_factory=list[float])
 
     def add(self, shot: Shot) -> None:
@@ -99,7 +85,7 @@ class StageTotals:
         """
         timing = shot.timing
         for one in timing:
-            self._found.setdefault(one.stage, _Durations()).add(one)
+            self._found.setdefault(one.stage, []).append(one)
         self._shot_s.append(math.fsum(one.duration_s for one in timing if one.stage.startswith(STEP)))
 
     def sum_up(self, run: Run) -> RunTiming:
@@ -126,17 +112,18 @@ def _place(name: str) -> tuple[bool, int, str]:
     return name.startswith(STEP), ORDER.index(name) if name in ORDER else len(ORDER), name
 
 
-def _sum_up(name: str, of: _Durations, n_shots: int, total_s: float) -> StageStatistics:
-    budgets_s = [s for s in of.budget_s if not math.isnan(s)]
+def _sum_up(name: str, timings: Sequence[StageTiming], n_shots: int, total_s: float) -> StageStatistics:
+    session_s = [one.duration_s for one in timings]
+    budgets_s = [one.budget_s for one in timings if not math.isnan(one.budget_s)]
     return StageStatistics(
         stage=name,
-        n=len(of.session_s),
-        n_per_shot=len(of.session_s) / n_shots,
+        n=len(timings),
+        n_per_shot=len(timings) / n_shots,
         budget_s=float(np.median(budgets_s)) if budgets_s else math.nan,
-        session_s=quantiles(of.session_s),
-        host_s=quantiles(of.host_s),
-        share=math.fsum(of.session_s) / total_s if total_s else math.nan,
-        n_over=of.n_over,
+        session_s=quantiles(session_s),
+        host_s=quantiles([one.host_s for one in timings]),
+        share=math.fsum(session_s) / total_s if total_s else math.nan,
+        n_over=sum(one.over_budget for one in timings),
     )
 
 

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -273,33 +273,26 @@ Opening = Callable[[RunObserver | None], Session]
 """Opens a session whose events go to an observer."""
 
 
+@dataclass(slots=True)
 class QueueRun:
     """Takes the entries of a queue: first one that was interrupted, then those that wait, in order.
 
-    Args:
+    Attributes:
         queue: The queue.
         take: Runs the session that its argument opens, and shows it.
         begin: Called with each entry that is taken.
         fail: Called with each error after which the queue continues.
         keep_going: Whether the queue continues after an entry that failed.
+        first_error: The error of the first entry that failed.
     """
 
-    def __init__(
-        self,
-        queue: Queue,
-        take: Callable[[Opening], None],
-        begin: Callable[[Entry], None],
-        fail: Callable[[LabseqError], object],
-        *,
-        keep_going: bool = False,
-    ) -> None:
-        self.first_error: LabseqError | None = None
-        self._queue = queue
-        self._take = take
-        self._begin = begin
-        self._fail = fail
-        self._keep_going = keep_going
-        self._tried: set[int] = set()
+    queue: Queue
+    take: Callable[[Opening], None]
+    begin: Callable[[Entry], None]
+    fail: Callable[[LabseqError], object]
+    keep_going: bool = False
+    first_error: LabseqError | None = None
+    _tried: set[int] = field(default_factory=set[int])
 
     def run(self, *, watch: bool = False) -> None:
         """Take entries until none waits, or the queue is asked to stop.
@@ -312,14 +305,14 @@ class QueueRun:
             LabseqError: The error that ended a run, unless the queue keeps going.
             StopRequested: Ctrl-C or SIGTERM.
         """
-        lock = self._queue.lock()
-        with explained(self._queue.folder):
+        lock = self.queue.lock()
+        with explained(self.queue.folder):
             holder = lock.take()
         if holder is not None:
-            raise ConfigError(Problem(f"the queue is already being run: {holder}", str(self._queue.folder)))
-        self._queue.clear_stop()
+            raise ConfigError(Problem(f"the queue is already being run: {holder}", str(self.queue.folder)))
+        self.queue.clear_stop()
         try:
-            while not self._queue.is_asked_to_stop:
+            while not self.queue.is_asked_to_stop:
                 entry = self._next()
                 if entry is not None:
                     self._work(entry)
@@ -328,15 +321,15 @@ class QueueRun:
                 else:
                     break
         finally:
-            self._queue.clear_stop()
+            self.queue.clear_stop()
             lock.release()
 
     def _next(self) -> Entry | None:
         """The entry to take; entries whose runs are complete leave the queue."""
         left: list[Entry] = []
-        for entry in self._queue.entries():
+        for entry in self.queue.entries():
             if entry.is_complete:
-                self._queue.drop(entry.id)
+                self.queue.drop(entry.id)
             elif entry.id not in self._tried:
                 left.append(entry)
         interrupted = [entry for entry in left if entry.is_interrupted]
@@ -345,13 +338,13 @@ class QueueRun:
 
     def _work(self, entry: Entry) -> None:
         self._tried.add(entry.id)
-        self._begin(entry)
+        self.begin(entry)
         recorder = _EntryRecorder(
-            self._queue, replace(entry, status="running", owner=Process.current(), error="")
+            self.queue, replace(entry, status="running", owner=Process.current(), error="")
         )
         recorder.write()
         try:
-            self._take(lambda observer: _open(entry, recorder.passing_to(observer)))
+            self.take(lambda observer: _open(entry, recorder.passing_to(observer)))
         except StopRequested as stop:
             if stop.after_shot or stop.signal_number == signal.SIGINT:
                 recorder.end("stopped", str(stop))
@@ -363,11 +356,11 @@ class QueueRun:
         except LabseqError as error:
             recorder.end("failed", str(error))
             self.first_error = self.first_error or error
-            if not self._keep_going:
+            if not self.keep_going:
                 raise
-            self._fail(error)
+            self.fail(error)
         else:
-            self._queue.drop(entry.id)
+            self.queue.drop(entry.id)
 
 
 class _EntryRecorder:

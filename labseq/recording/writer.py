@@ -67,27 +67,21 @@ class RunWriter:
         Raises:
             RecordingError: The folder cannot be written to, or the disk is full.
         """
-        started = datetime.fromisoformat(run.t_start_utc)
-        run_dir = folders.make_run_folder(root, run.name, started)
+        run_dir = folders.make_run_folder(root, run.name, datetime.fromisoformat(run.t_start_utc))
         try:
-            return cls._fill(run_dir, run, extra_files or {})
+            with explained(run_dir):
+                (run_dir / folders.SHOTS_FOLDER).mkdir()
+            write_file(run_dir / folders.STATE_FILE, encode_state("running"))
+            texts = {folders.SEQUENCE_FILE: run.sequence_text, folders.PROFILE_FILE: run.profile_text}
+            for name, content in {**texts, **(extra_files or {})}.items():
+                write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
+            writer = cls(run_dir, run)
+            write_file(run_dir / folders.RUN_FILE, encode_run(run, _run_id(run_dir)))
+            with explained(run_dir):
+                sync_folder(run_dir)
         except BaseException:
             shutil.rmtree(run_dir, ignore_errors=True)  # it holds no shots yet
             raise
-
-    @classmethod
-    def _fill(cls, run_dir: Path, run: RunRecord, extra_files: Mapping[str, str | bytes]) -> RunWriter:
-        with explained(run_dir):
-            (run_dir / folders.SHOTS_FOLDER).mkdir()
-        write_file(run_dir / folders.STATE_FILE, encode_state("running"))
-        write_file(run_dir / folders.SEQUENCE_FILE, encode_text(run.sequence_text))
-        write_file(run_dir / folders.PROFILE_FILE, encode_text(run.profile_text))
-        for name, content in extra_files.items():
-            write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
-        writer = cls(run_dir, run)
-        write_file(run_dir / folders.RUN_FILE, encode_run(run, _run_id(run_dir)))
-        with explained(run_dir):
-            sync_folder(run_dir)
         return writer
 
     @classmethod

@@ -111,7 +111,7 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
 
 def _refresh_schemas(folder: Path) -> list[Path]:
     """Write again the schemas that a folder has, because there are other plugins now."""
-    kinds = [kind for kind in FILE_KINDS if schema_path(kind, folder).is_file()]
+    kinds: list[FileKind] = [kind for kind in FILE_KINDS if schema_path(kind, folder).is_file()]
     registry = _plugins_of(folder).registry if kinds else Registry()
     return [write_schema(kind, folder, registry) for kind in kinds]
 
@@ -179,9 +179,7 @@ def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> N
         (taken, f"there is a plugin '{package}' ({taken and taken.origin})"),
         (_is_installed(package), f"there is a Python package '{package}', which the plugin would hide"),
     )
-    for is_refused, why in reasons:
-        if is_refused:
-            raise _refused(kind, name, why, "another name", f"my_{name}")
+    _refuse_if(reasons, kind, name)
 
 
 def check_file_name(kind: str, name: str, profiles: Path) -> None:
@@ -204,6 +202,10 @@ def check_file_name(kind: str, name: str, profiles: Path) -> None:
             "a profile of that name comes with labseq, and yours would hide it",
         ),
     )
+    _refuse_if(reasons, kind, name)
+
+
+def _refuse_if(reasons: Iterable[tuple[object, str]], kind: str, name: str) -> None:
     for is_refused, why in reasons:
         if is_refused:
             raise _refused(kind, name, why, "another name", f"my_{name}")
