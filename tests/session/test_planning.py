@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import InvalidPlanError, PlanError, PluginLoadError
+from labseq.model import SiteGrid
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from tests.system.replay import replay
 
@@ -108,8 +109,12 @@ def test_without_atoms_or_defects_nothing_is_moved(occupancy: str) -> None:
     assert moves.report.duration_s == 0.0
 
 
-def test_too_few_atoms_are_no_error() -> None:
+def test_too_few_atoms_fill_the_sites_nearest_to_the_centre() -> None:
     moves = planned("random:6x6@0.2", "compact:4x4", seed=3)
+    fill, sites_m = moves.target.fill, SiteGrid(6, 6).positions_m
+    from_centre_m = np.linalg.norm(sites_m - sites_m[fill].mean(axis=0), axis=-1)
+    filled = fill & moves.report.predicted
+    assert from_centre_m[filled].max() <= from_centre_m[fill & ~filled].min() + 1e-9
     assert moves.n_missing_atoms == 16 - int(moves.occupancy.sum()) > 0
     assert moves.n_filled == int(moves.occupancy.sum())
     assert not moves.report.meets_target
