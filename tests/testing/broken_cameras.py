@@ -46,6 +46,12 @@ class ExposesOnceMore(RecordingCamera):
         super().arm(n_frames + (n_frames == 3), exposure_s, trigger)
 
 
+class ChangesItsShape(RecordingCamera):
+    def trigger(self) -> None:
+        super().trigger()
+        self.frame_shape = (self.frame_shape[0] + 1, 16)
+
+
 class TellsTheWallClock(RecordingCamera):
     def read(self, timeout_s: float) -> Frame:
         frame = super().read(timeout_s)
@@ -107,6 +113,7 @@ PLANTED = Planted(
         (GivesAnArray, "test_gives_a_frame"),
         (TellsAnotherExposure, "test_gives_a_frame"),
         (ExposesOnceMore, "test_gives_as_many_frames_as_armed_for"),
+        (ChangesItsShape, "test_gives_as_many_frames_as_armed_for"),
         (TellsTheWallClock, "test_tells_when_it_exposed"),
         (CountsOnFromTheLastSeries, "test_numbers_its_frames"),
         (StampsBackwards, "test_numbers_its_frames"),

@@ -43,6 +43,19 @@ class ClosesOnce(RecordingCamera):
         self.closed = False
 
 
+class OpensOnlyOnceEver(RecordingCamera):
+    closed = False
+
+    def open(self) -> None:
+        if self.closed:
+            raise DeviceError(self.name, "the handle was given back")
+        super().open()
+
+    def close(self) -> None:
+        super().close()
+        self.closed = True
+
+
 class ClosesOnlyWhatIsOpen(RecordingCamera):
     opened = False
 
@@ -137,6 +150,11 @@ class DescribesInNumpy(RecordingCamera):
         return {**super().describe(), "temperature": np.float32(-70.0)}
 
 
+class DescribesWithNan(RecordingCamera):
+    def describe(self) -> Mapping[str, Any]:
+        return {**super().describe(), "temperature": float("nan")}
+
+
 class ArmsWhileClosed(RecordingCamera):
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         was_open, self.is_open = self.is_open, True
@@ -149,6 +167,13 @@ class ArmsWhileClosed(RecordingCamera):
 class TakesAnyExposure(RecordingCamera):
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         super().arm(n_frames, exposure_s if 0 < exposure_s < 10 else 0.01, trigger)
+
+
+class RefusesAfterAWait(RecordingCamera):
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        if not exposure_s > 0:
+            self.clock.sleep(0.1)
+        super().arm(n_frames, exposure_s, trigger)
 
 
 class RefusesAfterAnExposure(RecordingCamera):
@@ -210,6 +235,7 @@ PLANTED = Planted(
         (ReadsAFile, "test_constructor_does_no_io"),
         (OpensOnce, "test_opens_and_closes_twice"),
         (ClosesOnce, "test_opens_and_closes_twice"),
+        (OpensOnlyOnceEver, "test_opens_and_closes_twice"),
         (ClosesOnlyWhatIsOpen, "test_closes_before_open"),
         (NeedsTheDeviceToBeSafe, "test_safe_state_in_every_state"),
         (UnsafeAfterClose, "test_safe_state_in_every_state"),
@@ -218,8 +244,10 @@ PLANTED = Planted(
         (ClosesToBeSafe, "test_works_after_safe_state"),
         (CannotBeClosedAfterAFailure, "test_closes_after_failures"),
         (DescribesInNumpy, "test_describes_itself"),
+        (DescribesWithNan, "test_describes_itself"),
         (ArmsWhileClosed, "test_refuses_calls_while_closed"),
         (TakesAnyExposure, "test_refuses_what_exceeds_limits"),
+        (RefusesAfterAWait, "test_refuses_what_exceeds_limits"),
         (RefusesAfterAnExposure, "test_refuses_what_exceeds_limits"),
         (IsStuckAfterARefusal, "test_refuses_what_exceeds_limits"),
         (RaisesItsOwnTimeout, "test_keeps_timeouts"),

@@ -28,6 +28,13 @@ class CannotTellItsState(Right):
         raise NotImplementedError
 
 
+class RaisesKeyError(Right):
+    def command(self, name: str, **arguments: Any) -> None:
+        if name not in self.commands:
+            raise KeyError(name)
+        super().command(name, **arguments)
+
+
 class IgnoresUnknownCommands(Right):
     def command(self, name: str, **arguments: Any) -> None:
         if name in self.commands:
@@ -48,6 +55,7 @@ PLANTED = Planted(
     Right,
     (
         (CannotTellItsState, "test_does_what_it_declares"),
+        (RaisesKeyError, "test_refuses_unknown_commands"),
         (IgnoresUnknownCommands, "test_refuses_unknown_commands"),
         (AnswersNone, "test_refuses_unknown_values"),
         (ObeysAnyPower, "test_refuses_what_exceeds_limits"),

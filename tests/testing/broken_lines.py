@@ -30,6 +30,13 @@ class ComesBackAtOnce(RecordingLines):
         self.use("wait", timeout_s)
 
 
+class WaitsInFire(RecordingLines):
+    def fire(self) -> None:
+        super().fire()
+        if self.programs[-1].duration_s < 1.0:
+            self.clock.sleep(self.programs[-1].duration_s)
+
+
 class StaysArmed(RecordingLines):
     def fire(self) -> None:
         super().fire()
@@ -49,6 +56,7 @@ PLANTED = Planted(
         (LeavesALineOn, "test_does_what_was_compiled"),
         (RunsSlow, "test_does_what_was_compiled"),
         (ComesBackAtOnce, "test_waits_for_the_end"),
+        (WaitsInFire, "test_waits_for_the_end"),
         (StaysArmed, "test_refuses_fire_without_arm"),
         (LeavesLightOn, "test_rests"),
     ),

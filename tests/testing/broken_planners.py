@@ -91,11 +91,30 @@ class RemembersHowOftenItWasAsked(OneByOnePlanner):
         return upside_down(super().plan, occupancy, target, next(self.turns))
 
 
+class DrawsItsOwnStart(OneByOnePlanner):
+    turns = itertools.cycle((1, -1))
+
+    def __init__(self, settings: None = None, context: Any = None) -> None:
+        super().__init__(settings, context)
+        self.turn = next(DrawsItsOwnStart.turns)
+
+    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
+        return upside_down(super().plan, occupancy, target, self.turn)
+
+
 class WritesIntoTheOccupancy(OneByOnePlanner):
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         plan = super().plan(occupancy, target)
         if occupancy.flags.writeable:
             occupancy[...] = False
+        return plan
+
+
+class WritesIntoTheTarget(OneByOnePlanner):
+    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
+        plan = super().plan(occupancy, target)
+        target.clear.flags.writeable = True
+        target.clear[...] = False
         return plan
 
 
@@ -150,7 +169,9 @@ PLANTED = Planted(
         (partial(DoesNothing, None), "test_fills_the_target"),
         (partial(GivesUpWithTooFewAtoms, None), "test_does_what_it_can_with_too_few_atoms"),
         (partial(RemembersHowOftenItWasAsked, None), "test_same_input_same_plan"),
+        (partial(DrawsItsOwnStart, None), "test_same_input_same_plan"),
         (partial(WritesIntoTheOccupancy, None), "test_leaves_the_input_untouched"),
+        (partial(WritesIntoTheTarget, None), "test_leaves_the_input_untouched"),
         (partial(ReadsTheMemoryAsItLies, None), "test_takes_any_memory_layout"),
         (partial(ChecksNothing, None), "test_refuses_wrong_input"),
         (partial(ReadsAFile, None), "test_is_pure"),

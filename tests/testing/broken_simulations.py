@@ -100,6 +100,12 @@ class DrawsItsOwnDisorder(TinyWorld):
         return replace(frame, image=np.rint(100 * self.gain).astype(np.uint16))
 
 
+class HearsNoSeed(TinyWorld):
+    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
+        frame = super().expose(t_start_s, exposure_s, mode)
+        return replace(frame, image=np.full_like(frame.image, 7))
+
+
 class DrawsFromOneStream(TinyWorld):
     def open(self) -> None:
         super().open()
@@ -115,6 +121,11 @@ class LoadsInTheDark(TinyWorld):
         is_lit, self.is_lit = self.is_lit, True
         super().load(t_start_s, duration_s)
         self.is_lit = is_lit
+
+
+class LoadsNothing(TinyWorld):
+    def load(self, t_start_s: float, duration_s: float) -> None:
+        pass
 
 
 class KeepsAtoms(TinyWorld):
@@ -161,8 +172,10 @@ PLANTED = Planted(
         (TellsMilliseconds, "test_gives_frames"),
         (SharesItsImage, "test_gives_frames"),
         (DrawsItsOwnDisorder, "test_same_seed_same_frames"),
+        (HearsNoSeed, "test_same_seed_same_frames"),
         (DrawsFromOneStream, "test_shots_are_independent"),
         (LoadsInTheDark, "test_loads_atoms"),
+        (LoadsNothing, "test_loads_atoms"),
         (KeepsAtoms, "test_loads_atoms"),
         (ExposesBackwards, "test_refuses_impossible_exposures"),
         (PlaysAnything, "test_refuses_wrong_signals"),
