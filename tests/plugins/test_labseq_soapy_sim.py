@@ -14,7 +14,6 @@ from labseq_soapy_sim import Fault, build
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-import labseq
 from labseq.errors import LabseqError
 from labseq.plugin import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
 from labseq.registry import Registry
@@ -22,6 +21,7 @@ from labseq.roles import RfSource, ToneSource
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 from .labseq_soapy_rig import GRID, Rig, need_radio, opened, until
+from .small_run import run
 
 ROWS, COLUMNS = np.array([0.1, 0.2, 0.15]), np.array([0.1, 0.05, 0.2, 0.1])
 
@@ -166,40 +166,12 @@ def test_atoms_are_lost_when_the_light_goes_off() -> None:
         assert lab.n_atoms == 0
 
 
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 5, cols: 6, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: STATIC
-mobile_tweezers: {use: virtual}
-detector: {use: threshold, frame: [128, 128], centre_px: [63.5, 63.5], pixel_size: 0.35 um}
-simulation: {use: virtual, image: {frame: [128, 128], centre_px: [63.5, 63.5]}}
-"""
-SEQUENCE = """labseq: 1
-name: small
-profile: p.yaml
-target: {pattern: compact, rows: 2, cols: 2}
-planner: {use: psca, degree_of_parallelism: 2}
-shot:
-  - load: {duration: 500 ms}
-  - image: {exposure: 45 ms}
-  - rearrange: {cycles: 1, window: 60 ms}
-  - image: {exposure: 45 ms}
-"""
 SIMULATED = "{use: soapy, device: simulated, sample_rate: 12.5 MHz, row_gain: 3, column_gain: 3}"
-
-
-def run(folder: Path, static: str) -> labseq.Run:
-    folder.mkdir(exist_ok=True)
-    (folder / "p.yaml").write_text(PROFILE.replace("STATIC", static), encoding="utf-8")
-    (folder / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
-    with labseq.Session.open(folder / "s.yaml", shots=1, seed=1, output=folder / "runs") as session:
-        return session.run()
 
 
 def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path: Path) -> None:
     need_radio()
-    radio, virtual = run(tmp_path / "radio", SIMULATED), run(tmp_path / "virtual", "{use: virtual}")
+    radio, virtual = run(tmp_path / "radio", SIMULATED), run(tmp_path / "virtual")
     assert (radio.status, radio.simulated, len(radio.shots)) == ("complete", True, 1)
     for one, other in zip(radio.shots, virtual.shots, strict=True):
         assert np.array_equal(one.occupancies, other.occupancies)

@@ -13,7 +13,7 @@ import pytest
 from labseq_spcm.mobile_tweezers import HOT_C, TEST_SAMPLES, SpcmMobileTweezers
 from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, SimulatedLibrary, Span, Tone, ToneSpan
+from labseq_spcm_sim import M4I6631, SimulatedLibrary, Span, Tone, ToneSpan, registers
 
 from labseq.motion import render, tone_program
 from labseq.plugin import (
@@ -105,6 +105,26 @@ class TestPlaying:
             assert lab.card.played(0)[0].start_s >= triggered_s
 
 
+def test_an_external_clock_and_trigger_are_set_up(driver: Any) -> None:
+    trigger = {
+        "trigger": "external",
+        "trigger_level": -1.234,
+        "trigger_edge": "falling",
+        "trigger_50_ohm": True,
+    }
+    with driver(reference_clock=20e6, **trigger) as lab:
+        found = {name: lab.card.read(getattr(registers, name))[1] for name in EXTERNAL}
+        assert found == EXTERNAL
+        assert lab.tweezers.describe()["trigger_level_mv"] == -1230
+
+
+EXTERNAL = {
+    "SPC_CLOCKMODE": registers.SPC_CM_EXTREFCLOCK,
+    "SPC_REFERENCECLOCK": 20_000_000,
+    "SPC_TRIG_ORMASK": registers.SPC_TMASK_EXT0,
+    "SPC_TRIG_EXT0_MODE": registers.SPC_TM_NEG,
+    "SPC_TRIG_TERM": 1,
+}
 MOTION = MotionSpec(max_row_tones=16, max_column_tones=5)
 DDS_CMD, EXEC_AT_TRG, WRITE_TO_CARD = 608003, 2, 8
 

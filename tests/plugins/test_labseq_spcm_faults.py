@@ -25,7 +25,6 @@ from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, vendor_library_found
 
-import labseq
 from labseq.motion import tone_program
 from labseq.plugin import (
     Context,
@@ -39,6 +38,8 @@ from labseq.plugin import (
     ToneProgram,
 )
 from labseq.testing.fakes import FakeClock
+
+from .small_run import run
 
 MODES = ["replay", "fifo", "dds"]
 
@@ -222,8 +223,8 @@ assert "spcm" in sys.modules
 tweezers.open()
 tweezers.close()
 """
-        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-        assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 class TestBehaviourOfTheCard:
@@ -256,9 +257,9 @@ for card in ("/dev/spcm0", "simulated", "/dev/spcm0"):
         print(error.exit_code, error)
     tweezers.close()
 """
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not run.stderr
-    before, after = run.stdout.splitlines()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not done.stderr
+    before, after = done.stdout.splitlines()
     for line in (before, after):
         assert line.startswith("3 mobile_tweezers: ")
         for text in ("no driver library", "install Spectrum's driver", "`card: simulated`"):
@@ -281,35 +282,6 @@ def test_closing_goes_through_even_if_the_card_is_broken(driver: Any) -> None:
             lab.tweezers.play()
 
 
-PROFILE = """labseq: 1
-name: bench
-grid: {rows: 5, cols: 6, spacing: 4.49 um}
-camera: {use: virtual}
-static_tweezers: {use: virtual}
-mobile_tweezers: MOBILE
-detector: {use: threshold, frame: [128, 128], centre_px: [63.5, 63.5], pixel_size: 0.35 um}
-simulation: {use: virtual, image: {frame: [128, 128], centre_px: [63.5, 63.5]}}
-"""
-SEQUENCE = """labseq: 1
-name: small
-profile: p.yaml
-target: {pattern: compact, rows: 2, cols: 2}
-planner: {use: psca, degree_of_parallelism: 2}
-shot:
-  - load: {duration: 500 ms}
-  - image: {exposure: 45 ms}
-  - rearrange: {cycles: 1, window: 60 ms}
-  - image: {exposure: 45 ms}
-"""
-
-
-def run(folder: Path, mobile: str) -> labseq.Run:
-    (folder / "p.yaml").write_text(PROFILE.replace("MOBILE", mobile), encoding="utf-8")
-    (folder / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
-    with labseq.Session.open(folder / "s.yaml", shots=1, seed=1, output=folder / "runs") as session:
-        return session.run()
-
-
 @pytest.mark.parametrize(
     "mobile",
     [
@@ -319,7 +291,7 @@ def run(folder: Path, mobile: str) -> labseq.Run:
     ],
 )
 def test_a_simulated_card_plays_in_virtual_time(tmp_path: Path, mobile: str) -> None:
-    done = run(tmp_path, mobile)
+    done = run(tmp_path, mobile=mobile)
     assert (done.status, done.simulated, len(done.shots)) == ("complete", True, 1)
 
 
@@ -340,7 +312,7 @@ def test_mistakes_are_reported_with_what_is_expected(
     tmp_path: Path, mobile: str, exit_code: int, text: str
 ) -> None:
     with pytest.raises(LabseqError) as raised:
-        run(tmp_path, f"{{use: spcm, {mobile}}}")
+        run(tmp_path, mobile=f"{{use: spcm, {mobile}}}")
     assert text in str(raised.value)
     assert raised.value.exit_code == exit_code
 
