@@ -255,16 +255,16 @@ def _motion(condition: Condition) -> MotionSpec:
     ]
     document = _document(overrides, "motion")
     motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
-    n, limit = condition.degree_of_parallelism, motion.max_tweezers
+    n = condition.degree_of_parallelism
+    limit, what = min(
+        (motion.max_tweezers, "the most tweezers that can be on at once"),
+        (max(motion.max_row_tones, motion.max_column_tones), "the most tones of an axis"),
+        key=lambda pair: pair[0],
+    )
     if n is not None and not 1 <= n <= limit:
-        hint = f"or raise the limit: --set {_MOTION_ADDRESS}.max_tweezers={n}" if n > limit else ""
-        what = f"the degree of parallelism is {n}"
-        expected = f"1 to {limit}, the most tweezers that can be on at once"
-        raise ConfigError(Problem(what, f"--dop {n}", expected=expected, hint=hint))
-    tones = max(motion.max_row_tones, motion.max_column_tones)
-    if n is not None and n > tones:
-        expected = f"at most {tones}, the most tones of an axis"
-        raise ConfigError(Problem(f"the degree of parallelism is {n}", f"--dop {n}", expected=expected))
+        hint = f"or raise the limit: --set {_MOTION_ADDRESS}.max_tweezers={n}" if "tweezers" in what else ""
+        text = f"the degree of parallelism is {n}"
+        raise ConfigError(Problem(text, f"--dop {n}", expected=f"1 to {limit}, {what}", hint=hint))
     return motion
 
 
@@ -282,14 +282,11 @@ def _planner(
     host: PluginHost, comparison: Comparison, condition: Condition, planner_entry: PlannerEntry
 ) -> ChosenPlugin:
     name, dop = planner_entry.planner, condition.degree_of_parallelism
-    overrides: list[Override] = []
+    overrides = [Override(f"planner.{k}", v, f"--set planner.{k}={v}") for k, v in comparison.settings]
+    overrides += [Override(f"planner.{k}", v, comparison.called) for k, v in planner_entry.settings]
     entry = host.registry.find("planner", name)
     if entry is not None and dop is not None and _DOP in getattr(entry.settings_model, "model_fields", {}):
-        overrides.append(Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
-    for key, value in comparison.settings:
-        overrides.append(Override(f"planner.{key}", value, f"--set planner.{key}={value}"))
-    for key, value in planner_entry.settings:
-        overrides.append(Override(f"planner.{key}", value, comparison.called))
+        overrides.insert(0, Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
     return _choose(host, Choice(use=name), overrides, comparison.called)
 
 

@@ -52,7 +52,9 @@ def run_jobs(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Gen
         return
     workers: dict[Connection, BaseProcess] = {}
     try:
-        with _interrupts_ignored():  # a process begins with the signals that its parent ignores
+        with _signals(
+            signal.SIG_IGN, signal.SIGINT
+        ):  # a process begins with the signals that its parent ignores
             for _ in range(n_workers):
                 connection, process = _start(comparison)
                 workers[connection] = process
@@ -118,15 +120,15 @@ def _serve(connection: Connection, comparison: Comparison) -> None:
 
 
 @contextmanager
-def _interrupts_ignored() -> Generator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _signals(handler: Any, *numbers: int) -> Generator[None]:
+    """Handle signals in another way for a while; other threads than the main one get none."""
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if is_main}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)
 
 
 MAX_AT_ONCE: Final = 50
@@ -190,8 +192,13 @@ def compare(
     wanted = comparison.n_loadings * len(prepared)
     ended_by: LabseqError | None = None
     received: list[int] = []
+
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
     try:
-        with _interrupted_by_signals(received):
+        with _signals(interrupt, signal.SIGINT, signal.SIGTERM):
             with announcing(announce):
                 warm(prepared)
             progress(0, wanted)
@@ -241,22 +248,3 @@ def _n_cores() -> int:
     if hasattr(os, "sched_getaffinity"):  # unavailable on Windows and macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-@contextmanager
-def _interrupted_by_signals(received: list[int]) -> Generator[None]:
-    """Make SIGTERM interrupt like Ctrl-C, and record which signal came."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(number: int, _frame: FrameType | None) -> None:
-        received.append(number)
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

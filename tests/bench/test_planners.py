@@ -155,7 +155,7 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
             BenchRequest(
                 dop=6, overrides=[f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")]
             ),
-            "--dop 6: .*; expected at most 5, the most tones of an axis",
+            "--dop 6: .*; expected 1 to 5, the most tones of an axis",
         ),
         (BenchRequest(planners="psca:dop=3"), "psca:dop=3: 'dop' is not a setting of planner 'psca'"),
         (BenchRequest(overrides=["planner.dop=3"]), "--set planner.dop=3: 'dop' is not a setting"),
