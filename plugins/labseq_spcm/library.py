@@ -46,12 +46,18 @@ class VendorLibrary:
 Library: TypeAlias = "VendorLibrary | SimulatedLibrary"
 
 
-def choose_library(settings: SpcmSettings, context: Context) -> Library:
-    """The library that the setting ``card`` asks for."""
+def choose_library(name: str, settings: SpcmSettings, context: Context) -> Library:
+    """The library that the setting ``card`` asks for.
+
+    Raises:
+        DeviceError: The package ``spcm`` is missing, from which the simulated card has its registers.
+    """
     if not settings.card.startswith(SIMULATED):
         return VendorLibrary(settings.card)
-    from labseq_spcm_sim import SimulatedLibrary
-
+    try:
+        from labseq_spcm_sim import SimulatedLibrary
+    except ModuleNotFoundError as error:
+        raise _not_installed(name, error) from error
     return SimulatedLibrary(settings.card, context.clock, context.simulation, settings.row_channel)
 
 
@@ -69,9 +75,13 @@ def load_spcm(name: str, library: Library) -> Any:
         with contextlib.redirect_stdout(io.StringIO()):  # spcm prints, and stdout may be for JSON
             return library.load()
     except ModuleNotFoundError as error:
-        text = f"the Python package 'spcm' cannot be imported ({error}); install it with `pip install spcm`"
-        raise DeviceError(name, f"{text}; {WITHOUT_A_CARD}") from error
+        raise _not_installed(name, error) from error
     except Exception as error:  # spcm raises a bare Exception without the library
         reason = (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")
         text = f"the Python package 'spcm' finds no driver library ({reason}); install Spectrum's driver"
         raise DeviceError(name, f"{text} for this system; {WITHOUT_A_CARD}") from error
+
+
+def _not_installed(name: str, error: ModuleNotFoundError) -> DeviceError:
+    text = f"the Python package 'spcm' cannot be imported ({error}); install it with `pip install spcm`"
+    return DeviceError(name, text)

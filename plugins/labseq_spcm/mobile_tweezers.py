@@ -107,7 +107,7 @@ class SpcmMobileTweezers(MobileTweezers):
             self._cores = choose_cores(self._name, settings, context.motion)
         else:
             limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
-        self.library = choose_library(settings, context)
+        self.library = choose_library(self._name, settings, context)
         self._card: AwgCard | None = None
         self._mode: PlayMode | None = None
         self._facts: dict[str, Any] = {}

@@ -268,9 +268,7 @@ for card in ("/dev/spcm0", "simulated", "/dev/spcm0"):
 
 def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "spcm", None)
-    with pytest.raises(
-        DeviceError, match=r"'spcm' cannot be imported .* `pip install spcm`; .* `card: simulated`"
-    ):
+    with pytest.raises(DeviceError, match=r"'spcm' cannot be imported .* `pip install spcm`"):
         load_spcm("mobile_tweezers", VendorLibrary("/dev/spcm0"))
 
 
