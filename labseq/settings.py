@@ -186,7 +186,7 @@ class Choice(Settings):
     def _is_no_bare_name(cls, value: Any) -> Any:
         if isinstance(value, str):
             name = clean(value)
-            raise setting_error(f"just '{name}' stands here", "a mapping", f"write '{{{cls.key}: {name}}}'")
+            raise setting_error(f"there is just '{name}' here", "a mapping", f"write '{{{cls.key}: {name}}}'")
         return value
 
 

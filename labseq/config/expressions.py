@@ -268,7 +268,7 @@ def _unexpected(text: str, at: int) -> ExpressionError:
         expected = "a number, an address or '('"
         return ExpressionError("the expression ends too early", expected, at=max(0, len(text) - 1))
     expected = "numbers, addresses, functions, brackets and + - * / **"
-    return ExpressionError(f"'{clean(text[at])}' cannot stand here", expected, at=at)
+    return ExpressionError(f"'{clean(text[at])}' is not allowed here", expected, at=at)
 
 
 @dataclass(slots=True)
@@ -333,7 +333,7 @@ class _Evaluation:
         raise ExpressionError(what, listing(FUNCTIONS), hint)
 
 
-_KNOWN: Final = "an expression knows what stands in its own file, not defaults"
+_KNOWN: Final = "an expression can use values of its own file, not defaults"
 _LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
 
 
@@ -386,7 +386,7 @@ def evaluate(root: Node, name: str, text: str) -> Expressions:
             evaluator.nodes[loc] = node
         elif is_expression(node):
             hint = "scan a variable, and let others follow from it"
-            evaluator.report(node, ExpressionError("an expression cannot stand in a scan", "a value", hint))
+            evaluator.report(node, ExpressionError("an expression is not allowed in a scan", "a value", hint))
         elif isinstance(node.value, str) and node.value.startswith("==") and loc[:1] != ("scan",):
             text_node = replace(node, value=node.value[1:], raw=node.raw[1:])
             result = result.replaced(loc, text_node, same_key=True)
@@ -501,7 +501,9 @@ class _Evaluator:
         parsed = _parse(str(self.nodes[ring[0]].value))
         address = next(text for text, loc in references[ring[0]].items() if loc == ring[1])
         at = next(at for at, value in parsed.values.items() if value == address) + parsed.shift
-        self.report(self.nodes[ring[0]], ExpressionError(f"this goes round in a circle: {clean(way)}", at=at))
+        self.report(
+            self.nodes[ring[0]], ExpressionError(f"this is a circular reference: {clean(way)}", at=at)
+        )
 
     def report(self, node: Node, error: ExpressionError) -> None:
         """Record a problem; its column is that of the character if the text is on a line of the file."""

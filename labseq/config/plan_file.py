@@ -177,7 +177,7 @@ class _NoPlanError(Exception):
 
 
 def _refuse_constant(constant: str) -> NoReturn:
-    raise _NoPlanError(f"{constant} stands in it")
+    raise _NoPlanError(f"it contains {constant}")
 
 
 def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
@@ -185,7 +185,7 @@ def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
     if len(values) < len(pairs):
         keys = [key for key, _ in pairs]
         twice = next(key for key in keys if keys.count(key) > 1)
-        raise _NoPlanError(f"{shown(twice)} stands in it twice")
+        raise _NoPlanError(f"{shown(twice)} occurs in it twice")
     return values
 
 

@@ -225,7 +225,7 @@ class AdaptiveChoice(Choice):
         if self.maximise is None and self.minimise is None:
             raise setting_error("the scan has no aim", "'maximise' or 'minimise' with the name of a figure")
         if self.maximise is not None and self.minimise is not None:
-            what = "'maximise' and 'minimise' stand together"
+            what = "'maximise' and 'minimise' are both given"
             raise setting_error(what, "one of them", at=("minimise",), key=True)
         return self
 
@@ -376,7 +376,7 @@ def _check_together(group: Group, name: str) -> None:
     for i, node in enumerate(group[0].values if group else ()):
         position = json.dumps([axis.values[i].plain() for axis in group])
         if position in seen:
-            what = f"{shown(node.plain(), node.raw)} stands twice in the scan of '{clean(group[0].address)}'"
+            what = f"{shown(node.plain(), node.raw)} occurs twice in the scan of '{clean(group[0].address)}'"
             raise scan_error(node.mark, name, what, "each value once", "write 'repeats' for more shots")
         seen.add(position)
 

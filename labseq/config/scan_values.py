@@ -56,7 +56,7 @@ def _number(node: Node, name: str) -> Number:
         return Number(float(value), "", isinstance(value, int))
     amount, unit = split_quantity(value) if isinstance(value, str) else (math.nan, "")
     if not math.isfinite(amount) or not any(unit in units for units in UNITS.values() if unit):
-        what = f"{shown(node.plain(), node.raw)} stands among the limits of a scan"
+        what = f"{shown(node.plain(), node.raw)} is among the limits of a scan"
         raise scan_error(node.mark, name, what, "a number, or a number with a unit such as '50 um/ms'")
     return Number(amount, unit, is_whole=False)
 

@@ -114,7 +114,7 @@ def _listed(choices: tuple[AnalysisChoice, ...]) -> tuple[AnalysisChoice, ...]:
     first: dict[str, int] = {}
     for i, choice in enumerate(choices):
         if first.setdefault(choice.use, i) != i:
-            what = f"the analysis '{choice.use}' stands here a second time"
+            what = f"the analysis '{choice.use}' is listed a second time"
             raise setting_error(what, "each analysis once", at=(i, "use"))
     return tuple(choice.placed("analysis", i) for i, choice in enumerate(choices))
 
@@ -160,7 +160,7 @@ def _step(value: Any) -> StepSpec:
     if not kinds:
         raise setting_error("a step says nothing to do", "a mapping such as 'image: {exposure: 45 ms}'")
     if len(kinds) > 1:
-        what = f"'{clean(kinds[1])}' stands in the same step as '{clean(kinds[0])}'"
+        what = f"'{clean(kinds[1])}' is in the same step as '{clean(kinds[0])}'"
         hint = f"begin a new step with '- ', or indent settings of '{clean(kinds[0])}' further"
         raise setting_error(what, "one step in each item of the list", hint, at=(kinds[1],), key=True)
     kind, settings = kinds[0], item[kinds[0]]

@@ -464,7 +464,7 @@ def node_of(value: Any, mark: Mark) -> Node:
     if isinstance(value, PurePath):
         return Node(str(value), mark)
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
-        raise ConfigError(mark.problem("", f"half of a character stands in '{clean(value)}'", "text"))
+        raise ConfigError(mark.problem("", f"there is half a character in '{clean(value)}'", "text"))
     if value is None or isinstance(value, str | int | float):
         return Node(value, mark)
     kind = type(cast("object", value)).__name__

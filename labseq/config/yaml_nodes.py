@@ -277,7 +277,7 @@ class _Composer(yaml.SafeLoader):
             what = f"'*{shown_name}' has no anchor '&{shown_name}' before it"
             self.stop(event.start_mark, what, "", hint)
         if name not in self._sizes:
-            self.stop(event.start_mark, f"'*{shown_name}' stands inside of '&{shown_name}' itself")
+            self.stop(event.start_mark, f"'*{shown_name}' is inside '&{shown_name}' itself")
         self._count(event, self._sizes[name])
         return _Alias(self.anchors[name], event.start_mark)
 
@@ -422,7 +422,7 @@ _RULES: Final = (
         "a list item ('- ') cannot begin here",
         "it on a line of its own",
     ),
-    _Rule("mapping keys are not allowed here", "a '?' cannot stand here", "", _QUOTE_IT),
+    _Rule("mapping keys are not allowed here", "a '?' is not allowed here", "", _QUOTE_IT),
     _Rule(
         "found unexpected (?:end of stream|document separator)",
         "the quotation mark that opens here is never closed",
@@ -500,7 +500,7 @@ def explain_syntax_error(
     since = error.context_mark or at
     if text[at.index : at.index + 1] == "\t":
         if text[at.index - at.column : at.index].strip():
-            return _at(at, "a tab stands here", "a space")
+            return _at(at, "there is a tab here", "a space")
         return _at(at, "a tab is used for indentation", "spaces")
     if "expected ':'" in problem:
         line = re.split(r"[\r\n]", text[since.index :], maxsplit=1)[0]
@@ -539,7 +539,7 @@ def _stray_colon(text: str, at: YamlMark) -> Problem:
         what = f"this line is indented further than line {line}, which has a value already"
         return _at(at, what, f"{above} spaces as there")
     hint = "put text that holds ': ' in quotes"
-    return _at(at, "a ':' cannot stand here", "one 'key: value' on a line", hint)
+    return _at(at, "a ':' is not allowed here", "one 'key: value' on a line", hint)
 
 
 def _line_above(text: str, at: YamlMark) -> tuple[int, int]:
@@ -577,7 +577,7 @@ def _out_of_place(found: str, context: str, text: str, since: YamlMark, at: Yaml
     is_item = found in ("-", "<block sequence start>")
     is_aligned = at.column == since.column
     if is_item and is_aligned:
-        return _at(at, "a list item ('- ') stands among the keys of a mapping", "'key: value'")
+        return _at(at, "a list item ('- ') is among the keys of a mapping", "'key: value'")
     if is_item:
         return _at(at, _MISALIGNED, "that of the other items of the list")
     if is_aligned and "collection" in context:

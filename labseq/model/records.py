@@ -205,7 +205,7 @@ class RunRecord:
         lattice: Lattice of the grid.
         scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
         calibrations: Those in use: kind -> id.
-        resumed: How it was gone on with after it had ended early, in order: ``t_utc``, ``first_shot``,
+        resumed: How it was resumed after it had ended early, in order: ``t_utc``, ``first_shot``,
             ``changes`` that were accepted (each ``what``, ``was`` and ``now``) and ``provenance``.
     """
 

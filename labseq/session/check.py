@@ -237,7 +237,7 @@ def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
             durations.append(report.duration_s)
             firsts.append(float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0)
     except LabseqError as error:
-        return None, f"on a random loading (75 % of the sites unless the simulation says else): {error}"
+        return None, f"on a random loading (75 % of the sites, or as the simulation loads): {error}"
     finally:
         guard.end()
     return Rehearsal(len(durations), n_filled, np.array(durations), np.array(firsts)), ""
@@ -325,7 +325,7 @@ def _deadline_warnings(
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
             loc = (*session.assembly.sequence.shot[number].loc, "for")
-            hint = "raise 'deadline' in the profile, or the other system is told that the shot failed"
+            hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
             problems.append(session.assembly.document.problem(loc, what, hint=hint))
     return problems
 

@@ -74,13 +74,13 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("=", "5: the expression ends too early; expected a number, an address or '('"),
         (
             "= 2 3",
-            "9: '3' cannot stand here; expected numbers, addresses, functions, brackets and + - * / **",
+            "9: '3' is not allowed here; expected numbers, addresses, functions, brackets and + - * / **",
         ),
-        ("= 2 + 3)", "12: ')' cannot stand here"),
+        ("= 2 + 3)", "12: ')' is not allowed here"),
         ("= variables.hold + 5", "22: a time and a number cannot be added; give the number its unit"),
         ('"= min(2 ms, 3)"', "8: a time and a number cannot be compared"),
         ("= variables.hodl", "7: there is no 'variables.hodl' in this file; did you mean 'hold'?"),
-        ("= shot.0.image.gain", "7: there is no 'shot.0.image.gain' in this file; an expression knows what"),
+        ("= shot.0.image.gain", "7: there is no 'shot.0.image.gain' in this file; an expression can use"),
         ("= shot.0.image", "7: 'shot.0.image' is a mapping"),
         ("= shot.0.image.name", "7: 'shot.0.image.name' is 'x'; expected a number or a quantity"),
         ("= 1 / variables.zero", "9: this divides by zero"),
@@ -94,13 +94,13 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("= sin(1, 2)", "sin() takes 1 value, not 2"),
         ("= min(1)", "7: min() takes 2 values or more, not 1"),
         ("= sni(1)", "7: there is no function 'sni'; expected one of"),
-        ("= __import__('os')", "18: ''' cannot stand here"),
+        ("= __import__('os')", "18: ''' is not allowed here"),
         ("= variables.n.real", "has no 'real' in it"),
         ("= 1 s * 1 s", "5: the result is in s^2, which is no unit of any setting"),
         ("= (1 m) ** 13", "13: powers of units go up to 12"),
-        ("= it", "7: this goes round in a circle: it -> it"),
+        ("= it", "7: this is a circular reference: it -> it"),
         (f"= {'-' * 300}1", f"the expression has more than {MAX_PARTS} parts"),
-        (f"= {'(' * 240}1{')' * 240}", "'(' cannot stand here"),
+        (f"= {'(' * 240}1{')' * 240}", "'(' is not allowed here"),
         (f"= {'1 + ' * 200}1", f"the expression has 803 characters; expected at most {MAX_LENGTH}"),
     ],
 )
@@ -114,7 +114,7 @@ def test_a_wrong_expression_is_reported_with_its_place(text: str, message: str) 
 def test_a_circle_and_what_depends_on_it_is_reported_once() -> None:
     more = "a: = b + 1\nb: = c\nc: = 2 * a\n"
     (told,) = refused("= a", more).splitlines()
-    assert told.endswith("this goes round in a circle: a -> b -> c -> a")
+    assert told.endswith("this is a circular reference: a -> b -> c -> a")
 
 
 @pytest.mark.parametrize("wrong", ["= b +", "= nothing", "= 1 s + 1"])

@@ -59,7 +59,7 @@ BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v["target"].update(fill=[[0, 1], [0]]), "'fill' is not of the grid's shape; expected 2 rows"),
     (lambda v: v["target"].update(clear=v["target"]["fill"]), "a site cannot be in both fill and clear"),
     (lambda v: v["occupancy"][0].__setitem__(0, 2), "occupancy.0.0 is 2; expected at most 1"),
-    (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is no plan: NaN stands in it"),
+    (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is no plan: it contains NaN"),
     (lambda v: v["grid"].update(spacing_m=4.49), "spacing_m is 4.49; expected at most 0.001"),
     (lambda v: v.update(planner="\x1b[31mred"), "name is '\\x1b[31mred', with '\\x1b' in it"),
     (lambda v: v.update(degree_of_parallelism=0), "degree_of_parallelism is 0; expected at least 1"),
@@ -80,7 +80,7 @@ def test_a_wrong_plan_is_refused_with_its_batch(
     [
         (b"", "plan.json:1:1: this is no JSON: expecting value"),
         (b'{\n"batches": [1,\n', "plan.json:3:1: this is no JSON: expecting value"),
-        (b'{"batches": [], "batches": []}', "this is no plan: 'batches' stands in it twice"),
+        (b'{"batches": [], "batches": []}', "this is no plan: 'batches' occurs in it twice"),
         (b'{"batches": ' + b"9" * 5000 + b"}", "a number in it has too many digits"),
         (b"[" * 100_000, "this is no plan: it is nested too deeply; expected what 'labseq plan --json'"),
         (b"\xff", "byte 0xFF at offset 0 is not UTF-8"),

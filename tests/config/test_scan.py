@@ -138,10 +138,10 @@ BAD = [
         "scan: {shot.sort.window: {linspace: [1 ms, 2, 3]}}",
         "1:44: 2 does not go with '1 ms'; expected a time",
     ),
-    ("scan: {shot.sort.window: {linspace: [.nan, 2, 3]}}", "1:38: .nan stands among the limits"),
+    ("scan: {shot.sort.window: {linspace: [.nan, 2, 3]}}", "1:38: .nan is among the limits"),
     ("scan: {shot.sort.window: {range: [1, 5, 0]}}", "1:41: the step 0 does not lead from start to stop"),
     ("scan: {shot.sort.window: {range: [0, 1, 1e-9]}}", "1:34: the range has 1e+09 values"),
-    ("scan: {shot.sort.window: [1 ms, 1 ms]}", "1:33: '1 ms' stands twice in the scan"),
+    ("scan: {shot.sort.window: [1 ms, 1 ms]}", "1:33: '1 ms' occurs twice in the scan"),
     (
         "scan: {shot.sort.window: [1], shot.2.rearrange.window: [2]}",
         "1:31: 'shot.2.rearrange.window' is scanned",

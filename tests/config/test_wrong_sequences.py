@@ -36,7 +36,7 @@ shots: 20 => shots:20
   - image: { => ⇥- image: {
   16:1: a tab is used for indentation; expected spaces
 shots: 20 => shots:⇥20
-  5:7: a tab stands here; expected a space
+  5:7: there is a tab here; expected a space
 target: {pattern: compact, rows: 15, cols: 15}⏎ => target: {pattern: compact, rows: 15⏎
   7:9: the '{' that opens here is not closed by line 8; expected ',' or '}'
 rows: 15, cols => rows: 15 cols
@@ -60,7 +60,7 @@ name: compact-225 => name: 'compact'-225
 - image:⏎ => - image: {a: 'b}⏎
   27:16: the quotation mark that opens here is never closed
 name: compact-225 => name: compact: 225
-  3:14: a ':' cannot stand here; expected one 'key: value' on a line; put text that holds ': ' in quotes
+  3:14: a ':' is not allowed here; expected one 'key: value' on a line; put text that holds ': ' in quotes
 name: compact-225 => name: "C:\\data"
   3:11: a backslash and 'd' mean nothing in double quotes; use single quotes, or write '\\\\' for a backslash
 name: compact-225 => name: @home
@@ -68,7 +68,7 @@ name: compact-225 => name: @home
 name: compact-225 => name: *best*
   3:7: '&' and '*' begin anchors and aliases, and a name must follow; put text with special characters in quotes
 [plugins, "more plugins"] => &a [*a]
-  13:21: '*a' stands inside of '&a' itself
+  13:21: '*a' is inside '&a' itself
 name: compact-225 => name: !mine x
   3:7: '!mine' is a YAML tag, which is not allowed; expected a plain value; put text that begins with '!' in quotes
 name: compact-225 => name: !!python/object/apply:os.system [exit 1]
@@ -80,7 +80,7 @@ name: compact-225 => 225: compact
 name: compact-225 => : compact
   3:1: a key is missing before this ':'; expected 'key: value'
 seed: 7 => - seed: 7
-  6:1: a list item ('- ') stands among the keys of a mapping; expected 'key: value'
+  6:1: a list item ('- ') is among the keys of a mapping; expected 'key: value'
 shot:⏎ => ---⏎shot:⏎
   14:1: a second document begins here; expected one document in a file; remove '---'
 shot:⏎ => ...⏎shot:⏎
@@ -142,7 +142,7 @@ record_frames: last => record_frames: lst
 [plugins, "more plugins"] => [plugins, 5]
   13:27: plugin_folders.1 is 5; expected text; put it in quotes
 target: {pattern: compact, rows: 15, cols: 15} => target: compact
-  7:9: just 'compact' stands here; expected a mapping; write '{pattern: compact}'
+  7:9: there is just 'compact' here; expected a mapping; write '{pattern: compact}'
 {pattern: compact => {patern: compact
   7:9: 'pattern' is missing from 'target' (the name of a target pattern); did you write 'patern' for it?
 use: psca⏎ => uses: psca⏎
@@ -160,9 +160,9 @@ shot:⏎ => shot: {}⏎rest:⏎
 - image: {exposure: 45 ms} => - name: look
   16:5: a step says nothing to do; expected a mapping such as 'image: {exposure: 45 ms}'
   - image: {exposure: 45 ms} =>     image: {exposure: 45 ms}
-  16:5: 'image' stands in the same step as 'load'; expected one step in each item of the list; begin a new step with '- ', or indent settings of 'load' further
+  16:5: 'image' is in the same step as 'load'; expected one step in each item of the list; begin a new step with '- ', or indent settings of 'load' further
 - image: {exposure: 45 ms} => - image:⏎    exposure: 45 ms
-  17:5: 'exposure' stands in the same step as 'image'; expected one step in each item of the list; begin a new step with '- ', or indent settings of 'image' further
+  17:5: 'exposure' is in the same step as 'image'; expected one step in each item of the list; begin a new step with '- ', or indent settings of 'image' further
 - image: {exposure: 45 ms} => - image: 45 ms
   16:12: image is '45 ms'; expected a mapping of settings such as {key: value}
 image: {exp => image:{exp

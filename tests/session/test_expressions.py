@@ -133,7 +133,7 @@ def test_a_run_with_expressions_is_resumed(tmp_path: Path) -> None:
         ("{variables.hold.x: [1 ms]}", "'variables.hold' is '20 ms' and has no 'x' in it"),
         ("{variables.hold: [1 ms, 1 um]}", "a length and a time cannot be added"),
         ("{variables.hold: [10 ms, -6 ms]}", "window is"),
-        ("{planner.degree_of_parallelism: [= 2 + 1]}", "1:40: an expression cannot stand in a scan"),
+        ("{planner.degree_of_parallelism: [= 2 + 1]}", "1:40: an expression is not allowed in a scan"),
     ],
 )
 def test_a_wrong_scan_of_a_variable_is_refused(tmp_path: Path, scan: str, message: str) -> None:
