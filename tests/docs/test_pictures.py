@@ -9,6 +9,7 @@ import pytest
 from PIL import Image, ImageChops, ImageStat
 
 from .blocks import PAGES, ROOT, blocks_of, commands_of
+from .running import labseq
 from .scripts import load_script
 
 STATIC = ROOT / "docs" / "_static"
@@ -38,7 +39,13 @@ def test_a_picture_is_made_by_the_commands_of_its_page(name: str) -> None:
     assert f"_static/{name}" in page.read_text("utf-8")
 
 
-def test_a_picture_can_be_made_again(tmp_path: Path) -> None:
+def test_a_picture_can_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(program: list[str], *, cwd: Path, **_: object) -> None:
+        monkeypatch.chdir(cwd)
+        assert labseq(program[3:])[0] == 0
+
+    monkeypatch.setattr("subprocess.run", run)
+    monkeypatch.chdir(tmp_path)
     SCRIPT.make("plan_kagome.png", tmp_path)
     with Image.open(tmp_path / "plan_kagome.png") as made, Image.open(STATIC / "plan_kagome.png") as kept:
         assert made.size == kept.size

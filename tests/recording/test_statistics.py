@@ -82,6 +82,11 @@ def test_each_cycle_is_judged_on_its_own_image(of_defects: Any, recorded: Any) -
     found = statistics_of(run.shots, run.target)
     assert [cycle.defect_free for cycle in found.cycles] == [Rate(1, 4), Rate(3, 4), Rate(2, 4)]
     assert [cycle.seen for cycle in found.cycles] == [Rate(1, 4), Rate(3, 4), Rate(4, 4)]
+    written = json.loads(json.dumps(found.as_dict()))
+    assert written["filling"] == {"mean": None, "error": None}
+    assert written["cycles"][0]["defect_free"] == {
+        "n": 1, "n_trials": 4, "rate": 0.25, "interval": [*Rate(1, 4).interval]
+    }  # fmt: skip
     assert found.defect_free == Rate(0, 0)
     assert math.isnan(found.filling.value)
     assert found.seen == Rate(4, 4)
