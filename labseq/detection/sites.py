@@ -115,10 +115,6 @@ class KnownSites:
 def known_sites(settings: RegionSettings, context: Context) -> KnownSites:
     """The sites from the file in ``sites``, else from the calibration in use, else from the geometry.
 
-    Args:
-        settings: Settings of the detector.
-        context: Grid and calibrations.
-
     Raises:
         ConfigError: The file cannot be read, or does not have one position for each site.
     """
@@ -162,7 +158,7 @@ def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
         ConfigError: It cannot be read, or does not have one position for each site.
     """
     try:
-        positions = _array(path) if path.suffix == ".npy" else _table(path, shape)
+        positions = read_npy(path) if path.suffix == ".npy" else _table(path, shape)
     except (OSError, ValueError, TypeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(
@@ -178,7 +174,8 @@ def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
     return positions
 
 
-def _array(path: Path) -> Floats:
+def read_npy(path: Path) -> Floats:
+    """Read the numbers of a .npy file; raises ``OSError``, ``ValueError`` or ``TypeError``."""
     with path.open("rb") as file:
         return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from labseq.detection.sites import RegionSettings, Thresholds, checked_image, known_sites, region_corners
+from labseq.detection.sites import (
+    RegionSettings,
+    Thresholds,
+    checked_image,
+    known_sites,
+    read_npy,
+    region_corners,
+)
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Frame, Occupancy
 from labseq.roles import Context
@@ -19,6 +26,10 @@ from labseq.roles import Context
 
 class ComparingDetector(ABC):
     """Base of detectors: there is an atom where the signal exceeds the site's threshold.
+
+    The sites come from the file in ``sites``, else from the calibration of sites in
+    use, else from the geometry in the settings; the thresholds from the calibration of
+    thresholds in use, else from the settings.
 
     Args:
         settings: Where the sites are.
@@ -74,11 +85,6 @@ class ComparingDetector(ABC):
 def known_thresholds(threshold: Thresholds, unit: str, context: Context) -> tuple[NDArray[np.float64], str]:
     """The thresholds of the calibration in use, else of the settings.
 
-    Args:
-        threshold: The setting.
-        unit: What the detector compares: "counts" or "log-odds".
-        context: Grid and calibrations.
-
     Returns:
         float64 (n_rows, n_cols), in the detector's unit, and where they come from, for messages.
 
@@ -127,8 +133,7 @@ def site_thresholds(threshold: Thresholds, shape: tuple[int, int]) -> NDArray[np
 
 def _load(path: Path) -> NDArray[np.float64]:
     try:
-        with path.open("rb") as file:
-            return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+        return read_npy(path)
     except (OSError, ValueError, TypeError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(
@@ -165,10 +170,6 @@ class ThresholdDetector(ComparingDetector):
     of each pixel, exceed T_ij (paper, "Experimental Setup"). The confidence is
     ``tanh(|counts - T_ij| / width)``: for two classes whose log-odds grow linearly
     with the counts, that is the probability of being right, scaled to 0..1.
-
-    The sites come from the file in ``sites``, else from the calibration of sites in
-    use, else from the geometry in the settings; the thresholds from the calibration of
-    thresholds in use, else from the settings.
 
     Args:
         settings: A threshold given as text is the path

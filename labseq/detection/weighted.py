@@ -127,10 +127,6 @@ class WeightedDetector(ComparingDetector):
     The confidence is ``tanh(|log-odds - T_ij| / width)``; at T = 0 and the width of 2 it is the
     probability of being right, scaled to 0..1, if half of the sites hold atoms.
 
-    The sites come from the file in ``sites``, else from the calibration of sites in
-    use, else from the geometry in the settings; the thresholds from the calibration of
-    thresholds in use, else from the settings.
-
     Args:
         settings: A threshold given as text is the path
             of a .npy file of floats (n_rows, n_cols), read here.
@@ -180,13 +176,7 @@ class WeightedDetector(ComparingDetector):
 
 
 def site_weights(settings: WeightedSettings, known: KnownSites, corners: NDArray[np.int64]) -> Weights:
-    """Compute the weights of all sites.
-
-    Args:
-        settings: Settings of the detector.
-        known: Where the sites are.
-        corners: int64 (n_sites, 2), (y, x) of the first pixel of each region.
-    """
+    """Compute the weights of all sites, whose regions have their first pixels at ``corners`` (n_sites, 2)."""
     sites = known.positions_px.reshape(-1, 2)
     spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
     own = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
