@@ -360,11 +360,13 @@ def test_a_stop_request_in_a_recovery_lets_the_driver_ramp_down():
         ramps.append("down")
 
     vars(rig.lab.mobile_tweezers)["safe_state"] = ramp_down
+    vars(rig.lab.mobile_tweezers)["close"] = lambda: rig.lab.clock.sleep(0.01)
     with pytest.raises(StopRequested):
         rig.run()
     assert ramps == ["down", "down"]
     assert [s.status for s in rig.sink.shots] == ["failed"]
     assert not rig.unsafe
+    assert all(values["ok"] for values in rig.observer.of("closed"))
 
 
 @pytest.mark.parametrize("failing", ["mobile_tweezers", "camera"])

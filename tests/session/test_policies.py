@@ -149,6 +149,18 @@ def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
     assert len(stopped.shots) == 5
 
 
+def test_a_policy_of_a_step_replaces_that_of_the_run(tmp_path: Path) -> None:
+    step = "{}\n    policy: {timeout: 2 s, retries: 1, over_budget: stop}"
+    path = sequence(tmp_path, step=step, policy={"over_budget": "warn", "on_failure": "repeat_shot"})
+    assembly = labseq.Session.open(path).assembly
+    own, other, *_ = assembly.policy.steps
+    assert (own.timeout_s, own.retries, own.over_budget, own.on_failure) == (2.0, 1, "stop", "repeat_shot")
+    assert (other.retries, other.over_budget) == (0, "warn")
+    assert assembly.resolved["shot"][0]["policy"] == {"timeout": 2.0, "retries": 1, "over_budget": "stop"}
+    assert "policy" not in assembly.resolved["shot"][1]
+    assert assembly.resolved["policy"]["over_budget"] == "warn"
+
+
 def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
     path = write(tmp_path)
     text = path.read_text(encoding="utf-8").replace(
