@@ -268,12 +268,16 @@ def drive(grid: SiteGrid, motion: MotionSpec, axis: AxisIndex) -> Drive:
     step_hz = _step_hz(all_hz[axis], all_hz[1 - axis])
     comb = fit_comb(all_hz[axis], grid.spacing_m)
     snapped = comb.worst_m <= rf.snap_within_m
+    site_hz = np.array(comb.frequency_hz if snapped else all_hz[axis])
     max_tones = (motion.max_row_tones, motion.max_column_tones)[axis]
+    amplitude = _amplitudes(rf, axis, grid.shape[axis], max_tones)
+    for array in (site_hz, amplitude):
+        array.flags.writeable = False  # as the kernels' signatures want them
     return Drive(
-        site_hz=comb.frequency_hz if snapped else all_hz[axis],
+        site_hz=site_hz,
         step_hz=step_hz,
         comb_error_m=comb.error_m if snapped else np.zeros_like(comb.error_m),
-        amplitude=_amplitudes(rf, axis, grid.shape[axis], max_tones),
+        amplitude=amplitude,
         phase=preassigned_phases(*grid.shape, rf.phase_seed)[axis],
         max_tones=max_tones,
         limits=_limits(rf, axis, np.sign(step_hz)),

@@ -106,7 +106,7 @@ def check_plan(
         InvalidPlanError: The plan breaks a rule; it says which, where and how. Or plan,
             target, grid or motion is something else.
         LimitError: The degree of parallelism is no whole number or below 1, or the speed
-            profile is none that exists.
+            profile does not exist.
 
     Example:
         >>> target = TargetPattern(fill=[[False, True]], clear=[[True, False]])
@@ -129,6 +129,10 @@ def check_plan(
         raise InvalidPlanError("shape", detail, planner=planner)
     grid = grid or default_grid(*target.shape)
     max_tweezers = min(degree_of_parallelism, motion.max_tweezers)
+    overheads_s = motion.overhead_per_cycle_s, motion.overhead_per_batch_s
+    times_s = np.array(
+        [*overheads_s, motion.pick_up_s, site_time_s(grid, motion), motion.drop_off_s], np.float64
+    )
     end_s = np.empty(plan.n_batches, np.float64)
     n_tweezers = np.empty(plan.n_batches, np.int32)
     fault, *where = check(
@@ -140,11 +144,7 @@ def check_plan(
         motion.max_row_tones,
         motion.max_column_tones,
         motion.eject_slots,
-        motion.pick_up_s,
-        motion.drop_off_s,
-        site_time_s(grid, motion),
-        motion.overhead_per_batch_s,
-        motion.overhead_per_cycle_s,
+        times_s,
         end_s,
         n_tweezers,
     )

@@ -1,7 +1,11 @@
 """Kernels of the plan check.
 
 They take any int16 moves: no index is used before it has been tested. A goal off
-the grid ejects the atom.
+the grid ejects the atom. In all of them ``batch`` is the moves of one batch, int16 (n, 4),
+``atoms``, bool (n_rows, n_cols), is the occupancy, and ``stamp`` the number of the batch, from 1.
+``lifted`` and ``goals``, int32 (n_rows, n_cols), are the stamps of the last batches that lifted an
+atom from each site and brought one to it; ``row_goal`` and ``column_goal``, int64, are where the
+tone of each row and column goes, or NO_TONE.
 """
 
 from __future__ import annotations
@@ -53,99 +57,66 @@ ATOMS: Final = const("bool_", 2)
 STAMPS: Final = "int32[:, ::1]"
 
 
-@kernel(f"{FAULT}({MOVES}, int64, int64, int64, int64, int64, boolean)")
-def check_shapes(
-    moves: Moves, start: int, stop: int, n_rows: int, n_cols: int, slots: int, chained: bool
-) -> Fault:
+@kernel(f"{FAULT}({MOVES}, int64, int64, int64, boolean)")
+def check_shapes(batch: Moves, n_rows: int, n_cols: int, slots: int, chained: bool) -> Fault:
     """Test that each move of a batch stays on the grid and all run along one axis.
 
-    Args:
-        moves: int16 (n, 4) of the plan; the batch is ``moves[start:stop]``.
-        start: Where the batch starts.
-        stop: Where it stops.
-        n_rows: Rows of the grid.
-        n_cols: Columns of the grid.
-        slots: Ejection slots on each side.
-        chained: Whether the batch or the one after it is linked: then an atom may wait.
+    In a ``chained`` batch, one that is linked or has the next one linked to it, an atom may wait.
     """
     first_along_row = first_along_column = -1
-    for i in range(start, stop):
-        row, col, to_row, to_col = moves[i, 0], moves[i, 1], moves[i, 2], moves[i, 3]
+    for i in range(len(batch)):
+        row, col, to_row, to_col = batch[i, 0], batch[i, 1], batch[i, 2], batch[i, 3]
         if not (0 <= row < n_rows and 0 <= col < n_cols):
-            return SOURCE_OUTSIDE, i - start, row, col
+            return SOURCE_OUTSIDE, i, row, col
         if row != to_row and col != to_col:
-            return DIAGONAL, i - start, to_row, to_col
+            return DIAGONAL, i, to_row, to_col
         if not (-slots <= to_row < n_rows + slots and -slots <= to_col < n_cols + slots):
-            return GOAL_OUTSIDE, i - start, to_row, to_col
+            return GOAL_OUTSIDE, i, to_row, to_col
         if col != to_col:
-            first_along_row = i - start
+            first_along_row = i
         elif row != to_row:
-            first_along_column = i - start
+            first_along_column = i
         elif not chained:
-            return NO_LENGTH, i - start, row, col
+            return NO_LENGTH, i, row, col
         if first_along_row >= 0 and first_along_column >= 0:
-            return TWO_AXES, i - start, first_along_row, first_along_column
+            return TWO_AXES, i, first_along_row, first_along_column
     return RIGHT, -1, 0, 0
 
 
-@kernel(f"{FAULT}({MOVES}, int64, int64, int64, {ATOMS}, {STAMPS}, {STAMPS}, int64, boolean)")
+@kernel(f"{FAULT}({MOVES}, int64, {ATOMS}, {STAMPS}, {STAMPS}, int64, boolean)")
 def check_sites(
-    moves: Moves,
-    start: int,
-    stop: int,
-    start_before: int,
-    atoms: Bools,
-    lifted: Stamps,
-    goals: Stamps,
-    stamp: int,
-    linked: bool,
+    batch: Moves, n_before: int, atoms: Bools, lifted: Stamps, goals: Stamps, stamp: int, linked: bool
 ) -> Fault:
     """Test that a batch's sources hold atoms and its goals are free once these are lifted.
 
-    Args:
-        moves: int16 (n, 4) of the plan; the batch is ``moves[start:stop]``.
-        start: Where the batch starts.
-        stop: Where it stops.
-        start_before: Where the batch before it starts.
-        atoms: bool (n_rows, n_cols), before the batch.
-        lifted: int32 (n_rows, n_cols), stamp of the last batch that lifted an atom there; updated.
-        goals: int32 (n_rows, n_cols), stamp of the last batch that brought an atom there; updated.
-        stamp: Number of the batch, from 1.
-        linked: Whether the tweezers are on since the batch before.
+    ``n_before`` is the number of moves of the batch before, to which it may be linked.
     """
     n_rows, n_cols = atoms.shape
-    if linked and stop - start != start - start_before:
-        return LINKED_NUMBER, -1, stop - start, start - start_before
-    for i in range(start, stop):
-        row, col = moves[i, 0], moves[i, 1]
+    if linked and len(batch) != n_before:
+        return LINKED_NUMBER, -1, len(batch), n_before
+    for i in range(len(batch)):
+        row, col = batch[i, 0], batch[i, 1]
         if linked and goals[row, col] != stamp - 1:
-            return LINKED_ELSEWHERE, i - start, row, col
+            return LINKED_ELSEWHERE, i, row, col
         if not atoms[row, col]:
-            return NO_ATOM, i - start, row, col
+            return NO_ATOM, i, row, col
         if lifted[row, col] == stamp:
-            return SOURCE_TWICE, i - start, row, col
+            return SOURCE_TWICE, i, row, col
         lifted[row, col] = stamp
-    for i in range(start, stop):
-        row, col = moves[i, 2], moves[i, 3]
+    for i in range(len(batch)):
+        row, col = batch[i, 2], batch[i, 3]
         if 0 <= row < n_rows and 0 <= col < n_cols:
             if atoms[row, col] and lifted[row, col] != stamp:
-                return GOAL_TAKEN, i - start, row, col
+                return GOAL_TAKEN, i, row, col
             if goals[row, col] == stamp:
-                return GOAL_TWICE, i - start, row, col
+                return GOAL_TWICE, i, row, col
             goals[row, col] = stamp
     return RIGHT, -1, 0, 0
 
 
 @kernel("UniTuple(int64, 3)(int64[::1])")
 def tones_in_order(tone_goal: Ints) -> tuple[int, int, int]:
-    """Count the tones of an axis, and find the first two neighbours that meet.
-
-    Args:
-        tone_goal: int64 (n_sites,), where the tone at each site goes, or ``NO_TONE``.
-
-    Returns:
-        Number of tones, and the sites of two that come closer than one site (-1, -1: none).
-    """
+    """Count the tones of an axis, and find the first two that come closer than one site (-1, -1: none)."""
     n = 0
     before = -1
     meet, with_ = -1, -1
@@ -158,11 +129,9 @@ def tones_in_order(tone_goal: Ints) -> tuple[int, int, int]:
     return n, meet, with_
 
 
-@kernel(f"{FAULT}({MOVES}, int64, int64, int64[::1], int64[::1], int64, int64, int64)")
+@kernel(f"{FAULT}({MOVES}, int64[::1], int64[::1], int64, int64, int64)")
 def check_tones(
-    moves: Moves,
-    start: int,
-    stop: int,
+    batch: Moves,
     row_goal: Ints,
     column_goal: Ints,
     max_tweezers: int,
@@ -171,29 +140,19 @@ def check_tones(
 ) -> Fault:
     """Test that a batch needs one trajectory per tone, in order, and not too many tones.
 
-    Args:
-        moves: int16 (n, 4) of the plan; the batch is ``moves[start:stop]``.
-        start: Where the batch starts.
-        stop: Where it stops.
-        row_goal: Result, int64 (n_rows,), where each row's tone goes, or ``NO_TONE``.
-        column_goal: Result, int64 (n_cols,), likewise for the columns.
-        max_tweezers: Most tweezers on at once.
-        max_row_tones: Most row tones on at once.
-        max_column_tones: Most column tones on at once.
-
-    Returns:
-        The fault; if there is none, its last number is the number of tweezers.
+    Works out ``row_goal`` and ``column_goal``. If there is no fault, its last number is
+    the number of tweezers.
     """
     for row in range(len(row_goal)):
         row_goal[row] = NO_TONE
     for col in range(len(column_goal)):
         column_goal[col] = NO_TONE
-    for i in range(start, stop):
-        row, col, to_row, to_col = moves[i, 0], moves[i, 1], moves[i, 2], moves[i, 3]
+    for i in range(len(batch)):
+        row, col, to_row, to_col = batch[i, 0], batch[i, 1], batch[i, 2], batch[i, 3]
         if row_goal[row] != NO_TONE and row_goal[row] != to_row:
-            return ROW_TONE_SPLIT, i - start, row, int(row_goal[row])
+            return ROW_TONE_SPLIT, i, row, int(row_goal[row])
         if column_goal[col] != NO_TONE and column_goal[col] != to_col:
-            return COLUMN_TONE_SPLIT, i - start, col, int(column_goal[col])
+            return COLUMN_TONE_SPLIT, i, col, int(column_goal[col])
         row_goal[row] = to_row
         column_goal[col] = to_col
     n_row_tones, meet, with_ = tones_in_order(row_goal)
@@ -217,13 +176,6 @@ def check_paths(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column
     """Test that no crossing of two tones, named or not, meets an atom that stands.
 
     All tones that move do so along one axis, so a crossing goes straight.
-
-    Args:
-        atoms: bool (n_rows, n_cols), before the batch.
-        lifted: int32 (n_rows, n_cols), ``stamp`` where the batch lifts an atom; all others stand.
-        stamp: Number of the batch, from 1.
-        row_goal: int64 (n_rows,), see :func:`check_tones`.
-        column_goal: int64 (n_cols,), likewise.
     """
     n_rows, n_cols = atoms.shape
     for row in range(n_rows):
@@ -252,15 +204,15 @@ def check_paths(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column
 GRID: Final = "bool_[:, ::1]"
 
 
-@kernel(f"boolean({MOVES}, int64, int64, {GRID})")
-def move_atoms(moves: Moves, start: int, stop: int, atoms: Bools) -> bool:
+@kernel(f"boolean({MOVES}, {GRID})")
+def move_atoms(batch: Moves, atoms: Bools) -> bool:
     """Carry out a batch; return whether it ejects an atom."""
     n_rows, n_cols = atoms.shape
     ejects = False
-    for i in range(start, stop):
-        atoms[moves[i, 0], moves[i, 1]] = False
-    for i in range(start, stop):
-        row, col = moves[i, 2], moves[i, 3]
+    for i in range(len(batch)):
+        atoms[batch[i, 0], batch[i, 1]] = False
+    for i in range(len(batch)):
+        row, col = batch[i, 2], batch[i, 3]
         if 0 <= row < n_rows and 0 <= col < n_cols:
             atoms[row, col] = True
         else:
@@ -268,13 +220,13 @@ def move_atoms(moves: Moves, start: int, stop: int, atoms: Bools) -> bool:
     return ejects
 
 
-@kernel(f"int64({MOVES}, int64, int64)")
-def longest_move(moves: Moves, start: int, stop: int) -> int:
+@kernel(f"int64({MOVES})")
+def longest_move(batch: Moves) -> int:
     """Length of the longest straight move of a batch, in sites."""
     longest = 0
-    for i in range(start, stop):
-        down = abs(int(moves[i, 2]) - int(moves[i, 0]))
-        right = abs(int(moves[i, 3]) - int(moves[i, 1]))
+    for i in range(len(batch)):
+        down = abs(int(batch[i, 2]) - int(batch[i, 0]))
+        right = abs(int(batch[i, 3]) - int(batch[i, 1]))
         longest = max(longest, down + right)
     return longest
 
@@ -292,7 +244,7 @@ def count_wrong(atoms: Bools, fill: Bools, clear: Bools) -> tuple[int, int]:
 
 @kernel(
     f"UniTuple(int64, 5)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, {GRID}, int64, int64, int64,"
-    " int64, float64, float64, float64, float64, float64, float64[::1], int32[::1])"
+    " int64, float64[::1], float64[::1], int32[::1])"
 )
 def check(
     moves: Moves,
@@ -303,11 +255,7 @@ def check(
     max_row_tones: int,
     max_column_tones: int,
     slots: int,
-    pick_up_s: float,
-    drop_off_s: float,
-    site_s: float,
-    batch_overhead_s: float,
-    cycle_overhead_s: float,
+    times_s: NDArray[np.float64],
     end_s: NDArray[np.float64],
     n_tweezers: Stamps,
 ) -> tuple[int, int, int, int, int]:
@@ -318,15 +266,12 @@ def check(
         offsets: int32 (n_batches + 1,), from 0 to n_moves, not decreasing.
         linked: bool (n_batches,).
         atoms: bool (n_rows, n_cols), before the plan; holds the occupancy after it.
-        max_tweezers: Most tweezers on at once.
-        max_row_tones: Most row tones on at once.
-        max_column_tones: Most column tones on at once.
+        max_tweezers: Maximum number of tweezers on at once.
+        max_row_tones: Maximum number of row tones on at once.
+        max_column_tones: Maximum number of column tones on at once.
         slots: Ejection slots on each side.
-        pick_up_s: Pick-up ramp, in seconds.
-        drop_off_s: Drop-off ramp, in seconds.
-        site_s: Time to move by one site, in seconds.
-        batch_overhead_s: Time before each batch that is not linked, in seconds.
-        cycle_overhead_s: Time before the first batch, in seconds.
+        times_s: float64 (5,): before the first batch, before each batch that is not linked,
+            pick-up ramp, move by one site, drop-off ramp.
         end_s: Result, float64 (n_batches,), end of each batch.
         n_tweezers: Result, int32 (n_batches,), tweezers on in each batch.
 
@@ -334,39 +279,37 @@ def check(
         The first fault, its batch and atom move (-1: none in particular), and two
         numbers that belong to it.
     """
-    n_batches = len(linked)
+    n_batches, n_before = len(linked), 0
     lifted = np.zeros(atoms.shape, np.int32)
     goals = np.zeros(atoms.shape, np.int32)
     row_goal = np.empty(atoms.shape[0], np.int64)
     column_goal = np.empty(atoms.shape[1], np.int64)
     ejected = False
-    time_s = cycle_overhead_s
-    for batch in range(n_batches):
-        start, stop = offsets[batch], offsets[batch + 1]
-        follows = linked[batch]
-        leads = batch + 1 < n_batches and linked[batch + 1]
-        if start == stop:
-            return EMPTY_BATCH, batch, -1, 0, 0
-        if follows and batch == 0:
-            return LINKED_FIRST, batch, -1, 0, 0
+    time_s = times_s[0]
+    for number in range(n_batches):
+        batch = moves[offsets[number] : offsets[number + 1]]
+        follows = linked[number]
+        leads = number + 1 < n_batches and linked[number + 1]
+        if len(batch) == 0:
+            return EMPTY_BATCH, number, -1, 0, 0
+        if follows and number == 0:
+            return LINKED_FIRST, number, -1, 0, 0
         if follows and ejected:
-            return LINKED_AFTER_EJECTION, batch, -1, 0, 0
-        stamp = batch + 1
-        fault = check_shapes(moves, start, stop, atoms.shape[0], atoms.shape[1], slots, follows or leads)
+            return LINKED_AFTER_EJECTION, number, -1, 0, 0
+        stamp = number + 1
+        fault = check_shapes(batch, atoms.shape[0], atoms.shape[1], slots, follows or leads)
         if fault[0] == RIGHT:
-            start_before = offsets[max(batch - 1, 0)]
-            fault = check_sites(moves, start, stop, start_before, atoms, lifted, goals, stamp, follows)
+            fault = check_sites(batch, n_before, atoms, lifted, goals, stamp, follows)
         if fault[0] == RIGHT:
-            fault = check_tones(
-                moves, start, stop, row_goal, column_goal, max_tweezers, max_row_tones, max_column_tones
-            )
-            n_tweezers[batch] = fault[3]
+            fault = check_tones(batch, row_goal, column_goal, max_tweezers, max_row_tones, max_column_tones)
+            n_tweezers[number] = fault[3]
         if fault[0] == RIGHT:
             fault = check_paths(atoms, lifted, stamp, row_goal, column_goal)
         if fault[0] != RIGHT:
-            return fault[0], batch, fault[1], fault[2], fault[3]
-        ejected = move_atoms(moves, start, stop, atoms)
-        time_s += 0.0 if follows else batch_overhead_s + pick_up_s
-        time_s += longest_move(moves, start, stop) * site_s + (0.0 if leads else drop_off_s)
-        end_s[batch] = time_s
+            return fault[0], number, fault[1], fault[2], fault[3]
+        ejected = move_atoms(batch, atoms)
+        n_before = len(batch)
+        time_s += 0.0 if follows else times_s[1] + times_s[2]
+        time_s += longest_move(batch) * times_s[3] + (0.0 if leads else times_s[4])
+        end_s[number] = time_s
     return RIGHT, -1, -1, 0, 0

@@ -80,14 +80,10 @@ STEP_OF_STEP: Final = 6
 
 @kernel(f"void({F64}, float64[:, ::1], float64, float64)")
 def enter_block(state: Floats, lanes: Floats, x: float, length: float) -> None:
-    """Prepare a group for a block.
+    """Prepare a group for a block that starts ``x`` samples after the start of the segment.
 
-    Args:
-        state: float64 (N_STATE,), its frequency and chirp given.
-        lanes: Result, float64 (4, LANES + 1), exp 2 pi i g_b r, and what it is
-            multiplied by from block to block.
-        x: Start of the block, in samples from the start of the segment.
-        length: Length of a block.
+    Its frequency and chirp are given in ``state``, float64 (N_STATE,). The result ``lanes``, float64
+    (4, LANES + 1), is exp 2 pi i g_b r, and what it is multiplied by from block to block.
     """
     frequency, chirp = state[FREQUENCY], state[CHIRP]
     state[NOW], state[NOW + 1] = turn(frequency * x + 0.5 * chirp * x * x)
@@ -99,15 +95,9 @@ def enter_block(state: Floats, lanes: Floats, x: float, length: float) -> None:
 
 @kernel(f"void({F32}, int64, int64, {F32}, {F32}, {F64})", fused=True)
 def add_parked(acc: Singles, n: int, block: int, re: Singles, im: Singles, state: Floats) -> None:
-    """Add a group at rest to ``n`` samples, and advance its state to the next block.
+    """Add a group at rest to the first ``n`` samples of ``acc``, and advance its state to the next block.
 
-    Args:
-        acc: float32 (>= n,), from the start of a block; updated.
-        n: How many samples.
-        block: Samples of a block.
-        re: float32 (>= block,), the group's table.
-        im: Its imaginary part.
-        state: float64 (N_STATE,), the group's state.
+    ``re`` and ``im``, float32 (>= block,), are the group's table.
     """
     x, y = state[NOW], state[NOW + 1]
     for b in range((n + block - 1) // block):
@@ -166,21 +156,10 @@ def add_moving(
     v_re: Singles,
     v_im: Singles,
 ) -> None:
-    """Add a moving group to ``n`` samples, and advance its state to the next block.
+    """Add a moving group to the first ``n`` samples of ``acc``, and advance its state to the next block.
 
-    Args:
-        acc: See :func:`add_parked`.
-        n: See there.
-        block: See there.
-        re: See there.
-        im: See there.
-        state: See there.
-        lane_re: float64 (LANES + 1,), cosine of g_b r; updated.
-        lane_im: Its sine.
-        by_re: What they are multiplied by from block to block.
-        by_im: Its imaginary part.
-        v_re: Scratch, float32 (>= LANES,): the lanes less 1, of which float32 holds more digits.
-        v_im: Their imaginary part.
+    The lanes, float64 (LANES + 1,), are cosine and sine of g_b r, and what they are multiplied by from
+    block to block. ``v_re`` and ``v_im`` are scratch: the lanes less 1, of which float32 holds more digits.
     """
     for b in range((n + block - 1) // block):
         for r in range(LANES):
@@ -200,13 +179,9 @@ def add_moving(
 def blend(tables: Singles, n: int, u: float, within: Singles, re: Singles, im: Singles) -> None:
     """Blend four tables into one by a cubic in the time since the start of the segment.
 
-    Args:
-        tables: float32 (8, >= n), real and imaginary part of the coefficient of each power.
-        n: How many samples.
-        u: Fraction of the segment that has passed at the start of the block.
-        within: float32 (>= n,), fraction of it that passes from there to each sample.
-        re: Result, float32 (>= n,).
-        im: Its imaginary part.
+    ``tables``, float32 (8, >= n), are real and imaginary part of the coefficient of each power. ``u``
+    is the fraction of the segment that has passed at the start of the block, ``within`` that from
+    there to each sample.
     """
     first = np.float32(u)
     for part, out in ((0, re), (1, im)):
@@ -322,17 +297,10 @@ def has_period(n_groups: int, block: int, length: float, workspace: Workspace) -
 
 @kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
 def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
-    """Render a part of segment ``i``.
+    """Render a part of segment ``i``, on the comb or blended, from sample ``skip`` of the segment on.
 
     It is worked out strip by strip, each from its start, so that a sample does not depend
     on the stretch.
-
-    Args:
-        axis: The axis.
-        i: The segment, on the comb or blended.
-        skip: Samples of the segment before the stretch.
-        out: Result, int16 (n,).
-        workspace: Workspace to work in.
     """
     _, offsets, _, path, _, _, _, _, delta, lengths, _, block = axis
     work, lanes, state = workspace[1], workspace[3], workspace[4]
@@ -388,12 +356,7 @@ CONST: Final = const("float64", 1)
 def distinct_tones(start_hz: Floats, distinct_hz: Floats) -> int:
     """Collect the different frequencies of some tones, to 1 Hz, in rising order.
 
-    Args:
-        start_hz: float64 (n_tones,).
-        distinct_hz: Result, float64 (MAX_TONES,).
-
-    Returns:
-        How many there are; -1 if they are more.
+    Returns how many there are; -1 if they are more than ``distinct_hz``, float64 (MAX_TONES,), can hold.
     """
     n = 0
     for k in range(len(start_hz)):
@@ -425,15 +388,10 @@ def count_multiples(gaps_hz: Floats, spacing_hz: float) -> tuple[int, float]:
 
 @kernel(f"float64({CONST})")
 def common_spacing(tones_hz: Floats) -> float:
-    """Find the largest spacing of which most gaps between tones are a multiple.
+    """Find the largest spacing, in Hz, of which most gaps between rising frequencies are a multiple.
 
-    Tried are the gaps and the differences of any two.
-
-    Args:
-        tones_hz: float64 (n,), rising.
-
-    Returns:
-        The spacing in Hz; 0 if there is one tone only, -1 if there are too many for a comb.
+    Candidates are the gaps and the differences of any two. Returns 0 if there is one tone only, -1 if
+    there are too many for a comb.
     """
     gaps_hz = tones_hz[1:] - tones_hz[:-1]
     gaps_hz = gaps_hz[gaps_hz > TOLERANCE_HZ]
@@ -456,13 +414,11 @@ def common_spacing(tones_hz: Floats) -> float:
 
 @kernel(f"void({CONST}, {CONST}, int64, float64[:, ::1])")
 def fill_teeth(cosine: Floats, sine: Floats, numerator: int, teeth: Floats) -> None:
-    """Fill in the cosine and the sine of each tooth's distance from the first over a period.
+    """Fill in cosine and sine of each tooth's distance from the first over a period.
 
-    Args:
-        cosine: float64 (period,), of one turn in steps of 1 / period.
-        sine: float64 (period,).
-        numerator: Turns per period from one tooth to the next.
-        teeth: Result, float64 (2 n_teeth, period).
+    The result is float64 (2 n_teeth, period). ``cosine`` and ``sine``, float64 (period,), are those of
+    one turn in steps of 1 / period; ``numerator`` is the number of turns per period from one tooth to
+    the next.
     """
     period = len(cosine)
     for tooth in range(len(teeth) // 2):

@@ -109,13 +109,7 @@ def course(kind: int, u: float) -> tuple[float, float, float, float]:
 
 @kernel("boolean(int64, float64, float64)")
 def is_steep(kind: int, sweep: float, length: float) -> bool:
-    """Whether the frequency of a tone changes too fast for :func:`add_tone`.
-
-    Args:
-        kind: Its course.
-        sweep: Its change in the segment, in cycles per sample.
-        length: Length of the segment, in samples.
-    """
+    """Whether the frequency of a tone changes too fast for :func:`add_tone`: by ``sweep`` in the segment."""
     chirp = abs(sweep) / length
     if kind == LINEAR:
         return chirp > MAX_CHIRP
@@ -184,19 +178,11 @@ def fill_nodes(
     n: int,
     nodes: Nodes,
 ) -> None:
-    """Compute phase, frequency and chirp of a tone in the middle of every LANES samples.
+    """Compute phase, frequency and chirp of a tone in the middle of every LANES samples, from ``x`` on.
 
     The third derivative is made part of the frequency such that its error is least.
-
-    Args:
-        kind: Course of the frequency.
-        phase: At the start of the segment, in cycles.
-        frequency: There, in cycles per sample.
-        sweep: Change of the frequency in the segment.
-        length: Length of the segment, in samples.
-        x: Samples from its start to the first sample.
-        n: Number of nodes.
-        nodes: Result, int32 (3, >= n), in 2^-32 cycles; the chirp halved and finer by BEND_BITS.
+    ``phase`` and ``frequency`` are those at the start of the segment, ``sweep`` is the change of the
+    frequency. The result is int32 (3, >= n), in 2^-32 cycles; the chirp halved and finer by BEND_BITS.
     """
     a, b, c = nodes[0], nodes[1], nodes[2]
     if kind == MINIMUM_JERK:
@@ -309,14 +295,7 @@ def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspa
 
 @kernel(f"void({AXIS}, int64, int16[::1], {WORKSPACE})")
 def render(axis: Axis, start: int, out: NDArray[np.int16], workspace: Workspace) -> None:
-    """Render a part of an axis; beyond its end the samples are 0.
-
-    Args:
-        axis: The axis.
-        start: First sample, counted from the start of the program.
-        out: Result, int16 (n,).
-        workspace: Workspace to work in, for this thread alone.
-    """
+    """Render samples ``start`` to ``start + len(out)`` of an axis; beyond its end they are 0."""
     path, first = axis[3], axis[7]
     stop = start + len(out)
     i = int(np.searchsorted(first, start, "right")) - 1
@@ -343,13 +322,9 @@ STORED_BLOCK: Final = 4096
 def sum_stored(
     stored: NDArray[np.int16], picked: NDArray[np.int64], first: int, out: NDArray[np.int16]
 ) -> None:
-    """Sum stored waveforms, block by block so that the sums stay in the fastest cache.
+    """Sum the stored waveforms int16 (n_tones, n) that are picked, from sample ``first`` on.
 
-    Args:
-        stored: int16 (n_tones, >= first + n_samples).
-        picked: int64 (n_picked,), which of them.
-        first: First sample.
-        out: Result, int16 (n_samples,).
+    Works block by block, so that the sums stay in the fastest cache.
     """
     for start in range(0, len(out), STORED_BLOCK):
         part = out[start : start + STORED_BLOCK]

@@ -71,16 +71,7 @@ def multiply(re: Floats, im: Floats, by_re: Floats, by_im: Floats, n: int) -> No
 def add_tooth(
     cosine: Floats, sine: Floats, weight_re: float, weight_im: float, re: Floats, im: Floats
 ) -> None:
-    """Add a tone to the sum over a period.
-
-    Args:
-        cosine: float64 (n,), of its tooth over a period.
-        sine: float64 (n,).
-        weight_re: Amplitude and phase of the tone.
-        weight_im: Their imaginary part.
-        re: float64 (>= n,), the sum so far; updated.
-        im: Its imaginary part.
-    """
+    """Add a tone, the wave of its tooth times a complex weight, to the sum over a period, float64 (>= n,)."""
     for j in range(len(cosine)):
         re[j] += weight_re * cosine[j] - weight_im * sine[j]
         im[j] += weight_re * sine[j] + weight_im * cosine[j]
@@ -90,13 +81,7 @@ def add_tooth(
 def fill_chirp(frequency: float, chirp: float, n: int, re: Singles, im: Singles, lanes: Floats) -> None:
     """Fill in exp 2 pi i (frequency j + chirp j^2 / 2), j = 0 ... n - 1.
 
-    Args:
-        frequency: In cycles per sample.
-        chirp: In cycles per sample squared.
-        n: How many samples.
-        re: Result, float32 (>= n + LANES,).
-        im: Its imaginary part.
-        lanes: Scratch, float64 (4, >= LANES).
+    ``re`` and ``im`` are float32 (>= n + LANES,), ``lanes`` is scratch, float64 (4, >= LANES).
     """
     step_re, step_im = turn(frequency + 0.5 * chirp)
     more_re, more_im = turn(chirp)
@@ -121,16 +106,18 @@ def fill_chirp(frequency: float, chirp: float, n: int, re: Singles, im: Singles,
 def find_chirp(frequency: float, chirp: float, n: int, chirps: Singles, keys: Floats, lanes: Floats) -> int:
     """Find or fill in exp 2 pi i (frequency j + chirp j^2 / 2), which many segments share.
 
+    Frequency and chirp are rounded to grids that make no difference in a block.
+
     Args:
-        frequency: In cycles per sample; rounded to a grid that makes no difference in a block.
-        chirp: In cycles per sample squared; likewise.
+        frequency: In cycles per sample.
+        chirp: In cycles per sample squared.
         n: Samples of a block.
         chirps: float32 (N_CHIRPS, 2, >= n + LANES), those that there are; updated.
-        keys: float64 (2 N_CHIRPS + 1,), frequency and chirp of each, and how often one was filled in.
+        keys: float64 (2 N_CHIRPS + 1,), frequency and chirp of each, and how many were filled in.
         lanes: Scratch, see :func:`fill_chirp`.
 
     Returns:
-        Where in ``chirps`` it is.
+        Its index in ``chirps``.
     """
     frequency = np.rint(frequency * FREQUENCY_GRID) / FREQUENCY_GRID
     chirp = np.rint(chirp * CHIRP_GRID) / CHIRP_GRID
@@ -226,12 +213,8 @@ def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
 def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[float, float]:
     """Amplitude and phase of a tone relative to its tooth at a fraction ``u`` of the segment.
 
-    Args:
-        u: From 0 to 1.
-        a: Amplitude at the start.
-        b: Amplitude at the end.
-        drift: How far it leaves the tooth with its first frequency, in cycles.
-        bend: How far it does with its chirp.
+    The amplitude goes from ``a`` to ``b``; ``drift`` and ``bend`` are the cycles by which the tone
+    leaves the tooth in the segment, by its first frequency and by its chirp.
     """
     amplitude = math.sqrt(max(0.0, a * a + (b * b - a * a) * u))
     re, im = turn(drift * u + bend * u * u)
@@ -240,19 +223,7 @@ def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[
 
 @kernel(f"float64(float64, float64, float64, float64, {F64}, {F64})")
 def fit_cubic(a: float, b: float, drift: float, bend: float, re: Floats, im: Floats) -> float:
-    """Fit a cubic to :func:`slow_part`.
-
-    Args:
-        a: See there.
-        b: See there.
-        drift: See there.
-        bend: See there.
-        re: Result, float64 (4,), coefficient of each power of u.
-        im: Their imaginary part.
-
-    Returns:
-        Its largest error.
-    """
+    """Fit a cubic in u to :func:`slow_part`, coefficients float64 (4,) by power; return its largest error."""
     re[:], im[:] = 0.0, 0.0
     for n in range(N_COEFFICIENTS):
         x, y = slow_part(NODES[n], a, b, drift, bend)
@@ -275,14 +246,8 @@ def off_tooth(
 ) -> tuple[float, float]:
     """Phase by which tone ``k`` leaves its tooth of the group's comb, in cycles: by frequency, by chirp.
 
-    Args:
-        tones: float64 (5, n_tones).
-        k: The tone.
-        anchor: The group's first tone, which defines its frequency and chirp.
-        tooth: The tone's tooth.
-        anchor_tooth: That of the group's first tone.
-        step: Spacing of the teeth, in cycles per sample.
-        length: Length of the segment, in samples.
+    ``anchor`` is the group's first tone, which defines its frequency and chirp; the spacing of the teeth,
+    ``step``, is in cycles per sample, the ``length`` of the segment in samples.
     """
     apart = tones[START, k] - tones[START, anchor] - step * (tooth - anchor_tooth)
     sweep = (tones[END, k] - tones[START, k]) - (tones[END, anchor] - tones[START, anchor])
@@ -500,13 +465,10 @@ def repeat(out: NDArray[np.int16], skip: int, block: NDArray[np.int16], n: int) 
 
 @kernel("void(float32[::1], int64, float64, float64)", fused=True)
 def apply_envelope(values: Singles, n: int, start: float, slope: float) -> None:
-    """Multiply by an amplitude whose square changes linearly from sample to sample.
+    """Multiply ``n`` samples by an amplitude whose square changes linearly from sample to sample.
 
-    Args:
-        values: float32 (>= n rounded up to a multiple of LANES,), changed in place.
-        n: How many.
-        start: Squared amplitude at the first; below 0 counts as 0.
-        slope: Its change from each to the next.
+    ``start`` is the squared amplitude at the first sample (below 0 counts as 0), ``slope`` its change from
+    each to the next; ``values`` is float32, its length a multiple of LANES.
     """
     by = np.float32(slope)
     for q in range((n + LANES - 1) // LANES):
@@ -541,17 +503,7 @@ def take_tones(
     sample_rate_hz: float,
     tones: Floats,
 ) -> tuple[int, int]:
-    """Convert the tones of an axis to the units of rendering.
-
-    Args:
-        start_hz: See :class:`labseq.model.AxisTones`, as for the next five.
-        end_hz: See there.
-        start_amplitude: See there.
-        end_amplitude: See there.
-        phase_rad: See there.
-        offsets: See there.
-        sample_rate_hz: Sample rate.
-        tones: Result, float64 (5, n_tones), see :mod:`labseq.motion.render_kernels`.
+    """Convert the tones of an axis, as in :class:`labseq.model.AxisTones`, to the units of rendering.
 
     Returns:
         What is wrong, a field or SUM (FINE: nothing is), and the first tone or segment where it is.

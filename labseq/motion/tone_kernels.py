@@ -2,7 +2,8 @@
 
 The tones of an axis are kept as rows of a float64 array: frequency in Hz at the
 start and at the end of the segment, amplitude at the start and at the end, and
-phase at the start, in cycles.
+phase at the start, in cycles. The tones of a batch are int64 (2, >= n_tones): site and goal
+of each, in sites of the axis.
 """
 
 from __future__ import annotations
@@ -25,19 +26,7 @@ TONES: Final = "int64[:, ::1]"
 
 @kernel(f"int64({MOVES}, int64, int64, int64, int64, {TONES})")
 def collect_tones(moves: Moves, start: int, stop: int, axis: int, n_sites: int, tones: Ints) -> int:
-    """Collect the tones that a batch needs on an axis.
-
-    Args:
-        moves: int16 (n, 4) of the plan; the batch is ``moves[start:stop]``.
-        start: Where the batch starts.
-        stop: Where it stops.
-        axis: 0 for rows, 1 for columns.
-        n_sites: Sites of the axis.
-        tones: Result, int64 (2, >= n_sites), site and goal of each tone, by site.
-
-    Returns:
-        Number of tones.
-    """
+    """Collect the tones that the batch ``moves[start:stop]`` needs on an axis, by site."""
     on = np.zeros(n_sites, np.bool_)
     goal = np.zeros(n_sites, np.int64)
     for i in range(start, stop):
@@ -90,15 +79,9 @@ def frequency(site_hz: Floats, step_hz: float, site: int) -> float:
 
 @kernel(f"float64({SITES}, int64, int64, int64)")
 def amplitude(site_amplitude: Floats, site: int, goal: int, travelled: int) -> float:
-    """Amplitude of a tone in motion: its square changes linearly from that of the site to that of the goal.
+    """Amplitude of a tone after ``travelled`` sites: its square changes linearly from site to goal.
 
     Beyond the grid it is that of the outermost site.
-
-    Args:
-        site_amplitude: float64 (n_sites,), amplitude preassigned to each site.
-        site: Where the tone starts.
-        goal: Where it goes.
-        travelled: Sites that it has travelled, or more if it has arrived.
     """
     last = len(site_amplitude) - 1
     start, end = site_amplitude[site], site_amplitude[min(max(goal, 0), last)]
@@ -114,19 +97,11 @@ def amplitude(site_amplitude: Floats, site: int, goal: int, travelled: int) -> f
 def first_phases(
     tones: Ints, n_tones: int, preassigned: Floats, low_crest: bool, site_amplitude: Floats, phase: Floats
 ) -> None:
-    """Choose the phases of a batch's tones at pick-up.
+    """Choose the phases of a batch's tones at pick-up, in cycles: as preassigned, or for a low crest factor.
 
-    For a low crest factor they follow Schroeder (IEEE Trans. Inf. Theory 16, 85, 1970):
+    The latter follow Schroeder (IEEE Trans. Inf. Theory 16, 85, 1970):
     on a comb of teeth with relative powers p_l, the k-th has the phase
     ``-2 pi sum_(l < k) (k - l) p_l``. Tones that are off count as teeth without power.
-
-    Args:
-        tones: int64 (2, >= n_tones), site and goal of each tone.
-        n_tones: Number of tones.
-        preassigned: float64 (n_sites,), phase of each site's tone, in cycles.
-        low_crest: Whether to choose by Schroeder's rule instead.
-        site_amplitude: float64 (n_sites,), amplitude of each site's tone.
-        phase: Result, float64 (>= n_tones,), in cycles, 0 <= phase < 1.
     """
     if not low_crest:
         for k in range(n_tones):
@@ -160,16 +135,22 @@ DROP_OFF: Final = 3
 LINEAR: Final = 0  # as labseq.model.FrequencyCourse
 
 
+Sites = tuple[Floats, float, Floats]
+"""Frequency of each site, the step of an axis with a single one, amplitude of each site's tone."""
+Segments = tuple[Labels, Offsets, Floats, Offsets]
+"""Kind and course, batch and duration of each segment, and where its tones start."""
+SITES_OF_AXIS: Final = f"Tuple(({SITES}, float64, {SITES}))"
+SEGMENTS: Final = "Tuple((int8[:, ::1], int32[::1], float64[::1], int32[::1]))"
+
+
 @kernel(
-    f"int64(float64[:, ::1], int64, {SITES}, float64, {SITES}, {TONES}, int64, int64, int64, float64,"
-    " float64, float64, float64[::1])"
+    f"int64(float64[:, ::1], int64, {SITES_OF_AXIS}, {TONES}, int64, int64, int64, float64, float64, float64,"
+    " float64[::1])"
 )
 def add_tones(
     values: Floats,
     n: int,
-    site_hz: Floats,
-    step_hz: float,
-    site_amplitude: Floats,
+    sites: Sites,
     tones: Ints,
     n_tones: int,
     travelled: int,
@@ -179,15 +160,13 @@ def add_tones(
     duration_s: float,
     phase: Floats,
 ) -> int:
-    """Add one segment of an axis.
+    """Add the tones of a segment to the ``n`` that there are; return how many there are then.
 
     Args:
         values: float64 (5, capacity), the axis' tones so far; updated.
         n: How many there are.
-        site_hz: float64 (n_sites,), frequency of each site.
-        step_hz: See :func:`frequency`.
-        site_amplitude: float64 (n_sites,), amplitude of each site's tone.
-        tones: int64 (2, >= n_tones), site and goal of each tone.
+        sites: The sites of the axis.
+        tones: The batch's tones.
         n_tones: Number of tones.
         travelled: Sites travelled at the start; tones with a shorter way have arrived.
         arriving: Sites travelled at the end.
@@ -195,10 +174,8 @@ def add_tones(
         on_end: The same for the end.
         duration_s: Duration of the segment.
         phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
-
-    Returns:
-        How many tones there are then.
     """
+    site_hz, step_hz, site_amplitude = sites
     for k in range(n_tones):
         site, goal = tones[0, k], tones[1, k]
         way = goal - site
@@ -214,26 +191,16 @@ def add_tones(
     return n + n_tones
 
 
-@kernel(
-    "int64(int8[:, ::1], int32[::1], float64[::1], int32[::1], int64, int64, int64, int64, float64, int64)"
-)
+@kernel(f"int64({SEGMENTS}, int64, int64, int64, int64, float64, int64)")
 def add_segment(
-    labels: Labels,
-    batch_of: Offsets,
-    duration_s: Floats,
-    offsets: Offsets,
-    n: int,
-    kind: int,
-    course: int,
-    batch: int,
-    its_duration_s: float,
-    n_tones: int,
+    segments: Segments, n: int, kind: int, course: int, batch: int, duration_s: float, n_tones: int
 ) -> int:
-    """Record a segment that ends with ``n_tones`` tones in all; return the number of segments."""
+    """Add a segment that ends with ``n_tones`` tones in all; return the number of segments."""
+    labels, batch_of, durations_s, offsets = segments
     labels[0, n] = kind
     labels[1, n] = course
     batch_of[n] = batch
-    duration_s[n] = its_duration_s
+    durations_s[n] = duration_s
     offsets[n + 1] = n_tones
     return n + 1
 
@@ -255,9 +222,8 @@ def next_joint(tones: Ints, n_tones: int, others: Ints, n_others: int, travelled
 
 
 @kernel(
-    f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64, {SITES},"
-    f" float64, {SITES}, {SITES}, boolean, int64, {SITES}, int8[:, ::1], int32[::1], float64[::1],"
-    " int32[::1], float64[:, ::1])"
+    f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64,"
+    f" {SITES_OF_AXIS}, {SITES}, boolean, int64, {SITES}, {SEGMENTS}, float64[:, ::1])"
 )
 def build_axis(
     moves: Moves,
@@ -266,17 +232,12 @@ def build_axis(
     n_batches: int,
     axis: int,
     n_other_sites: int,
-    site_hz: Floats,
-    step_hz: float,
-    site_amplitude: Floats,
+    sites: Sites,
     preassigned: Floats,
     low_crest: bool,
     course: int,
     times_s: Floats,
-    labels: Labels,
-    batch_of: Offsets,
-    duration_s: Floats,
-    offsets: Offsets,
+    segments: Segments,
     values: Floats,
 ) -> tuple[int, int]:
     """Build all segments of a plan, and the tones of one axis in them.
@@ -291,69 +252,54 @@ def build_axis(
         moves: int16 (n, 4), sources on the grid.
         batch_offsets: int32 (>= n_batches + 1,).
         linked: bool (>= n_batches,).
-        n_batches: How many batches to write down.
+        n_batches: Number of batches to build.
         axis: 0 for the row tones, 1 for the column tones.
         n_other_sites: Sites of the other axis.
-        site_hz: float64 (n_sites,), frequency of each site of the axis.
-        step_hz: See :func:`frequency`.
-        site_amplitude: float64 (n_sites,), amplitude of each site's tone, as a fraction of full scale.
+        sites: The sites of the axis.
         preassigned: float64 (n_sites,), phase of each site's tone at pick-up, in cycles.
         low_crest: See :func:`first_phases`.
         course: Of the transports, a value of :class:`labseq.model.FrequencyCourse`.
         times_s: float64 (4,): the pause before each batch that is not linked, the pick-up
             ramp, the move by one site, the drop-off ramp.
-        labels: Result, int8 (2, >= n_segments), kind and course.
-        batch_of: Result, int32 (>= n_segments,).
-        duration_s: Result, float64 (>= n_segments,).
-        offsets: Result, int32 (> n_segments,), where each segment's tones start.
+        segments: Result, arrays of sufficient length.
         values: Result, float64 (5, >= n_tones), the tones.
 
     Returns:
         Number of segments and number of tones.
     """
     pause_s, pick_up_s, site_s, drop_off_s = times_s[0], times_s[1], times_s[2], times_s[3]
-    tones = np.empty((2, len(site_hz)), np.int64)
+    n_sites = len(preassigned)
+    tones = np.empty((2, n_sites), np.int64)
     others = np.empty((2, n_other_sites), np.int64)
-    phase = np.zeros(len(site_hz), np.float64)
-    offsets[0] = 0
+    phase = np.zeros(n_sites, np.float64)
+    segments[3][0] = 0
     m = n = 0
     for batch in range(n_batches):
         start, stop = batch_offsets[batch], batch_offsets[batch + 1]
-        n_tones = collect_tones(moves, start, stop, axis, len(site_hz), tones)
+        n_tones = collect_tones(moves, start, stop, axis, n_sites, tones)
         n_others = collect_tones(moves, start, stop, 1 - axis, n_other_sites, others)
         moving = last_arrival(tones, n_tones) > 0
         ramped = moving or (axis == 1 and last_arrival(others, n_others) == 0)
         off = 0.0 if ramped else 1.0
         if not linked[batch]:
-            first_phases(tones, n_tones, preassigned, low_crest, site_amplitude, phase)
+            first_phases(tones, n_tones, preassigned, low_crest, sites[2], phase)
             if pause_s > 0.0:
-                m = add_segment(labels, batch_of, duration_s, offsets, m, IDLE, LINEAR, batch, pause_s, n)
+                m = add_segment(segments, m, IDLE, LINEAR, batch, pause_s, n)
             if pick_up_s > 0.0:
-                n = add_tones(
-                    values, n, site_hz, step_hz, site_amplitude, tones, n_tones, 0, 0, off, 1.0, pick_up_s,
-                    phase,
-                )  # fmt: skip
-                m = add_segment(
-                    labels, batch_of, duration_s, offsets, m, PICK_UP, LINEAR, batch, pick_up_s, n
-                )
-        travelled = 0
+                n = add_tones(values, n, sites, tones, n_tones, 0, 0, off, 1.0, pick_up_s, phase)
+                m = add_segment(segments, m, PICK_UP, LINEAR, batch, pick_up_s, n)
+        at = 0
         while True:
-            arriving = next_joint(tones, n_tones, others, n_others, travelled, course)
-            if arriving == travelled:
+            goal = next_joint(tones, n_tones, others, n_others, at, course)
+            if goal == at:
                 break
-            took_s = (arriving - travelled) * site_s
-            n = add_tones(
-                values, n, site_hz, step_hz, site_amplitude, tones, n_tones, travelled, arriving, 1.0, 1.0,
-                took_s, phase,
-            )  # fmt: skip
-            m = add_segment(labels, batch_of, duration_s, offsets, m, TRANSPORT, course, batch, took_s, n)
-            travelled = arriving
+            took_s = (goal - at) * site_s
+            n = add_tones(values, n, sites, tones, n_tones, at, goal, 1.0, 1.0, took_s, phase)
+            m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)
+            at = goal
         if drop_off_s > 0.0 and not (batch + 1 < n_batches and linked[batch + 1]):
-            n = add_tones(
-                values, n, site_hz, step_hz, site_amplitude, tones, n_tones, travelled, travelled, 1.0, off,
-                drop_off_s, phase,
-            )  # fmt: skip
-            m = add_segment(labels, batch_of, duration_s, offsets, m, DROP_OFF, LINEAR, batch, drop_off_s, n)
+            n = add_tones(values, n, sites, tones, n_tones, at, at, 1.0, off, drop_off_s, phase)
+            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, drop_off_s, n)
     return m, n
 
 
@@ -418,7 +364,7 @@ def first_excess(offsets: Offsets, values: Floats, limits: Floats) -> tuple[int,
 
     Args:
         offsets: int32 (n_segments + 1,), where each segment's tones start.
-        values: float64 (5, n_tones), see :mod:`labseq.motion.tone_kernels`.
+        values: float64 (5, n_tones), the tones.
         limits: float64 (6,): lowest and highest frequency, least spacing, 1 or -1 where
             frequencies rise or fall from tone to tone, greatest sum of the amplitudes, greatest
             sum of their squares.

@@ -31,7 +31,7 @@ def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     way of a batch, so that a batch takes the same time whatever the course.
 
     Raises:
-        LimitError: The speed profile is none that exists.
+        LimitError: The speed profile does not exist.
 
     Example:
         >>> round(site_time_s(SiteGrid(), MotionSpec()), 9)
@@ -105,7 +105,7 @@ def tone_program(
         PlanError: The plan does not fit onto the grid, or has fewer batches than asked for.
         LimitError: Tones break a limit of AOD or amplifier (band, number, spacing, sum of
             amplitudes, peak voltage, mean power), the amplitudes are not one per site, or the
-            speed profile is none that exists.
+            speed profile does not exist.
     """
     from labseq.motion.tone_kernels import N_FIELDS, build_axis
 
@@ -134,17 +134,12 @@ def tone_program(
             n_batches,
             axis,
             grid.shape[1 - axis],
-            driven.site_hz,
-            driven.step_hz,
-            driven.amplitude,
+            (driven.site_hz, driven.step_hz, driven.amplitude),
             driven.phase,
             motion.rf.phases == "low_crest",
             course,
             times_s,
-            labels,
-            batch,
-            duration_s,
-            offsets,
+            (labels, batch, duration_s, offsets),
             values,
         )
         offsets = offsets[: n + 1]

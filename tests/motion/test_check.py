@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise, product
 from typing import Any
 
@@ -95,8 +96,8 @@ def test_defects_and_surplus_are_counted_after_the_plan() -> None:
 
 def test_times() -> None:
     """A site takes 1 s; linked batches need no overhead and no ramps."""
-    overheads: dict[str, float] = {"overhead_per_batch_s": 100.0, "overhead_per_cycle_s": 1000.0}
-    motion = MotionSpec(pick_up_s=3.0, drop_off_s=5.0, speed_m_s=10e-6, **overheads)
+    motion = MotionSpec(pick_up_s=3.0, drop_off_s=5.0, speed_m_s=10e-6)
+    motion = replace(motion, overhead_per_batch_s=100.0, overhead_per_cycle_s=1000.0)
     plan = [
         batch((0, 0, 0, 1), (0, 2, 0, 5)),
         batch((0, 5, 1, 5)),

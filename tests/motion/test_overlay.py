@@ -89,15 +89,6 @@ def test_the_far_side_of_the_ring_does_not_pull_the_centre(atoms: Any) -> None:
     assert fit.centre_m == pytest.approx(-hidden, abs=15e-9)
 
 
-def test_counts_of_each_site_are_added_up(atoms: Any) -> None:
-    offset = atoms.scan()
-    n, k = probe(atoms, offset, (0, 0), 300, 1)
-    spread = [np.stack([each // 3, each - each // 3], axis=1)[:, :, None] for each in (k, n - k)]
-    whole, split = fit_overlay(offset, n, k, GRID), fit_overlay(offset, sum(spread), spread[0], GRID)
-    assert split.centre_m == pytest.approx(whole.centre_m)
-    assert split.n_atoms == whole.n_atoms == n.sum()
-
-
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_without_a_peak_there_is_no_overlay(atoms: Any, share: float) -> None:
     offset = atoms.scan()

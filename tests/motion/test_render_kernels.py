@@ -17,7 +17,6 @@ from labseq.motion.render_kernels import (
     END_AMPLITUDE,
     FINE,
     N_FIELDS,
-    PHASE,
     START,
     START_AMPLITUDE,
     SUM,
@@ -170,12 +169,6 @@ def test_the_spacing_is_what_numpy_finds(sites: list[int], strays: list[float], 
     assert render_comb_kernels.common_spacing(hz) == pytest.approx(spacing_of(hz), rel=1e-12)
 
 
-@pytest.mark.parametrize(("sites", "steps"), [([0, 1, 2, 5], 1), ([0, 2, 5], 1), ([3, 7, 11], 4)])
-def test_the_spacing_is_the_largest_that_suits(sites: list[int], steps: int) -> None:
-    hz = 80e6 + SPACING_HZ * np.array(sites, np.float64)
-    assert render_comb_kernels.common_spacing(hz) == steps * SPACING_HZ
-
-
 def test_one_tone_has_no_spacing_and_too_many_have_none_in_common() -> None:
     assert render_comb_kernels.common_spacing(np.array([80e6])) == 0.0
     assert render_comb_kernels.common_spacing(np.array([80e6, 80e6 + 50])) == 0.0
@@ -206,21 +199,6 @@ def take(**changes: tuple[int, float]) -> tuple[tuple[int, int], NDArray[np.floa
     start_hz, end_hz, start, end, phase = fields
     tones = np.empty((N_FIELDS, 5))
     return take_tones(start_hz, end_hz, start, end, phase, OFFSETS, RATE_HZ, tones), tones
-
-
-@pytest.mark.parametrize(
-    ("name", "field"),
-    [
-        ("start_hz", START),
-        ("end_hz", END),
-        ("start_amplitude", START_AMPLITUDE),
-        ("end_amplitude", END_AMPLITUDE),
-        ("phase_rad", PHASE),
-    ],
-)
-def test_what_is_not_finite_is_found(name: str, field: int) -> None:
-    assert take(**{name: (3, math.nan)})[0] == (field, 3)
-    assert take(**{name: (4, -math.inf)})[0] == (field, 4)
 
 
 @pytest.mark.parametrize(

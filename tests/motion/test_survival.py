@@ -17,10 +17,6 @@ from labseq.motion.overlay import (
 SHAPE = SurvivalShape(0.95e-6, 0.12e-6, floor=0.02, ceiling=0.97)
 
 
-def test_a_peak_has_a_flat_top_and_an_edge() -> None:
-    assert SHAPE.survival([0.0, 0.95e-6, 1.4e-6]) == pytest.approx([0.97, 0.495, 0.02], abs=1e-3)
-
-
 def test_a_shape_comes_back_from_its_calibration() -> None:
     assert SurvivalShape.from_values(SHAPE.values()) == SHAPE
     assert SurvivalShape.from_values({"offset_m": [0.0, 0.0]}) is None
@@ -44,10 +40,6 @@ def test_residuals_are_the_roots_of_the_deviance(n: int, p: float, share: float)
     deviance = 2 * (log_likelihood(k / n) - log_likelihood(p))
     assert residual**2 == pytest.approx(deviance, rel=1e-6, abs=1e-9)
     assert residual * (k / n - p) >= 0
-
-
-def test_no_atoms_say_nothing() -> None:
-    assert deviance_residuals(np.zeros(1), np.zeros(1), np.array([0.3])).tolist() == [0.0]
 
 
 def test_the_covariance_of_a_share_is_binomial() -> None:

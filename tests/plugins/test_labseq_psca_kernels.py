@@ -197,13 +197,6 @@ class TestChooseRow:
         atoms = [[1, 0, 1, 1], [1, 1, 0, 0], [0, 0, 0, 0]]
         assert self.choose(atoms, [0, 0, 90, 90], [0, 0, -1, -1]) == (1, [-1, -1, 1, 1])
 
-    def test_counts_the_batches_that_a_row_takes(self) -> None:
-        atoms = [[1, 1, 1, 0], [0, 0, 1, 0]]
-        weights, leave = [0, 0, 0, 90], [0, 0, 0, -1]
-        assert self.choose(atoms, weights, leave, limit=1) == (0, [0, 0, -1, 1])
-        far = [[1, 1, 1, 0], [0, 1, 0, 0]]
-        assert self.choose(far, weights, [0, -1, -1, -1], limit=1) == (0, [-1, 0, 0, 1])
-
     @pytest.mark.parametrize(("order", "row"), [("HALF_FILLED", 1), ("FULLEST", 0), ("EMPTIEST", 2)])
     def test_of_equals_takes_the_first_in_the_order(self, order: str, row: int) -> None:
         atoms = [[1, 0, 1, 1], [1, 0, 0, 1], [1, 0, 0, 0]]
@@ -300,10 +293,6 @@ class TestRepair:
         batches, after = self.repair([[0, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
         assert batches == [[[0, 2, 0, 1], [0, 4, 0, 2], [0, 5, 0, 4]]]
         assert after.tolist() == [[False, True, True, False, True, False]]
-
-    def test_two_defects_of_a_line_are_filled_together(self) -> None:
-        batches, _ = self.repair([[0, 1, 0, 1, 1, 1]], [[1, 1, 1, 1, 0, 0]])
-        assert batches == [[[0, 1, 0, 0], [0, 3, 0, 1], [0, 4, 0, 2], [0, 5, 0, 3]]]
 
     def test_an_atom_comes_from_beside_where_the_line_has_none(self) -> None:
         batches, _ = self.repair(
