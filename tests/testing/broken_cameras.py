@@ -35,6 +35,12 @@ class ArrayWithAttributes:
         self.t_start_s = frame.t_start_s
 
 
+class GivesEmptyImages(RecordingCamera):
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.frame_shape = (0, 0)
+
+
 class TellsAnotherExposure(RecordingCamera):
     def read(self, timeout_s: float) -> Frame:
         frame = super().read(timeout_s)
@@ -58,6 +64,12 @@ class TellsTheWallClock(RecordingCamera):
         return replace(frame, t_start_s=frame.t_start_s + 1.7e9)
 
 
+class TellsTheTimeOfOpening(RecordingCamera):
+    def read(self, timeout_s: float) -> Frame:
+        frame = super().read(timeout_s)
+        return replace(frame, t_start_s=0.0)
+
+
 class SharesItsBuffer(RecordingCamera):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -69,6 +81,12 @@ class SharesItsBuffer(RecordingCamera):
         view = self.buffer[:]
         view.flags.writeable = False
         return replace(frame, image=view)
+
+
+class TriggersUnarmed(RecordingCamera):
+    def open(self) -> None:
+        super().open()
+        self._n_left = 1
 
 
 class StaysArmed(RecordingCamera):
@@ -111,15 +129,18 @@ PLANTED = Planted(
     (
         (SeedsRandom, "test_constructor_does_no_io"),
         (GivesAnArray, "test_gives_a_frame"),
+        (GivesEmptyImages, "test_gives_a_frame"),
         (TellsAnotherExposure, "test_gives_a_frame"),
         (ExposesOnceMore, "test_gives_as_many_frames_as_armed_for"),
         (ChangesItsShape, "test_gives_as_many_frames_as_armed_for"),
         (TellsTheWallClock, "test_tells_when_it_exposed"),
+        (TellsTheTimeOfOpening, "test_tells_when_it_exposed"),
         (CountsOnFromTheLastSeries, "test_numbers_its_frames"),
         (StampsBackwards, "test_numbers_its_frames"),
         (TakesAnyTrigger, "test_refuses_unknown_triggers"),
         (SaysItExposesByItself, "test_exposes_by_itself"),
         (SharesItsBuffer, "test_frames_do_not_change"),
+        (TriggersUnarmed, "test_refuses_trigger_without_arm"),
         (StaysArmed, "test_refuses_trigger_without_arm"),
     ),
 )
