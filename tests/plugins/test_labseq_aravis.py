@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,9 @@ def test_a_name_that_fits_no_camera_is_reported_with_those_there_are(
     assert caught.value.code == "not found"
     monkeypatch.setattr("labseq_aravis.camera.find_cameras", lambda: _found("A1"))
     assert {camera_id(fitting) for fitting in (None, "A1", "id A1")} == {"id A1"}
+    here = replace(*_found("A1"), address="192.168.7.2")
+    monkeypatch.setattr("labseq_aravis.camera.find_cameras", lambda: (here,))
+    assert camera_id("A1") == "192.168.7.2"
 
 
 @given(

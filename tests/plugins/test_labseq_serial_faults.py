@@ -76,6 +76,7 @@ def test_a_reply_that_comes_in_bits_is_put_together(counterpart: Counterpart, sy
 def test_what_comes_unasked_is_dropped(counterpart: Counterpart, synth: SerialDevice) -> None:
     counterpart.order("fault", "two", 1)
     assert synth.read("temperature") == pytest.approx(294.65)
+    counterpart.order("say", b"LATER\n".hex())
     assert synth.read("is_open") is False
     assert counterpart.log.count("STATE?") == 1
 
