@@ -341,14 +341,14 @@ def _too_late(cooling: Cooling, temperature_k: float) -> str:
 
 
 class SimulatedSensor:
-    """Exposes the simulated world for a camera, and knows when each frame could be read.
+    """Exposes the simulation for a camera, and knows when each frame could be read.
 
-    A virtual camera reads its frames here. The simulated counterpart of a real driver takes only the
-    pixels from here and sends them on the way that a real camera would; its driver then waits here until
-    the frame is due. Exposures may be asked for by another thread than frames.
+    A virtual camera reads its frames here. The simulator of a real camera takes only the pixels from here and
+    sends them as that camera would; its driver then waits here until the frame is due. One thread may ask for
+    exposures while another takes frames.
 
     Args:
-        world: The simulated world.
+        world: The simulation.
         clock: The session's clock.
     """
 
@@ -389,7 +389,7 @@ class SimulatedSensor:
             Its frame, which can be read when it is due; None if no further exposure is armed.
 
         Raises:
-            DeviceError: The world is further in time already.
+            DeviceError: The simulation is already at a later time.
         """
         with self._lock:
             series = self._series

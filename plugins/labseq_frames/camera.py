@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, Final, Literal
 
 from pydantic import Field
@@ -19,7 +20,6 @@ from labseq.plugin import (
     Duration,
     ExposureResult,
     FilePath,
-    Problem,
     Series,
     Settings,
 )
@@ -100,9 +100,8 @@ class FramesCamera(CameraDriver):
         try:
             self._source = self._look()
         except BadFramesError as error:
-            raise ConfigError(
-                Problem(error.what, f"{self._name}: {error.path}", expected=error.expected, hint=error.hint)
-            ) from error
+            source = f"{self._name}: {error.problem.source}"
+            raise ConfigError(replace(error.problem, source=source)) from error
         self._n_played = 0
 
     def _look(self) -> Source:

@@ -40,18 +40,12 @@ class BadFramesError(Exception):
     """Files that cannot be played; the camera turns it into an error of labseq.
 
     Attributes:
-        path: The file or folder, or a place in a file.
-        what: What is wrong with it.
-        expected: What was expected; may be empty.
-        hint: What to do; may be empty.
+        problem: The file or folder, what is wrong with it, and perhaps what was expected and what to do.
     """
 
     def __init__(self, path: Path | str, what: str, expected: str = "", hint: str = "") -> None:
-        self.path = path
-        self.what = what
-        self.expected = expected
-        self.hint = hint
-        super().__init__(str(Problem(what, str(path), expected=expected, hint=hint)))
+        self.problem = Problem(what, str(path), expected=expected, hint=hint)
+        super().__init__(str(self.problem))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
