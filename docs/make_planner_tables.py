@@ -27,8 +27,15 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.bench.comparison import BARE_MOTION, Comparison, Condition, PlannerEntry
-from labseq.bench.planners import BenchRequest, compare, read_request
+from labseq.bench.comparison import (
+    BARE_MOTION,
+    BenchRequest,
+    Comparison,
+    Condition,
+    PlannerEntry,
+    read_request,
+)
+from labseq.bench.planners import compare
 from labseq.bench.report import Report, Row, draw_histogram
 from labseq.model.estimate import Estimate
 from labseq.units import format_quantity

@@ -83,7 +83,7 @@ def planners(
     ] = None,
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
-    from labseq.bench.planners import BenchRequest
+    from labseq.bench.comparison import BenchRequest
     from labseq.bench.terminal import bench_planners
 
     request = BenchRequest(planners, grid, target, loading, dop, loadings, seed, tuple(overrides or ()))

@@ -7,29 +7,18 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import FrameType
 from typing import Any, Final, cast
 
 from labseq.bench.comparison import (
-    BARE_MOTION,
     Comparison,
-    Condition,
-    Done,
-    Job,
-    parse_entrants,
-    parse_grid,
-    parse_loading,
-    parse_overrides,
-    prepare,
-    set_up,
-    warm,
 )
 from labseq.bench.report import Report, Tally
+from labseq.bench.work import Done, Job, prepare, set_up, warm
 from labseq.errors import LabseqError, StopRequested
 
 _LOOK_S: Final = 0.1
@@ -135,31 +124,6 @@ MAX_AT_ONCE: Final = 50
 """Maximum number of loadings of a job; each process loses its current job when a comparison is stopped."""
 ALONE_S: Final = 2.0
 """Minimum work for a second process, in seconds: about the time to start one."""
-
-
-@dataclass(frozen=True, slots=True)
-class BenchRequest:
-    """The options of ``labseq bench planners`` that say what is compared, as text."""
-
-    planners: str = "psca"
-    grid: str = "20x20"
-    target: str = "compact:15x15"
-    loading: str = "75 %"
-    dop: int | None = None
-    loadings: int = 1000
-    seed: int = 1
-    overrides: Sequence[str] = ()
-
-
-def read_request(request: BenchRequest) -> Comparison:
-    """Convert a request to a comparison; raises ``ConfigError`` if it has an error."""
-    settings, motion = parse_overrides(request.overrides)
-    shape, loading = parse_grid(request.grid), parse_loading(request.loading)
-    condition = Condition(shape, request.target, loading, request.dop, (*BARE_MOTION, *motion))
-    called = f"--planners {request.planners}"
-    return Comparison(
-        parse_entrants(request.planners), (condition,), request.loadings, request.seed, settings, called
-    )
 
 
 def compare(

@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.bench.comparison import (
-    LOADING,
-    RESULT,
-    Comparison,
-    Condition,
-    Done,
-    Failure,
-    PlannerEntry,
-    PreparedCondition,
-)
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry
+from labseq.bench.work import LOADING, RESULT, Done, Failure, PreparedCondition
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import make_figure, save_figure
@@ -84,7 +76,7 @@ class Row:
         filling_fraction: Mean fraction of the target's sites that hold an atom after the plan.
         target_met: Fraction of the loadings whose plan ends with the target exactly met.
         bound: Mean number of lines that cover the vacancies, see
-            :func:`labseq.bench.comparison.lines_to_cover`.
+            :func:`labseq.bench.work.lines_to_cover`.
         ratio_to_bound: Mean number of batches over mean bound, both over the loadings
             whose target was filled.
         counts: int64 (n,), number of plans with 0, 1, 2, ... batches.

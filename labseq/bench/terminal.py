@@ -10,11 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from labseq.bench.comparison import BARE_MOTION, loading_seed
+from labseq.bench.comparison import BARE_MOTION, BenchRequest, read_request
 from labseq.bench.latency import GOAL_S, LatencyReport, LatencyRequest, Stage, measure_latency
-from labseq.bench.planners import BenchRequest, compare, read_request
+from labseq.bench.planners import compare
 from labseq.bench.rendering import WaveformReport, bench_waveform
 from labseq.bench.report import Report, Row, save_histogram
+from labseq.bench.work import loading_seed
 from labseq.console.output import (
     STDOUT,
     check_different,

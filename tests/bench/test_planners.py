@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from labseq.bench import planners as bench
-from labseq.bench.comparison import Comparison, Condition, PlannerEntry, draw, set_up
-from labseq.bench.planners import BenchRequest, compare, read_request
+from labseq.bench.comparison import BenchRequest, Comparison, Condition, PlannerEntry, read_request
+from labseq.bench.planners import compare
 from labseq.bench.report import Report
+from labseq.bench.work import draw, set_up
 from labseq.errors import ConfigError, PlanError
 
 SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from labseq.bench.comparison import PlannerEntry, parse_entrants, parse_grid, parse_loading, parse_overrides
+from labseq.bench.comparison import PlannerEntry, parse_grid, parse_loading, parse_overrides, parse_planners
 from labseq.errors import ConfigError
 
 
@@ -19,18 +19,18 @@ from labseq.errors import ConfigError
     ],
 )  # fmt: skip
 def test_commas_separate_planners_and_their_settings(text: str, planner_entries: list[PlannerEntry]) -> None:
-    assert list(parse_entrants(text)) == planner_entries
+    assert list(parse_planners(text)) == planner_entries
 
 
 @pytest.mark.parametrize("text", ["", "psca,,lsap", "psca:a", "psca:a=", "a b", "psca:=1"])
 def test_what_is_no_list_of_planners_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="this is no list of planners; expected names"):
-        parse_entrants(text)
+        parse_planners(text)
 
 
 def test_a_planner_is_named_once() -> None:
     with pytest.raises(ConfigError, match="'psca a=1' is named twice"):
-        parse_entrants("psca:a=1,psca,psca:a=1")
+        parse_planners("psca:a=1,psca,psca:a=1")
 
 
 @pytest.mark.parametrize("text", ["20", "0x5", "20x1001", "20x20x20", ""])

@@ -11,18 +11,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from labseq import Plan
-from labseq.bench.comparison import (
-    Comparison,
-    Condition,
-    Job,
-    PlannerEntry,
-    PreparedCondition,
-    draw,
-    lines_to_cover,
-    loading_seed,
-    set_up,
-    work,
-)
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry
+from labseq.bench.work import Job, PreparedCondition, draw, lines_to_cover, loading_seed, set_up, work
 from labseq.session.occupancies import read_source
 
 
@@ -64,7 +54,7 @@ def test_loadings_differ_from_one_another_and_fill_as_asked() -> None:
 
 
 class Scripted:
-    """A planner that gives back what it is told to."""
+    """A planner that returns a given plan, or raises a given error."""
 
     degree_of_parallelism = 1
 

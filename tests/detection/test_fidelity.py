@@ -59,15 +59,17 @@ def exposures(spacing: float, spot: float, n_frames: int) -> Iterator[tuple[Fram
     """Frame, atoms that survived it, atoms before it."""
     random = RandomStream(2026)
     settings = SimulationSettings.model_validate({"image": PLACE | {"spot": spot}})
-    world = VirtualSimulation(settings, Context("simulation", SiteGrid(spacing_m=spacing), random=random))
-    world.open()
-    world.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    simulation = VirtualSimulation(
+        settings, Context("simulation", SiteGrid(spacing_m=spacing), random=random)
+    )
+    simulation.open()
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     for shot in range(n_frames):
         random.begin_shot(shot, 0)
-        world.begin_shot()
-        world.load(0.0, 0.5)
-        before = world.truth()
-        yield world.expose(0.5, 45e-3), before & world.truth(), before
+        simulation.begin_shot()
+        simulation.load(0.0, 0.5)
+        before = simulation.truth()
+        yield simulation.expose(0.5, 45e-3), before & simulation.truth(), before
 
 
 def at(statistic: Floats, atoms: Bools, empty: Bools, threshold: float) -> Errors:

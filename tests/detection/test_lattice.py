@@ -71,7 +71,7 @@ def test_any_lattice_is_found_wherever_it_lies(
     assert furthest(found, sites) < 0.05 + 0.1 * width
 
 
-def test_what_is_found_is_told_in_the_grids_terms() -> None:
+def test_the_lattice_is_described_in_the_grids_terms() -> None:
     sites = seen_sites(GRID, 12.8, 3.0, 1.08, centre=MIDDLE)
     found = find_lattice(drawn(sites, SHAPE, 1.2, np.random.default_rng(1)), GRID)
     assert found.frame == SHAPE
@@ -134,7 +134,7 @@ def test_frames_without_a_lattice_say_why(image: NDArray[Any], reason: str) -> N
 
 
 @pytest.mark.parametrize("lit", [(8, 8), (9, 9)])
-def test_a_grid_of_another_size_is_told_with_both_sizes(lit: tuple[int, int]) -> None:
+def test_a_grid_of_another_size_is_refused_with_both_sizes(lit: tuple[int, int]) -> None:
     image = small_frame(grid=SiteGrid(*lit))
     with pytest.raises(DeviceError, match=rf"{lit[0]} x {lit[1]} rows and columns .* has 9 x 8"):
         find_lattice(image, SMALL)

@@ -28,7 +28,7 @@ def law(sensor: WeightedSettings, light: float) -> Floats:
     return np.fft.irfft(np.exp(transform) * np.sinc(t / 2 / np.pi), N)
 
 
-def told(found: LightLikelihood, light: float) -> Floats:
+def log_ratio(found: LightLikelihood, light: float) -> Floats:
     """Log-likelihood over that of the darkest light, for the counts 0 to N."""
     weight, constant = (np.interp(light, found.light, values) for values in (found.weight, found.constant))
     weight, constant = weight - found.weight[0], constant - found.constant[0]
@@ -51,7 +51,7 @@ def test_log_likelihoods_are_those_of_the_law(
     solid = (with_atom > 1e-9) & (without > 1e-9)
     often = ((with_atom + without) / 2)[solid]
     exact = np.log(with_atom[solid] / without[solid])
-    off = told(found, light)[solid] - exact
+    off = log_ratio(found, light)[solid] - exact
     assert np.sqrt((often * off**2).sum()) < 0.15 * np.sqrt((often * exact**2).sum()) + 0.02
 
 

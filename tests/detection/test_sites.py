@@ -116,10 +116,10 @@ def test_the_file_counts_before_the_calibration_and_that_before_the_geometry(
     np.testing.assert_allclose(by_geometry.sites_px, site_pixels(GRID, 0.35e-6, (29.5, 44.5)))
     np.testing.assert_array_equal(by_entry.sites_px, PLACES)
     np.testing.assert_array_equal(by_file.sites_px, moved)
-    told = [detector.describe()["sites"] for detector in (by_geometry, by_entry, by_file)]
-    assert told[0] == "the detector's settings"
-    assert entry.id in told[1]
-    assert "sites.npy" in told[2]
+    sources = [detector.describe()["sites"] for detector in (by_geometry, by_entry, by_file)]
+    assert sources[0] == "the detector's settings"
+    assert entry.id in sources[1]
+    assert "sites.npy" in sources[2]
 
 
 @MAKERS

@@ -245,7 +245,7 @@ def strokes(draw: st.DrawFn) -> list[tuple[Tones, Tones]]:
 
 PARTS = st.one_of(strokes(), strokes(), strokes(), st.tuples(CHAOS, CHAOS).map(lambda pair: [pair]))
 PROGRAMS = st.lists(PARTS, min_size=1, max_size=4)
-WORLDS = st.fixed_dictionaries(
+PHYSICS = st.fixed_dictionaries(
     {
         "transport_loss": st.sampled_from([0.0, 0.3]),
         "transport_loss_per_tone": st.sampled_from([0.0, 0.05]),
@@ -264,7 +264,7 @@ WORLDS = st.fixed_dictionaries(
 )
 
 
-@given(PROGRAMS, WORLDS, st.sampled_from([0.1, 0.4, 1.0]), st.sampled_from([1e-5, 1e-4, 1e-3]), st.data())
+@given(PROGRAMS, PHYSICS, st.sampled_from([0.1, 0.4, 1.0]), st.sampled_from([1e-5, 1e-4, 1e-3]), st.data())
 @settings(max_examples=60)
 def test_the_kernels_agree_with_the_naive_transport(
     parts: list[Any], simulation: dict[str, Any], filling: float, segment_s: float, data: st.DataObject

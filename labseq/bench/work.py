@@ -1,0 +1,353 @@
+"""The work of a comparison: plan for random loadings, check the plans, and count."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry
+from labseq.config.addresses import Override
+from labseq.config.document import Document
+from labseq.config.profile import MotionSettings
+from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
+from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
+from labseq.motion import check_plan
+from labseq.plugins import PluginHost
+from labseq.roles import Context, NeedsWarmUp, Planner
+from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
+from labseq.session.lab import construct
+from labseq.session.planning import parse_target
+from labseq.settings import Choice, PatternChoice
+
+_DOP: Final = "degree_of_parallelism"
+_MOTION_ADDRESS: Final = "profile.mobile_tweezers"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runner:
+    """A constructed planner, with all its settings, JSON-ready.
+
+    Attributes:
+        degree_of_parallelism: Maximum number of tweezers on at once, for the check of its plans.
+    """
+
+    planner: Planner
+    name: str
+    settings: Mapping[str, Any]
+    degree_of_parallelism: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedCondition:
+    """A condition, ready for planning, with one runner for each planner of the comparison."""
+
+    grid: SiteGrid
+    motion: MotionSpec
+    target: TargetPattern
+    loading: float
+    runners: tuple[Runner, ...]
+
+
+def set_up(comparison: Comparison) -> list[PreparedCondition]:
+    """Load the plugins, and validate and prepare every condition."""
+    host = load_plugins()
+    return [_prepare(host, comparison, condition) for condition in comparison.conditions]
+
+
+def warm(prepared: list[PreparedCondition]) -> None:
+    """Compile all kernels that will be needed, or load them from the cache."""
+    importlib.import_module("labseq.motion.check_kernels")
+    for runner in [runner for condition in prepared for runner in condition.runners]:
+        if isinstance(runner.planner, NeedsWarmUp):
+            try:
+                runner.planner.warm()
+            except Exception as error:
+                raise PlanError(f"warm() raised {type(error).__name__}: {error}", runner.name) from error
+
+
+def _prepare(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:
+    found = ProblemCollector()
+    grid, motion, target = SiteGrid(*condition.shape), _motion(condition), None
+    with found:
+        target = _target(host, condition, grid)
+    runners: list[Runner] = []
+    for planner_entry in comparison.planner_entries:
+        with found:
+            chosen = _planner(host, comparison, condition, planner_entry)
+            runners.append(_runner(chosen, grid, motion, comparison.seed))
+    found.raise_any()
+    assert target is not None
+    return PreparedCondition(grid, motion, target, condition.loading, tuple(runners))
+
+
+def _motion(condition: Condition) -> MotionSpec:
+    overrides = [
+        Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
+        for key, value in condition.motion
+    ]
+    document = _document(overrides, "motion")
+    motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
+    n = condition.degree_of_parallelism
+    limit, what = min(
+        (motion.max_tweezers, "the most tweezers that can be on at once"),
+        (max(motion.max_row_tones, motion.max_column_tones), "the most tones of an axis"),
+        key=lambda pair: pair[0],
+    )
+    if n is not None and not 1 <= n <= limit:
+        hint = f"or raise the limit: --set {_MOTION_ADDRESS}.max_tweezers={n}" if "tweezers" in what else ""
+        text = f"the degree of parallelism is {n}"
+        raise ConfigError(Problem(text, f"--dop {n}", expected=f"1 to {limit}, {what}", hint=hint))
+    return motion
+
+
+def _target(host: PluginHost, condition: Condition, grid: SiteGrid) -> TargetPattern:
+    option = f"--target {condition.target}"
+    name, settings = parse_target(condition.target)
+    overrides = [Override(f"pattern.{key}", value, option) for key, value in settings.items()]
+    try:
+        return construct_target(_choose(host, PatternChoice(pattern=name), overrides, option), grid)
+    except LimitError as error:
+        raise ConfigError(Problem(str(error), option)) from error
+
+
+def _planner(
+    host: PluginHost, comparison: Comparison, condition: Condition, planner_entry: PlannerEntry
+) -> ChosenPlugin:
+    name, dop = planner_entry.planner, condition.degree_of_parallelism
+    overrides = [Override(f"planner.{k}", v, f"--set planner.{k}={v}") for k, v in comparison.settings]
+    overrides += [Override(f"planner.{k}", v, comparison.called) for k, v in planner_entry.settings]
+    entry = host.registry.find("planner", name)
+    if entry is not None and dop is not None and _DOP in getattr(entry.settings_model, "model_fields", {}):
+        overrides.insert(0, Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
+    return _choose(host, Choice(use=name), overrides, comparison.called)
+
+
+def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option: str) -> ChosenPlugin:
+    """Resolve a plugin that was named in an option."""
+    kind = "pattern" if choice.key == "pattern" else "planner"
+    named = Override(f"{kind}.{choice.key}", choice.use, option)
+    return resolve(host, _document([named, *overrides], kind), kind, choice.placed(kind))
+
+
+def _document(overrides: list[Override], top: str) -> Document:
+    return Document.parse("{}", "the command line").override_all(overrides, may_add=(top,))
+
+
+def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
+    planner: Planner = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)[0]["planner"]
+    dop = getattr(planner, _DOP, None)
+    dop = dop if isinstance(dop, int) else motion.max_tweezers
+    return Runner(planner, chosen.entry.name, dump(chosen.entry, chosen.settings), dop)
+
+
+RESULT: Final = np.dtype(
+    [
+        ("n_batches", np.int32),
+        ("n_atoms_moved", np.int32),
+        ("distance_m", np.float64),
+        ("motion_s", np.float64),
+        ("n_scans", np.float64),
+        ("scan_s", np.float64),
+        ("planning_s", np.float64),
+        ("n_defects", np.int32),
+        ("n_surplus", np.int32),
+        ("failed", np.bool_),
+    ]
+)
+"""Results of one plan; linked batches, which share one pick-up, count as one. NaN without scans."""
+
+LOADING: Final = np.dtype([("n_atoms", np.int32), ("n_lines", np.int32)])
+"""Results of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
+
+_NO_SCANS: Final = (math.nan, math.nan)
+_FAILED: Final = (0, 0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
+
+
+class Scanned(Protocol):
+    """A plan made of scans, in which moving tweezers pick up and drop atoms without stopping.
+
+    Attributes:
+        plan: The equivalent batches.
+        n_scans: Number of scans, which the paper of the algorithm counts as moves.
+    """
+
+    @property
+    def plan(self) -> Plan: ...  # noqa: D102 - see above
+
+    @property
+    def n_scans(self) -> int: ...  # noqa: D102
+
+    def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:
+        """Time that the scans would take, in seconds."""
+        ...
+
+
+@runtime_checkable
+class ScanningPlanner(Protocol):
+    """A planner whose paper counts scans instead of batches; an optional capability."""
+
+    def scan(self, occupancy: Occupancy, target: TargetPattern) -> Scanned:
+        """Plan as ``plan()`` does, and return the scans too."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Loadings ``start`` to ``stop`` (exclusive) of a condition."""
+
+    condition: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A planner raised, or its plan breaks a rule; planner, condition and loading are indices."""
+
+    planner_entry: int
+    condition: int
+    loading: int
+    message: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Done:
+    """The results of a job.
+
+    Attributes:
+        results: :data:`RESULT` (n_planners, n_loadings).
+        loadings: :data:`LOADING` (n_loadings,).
+        failures: The first failure of each planner.
+    """
+
+    job: Job
+    results: NDArray[Any]
+    loadings: NDArray[Any]
+    failures: tuple[Failure, ...]
+
+
+def loading_seed(seed: int, index: int) -> int:
+    """The seed of loading ``index``: the first word of the state of the seed's index-th child.
+
+    A loading is ``numpy.random.default_rng(loading_seed).random((rows, cols)) <
+    loading``, as for ``labseq plan random:ROWSxCOLS@LOADING --seed LOADING_SEED``.
+
+    Example:
+        >>> child = np.random.SeedSequence(5).spawn(3)[2]
+        >>> loading_seed(5, 2) == int(child.generate_state(1)[0])
+        True
+    """
+    return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1)[0])
+
+
+def draw(shape: tuple[int, int], loading: float, seed: int, index: int) -> Occupancy:
+    """Draw a loading, bool ``shape``; see :func:`loading_seed`."""
+    return np.random.default_rng(loading_seed(seed, index)).random(shape) < loading
+
+
+def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """The smallest number of rows and columns that together cover all vacancies.
+
+    Every vacancy is filled by a batch that moves along its row or its column, so
+    no planner that moves one line at a time needs fewer batches. Vacancies as
+    edges between rows and columns make a bipartite graph, whose smallest vertex
+    cover is as large as its largest matching (D. Konig, 1931).
+
+    Args:
+        vacancies: bool (n_loadings, n_rows, n_cols), fill sites that are empty.
+
+    Returns:
+        int32 (n_loadings,).
+
+    Example:
+        >>> lines_to_cover(np.array([[[1, 1, 1], [0, 1, 0], [0, 0, 0]]], np.bool_))
+        array([2], dtype=int32)
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    n_loadings, n_rows, n_cols = vacancies.shape
+    loading, row, col = np.nonzero(vacancies)
+    ones = np.ones(len(loading), np.bool_)
+    shape = (n_loadings * n_rows, n_loadings * n_cols)  # one call for all loadings: one graph
+    graph = csr_array((ones, (loading * n_rows + row, loading * n_cols + col)), shape=shape)
+    matched = maximum_bipartite_matching(graph, perm_type="column")
+    return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
+
+
+def work(prepared: list[PreparedCondition], seed: int, job: Job) -> Done:
+    """Run every planner on the loadings of a job, and check and count its plans."""
+    condition = prepared[job.condition]
+    indices = range(job.start, job.stop)
+    occupancies = [draw(condition.grid.shape, condition.loading, seed, index) for index in indices]
+    loadings = np.empty(len(occupancies), LOADING)
+    stack = np.array(occupancies)
+    loadings["n_atoms"] = np.count_nonzero(stack, axis=(1, 2))
+    loadings["n_lines"] = lines_to_cover(condition.target.fill & ~stack)
+    results = np.empty((len(condition.runners), len(occupancies)), RESULT)
+    failures: list[Failure] = []
+    for i, runner in enumerate(condition.runners):
+        rows: list[tuple[Any, ...]] = []
+        for index, occupancy in zip(indices, occupancies, strict=True):
+            try:
+                rows.append(_run(condition, runner, occupancy))
+            except Exception as error:  # noqa: BLE001 - a planner may raise anything; it is counted
+                if not any(failure.planner_entry == i for failure in failures):
+                    failures.append(Failure(i, job.condition, index, _format_error(error)))
+                rows.append(_FAILED)
+        results[i] = rows
+    return Done(job, results, loadings, tuple(failures))
+
+
+def prepare(comparison: Comparison) -> Callable[[Job], Done]:
+    """Prepare for jobs; every planner is called once, so that no measured call is the first one."""
+    prepared = set_up(comparison)
+    warm(prepared)
+    for i in range(len(prepared)):
+        work(prepared, comparison.seed, Job(i, 0, 1))
+    return lambda job: work(prepared, comparison.seed, job)
+
+
+def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> tuple[Any, ...]:
+    own = occupancy.copy()  # a planner may change its input
+    scanned: Scanned | None = None
+    start_s = perf_counter()
+    if isinstance(runner.planner, ScanningPlanner):
+        scanned = runner.planner.scan(own, condition.target)
+        plan = scanned.plan
+    else:
+        plan = runner.planner.plan(own, condition.target)
+    planning_s = perf_counter() - start_s
+    dop = runner.degree_of_parallelism
+    report = check_plan(plan, occupancy, condition.target, dop, condition.grid, condition.motion)
+    scans = _NO_SCANS
+    if scanned is not None:
+        scans = float(scanned.n_scans), scanned.duration_s(condition.grid, condition.motion)
+    starts = ~plan.linked
+    n_atoms_moved = int(np.diff(plan.batch_offsets)[starts].sum())
+    n_sites = int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
+    return (
+        int(np.count_nonzero(starts)),
+        n_atoms_moved,
+        n_sites * condition.grid.spacing_m,
+        report.duration_s,
+        *scans,
+        planning_s,
+        report.n_defects,
+        report.n_surplus,
+        False,
+    )
+
+
+def _format_error(error: Exception) -> str:
+    if isinstance(error, PlanError):
+        return str(error)
+    text = str(error)
+    return f"plan() raised {type(error).__name__}" + (f": {text}" if text else "")
