@@ -92,8 +92,8 @@ class Bench:
 
     def __init__(self, lose: Mapping[int, str] | None = None, **facts: Any) -> None:
         self.clock = FakeClock()
-        told: dict[str, Any] = {"readout_s": 5e-3, "max_exposure_s": 10.0, "frame_shape": SHAPE} | facts
-        self.camera = TinyCamera(Context("cam", clock=self.clock), CameraFacts(**told), lose)
+        known: dict[str, Any] = {"readout_s": 5e-3, "max_exposure_s": 10.0, "frame_shape": SHAPE} | facts
+        self.camera = TinyCamera(Context("cam", clock=self.clock), CameraFacts(**known), lose)
         self.camera.open()
         self.camera.log.clear()
 

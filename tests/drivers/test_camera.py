@@ -172,7 +172,7 @@ def test_a_timeout_says_why_and_takes_its_time(
 
 
 @given(st.integers(1, 5), st.floats(1e-3, 1.0))
-def test_a_frame_tells_what_is_known_of_it(n_frames: int, exposure_s: float) -> None:
+def test_a_frame_carries_what_is_known_of_it(n_frames: int, exposure_s: float) -> None:
     bench = Bench()
     bench.clock.sleep(2.0)
     bench.fire(n_frames, exposure_s)
@@ -185,7 +185,7 @@ def test_a_frame_tells_what_is_known_of_it(n_frames: int, exposure_s: float) -> 
         assert math.isnan(frame.device_time_s)
 
 
-def test_what_the_camera_tells_goes_before_what_it_was_told(bench: Bench) -> None:
+def test_what_the_camera_reports_goes_before_what_was_requested(bench: Bench) -> None:
     bench.camera.tells = {"exposure_s": 0.011, "t_start_s": 7.0, "device_time_s": 1e6}
     bench.fire(1)
     frame = bench.read()

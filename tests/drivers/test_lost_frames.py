@@ -22,7 +22,7 @@ def outcomes(bench: Bench, n_reads: int) -> list[int | str]:
     return found
 
 
-def test_a_gap_in_the_numbers_is_told_once_and_the_next_frame_follows() -> None:
+def test_a_gap_in_the_numbers_is_reported_once_and_the_next_frame_follows() -> None:
     bench = Bench(lose={1: ""})
     bench.fire(3)
     said = "cam: frame 2 was lost, of a series of 3: the camera's frame numbers have a gap"
@@ -31,14 +31,14 @@ def test_a_gap_in_the_numbers_is_told_once_and_the_next_frame_follows() -> None:
         bench.read(0.0)
 
 
-def test_several_frames_in_a_gap_are_told_together() -> None:
+def test_several_frames_in_a_gap_are_reported_together() -> None:
     bench = Bench(lose={0: "", 1: "", 2: ""})
     bench.fire(5)
     said = "cam: frames 1 to 3 were lost, of a series of 5: the camera's frame numbers have a gap"
     assert outcomes(bench, 3) == [said, 3, 4]
 
 
-def test_a_frame_that_the_camera_reports_as_lost_is_told_with_its_reason() -> None:
+def test_a_frame_that_the_camera_reports_as_lost_is_reported_with_its_reason() -> None:
     bench = Bench(lose={0: "17 packets are missing", 2: "bad checksum"})
     bench.fire(3)
     assert outcomes(bench, 3) == [

@@ -43,8 +43,8 @@ def test_a_region_fits_if_its_last_pixel_is_on_the_sensor(y: int, x: int, height
 @given(sizes, sizes, st.integers(1, 8))
 def test_what_cannot_be_binned_is_refused(height: int, width: int, binning: int) -> None:
     fits = height % binning == 0 and width % binning == 0
-    told = "" if fits else f"{height} x {width} pixels cannot be binned by {binning}; choose a `region`"
-    assert camera(binning=binning).sensor_conflict((height, width)).startswith(told)
+    message = "" if fits else f"{height} x {width} pixels cannot be binned by {binning}; choose a `region`"
+    assert camera(binning=binning).sensor_conflict((height, width)).startswith(message)
     assert bool(camera(binning=binning).sensor_conflict((height, width))) != fits
     region = {"height": height, "width": width}
     if fits:
@@ -73,8 +73,8 @@ def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], reaso
 
 
 def test_a_temperature_is_given_in_degrees_celsius_or_kelvins() -> None:
-    for told in ("-70 degC", "203.15 K", 203.15):
-        cooling = CoolingSettings.model_validate({"temperature": told})
+    for given_as in ("-70 degC", "203.15 K", 203.15):
+        cooling = CoolingSettings.model_validate({"temperature": given_as})
         assert cooling.temperature == pytest.approx(203.15)
         assert cooling.spec() == Cooling(cooling.temperature, 1.0, 5.0, 900.0)
 
@@ -84,7 +84,7 @@ def test_cooling_says_how_steady_and_how_long() -> None:
     assert CoolingSettings.model_validate(given).spec() == Cooling(250.0, 0.5, 10.0, 300.0)
 
 
-@pytest.mark.parametrize("told", ["-70", -70, "-70 K", "-124 degC", "51 degC", "300 uK"])
-def test_what_is_no_temperature_of_a_sensor_is_refused(told: Any) -> None:
+@pytest.mark.parametrize("given_as", ["-70", -70, "-70 K", "-124 degC", "51 degC", "300 uK"])
+def test_what_is_no_temperature_of_a_sensor_is_refused(given_as: Any) -> None:
     with pytest.raises(ValidationError, match=r"degC|'-70' has no unit"):
-        CoolingSettings.model_validate({"temperature": told})
+        CoolingSettings.model_validate({"temperature": given_as})

@@ -80,7 +80,7 @@ def test_smaller_regions_and_isolated_crop_are_read_faster() -> None:
     assert times[0] > 5 * times[1] > 25 * times[2]
 
 
-def test_a_known_model_tells_sensor_and_read_out_before_it_is_opened() -> None:
+def test_sensor_and_read_out_of_a_known_model_are_known_before_it_is_opened() -> None:
     settings = AndorSettings.model_validate({"model": "DU-888", "readout_rate": "10 MHz"})
     facts = AndorCamera(settings, Context("camera")).facts
     assert facts.frame_shape == (1024, 1024)

@@ -137,7 +137,7 @@ def test_the_frames_of_a_run_come_shot_by_shot_or_only_the_first_of_each(tmp_pat
         player.take()
 
 
-def test_a_frame_tells_the_exposure_that_it_was_recorded_with(tmp_path: Path) -> None:
+def test_a_frame_has_the_exposure_that_it_was_recorded_with(tmp_path: Path) -> None:
     player = Player(write_run(tmp_path, [stack_of(2)], exposure_s=0.02)).open()
     player.clock.sleep(5.0)
     frame = player.take(exposure_s=0.045)

@@ -110,18 +110,18 @@ def test_what_is_no_ordinary_file_is_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "told"),
+    ("mode", "message"),
     [
         ("RGB", "8 bit colour;"),
         ("RGBA", "8 bit colour with transparency;"),
         ("1", "1 bit gray;"),
     ],
 )
-def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, told: str) -> None:
+def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, message: str) -> None:
     IMAGE.new(mode, (6, 4)).save(tmp_path / "x.png")
     text = refusal(tmp_path)
     assert "x.png: the picture is " in text
-    assert f"{told} expected 16 bit gray; save the camera's own counts" in text
+    assert f"{message} expected 16 bit gray; save the camera's own counts" in text
 
 
 def test_a_damaged_png_is_named(tmp_path: Path) -> None:
@@ -156,14 +156,14 @@ def test_files_of_another_size_are_found_before_anything_is_played(tmp_path: Pat
 
 
 def test_what_is_wrong_with_a_later_page_is_reported_when_it_comes(tmp_path: Path) -> None:
-    for file, later, told in (
+    for file, later, message in (
         ("size.tif", pixels(5), "page 2: the frame has 5 x 6 pixels, the first one 4 x 6"),
         ("dtype.tif", pixels(dtype="f4"), "page 2 is float32, 4 x 6; expected uint16"),
     ):
         with TIFFFILE.TiffWriter(tmp_path / file) as stack:
             for page in (pixels(), pixels(), later):
                 stack.write(page, contiguous=False)
-        assert told in failure(tmp_path / file, 2)
+        assert message in failure(tmp_path / file, 2)
 
 
 def test_a_stack_that_is_cut_off_never_counts_as_a_shorter_one(tmp_path: Path) -> None:
@@ -187,13 +187,13 @@ def test_a_stack_that_hides_its_frames_behind_one_page_is_refused(tmp_path: Path
 
 
 def test_a_run_without_its_frames_is_refused(tmp_path: Path) -> None:
-    for record_frames, n_shots, n_images, ends, told in (
+    for record_frames, n_shots, n_images, ends, message in (
         ("all", 2, 2, False, "the run is still being written; wait until it has ended"),
         ("none", 2, 2, True, "the run holds no frames; expected one that was made with `record_frames: all`"),
         ("all", 0, 2, True, "the run holds no complete shot"),
         ("all", 2, 0, True, "holds no frames; expected at least one"),
     ):
-        assert told in refusal(recorded(tmp_path, record_frames, n_shots, n_images, ends=ends))
+        assert message in refusal(recorded(tmp_path, record_frames, n_shots, n_images, ends=ends))
     run = recorded(tmp_path, record_frames="last")
     assert "the first image of the shot was not kept; record with" in refusal(run, images="first")
     camera_of(run).open()

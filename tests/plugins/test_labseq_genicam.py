@@ -87,7 +87,7 @@ def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure() -> None:
 @given(sensor=sensors(tuple(name for name in FORMATS if name != "Mono14")))
 def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]) -> None:
     with rig(**sensor) as lab:
-        told = lab.camera.facts.frame_shape
+        about = lab.camera.facts.frame_shape
         (frame,) = lab.take(1)
         assert lab.camera._link is not None
         features = ("OffsetY", "OffsetX", "Height", "Width")
@@ -95,7 +95,7 @@ def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]
     wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
     binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
     assert read == binned
-    assert told == tuple(binned[2:])
+    assert about == tuple(binned[2:])
     largest = 2 ** int(sensor["pixel_format"].removeprefix("Mono")) - 1
     np.testing.assert_array_equal(frame.image, np.minimum(lab.world.shown[0], largest))
 
@@ -130,20 +130,24 @@ def test_the_camera_answers_while_its_image_is_made(monkeypatch: pytest.MonkeyPa
 def test_it_says_what_it_is_and_what_it_took() -> None:
     with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2, serial="SIM1") as lab:
         lab.take(1, 0.02)
-        told = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
+        about = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
         assert lab.camera.facts.max_exposure_s == 10.0
         assert lab.camera._link is not None
         assert lab.camera._link.camera.packet_size == 9000
         assert lab.camera._link.camera.packet_delay_s == pytest.approx(1e-6)
-    assert (told["vendor"], told["model"], told["serial_number"]) == ("labseq", "Simulated", "SIM1")
-    assert (told["pixel_format"], told["frame_shape"], told["connection"]) == (
+    assert (about["vendor"], about["model"], about["serial_number"]) == (
+        "labseq",
+        "Simulated",
+        "SIM1",
+    )
+    assert (about["pixel_format"], about["frame_shape"], about["connection"]) == (
         "Mono16",
         [48, 64],
         "GigE Vision",
     )
-    assert told["firmware"]
-    assert told["gain_now"] == pytest.approx(6.0)
-    assert told["exposure_now_s"] == pytest.approx(0.02)
+    assert about["firmware"]
+    assert about["gain_now"] == pytest.approx(6.0)
+    assert about["exposure_now_s"] == pytest.approx(0.02)
 
 
 def test_a_camera_with_an_address_is_used_as_a_real_one() -> None:

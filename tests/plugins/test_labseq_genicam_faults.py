@@ -193,7 +193,7 @@ def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
         assert len(lab.take(1)) == 1
 
 
-def test_a_camera_that_reads_another_region_than_it_was_told_is_noticed() -> None:
+def test_a_camera_that_reads_another_region_is_noticed() -> None:
     with rig(region={"y": 0, "x": 0, "height": 32, "width": 32}) as lab:
         assert lab.camera._link is not None
         lab.camera._link.camera.set_integer("OffsetX", 5)

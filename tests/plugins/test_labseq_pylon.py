@@ -32,13 +32,13 @@ def pypylon() -> None:
 def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(sensor: dict[str, Any]) -> None:
     with rig(**sensor) as lab:
         frames = lab.take(2)
-        told = lab.camera.facts.frame_shape
+        about = lab.camera.facts.frame_shape
         nodes = lab.pylon.GetNodeMap()
         place = [nodes.GetNode(name).GetValue() for name in ("OffsetY", "OffsetX", "Height", "Width")]
     wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
     binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
     assert place == binned
-    assert told == tuple(binned[2:])
+    assert about == tuple(binned[2:])
     for frame, shown in zip(frames, lab.world.shown, strict=True):
         assert frame.image.dtype == np.uint16
         np.testing.assert_array_equal(frame.image, np.minimum(shown, 2 ** BITS[sensor["pixel_format"]] - 1))
@@ -74,13 +74,13 @@ class Slow:
 
 def test_it_says_what_it_is_and_what_it_took() -> None:
     with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2) as lab:
-        told = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
-    assert (told["model"], told["serial_number"]) == ("Emulation", "0815-0000")
-    assert told["firmware"]
-    assert told["gain_now"] == pytest.approx(6.0, abs=1e-3)
-    assert told["packet_size_now"] == 9000
-    assert told["pixel_format"] == "Mono16"
-    assert told["frame_shape"] == [48, 64]
+        about = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
+    assert (about["model"], about["serial_number"]) == ("Emulation", "0815-0000")
+    assert about["firmware"]
+    assert about["gain_now"] == pytest.approx(6.0, abs=1e-3)
+    assert about["packet_size_now"] == 9000
+    assert about["pixel_format"] == "Mono16"
+    assert about["frame_shape"] == [48, 64]
 
 
 def serial_numbers() -> list[str]:

@@ -166,7 +166,7 @@ def test_a_simulated_line_takes_its_time() -> None:
 
 
 class Answering(socketserver.StreamRequestHandler):
-    """An instrument on the network; it hangs up when told so."""
+    """An instrument on the network; it hangs up when described so."""
 
     def handle(self) -> None:
         for line in self.rfile:

@@ -75,9 +75,13 @@ def test_the_self_test_changes_no_line(simulated_by: str) -> None:
 @SIMULATED
 def test_it_says_what_it_is(simulated_by: str) -> None:
     with rig(simulated_by=simulated_by) as lab:
-        told = json.loads(json.dumps(dict(lab.lines.describe()), allow_nan=False))
-    assert (told["firmware"], told["serial_number"], told["started_by"]) == ("protocol 2", 0, "power-up")
-    assert told["lines"] == {"cooling": 2, "mot": 3, "imaging": 4, "camera": 5, "shutter": 6}
+        about = json.loads(json.dumps(dict(lab.lines.describe()), allow_nan=False))
+    assert (about["firmware"], about["serial_number"], about["started_by"]) == (
+        "protocol 2",
+        0,
+        "power-up",
+    )
+    assert about["lines"] == {"cooling": 2, "mot": 3, "imaging": 4, "camera": 5, "shutter": 6}
 
 
 def test_a_known_program_is_not_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:

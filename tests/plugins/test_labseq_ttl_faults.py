@@ -92,12 +92,12 @@ class DamagesLines(ModelBox):
 class DamagesAnswers(ModelBox):
     """Every other answer is damaged on its way back, but not that to `fire`, which is never sent twice."""
 
-    n_told = 0
+    n_sent = 0
 
     def _send(self, text: str) -> None:
-        self.n_told += 1
+        self.n_sent += 1
         is_answer = not text.startswith("!") and text[1:] != " ok"
-        self._out += framed(text).replace(b"*", b"+") if is_answer and self.n_told % 2 else framed(text)
+        self._out += framed(text).replace(b"*", b"+") if is_answer and self.n_sent % 2 else framed(text)
 
 
 def use_box(monkeypatch: pytest.MonkeyPatch, box: Any) -> None:
@@ -150,7 +150,7 @@ class KeepsQuiet(ModelBox):
             super()._send(text)
 
 
-def test_an_end_that_nobody_heard_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_whose_message_is_lost_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess.max_wait_s", 0.01)
     use_box(monkeypatch, KeepsQuiet())
     with rig() as lab:
@@ -190,18 +190,18 @@ class Other(ModelBox):
 
 
 @pytest.mark.parametrize(
-    ("says", "told"),
+    ("says", "text"),
     [
         ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers; expected 'labseq-ttl'"),
         ("labseq-ttl 03 0000 0000 01", "has version 3 of the protocol; expected 2"),
         ("labseq-ttl 02 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
     ],
 )
-def test_something_else_at_the_port_is_refused(monkeypatch: pytest.MonkeyPatch, says: str, told: str) -> None:
+def test_something_else_at_the_port_is_refused(monkeypatch: pytest.MonkeyPatch, says: str, text: str) -> None:
     other = Other()
     other.says = says
     use_box(monkeypatch, other)
-    with pytest.raises(DeviceError, match=told):
+    with pytest.raises(DeviceError, match=text):
         make_rig().lines.open()
 
 
@@ -219,18 +219,18 @@ class Mute(ModelBox):
         pass
 
 
-@pytest.mark.parametrize(("box", "told"), [(Babble, "but 'ERR -113"), (Mute, "is this the box's port")])
+@pytest.mark.parametrize(("box", "message"), [(Babble, "but 'ERR -113"), (Mute, "is this the box's port")])
 def test_a_port_at_which_no_box_answers_is_reported(
-    monkeypatch: pytest.MonkeyPatch, box: type[ModelBox], told: str
+    monkeypatch: pytest.MonkeyPatch, box: type[ModelBox], message: str
 ) -> None:
     monkeypatch.setattr(box_module, "BOOT_S", 0.0)
     monkeypatch.setattr("labseq_ttl_sim.access.SimulatedAccess.max_wait_s", 0.01)
     use_box(monkeypatch, box())
-    with pytest.raises(DeviceTimeoutError, match=told):
+    with pytest.raises(DeviceTimeoutError, match=message):
         make_rig().lines.open()
 
 
-def test_garbage_that_nobody_asked_for_does_no_harm() -> None:
+def test_garbage_does_no_harm() -> None:
     with rig() as lab:
         for noise in (b"\xff\x00\n", b"!done 0000 0007*0000\n", b"a ok*dead\n", b"x" * 10_000, b"\n"):
             lab.box.say(noise)
@@ -238,13 +238,13 @@ def test_garbage_that_nobody_asked_for_does_no_harm() -> None:
 
 
 @pytest.mark.parametrize(
-    ("says", "told"),
+    ("says", "text"),
     [("!off 0000", "told to turn all lines off"), ("!alone 0000", "heard nothing for 0 s")],
 )
-def test_a_box_that_turned_all_lines_off_by_itself_is_an_error(says: str, told: str) -> None:
+def test_a_box_that_turned_all_lines_off_by_itself_is_an_error(says: str, text: str) -> None:
     with rig() as lab:
         lab.box.say(framed(says))
-        with pytest.raises(DeviceError, match=told):
+        with pytest.raises(DeviceError, match=text):
             lab.fire()
         lab.lines.safe_state()
         works(lab)

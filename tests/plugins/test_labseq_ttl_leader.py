@@ -60,7 +60,7 @@ class Pins:
     def state(self) -> list[str]:
         return self.firmware.ask("a leader").split()[2:]
 
-    def told(self) -> list[tuple[int, set[str]]]:
+    def outputs(self) -> list[tuple[int, set[str]]]:
         """Clock cycle, and which of the leader's outputs were on from then on; "go" for its edge."""
         self.firmware.ask("a id")
         course: list[tuple[int, set[str]]] = []
@@ -79,12 +79,12 @@ def test_the_box_raises_busy_at_the_edge_and_the_answer_afterwards(running: Firm
     assert pins.go().split()[2] == "0001"
     assert pins.state() == ["02", "0001", "00", "01"]
     assert running.ask("a answer 1") == "a ok 02 00"
-    (went, go), (raised, busy), *_, (_, ready) = pins.told()
+    (went, go), (raised, busy), *_, (_, ready) = pins.outputs()
     assert (go, busy, ready) == ({"go"}, {"busy"}, {"ready"})
     assert (raised - went) / 16e6 < 50e-6
     pins.go()
     assert running.ask("a answer 0") == "a ok 02 00"
-    assert [names for _, names in pins.told()][-1] == {"failed"}
+    assert [names for _, names in pins.outputs()][-1] == {"failed"}
     assert pins.state() == ["01", "0002", "00", "01"]
 
 
@@ -119,25 +119,25 @@ def test_the_box_keeps_the_deadline_by_itself(running: Firmware) -> None:
     running.simavr.command("skip 16000000")
     while pins.state()[0] != "03":
         pass
-    (went, _), (_, busy), *_, (failed_at, failed) = pins.told()
+    (went, _), (_, busy), *_, (failed_at, failed) = pins.outputs()
     assert (busy, failed) == ({"busy"}, {"busy", "failed"})
     assert 0.43 < (failed_at - went) / 16e6 <= 0.5
     assert running.ask("a answer 1") == "a ok 03 00"
-    assert pins.told()[-1][1] == {"failed"}
+    assert pins.outputs()[-1][1] == {"failed"}
 
 
 def test_a_go_without_an_answer_has_failed_when_labseq_ends_or_is_silent(running: Firmware) -> None:
     pins = Pins(running)
     pins.go()
     running.ask("a deaf")
-    assert pins.told()[-1][1] == {"failed"}
+    assert pins.outputs()[-1][1] == {"failed"}
     assert running.ask("a answer 1") == "a no deaf"
     pins = Pins(running)
     pins.go()
     running.ask("a timeout 64")
     running.simavr.command("skip 4000000")
     assert (running.line() or "").startswith("!alone")
-    assert pins.told()[-1][1] == {"failed"}
+    assert pins.outputs()[-1][1] == {"failed"}
     running.ask("a timeout 0")
 
 
@@ -311,15 +311,15 @@ def test_an_unknown_signal_and_a_closed_box_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("go", "told"),
+    ("go", "message"),
     [
         ({"ready": 5}, "'failed' has no output"),
         ({"ready": 5, "failed": 5}, "'ready' and 'failed' are both on output 5"),
         ({"ready": 5, "failed": 8}, "expected an output of the box"),
     ],
 )
-def test_wrong_outputs_are_refused(go: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValidationError, match=told):
+def test_wrong_outputs_are_refused(go: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         GoSettings.model_validate(go)
 
 
