@@ -175,6 +175,16 @@ BOTH = "from: 1, to: 9"
         (f"use: climb, {OVER}", "1:7: 'points' is missing from 'scan' (the most points)"),
         (f"use: climb, {OVER}, points: 3, stop: 0.1", "'stop' is not a setting of scanner 'climb'"),
         (f"use: climb, over: {{{DOP}: {{from: 1}}}}, maximise: success, points: 3", "'to' is missing"),
+        (f"use: climb, over: {{{DOP}: [1, 9]}}, maximise: success, points: 3", f"{DOP} is a list"),
+        (
+            f"use: climb, over: {{{DOP}: {{from: 9, to: 1}}}}, maximise: success, points: 3",
+            "goes from 9 to 1",
+        ),
+        (
+            f"use: climb, over: {{{DOP}: {{from: 0, to: 9}}}}, maximise: success, points: 3",
+            f"puts it into '{DOP}'",
+        ),
+        (f"use: climb, {OVER}, minimise: success, points: 3", "'maximise' and 'minimise' are both given"),
         (
             f"use: climb, over: {{{DOP}: {{from: 1, to: 9 ms}}}}, maximise: success, points: 3",
             "'9 ms' does not go with 1; expected a number without a unit",
