@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
@@ -41,11 +42,10 @@ def test_a_picture_is_made_by_the_commands_of_its_page(name: str) -> None:
 
 def test_a_picture_can_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def run(program: list[str], *, cwd: Path, **_: object) -> None:
-        monkeypatch.chdir(cwd)
-        assert labseq(program[3:])[0] == 0
+        with chdir(cwd):
+            assert labseq(program[3:])[0] == 0
 
     monkeypatch.setattr("subprocess.run", run)
-    monkeypatch.chdir(tmp_path)
     SCRIPT.make("plan_kagome.png", tmp_path)
     with Image.open(tmp_path / "plan_kagome.png") as made, Image.open(STATIC / "plan_kagome.png") as kept:
         assert made.size == kept.size
