@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from labseq.bench.report import ratio_of_means
 
@@ -29,6 +29,7 @@ def test_a_ratio_to_nothing_is_not_known(below: list[float]) -> None:
     assert math.isnan(ratio_of_means([1.0] * len(below), below).value)
 
 
+@settings(max_examples=25)
 @given(POSITIVE, st.floats(-2.0, 2.0), st.lists(st.integers(1, 10_000), min_size=3, max_size=12, unique=True))
 def test_a_fit_finds_the_power_law_that_the_points_follow(
     factor: float, exponent: float, x: list[int]

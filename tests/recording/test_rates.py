@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.stats import beta
 
 from labseq.analysis.statistics import Rate, jeffreys
 
 
+@settings(max_examples=30)
 @given(st.integers(1, 20_000), st.floats(0, 1), st.floats(0.5, 0.999))
 def test_its_ends_are_quantiles_of_the_beta_distribution(n_trials: int, share: float, level: float) -> None:
     n = round(share * n_trials)
