@@ -34,9 +34,8 @@ class Lab:
         self.profile.write_text(HEAD + text, "utf-8")
 
     def calibrate(self, kind: str, **changes: Any) -> Outcome:
-        request = CalibrationRequest(
-            str(self.profile), **({"output": self.folder / "data", "seed": 1} | changes)
-        )
+        changes = {"output": self.folder / "data", "seed": 1} | changes
+        request = CalibrationRequest(str(self.profile), **changes)
         return calibrate(METHODS[kind], request, self.observer)
 
 

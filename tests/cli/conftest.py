@@ -35,7 +35,8 @@ def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
             os.dup2(descriptor, 1)
             os.close(descriptor)
         code: Any = leaving.value.code or 0
-        return code, *capfd.readouterr()
+        out, err = capfd.readouterr()
+        return code, out, err
 
     return run
 
