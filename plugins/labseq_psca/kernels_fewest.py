@@ -33,19 +33,20 @@ from labseq_psca.kernels_rows import count_columns, place_in_order, sort_row, un
 ON_TARGET: Final = 10  # more for an atom that lands on a fill site, less for one that leaves it
 EFFORT: Final = 240  # columns looked at closely for each choice, but no fewer than
 ROWS_TRIED: Final = 3  # so many rows; more hardly helps
+PLACES: Final = 1 << 20  # more than twice any place in an order
 PER_BATCH: Final = 1000  # worth per batch is compared in integers, in thousandths
 
 Work = tuple[Ints, NDArray[np.int8], Ints, Ints]
-"""int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange; int64 (3, n_cols) and (n_rows, 2)."""
-WORK: Final = "Tuple((int64[::1], int8[:, ::1], int64[:, ::1], int64[:, ::1]))"
+"""int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange; int64 (3, n_cols) and (n_rows,)."""
+WORK: Final = "Tuple((int64[::1], int8[:, ::1], int64[:, ::1], int64[::1]))"
 
 
-@kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[:, ::1])")
+@kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[::1])")
 def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, rank: Ints) -> None:
     """Bound from above what sorting each row is worth per batch.
 
-    The result, int64 (n_rows, 2), holds the bound, and the place in the order;
-    ``weight`` and ``leave`` are those of :func:`weigh_columns`.
+    The result, int64 (n_rows,), is the bound times PLACES, plus more for rows that are first in the
+    order; 0 for rows that cannot help. ``weight`` and ``leave`` are those of :func:`weigh_columns`.
     """
     n_rows, n_cols = atoms.shape
     for row in range(n_rows):
@@ -60,11 +61,11 @@ def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, r
             total += weight[col] if wanted else 0
             least = min(least, weight[col] if wanted else IMPOSSIBLE)
         n_most = min(n_leavers, n_vacancies)
-        rank[row, 0] = 0
-        rank[row, 1] = place_in_order(n_atoms, n_cols, order)
+        rank[row] = 0
         if n_most > 0:
             worth = total - (n_vacancies - n_most) * least + (ON_TARGET - 1) * n_most
-            rank[row, 0] = worth * PER_BATCH // ((n_most + limit - 1) // limit)
+            bound = worth * PER_BATCH // ((n_most + limit - 1) // limit)
+            rank[row] = bound * PLACES + PLACES // 2 - place_in_order(n_atoms, n_cols, order)
 
 
 @kernel(f"int64({LINE}, int64[::1], int64[::1], {WORK}, int64[::1])")
@@ -154,22 +155,15 @@ def choose_row(
     Returns:
         The row, or -1 if no row helps.
     """
-    n_rows, n_cols = atoms.shape
+    n_cols = atoms.shape[1]
     _, _, lists, rank = work
     gain, cost, trial = lists[0], lists[1], lists[2]
     rank_rows(atoms, weight, leave, limit, order, rank)
     best = 0
     best_row = -1
     for _ in range(max(ROWS_TRIED, EFFORT // n_cols)):
-        row = -1
-        for r in range(n_rows):
-            if rank[r, 0] > best and (
-                row < 0
-                or rank[r, 0] > rank[row, 0]
-                or (rank[r, 0] == rank[row, 0] and rank[r, 1] < rank[row, 1])
-            ):
-                row = r
-        if row < 0:
+        row = int(np.argmax(rank))
+        if rank[row] // PLACES <= best:
             break
         for col in range(n_cols):
             on_target = ON_TARGET if fill[row, col] else 0
@@ -182,7 +176,7 @@ def choose_row(
             best_row = row
             for col in range(n_cols):
                 change[col] = trial[col]
-        rank[row, 0] = 0
+        rank[row] = 0
     return best_row
 
 
@@ -199,7 +193,7 @@ def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int
         np.empty(n_cols + 1, np.int64),
         np.empty((n_cols, n_cols + 1), np.int8),
         np.empty((3, n_cols), np.int64),
-        np.empty((n_rows, 2), np.int64),
+        np.empty(n_rows, np.int64),
     )
     while weigh_columns(need, room, count, weight, leave) > 0:
         row = choose_row(atoms, fill, weight, leave, limit, order, work, change)

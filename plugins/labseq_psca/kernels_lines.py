@@ -260,15 +260,16 @@ def compress(
     """
     n_atoms = len(source)
     n_sites = len(fill)
-    n_fill = 0
+    n_fill = n_room = 0
     for site in range(n_sites):
+        n_room += not clear[site]
         if fill[site]:
             if n_fill < n_atoms:
                 goal[n_fill] = site
             n_fill += 1
     if n_fill >= n_atoms:  # no choice
         return n_fill == n_atoms
-    beyond = max(0, n_atoms + int(np.count_nonzero(clear)) - n_sites) if slots > 0 else 0
+    beyond = max(0, n_atoms - n_room) if slots > 0 else 0
     places = np.empty((n_atoms, 2), np.int64)
     reach(fill, n_atoms, beyond, places)
     before, last_before = 0, -1

@@ -27,7 +27,7 @@ def work(n: int, n_rows: int = 1) -> kernels_fewest.Work:
     step, lists, rank = (
         np.zeros((n, n + 1), np.int8),
         np.zeros((3, n), np.int64),
-        np.zeros((n_rows, 2), np.int64),
+        np.zeros(n_rows, np.int64),
     )
     return np.zeros(n + 1, np.int64), step, lists, rank
 
