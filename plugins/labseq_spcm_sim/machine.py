@@ -209,7 +209,7 @@ class Machine:
             self.fifo.set_length(loops * setup[r.SPC_SEGMENTSIZE])
             self.run = self.fifo
         self.running = True
-        self.triggered = self.trigger_enabled = self.underrun = False
+        self.triggered = self.underrun = False
 
     def _fire(self, now_s: float) -> None:
         """A trigger from any source."""
