@@ -13,13 +13,16 @@ import numpy as np
 
 import labseq
 from labseq.calibration.compare import Difference, compare
-from labseq.calibration.frequencies import analyse_frequencies
 from labseq.calibration.method import AnalysisResult, CalibrationData, Method
-from labseq.calibration.overlay import analyse_overlay
-from labseq.calibration.sites import analyse_sites, read_site_file
+from labseq.calibration.methods import (
+    analyse_frequencies,
+    analyse_overlay,
+    analyse_sites,
+    analyse_tweezers,
+    read_site_file,
+)
 from labseq.calibration.store import Store, Stored, grid_text
 from labseq.calibration.thresholds import analyse_thresholds
-from labseq.calibration.tweezers import analyse_tweezers
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError

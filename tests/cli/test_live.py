@@ -10,8 +10,7 @@ from hypothesis import given, strategies as st
 from rich.console import Console
 
 from labseq.cli.arrays import ASCII, UNICODE
-from labseq.cli.live import REDRAW_S, LiveView, Picture, draw_scan, observer_for
-from labseq.cli.tally import ScanTally, Tally
+from labseq.cli.live import REDRAW_S, LiveView, Picture, ScanTally, Tally, draw_scan, observer_for
 from labseq.console.events import LogLines
 from labseq.model import ShotRecord
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.tally import Tally
+from labseq.cli.live import Tally
 from labseq.cli.watch import POLL_S, EventReader, NewLines, watch_run
 from labseq.recording import RunWriter, open_run
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from labseq.calibration.frequencies import fit_frequencies, smoothed
+from labseq.calibration.methods import fit_frequencies, smoothed
 from labseq.errors import DeviceError
 from labseq.model import MotionSpec, RfSpec, SiteGrid
 

@@ -10,8 +10,8 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError
-from labseq.session.changes import changes_between
 from labseq.session.provenance import run_record
+from labseq.session.resume import changes_between
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import SEQUENCE, changed, no_git, resumed, stopped, stopped_home

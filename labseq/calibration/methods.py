@@ -1,18 +1,22 @@
-"""Calibration of the tone frequency of each row and column, from a run of probes."""
+"""Evaluates the runs that calibrate sites, tweezers, frequencies and overlay."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.calibration.method import AnalysisResult, CalibrationData, count_probed
-from labseq.calibration.overlay import offset_text
-from labseq.calibration.pictures import draw_tone_offsets
-from labseq.errors import DeviceError
+from labseq.builtin.equalise import READINGS
+from labseq.calibration.lattice import FoundLattice, find_lattice
+from labseq.calibration.method import AnalysisResult, CalibrationData, ProbeCounts, count_probed
+from labseq.calibration.pictures import draw_powers, draw_sites, draw_survival, draw_tone_offsets
+from labseq.detection.sites import read_sites
+from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.model import MotionSpec, SiteGrid
+from labseq.motion import overlay_offset
 from labseq.motion.axes import drive
 from labseq.motion.overlay import (
     MIN_P,
@@ -23,15 +27,129 @@ from labseq.motion.overlay import (
     fit_overlay,
     unit_axes,
 )
+from labseq.recording import Run
+from labseq.session.profile import ResolvedProfile
 from labseq.units import format_quantity
+
+
+def analyse_sites(data: CalibrationData) -> AnalysisResult:
+    """Find the lattice on the mean of the run's frames.
+
+    Raises:
+        DeviceError: No lattice was found; says why.
+        ConfigError: The run has no frames.
+    """
+    total, n_frames = np.zeros(1), 0
+    for frame in data.frames():
+        total, n_frames = total + frame.image, n_frames + 1
+    mean = total / n_frames
+    found = find_lattice(mean, data.hardware.grid)
+    quality = {
+        "residual_px": found.residual_px,
+        "n_sites_found": float(found.n_sites_found),
+        "spacing_px": sum(found.spacing_px) / 2,
+        "angle_rad": found.angle_rad,
+        "stretch": found.stretch,
+        "spot_px": found.spot_px,
+        "pixel_size_m": found.pixel_size_m,
+    }
+    return AnalysisResult(
+        {"positions_px": found.positions_px, "frame": found.frame},
+        quality,
+        _summary_lines(found, n_frames),
+        draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px),
+    )
+
+
+def read_site_file(path: Path, hardware: ResolvedProfile) -> AnalysisResult:
+    """Read the positions of the sites from a file, on frames of the size in the detector's settings.
+
+    Raises:
+        ConfigError: The file has an error, or the detector has no setting for the size of its frames.
+    """
+    settings: Any = hardware.chosen["detector"].settings
+    frame = getattr(settings, "frame", None)
+    if frame is None:
+        what = "the detector does not say how large the frames are that the sites are on"
+        raise ConfigError(Problem(what, expected="a detector with the setting 'frame'"))
+    positions = read_sites(path, hardware.grid.shape)
+    if np.any((positions < 0) | (positions > np.array(frame) - 1)):
+        what = f"some of the sites are outside of the frame of {frame[0]} x {frame[1]} pixels"
+        raise ConfigError(Problem(what, str(path), expected="(y, x) of each site on the frame"))
+    summary_lines = (f"{positions[..., 0].size} sites read from {path}",)
+    return AnalysisResult({"positions_px": positions, "frame": frame}, {}, summary_lines)
+
+
+def _summary_lines(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
+    along, down = found.spacing_px
+    angle, pixel = format_quantity(found.angle_rad, "angle"), format_quantity(found.pixel_size_m, "length")
+    seen = f"{found.n_sites_found} of {found.found.size} sites found on the mean of {n_frames} frames"
+    size = f"spacing {along:.2f} px along rows, {down:.2f} px from row to row"
+    form = f"rotated by {angle}, stretched by {100 * (found.stretch - 1):.1f} %"
+    return (
+        f"{seen}, {found.residual_px:.3f} px r.m.s. from a smooth lattice",
+        f"{size}; {form}; a pixel is {pixel} wide if the grid's spacing is true",
+    )
+
+
+def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
+    """Read the amplitudes that the step ``equalise`` found in the run's last shot.
+
+    Raises:
+        ConfigError: No shot of the run equalised the tweezers of this grid.
+    """
+    found = _readings(data.run)
+    rows, cols, before, after = (
+        np.array(found[name], np.float64)
+        for name in ("row_amplitudes", "column_amplitudes", "power_before", "power_after")
+    )
+    if (len(rows), len(cols)) != data.hardware.grid.shape:
+        raise _wrong_run(data.run, f"it equalised {len(rows)} x {len(cols)} tweezers")
+    names = ("separable_spread", "residual_spread", "noise", "n_measured")
+    quality = {name: float(found[name]) for name in names}
+    n_rounds = len(found["spreads"])
+    work = f"{n_rounds} round{'s' * (n_rounds > 1)}, {found['n_measured']} measurements"
+    spread = f"{quality['separable_spread']:.2%} (before: {found['spreads'][0]:.2%})"
+    return AnalysisResult(
+        {"row_amplitudes": rows, "column_amplitudes": cols},
+        quality,
+        (
+            f"{work}: rows and columns are equal to {spread}",
+            f"left from site to site, which the tones cannot change: {quality['residual_spread']:.1%}",
+        ),
+        draw=lambda: draw_powers(before, after, rows, cols),
+    )
+
+
+def _readings(run: Run) -> dict[str, Any]:
+    """The readings of ``equalise`` in the last shot that has them."""
+    for shot in reversed(run.shots):
+        found = {k.removeprefix(READINGS): v for k, v in shot.readings.items() if k.startswith(READINGS)}
+        if found:
+            return found
+    raise _wrong_run(run, "no shot of it equalised the tweezers")
+
+
+def _wrong_run(run: Run, what: str) -> ConfigError:
+    return ConfigError(Problem(what, str(run.path), expected="a run with the step 'equalise', on this grid"))
+
 
 Floats = NDArray[np.float64]
 
+
 ROUNDS: Final = 30
+
+
 SETTLED_M: Final = 0.1e-9
+
+
 KNOWN_BEFORE_M: Final = 0.5e-6
 """Expected distance of a row or column from the common centre, 1 sigma, before the measurement."""
+
+
 WORST_ERROR_M: Final = 50e-9
+
+
 SLOPE_STEP_M: Final = 1e-9
 
 
@@ -223,3 +341,37 @@ def analyse_frequencies(data: CalibrationData) -> AnalysisResult:
         {"calibrations": probed.calibrations},
         lambda: draw_tone_offsets((row_m, fit.row_error_m), (column_m, fit.column_error_m)),
     )
+
+
+def analyse_overlay(data: CalibrationData) -> AnalysisResult:
+    """Find the offset at which most atoms survive.
+
+    Raises:
+        DeviceError: There is no such offset; says why, and where to look.
+        ConfigError: The run is not a scan of a probe's offset.
+    """
+    probed = count_probed(data.run)
+    fit = fit_overlay(probed.offset_m, probed.n_before, probed.n_survived, probed.grid)
+    shape, error_m = fit.shape.values(), float(fit.error_m.max())
+    n_before, n_survived = (counts.sum(axis=(1, 2)) for counts in (probed.n_before, probed.n_survived))
+    axes = unit_axes(probed.grid)
+    return AnalysisResult(
+        {"offset_m": overlay_offset(fit.centre_m, probed.in_use_m), **shape},
+        {"error_m": error_m, "dispersion": fit.dispersion, "n_atoms": float(fit.n_atoms), **shape},
+        (f"{offset_text(fit, probed)}, known to {format_quantity(error_m, 'length')}",),
+        {"calibrations": probed.calibrations},
+        lambda: draw_survival(
+            probed.offset_m,
+            n_before,
+            n_survived,
+            lambda offset_m: fit.shape.survival(distance_m(offset_m - fit.centre_m, axes)),
+        ),
+    )
+
+
+def offset_text(fit: OverlayFit, probed: ProbeCounts) -> str:
+    """The position of the mobile tweezers in the run, as text."""
+    along, across = (format_quantity(float(-centre), "length") for centre in fit.centre_m)
+    use = " beyond the correction of the overlay in use" if np.any(probed.in_use_m) else ""
+    where = f"{along} along a row and {across} from row to row away from the sites{use}"
+    return f"{fit.n_atoms} atoms: the mobile tweezers were {where}"
