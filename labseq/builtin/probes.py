@@ -12,7 +12,7 @@ from pydantic import Field
 
 from labseq.builtin.rearrange import play
 from labseq.builtin.steps import PositiveDuration
-from labseq.detection.drift import measure_shift
+from labseq.detection.sites import measure_shift
 from labseq.motion import (
     FastOffset,
     SurvivalShape,
