@@ -72,7 +72,7 @@ class Memory:
 
     def __init__(self, bus_bytes_per_s: float) -> None:
         self._bus_bytes_per_s = bus_bytes_per_s
-        self._samples: Samples = np.zeros(0, np.int16)
+        self._uploaded: list[Samples] = []  # the latest first; those behind it are longer
         self._idle_s = -math.inf
         self.uploads: deque[tuple[float, Samples]] = deque()
 
@@ -82,14 +82,18 @@ class Memory:
         self.uploads.append((self._idle_s, data))
 
     def store(self, data: Samples) -> None:
-        """Data arrive, in a new array: a replay that has begun keeps the old content."""
-        self._samples = np.concatenate([data, self._samples[len(data) :]])
+        """Data arrive; a replay that has begun keeps the old content."""
+        self._uploaded = [data, *(older for older in self._uploaded if len(older) > len(data))]
 
     def read(self, n_samples: int, n_channels: int) -> Samples:
         """The content, int16 (n_samples, n_channels); zeros where nothing was ever written."""
-        missing = max(0, n_samples * n_channels - len(self._samples))
-        found = np.pad(self._samples, (0, missing)) if missing else self._samples
-        return found[: n_samples * n_channels].reshape(n_samples, n_channels)
+        n = n_samples * n_channels
+        found = np.zeros(0, np.int16)
+        for data in self._uploaded:
+            if len(found) < n:
+                found = np.concatenate([found, data[len(found) : n]]) if len(found) else data[:n]
+        missing = n - len(found)
+        return (np.pad(found, (0, missing)) if missing else found).reshape(n_samples, n_channels)
 
 
 @dataclass(frozen=True, slots=True)
