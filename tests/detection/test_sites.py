@@ -51,10 +51,10 @@ def test_the_grid_turns_clockwise_about_its_centre() -> None:
     np.testing.assert_allclose(turned[0], [[9.0, 20.0], [10.0, 20.0], [11.0, 20.0]])
 
 
-PLACES = st.tuples(st.floats(-3, 13), st.floats(-3, 13))
+POINTS = st.tuples(st.floats(-3, 13), st.floats(-3, 13))
 
 
-@given(PLACES, st.floats(0.2, 3.0))
+@given(POINTS, st.floats(0.2, 3.0))
 def test_the_light_is_that_of_photons_drawn_one_by_one(place: tuple[float, float], width: float) -> None:
     rng = np.random.default_rng(0)
     y, x = np.rint(rng.normal(place, width, (20_000, 2))).astype(int).T
@@ -64,7 +64,7 @@ def test_the_light_is_that_of_photons_drawn_one_by_one(place: tuple[float, float
     assert np.abs(light - drawn).max() < 5 * np.sqrt(0.25 / 20_000)
 
 
-@given(st.lists(PLACES, max_size=30), st.floats(0.1, 10))
+@given(st.lists(POINTS, max_size=30), st.floats(0.1, 10))
 def test_pairs_are_those_of_all_distances(places: list[tuple[float, float]], distance: float) -> None:
     points = np.array(places).reshape(-1, 2)
     gaps = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=-1))

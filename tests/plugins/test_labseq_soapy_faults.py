@@ -190,7 +190,7 @@ def test_the_light_is_ramped_down_by_a_signal_and_when_labseq_hangs(
 ) -> None:
     with opened(arguments=f"folder={tmp_path},record=10000000", patience=0.3) as rig:
         rig.tweezers.start()
-        until(lambda: np.count_nonzero(recorded(tmp_path)) > 100_000)
+        until(lambda: bool(np.count_nonzero(recorded(tmp_path)) > 100_000))
         end(rig)
         until(raised(DeviceError, rig.tweezers.check_interlocks))
         with pytest.raises(DeviceError, match=text):

@@ -369,13 +369,15 @@ CASES = [
     Broken("twice the speed", motion={"speed_m_s": 0.26}),
 ]
 if "LABSEQ_ATOMS" in os.environ:
-    CASES += [
-        Broken("nothing"),
-        Broken("150 nm beside the sites", offset_m=150e-9),
-        Broken("10 % less depth", depth_k=0.9 * 2.1e-3),
-        Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 2, 1.0)),
-        Broken("a pick-up of no length", motion={"pick_up_s": 1e-9}),
-    ]
+    CASES.extend(
+        [
+            Broken("nothing"),
+            Broken("150 nm beside the sites", offset_m=150e-9),
+            Broken("10 % less depth", depth_k=0.9 * 2.1e-3),
+            Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 2, 1.0)),
+            Broken("a pick-up of no length", motion={"pick_up_s": 1e-9}),
+        ]
+    )
 
 
 class CachedTransport(RfTransport):

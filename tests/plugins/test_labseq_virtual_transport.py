@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -95,7 +96,7 @@ def start(rows: list[float], cols: list[float]) -> ToneProgramBuilder:
     return ToneProgramBuilder().add([(r, r, ON, ON) for r in rows], [(c, c, 0.0, ON) for c in cols])
 
 
-def move(rows: list[Tone2], cols: list[Tone2]) -> ToneProgramBuilder:
+def move(rows: Sequence[Tone2], cols: Sequence[Tone2]) -> ToneProgramBuilder:
     return ToneProgramBuilder().move(rows, cols)
 
 

@@ -14,16 +14,21 @@ from labseq.testing.fakes import ListSink
 from tests.sequencer.rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 
-def test_devices_open_before_and_are_safe_and_closed_after():
+def test_devices_open_before_and_are_safe_and_closed_after(monkeypatch):
     rig, n_safe = Rig(), []
-    rig.observer.event = lambda name, _: n_safe.append(len(rig.made_safe())) if name == "safe_state" else None
+
+    def count(name, values):
+        if name == "safe_state":
+            n_safe.append((values["device"], len(rig.made_safe())))
+
+    monkeypatch.setattr(rig.observer, "event", count)
     rig.run()
     names = rig.lab.calls.names()
     opened = [n for n in names if n.endswith(".open")]
     assert opened == ["static_tweezers.open", "camera.open", "shutter.open", "mobile_tweezers.open"]
     assert names[-4:] == [f"{device}.close" for device in SAFE_ORDER]
     assert rig.made_safe() == SAFE_ORDER
-    assert n_safe == [4, 4, 4, 4]  # observers are called after all devices are safe
+    assert n_safe == [(name, 4) for name in SAFE_ORDER]  # observers are called after all devices are safe
     assert not rig.unsafe
     assert rig.sequencer.state is State.CLOSED
 

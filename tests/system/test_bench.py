@@ -120,7 +120,8 @@ def test_what_is_done_is_kept_without_other_processes(
     monkeypatch.setenv("STUCK_SIGNAL", str(int(signal.SIGTERM)))
     with pytest.raises(SystemExit, match=r"^143$"):
         main([*COMMAND, "--workers", "1", *FILES])
-    check_kept(50, *capfd.readouterr())
+    out, err = capfd.readouterr()
+    check_kept(50, out, err)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
