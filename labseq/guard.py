@@ -193,7 +193,7 @@ class Guard:
             raise StopRequested(self._stop.signal_number)
         return self._named(owner, timeout_s, GRACE_S, partial(function, *args, **kwargs))
 
-    def call_to_the_end(
+    def call_despite_stop(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """The same, even if the run is asked to stop; for opening, safe states and closing."""
@@ -261,7 +261,9 @@ class Guard:
         name = f"{name}() " if name.isidentifier() else ""  # a lambda has none
         if call is None:
             text = f"{name}did not answer within {timeout_s:.3g} s and is abandoned"
-            raise PlanError(text) if owner == "planner" else DeviceHungError(owner, text, timeout_s)
+            if owner == "planner":
+                raise PlanError(f"{text}; if it is only slow, raise 'timeouts: {{plan: ...}}' in the profile")
+            raise DeviceHungError(owner, text, timeout_s)
         if isinstance(call.error, LabseqError):
             raise call.error
         text = f"{name}raised {type(call.error).__name__}" + (f": {call.error}" if str(call.error) else "")

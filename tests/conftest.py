@@ -26,7 +26,7 @@ for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not r
     os.environ.pop(_name, None)
 os.environ["LABSEQ_STATE"] = os.devnull  # for fixtures that outlive a test: leads nowhere
 
-if sys.dont_write_bytecode:  # else each process would compile the tests and numba's source anew
+if sys.dont_write_bytecode:  # else each process would compile the tests and numba's source again
     _BYTECODE, _TEMPORARY = cache_root() / "bytecode", Path(tempfile.gettempdir())
     shutil.rmtree(_BYTECODE / _TEMPORARY.relative_to(_TEMPORARY.anchor), ignore_errors=True)  # of past tests
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -72,7 +72,7 @@ def test_after_a_hang_the_device_can_still_be_made_safe(guard):
     release, safe = threading.Event(), threading.Event()
     with pytest.raises(DeviceTimeoutError):
         guard.call("camera", 0.02, release.wait)
-    guard.call_to_the_end("camera", 10.0, safe.set)
+    guard.call_despite_stop("camera", 10.0, safe.set)
     assert safe.is_set()
     assert not release.is_set()
     release.set()
@@ -84,7 +84,7 @@ def test_no_call_is_made_after_a_stop_request(guard, stop):
     with pytest.raises(StopRequested):
         guard.call("camera", 10.0, called.set)
     assert not called.is_set()
-    guard.call_to_the_end("camera", 10.0, called.set)  # as safe states are
+    guard.call_despite_stop("camera", 10.0, called.set)  # as safe states are
     assert called.is_set()
 
 

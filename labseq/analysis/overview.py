@@ -31,7 +31,7 @@ from labseq.analysis.statistics import CycleStatistics, Estimated, Rate, Statist
 from labseq.analysis.survival import Survival, SurvivalCounts, steps_that_load
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
-from labseq.detection.sites import KnownSites, RegionSettings, known_sites
+from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean
 from labseq.model import CalibrationEntry, SiteGrid, TargetPattern
@@ -555,7 +555,7 @@ def sites_of(run: Run) -> KnownSites | None:
     detector = _mapping(_profile(run).get("detector"))
     names = ("frame", "centre_px", "pixel_size", "angle")
     try:
-        settings = RegionSettings(sites=detector.get("sites"), **{name: detector[name] for name in names})
+        settings = SiteSettings(sites=detector.get("sites"), **{name: detector[name] for name in names})
         calibration = run.path / "calibration_sites.json"
         calibrations: dict[str, CalibrationEntry] = {}
         if calibration.is_file():

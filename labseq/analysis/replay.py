@@ -430,7 +430,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] 
     images = ReplayedImages.none(replayer.grid.shape)
     unreadable: dict[int, str] = {}
     with announcing(announce):
-        chosen = replayer.at(assembly.begun).chosen
+        chosen = replayer.at(assembly.first_point).chosen
         for shot in wanted:
             crew = replayer.at(point_of(assembly, shot, scan_run))
             for stream in crew.streams:

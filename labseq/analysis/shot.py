@@ -18,10 +18,10 @@ from labseq.pictures.figures import (
     MarkerStyle,
     Sheet,
     extent_of_sites,
-    lay_out,
     make_figure,
     outline,
     place_sites,
+    plan_timelines,
     save_figure,
 )
 from labseq.pictures.plans import (
@@ -120,7 +120,7 @@ def _draw(drawing: ShotDrawing) -> Figure:
     grid, panels = drawing.grid, drawing.panels
     moved = np.concatenate([panel.moves for panel in panels])
     panel_in = PANEL_IN if len(panels) > 2 else LARGE_IN
-    sheet = lay_out(extent_of_sites(moved[:, 2:], grid), len(panels), panel_in)
+    sheet = plan_timelines(extent_of_sites(moved[:, 2:], grid), len(panels), panel_in)
     figure = make_figure(sheet.width_in, sheet.height_in)
     n_rows, n_cols = grid.shape
     edge = place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)

@@ -241,7 +241,7 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
     run = chosen_run(path)
     failed = False
     for settings in _wanted(run, use, overrides):
-        done = analyse_missing(run, settings, anew=again)
+        done = analyse_missing(run, settings, again=again)
         _report(done)
         failed = failed or bool(done.failures)
     return int(failed)

@@ -336,7 +336,7 @@ def analyse_frequencies(data: CalibrationData) -> AnalysisResult:
         },
         (
             offset_text(fit.overlay, probed),
-            f"single rows and columns were up to {worst} away from that, known to {error} r.m.s.",
+            f"single rows and columns were up to {worst} away from that; r.m.s. uncertainty {error}",
         ),
         {"calibrations": probed.calibrations},
         lambda: draw_tone_offsets((row_m, fit.row_error_m), (column_m, fit.column_error_m)),
@@ -358,7 +358,7 @@ def analyse_overlay(data: CalibrationData) -> AnalysisResult:
     return AnalysisResult(
         {"offset_m": overlay_offset(fit.centre_m, probed.in_use_m), **shape},
         {"error_m": error_m, "dispersion": fit.dispersion, "n_atoms": float(fit.n_atoms), **shape},
-        (f"{offset_text(fit, probed)}, known to {format_quantity(error_m, 'length')}",),
+        (f"{offset_text(fit, probed)}; uncertainty {format_quantity(error_m, 'length')}",),
         {"calibrations": probed.calibrations},
         lambda: draw_survival(
             probed.offset_m,

@@ -210,7 +210,7 @@ def copy_files(folder: Path) -> None:
             ) from error
     say(
         f"{plural(len(copies), 'file')} copied to sequences and hardware_profiles in {visible(str(folder))}. "
-        "There:",
+        "Run the copy there:",
         f"  labseq run sequences/{SEQUENCE}.yaml",
         "A sequence with 'profile: virtual' now uses the copy in ./hardware_profiles.",
     )

@@ -107,8 +107,8 @@ def cycle_table(statistics: Statistics) -> list[str]:
     header = ("cycle", "shots", "defect-free", "filling", "atom moves", "batches", "left out")
     lines = columns([header, *map(_cycle_row, statistics.cycles)], right=range(len(header)))
     ended = statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots
-    without = ", without the shots that had ended before it" if ended else ""
-    return [*lines, f"each cycle on its own image{without}"]
+    reached = "; only shots that reached it count" if ended else ""
+    return [*lines, f"each cycle is judged on its own final image{reached}"]
 
 
 def _cycle_row(cycle: CycleStatistics) -> tuple[str, ...]:

@@ -572,7 +572,7 @@ def load_profile(
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
     document = document.override_all(placed, may_add=MAY_ADD, found=found).evaluated()
-    document = document if scan is None else scan.bound(document).begun(document, profile=True)
+    document = document if scan is None else scan.bound(document).at_first_point(document, profile=True)
     return load_checked(document, ProfileSpec, "a hardware profile", _FALLBACKS, found)
 
 

@@ -159,7 +159,7 @@ class Scan:
         pairs = self.values(point)
         return document.with_values((axis.loc, node) for axis, node in pairs if axis.of_profile == profile)
 
-    def begun(self, document: Document, *, profile: bool) -> Document:
+    def at_first_point(self, document: Document, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of the first point.
 
         The first point of an adaptive scan is not known yet; the values of the file are then kept.

@@ -295,7 +295,7 @@ def _at_first_point(
         expected = f"at most {n_shots}" if is_option else ""
         hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
         found.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
-    return scan.begun(document, profile=False), scan
+    return scan.at_first_point(document, profile=False), scan
 
 
 def _without_scan(document: Document) -> Document:

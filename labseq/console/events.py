@@ -110,7 +110,7 @@ def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
     if not math.isnan(shot.filling_fraction):
         parts.append(f"filling {percent(shot.filling_fraction)}")
     if shot.n_missing_atoms:
-        parts.append(f"{plural(shot.n_missing_atoms, 'atom')} too few loaded")
+        parts.append(f"{plural(shot.n_missing_atoms, 'atom')} short after loading")
     duration_s = max((timing.t_start_s + timing.duration_s for timing in shot.timing), default=0.0)
     return "  ".join([*parts, format_quantity(duration_s, "time")])
 

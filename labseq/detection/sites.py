@@ -27,7 +27,7 @@ Thresholds: TypeAlias = float | FilePath | tuple[tuple[float, ...], ...]
 COLUMNS: Final = ("row", "col", "y", "x")
 
 
-class RegionSettings(Settings):
+class SiteSettings(Settings):
     """Where the sites are on the frames.
 
     The file in `sites` takes precedence over the calibration of sites in use, and that
@@ -112,7 +112,7 @@ class KnownSites:
         object.__setattr__(self, "positions_px", positions)
 
 
-def known_sites(settings: RegionSettings, context: Context) -> KnownSites:
+def known_sites(settings: SiteSettings, context: Context) -> KnownSites:
     """The sites from the file in ``sites``, else from the calibration in use, else from the geometry.
 
     Raises:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
 from labseq.detection.sites import (
-    RegionSettings,
+    SiteSettings,
     Thresholds,
     checked_image,
     known_sites,
@@ -45,9 +45,7 @@ class ComparingDetector(ABC):
 
     signal_unit: ClassVar[str]
 
-    def __init__(
-        self, settings: RegionSettings, threshold: Thresholds, width: float, context: Context
-    ) -> None:
+    def __init__(self, settings: SiteSettings, threshold: Thresholds, width: float, context: Context) -> None:
         self._name = context.name or "detector"
         self._width = width
         self._known = known_sites(settings, context)
@@ -142,7 +140,7 @@ def _load(path: Path) -> NDArray[np.float64]:
         ) from error
 
 
-class ThresholdSettings(RegionSettings):
+class ThresholdSettings(SiteSettings):
     """A region of interest and a threshold per site.
 
     The defaults fit the virtual lab: they give the paper's mean detection

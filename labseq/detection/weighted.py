@@ -12,7 +12,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from labseq.detection.sites import (
     KnownSites,
     PositiveLength,
-    RegionSettings,
+    SiteSettings,
     Thresholds,
     checked_image,
     pairs_within,
@@ -31,7 +31,7 @@ SPOT_REACH: Final = 4.0
 """Distance up to which a spot's light is included, in widths of the spot."""
 
 
-class WeightedSettings(RegionSettings):
+class WeightedSettings(SiteSettings):
     """The likelihood of an atom from spot-shaped weights, corrected for the neighbours' light.
 
     Fewer errors than with `threshold`, for more to be known of the camera. The

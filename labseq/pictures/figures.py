@@ -206,7 +206,7 @@ def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
     return Extent(float(left), float(right), float(top), float(bottom))
 
 
-def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
+def plan_timelines(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
     """Choose the size of the panels, and their number in a row.
 
     The sheet is to be somewhat wider than high, with few empty places.
@@ -217,7 +217,7 @@ def lay_out(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
         panel_in: Width of a panel, in inches, unless its sites become too small or too large.
 
     Example:
-        >>> sheet = lay_out(Extent(-1, 11, -1, 11), 6)
+        >>> sheet = plan_timelines(Extent(-1, 11, -1, 11), 6)
         >>> sheet.n_cols, sheet.n_rows, sheet.site_in
         (3, 2, 0.3)
     """

@@ -19,9 +19,9 @@ from labseq.pictures.figures import (
     Sheet,
     check_place,
     extent_of,
-    lay_out,
     make_figure,
     place_sites,
+    plan_timelines,
     save_figure,
 )
 
@@ -414,7 +414,7 @@ def save_plan(path: Path, drawing: PlanDrawing) -> None:
 def _draw(drawing: PlanDrawing) -> Figure:
     plan, grid = drawing.plan, drawing.grid
     panels = make_panels(batch_lines(plan))
-    sheet = lay_out(extent_of(plan, grid), len(panels) + 2)
+    sheet = plan_timelines(extent_of(plan, grid), len(panels) + 2)
     figure = make_figure(sheet.width_in, sheet.height_in)
     looks = _fill(figure, sheet, drawing, panels)
     _write_head(figure, sheet, drawing, looks)

@@ -1,7 +1,7 @@
 """Results of analyses: a file of JSON lines for each analysis, in the run's folder.
 
 A line with "shot" is the result of a shot; of several lines for the same shot the last one counts. Any
-other line describes the analysis of the results that follow it: plugin, version, settings. If "anew" in
+other line describes the analysis of the results that follow it: plugin, version, settings. If "again" in
 it is true, the lines before it no longer count.
 """
 
@@ -17,7 +17,7 @@ from labseq.recording import folders
 
 SHOT: Final = "shot"
 ERROR: Final = "error"
-ANEW: Final = "anew"
+AGAIN: Final = "again"
 _SUFFIX: Final = ".jsonl"
 
 
@@ -31,7 +31,7 @@ class ResultsLog:
 
     Args:
         path: The file; its folder is made if it does not exist.
-        about: Plugin, version and settings; if "anew" is true in it, earlier results no longer count.
+        about: Plugin, version and settings; if "again" is true in it, earlier results no longer count.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -84,7 +84,7 @@ def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
             rows[row[SHOT]] = row
         else:
             about = row
-            if row.get(ANEW):
+            if row.get(AGAIN):
                 rows.clear()
     return [rows[shot] for shot in sorted(rows)], about
 

@@ -180,7 +180,7 @@ def _each(
     outcome: Outcome = {}
     for name, part in parts:
         try:
-            guard.call_to_the_end(name, timeout_s, getattr(part, method))
+            guard.call_despite_stop(name, timeout_s, getattr(part, method))
             outcome[name] = None
         except LabseqError as failure:
             outcome[name] = failure

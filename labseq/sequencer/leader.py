@@ -63,7 +63,7 @@ class LeaderAnswers:
         reason = str(error) or type(error).__name__
         for name, leader in leaders(dict(self.lab.hardware())):
             try:
-                self._answer(name, leader, "failed", self.guard.call_to_the_end, reason)
+                self._answer(name, leader, "failed", self.guard.call_despite_stop, reason)
             except LabseqError as failure:
                 text = f"the failure could not be reported to the system behind '{name}': {failure}"
                 self.emit("warning", {"text": text})
@@ -88,7 +88,7 @@ class LeaderAnswers:
 
     def _log_events(self, name: str, leader: LeaderLink) -> None:
         try:
-            new_events = self.guard.call_to_the_end(name, self.lab.timeouts.call_s, leader.new_events)
+            new_events = self.guard.call_despite_stop(name, self.lab.timeouts.call_s, leader.new_events)
         except LabseqError as failure:
             new_events = [str(failure)]
         for text in new_events:

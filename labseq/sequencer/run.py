@@ -91,7 +91,7 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
         if name in names:
             stop.check()
             # A slow open() must end first: its last actions would undo the safe state.
-            guard.call_to_the_end(name, timeout_s, part.open)
+            guard.call_despite_stop(name, timeout_s, part.open)
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
@@ -110,14 +110,14 @@ def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
     timeout_s = lab.timeouts.safe_state_s
     devices = [(name, device) for name, device in lab.safe_order() if name in names]
     for name, device in devices:
-        guard.call_to_the_end(name, timeout_s, device.safe_state)
+        guard.call_despite_stop(name, timeout_s, device.safe_state)
     for name, device in devices:
-        guard.call_to_the_end(name, timeout_s, device.close)
+        guard.call_despite_stop(name, timeout_s, device.close)
     if lab.simulation is not None and "simulation" in names:
-        guard.call_to_the_end("simulation", timeout_s, lab.simulation.close)
+        guard.call_despite_stop("simulation", timeout_s, lab.simulation.close)
 
 
-def lay_out(
+def plan_timelines(
     lab: Lab, guard: Guard, steps: Sequence[tuple[str, Step]], context: StepContext | None = None
 ) -> list[list[TimelineEntry]]:
     """The timeline of each step.
@@ -255,7 +255,7 @@ class Sequencer:
         """Budget of each step in seconds: the length of its timeline; nan for one without a length."""
         detect_s = self.lab.budgets.get("detect", 0.0)  # a timeline leaves out the detection
         budgets: list[float] = []
-        for entries in lay_out(self.lab, self.guard, self._steps):
+        for entries in plan_timelines(self.lab, self.guard, self._steps):
             planned_s = sum(entry.duration_s for entry in entries)
             detection_s = detect_s * sum(entry.n_images for entry in entries)
             budgets.append(planned_s + detection_s if planned_s else math.nan)
@@ -394,7 +394,7 @@ class Sequencer:
         busy = [("mobile_tweezers", lab.mobile_tweezers), ("camera", lab.camera)]
         with self._stop.held():
             for name, device in busy if lab.lines is None else (*busy, ("lines", lab.lines)):
-                self.guard.call_to_the_end(name, timeout_s, device.safe_state)
+                self.guard.call_despite_stop(name, timeout_s, device.safe_state)
 
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
         """Make the devices safe; only then answer the other control system and write the shot."""

@@ -14,7 +14,7 @@ from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import Lock, knows_no_locks
 from labseq.recording import Run
-from labseq.recording.results import ANEW, ResultsLog, done, read_results, results_file
+from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
 from labseq.session.chosen import ChosenPlugin, construct_one
 from labseq.session.observers import FINISH_WITHIN, USE
@@ -97,7 +97,7 @@ def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
 
 @contextlib.contextmanager
 def results_of(
-    run_dir: Path, prepared: PreparedAnalysis, *, anew: bool = False
+    run_dir: Path, prepared: PreparedAnalysis, *, again: bool = False
 ) -> Generator[tuple[ResultsLog, set[int]]]:
     """Open the results of an analysis for writing, locked against other processes.
 
@@ -106,7 +106,7 @@ def results_of(
     Args:
         run_dir: The run's folder.
         prepared: The analysis.
-        anew: Whether to analyse all shots again even if the settings are unchanged.
+        again: Whether to analyse all shots again even if the settings are unchanged.
 
     Yields:
         The file of the results, and the shots that already have one.
@@ -118,8 +118,8 @@ def results_of(
     path = results_file(run_dir, prepared.name)
     with _alone(path, prepared.name):
         rows, about = read_results(path)
-        anew = anew or about.get("settings") != prepared.about["settings"]
-        yield ResultsLog(path, {**prepared.about, ANEW: anew}), set() if anew else done(rows)
+        again = again or about.get("settings") != prepared.about["settings"]
+        yield ResultsLog(path, {**prepared.about, AGAIN: again}), set() if again else done(rows)
 
 
 def analyse(
@@ -155,13 +155,13 @@ def analyse(
     return n_done
 
 
-def analyse_missing(run: Run, settings: Mapping[str, Any], *, anew: bool = False) -> AnalysisOutcome:
+def analyse_missing(run: Run, settings: Mapping[str, Any], *, again: bool = False) -> AnalysisOutcome:
     """Analyse the shots of a run that have no result yet.
 
     Args:
         run: The run.
         settings: "use" and its settings.
-        anew: Whether to analyse all shots again.
+        again: Whether to analyse all shots again.
 
     Raises:
         ConfigError: A setting is invalid, or another process writes the same results.
@@ -173,7 +173,7 @@ def analyse_missing(run: Run, settings: Mapping[str, Any], *, anew: bool = False
     def failed(shot: int, error: BaseException) -> None:
         failures[shot] = f"{type(error).__name__}: {error}"
 
-    with results_of(run.path, prepared, anew=anew) as (log, before):
+    with results_of(run.path, prepared, again=again) as (log, before):
         n_done = analyse(prepared, (s for s in run.shots if s.index not in before), log, failed)
     return AnalysisOutcome(prepared.name, n_done, len(before), failures, log.path)
 

@@ -81,7 +81,7 @@ class Assembly:
         return (*self.hardware.warnings, *notes)
 
     @property
-    def begun(self) -> Point:
+    def first_point(self) -> Point:
         """The settings of the first point of a scan; those of the files if no point is known yet."""
         alone = self.scanned is None or self.search is not None
         return Point(self.planner, self.steps, self.hardware, {}) if alone else self.at(0)

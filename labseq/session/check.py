@@ -18,7 +18,7 @@ from labseq.motion import check_plan
 from labseq.roles import Step, find_leader, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import spans_on
-from labseq.sequencer.run import lay_out
+from labseq.sequencer.run import plan_timelines
 from labseq.session.assembly import Assembly
 from labseq.session.scan import Point
 from labseq.units import format_quantity
@@ -199,7 +199,7 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     min_duration_s, most_s = list[float](), list[float]()
     for point, n in session.scan_run.counted():
         context = replace(lab.step_context, motion=point.hardware.profile.motion)
-        bars = [bar for bars in lay_out(lab, guard, point.steps, context) for bar in bars]
+        bars = [bar for bars in plan_timelines(lab, guard, point.steps, context) for bar in bars]
         min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
     guard.end()
@@ -237,7 +237,7 @@ def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
             durations.append(report.duration_s)
             firsts.append(float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0)
     except LabseqError as error:
-        return None, f"on a random loading (75 % of the sites, or as the simulation loads): {error}"
+        return None, f"on a random loading of {loading:.0%} of the sites: {error}"
     finally:
         guard.end()
     return Rehearsal(len(durations), n_filled, np.array(durations), np.array(firsts)), ""

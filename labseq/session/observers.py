@@ -87,7 +87,7 @@ class Observers:
             if plugin in self._hung:
                 continue
             try:
-                self._guard.call_to_the_end(plugin, MAX_WAIT_S, call)
+                self._guard.call_despite_stop(plugin, MAX_WAIT_S, call)
             except LabseqError as error:
                 if isinstance(error, DeviceTimeoutError):
                     self._hung.add(plugin)

@@ -43,7 +43,7 @@ class ResolvedProfile:
         chosen: Role or device name -> its plugin; without the planner.
         warnings: For the user.
         refused: Role or device name -> why no plugin could be chosen.
-        calibrations: The active calibrations: kind -> entry.
+        calibrations: The calibrations in use: kind -> entry.
     """
 
     document: Document

@@ -147,7 +147,7 @@ class ResumableRun:
         for path, own in ((sequence, kept["sequence"]), (profile, kept["profile"])):
             if _has_changed(path, own.text):
                 self.warnings.append(
-                    f"{path} has been changed since; the run goes on with its earlier content"
+                    f"{path} has been changed since; the run continues with its earlier content"
                 )
         return assembly, options
 

@@ -139,7 +139,7 @@ def make_each_safe(
     guard = Guard()
     outcome: dict[str, LabseqError | None] = {}
     if simulation is not None:
-        guard.call_to_the_end("simulation", timeouts.call_s, simulation.open)
+        guard.call_despite_stop("simulation", timeouts.call_s, simulation.open)
     for name, device in devices:
         opened = attempt(guard, name, timeouts.call_s, device.open)
         # it may be possible to make it safe even if it did not open
@@ -150,7 +150,7 @@ def make_each_safe(
             for event, failure in (("safe_state", outcome[name]), ("closed", closed)):
                 observer.event(event, {"device": name, "ok": failure is None, "error": str(failure or "")})
     if simulation is not None:
-        guard.call_to_the_end("simulation", timeouts.call_s, simulation.close)
+        guard.call_despite_stop("simulation", timeouts.call_s, simulation.close)
     guard.end()
     return outcome
 
@@ -158,7 +158,7 @@ def make_each_safe(
 def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) -> LabseqError | None:
     """Call a device without interruption by a stop request; returns why the call failed, or None."""
     try:
-        guard.call_to_the_end(name, timeout_s, method)
+        guard.call_despite_stop(name, timeout_s, method)
     except LabseqError as failure:
         return failure
     return None
@@ -435,7 +435,7 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> Check
     try:
         if name != "simulation" and offers(device, "warm"):
             guard.call(name, WARM_S, device.warm)  # else a self test might have to compile within its timeout
-        guard.call_to_the_end(name, timeouts.call_s, device.open)
+        guard.call_despite_stop(name, timeouts.call_s, device.open)
         described: Any = guard.call(name, timeouts.call_s, device.describe)
         if not isinstance(described, Mapping):
             text = f"describe() gave a {type(described).__name__}; expected a mapping"

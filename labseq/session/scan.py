@@ -102,7 +102,7 @@ class ScanPoints:
     steps: tuple[tuple[str, Step], ...]
     _documents: dict[Any, Document] = field(default_factory=dict[Any, Document], repr=False)
     _made: dict[Any, PartSettings] = field(default_factory=dict[Any, PartSettings], repr=False)
-    _benches: dict[Any, ResolvedProfile] = field(default_factory=dict[Any, ResolvedProfile], repr=False)
+    _profiles: dict[Any, ResolvedProfile] = field(default_factory=dict[Any, ResolvedProfile], repr=False)
 
     def check(self, found: ProblemCollector) -> None:
         """Validate the parts with the values of every point.
@@ -149,7 +149,7 @@ class ScanPoints:
             for loc in self._dependents(axis):
                 part = _part_of(axis.of_profile, loc)
                 parameters[_address(axis.of_profile, loc)] = _value_in(parts[part], part, loc)
-        return Point(planner, tuple(steps), self._bench_at(parts), parameters)
+        return Point(planner, tuple(steps), self._profile_at(parts), parameters)
 
     def of(self, scan: Scan) -> ScanPoints:
         """The points of another scan of the same run."""
@@ -245,11 +245,11 @@ class ScanPoints:
             dumped |= choice.model_dump(mode="json", exclude={"use"})
         return PartSettings(chosen, None, choice, dumped)
 
-    def _bench_at(self, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
+    def _profile_at(self, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
         """The profile at a point; points with equal parts share one object."""
         changed = {str(loc[-1]): made for (in_profile, loc), made in parts.items() if in_profile}
         key = tuple(map(id, changed.values()))
-        if key not in self._benches:
+        if key not in self._profiles:
             chosen, profile = dict(self.hardware.chosen), self.hardware.profile
             for name, made in changed.items():
                 assert made.chosen is not None
@@ -257,8 +257,8 @@ class ScanPoints:
                 if isinstance(made.choice, MobileTweezersChoice):
                     profile = profile.model_copy(update={"mobile_tweezers": made.choice})
             hardware = replace(self.hardware, profile=profile, chosen=chosen) if changed else self.hardware
-            self._benches[key] = hardware
-        return self._benches[key]
+            self._profiles[key] = hardware
+        return self._profiles[key]
 
 
 def _part_of(in_profile: bool, loc: Loc) -> Part:

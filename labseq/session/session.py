@@ -17,7 +17,7 @@ from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.run import Sequencer, lay_out
+from labseq.sequencer.run import Sequencer, plan_timelines
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.check import check_steps
 from labseq.session.chosen import DryRun
@@ -156,7 +156,7 @@ class Session:
         lab, guard = self.build_lab(), Guard(self.stop_flag)
         steps = self.assembly.steps
         try:
-            entries = lay_out(lab, guard, steps)
+            entries = plan_timelines(lab, guard, steps)
         finally:
             guard.end()
         return [(name, own) for (name, _), own in zip(steps, entries, strict=True)]
@@ -208,7 +208,7 @@ class Session:
             point: Point of the scan; None for the first one.
         """
         clock = clock_for(self.stop_flag, virtual=self.assembly.virtual_time, paced=self.options.realtime)
-        return build_lab(point or self.assembly.begun, self.assembly.target, clock, self.seed)
+        return build_lab(point or self.assembly.first_point, self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
         """Compile the kernels of a lab; see :func:`labseq.session.lab.warm`."""

@@ -1,4 +1,4 @@
-"""What the card can do, and the checks that refuse everything else.
+"""Figures of the card, and the checks of set-up and program against them (memory: ``replay_fifo.py``).
 
 Source of the figures, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on
 analog outputs, clock, generation modes, trigger and DDS20. Figures marked (EDMSuite) were measured

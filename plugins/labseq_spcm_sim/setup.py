@@ -110,7 +110,7 @@ class Refusal(Exception):  # noqa: N818 - an answer of the card, not a fault of 
 
 @dataclass(frozen=True, slots=True)
 class ErrorInfo:
-    """The error that locks the driver.
+    """The error that blocks the driver.
 
     Attributes:
         code: The vendor's code; 0: none.

@@ -109,10 +109,10 @@ def test_each_cycle_has_a_row() -> None:
         "33.6(7)",
         "0",
     ]
-    assert note == "each cycle on its own image"
+    assert note == "each cycle is judged on its own final image"
     assert cycle_table(replace(STATISTICS, cycles=())) == []
 
 
 def test_cycles_that_not_all_shots_made_are_said_to_be() -> None:
     *_, note = cycle_table(replace(STATISTICS, cycles=(CYCLE, replace(CYCLE, cycle=2, n_shots=12))))
-    assert "without the shots that had ended" in note
+    assert "only shots that reached it count" in note

@@ -23,11 +23,11 @@ from labseq.pictures.figures import (
     cell,
     check_place,
     extent_of,
-    lay_out,
     make_figure,
     neighbours,
     outline,
     place_sites,
+    plan_timelines,
     save_figure,
 )
 from labseq.testing.strategies import grids
@@ -127,7 +127,7 @@ def test_a_panel_shows_every_site_and_where_atoms_are_ejected(grid: SiteGrid) ->
 @settings(max_examples=30)
 @given(st.floats(3, 200), st.floats(3, 200), st.integers(2, 40))
 def test_panels_stand_on_the_sheet_beside_one_another(width: float, height: float, n_panels: int) -> None:
-    sheet = lay_out(Extent(0.0, width, 0.0, height), n_panels)
+    sheet = plan_timelines(Extent(0.0, width, 0.0, height), n_panels)
     places = [sheet.place(i) for i in range(n_panels)]
     for left, bottom, across, up in places:
         assert left >= -1e-9

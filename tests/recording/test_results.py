@@ -13,7 +13,7 @@ from labseq.recording.results import ResultsLog, done, read_results, results_fil
 
 from .records import make_run
 
-ABOUT = {"analysis": "mine", "settings": {"width": 1.0}, "anew": False}
+ABOUT = {"analysis": "mine", "settings": {"width": 1.0}, "again": False}
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_of_several_rows_of_a_shot_the_last_counts(path):
 def test_what_was_before_results_that_are_begun_again_does_not_count(path):
     ResultsLog(path, ABOUT).write(0, {"mean": 1})
     ResultsLog(path, ABOUT).write(1, {"mean": 2})
-    ResultsLog(path, {**ABOUT, "anew": True}).write(5, {"mean": 3})
+    ResultsLog(path, {**ABOUT, "again": True}).write(5, {"mean": 3})
     assert read_results(path)[0] == [{"shot": 5, "mean": 3}]
 
 

@@ -151,7 +151,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
 
 def test_missing_results_are_computed_once_and_again_for_other_settings(taken):
     def analyse(again: bool = False, **settings: str) -> tuple[int, int]:
-        made = analyse_missing(taken, settings, anew=again)
+        made = analyse_missing(taken, settings, again=again)
         return made.n_done, made.n_before
 
     assert [analyse(use="mean"), analyse(use="mean"), analyse(True, use="mean")] == [(3, 0), (0, 3), (3, 0)]

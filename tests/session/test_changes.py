@@ -82,4 +82,4 @@ def test_the_runs_own_texts_count(stopped: Path, tmp_path: Path) -> None:
     seen = RecordingObserver()
     assert len(resumed(stopped, seen).shots) == 6
     (warning,) = [values["text"] for values in seen.of("warning")]
-    assert warning == f"{sequence} has been changed since; the run goes on with its earlier content"
+    assert warning == f"{sequence} has been changed since; the run continues with its earlier content"
