@@ -161,6 +161,7 @@ def test_options_reach_the_profile() -> None:
             "row_band: the band goes from 110 MHz to 90 MHz",
         ),
         ("mobile_tweezers.rf.max_mean_power", "3 V", "max_mean_power: '3 V' is a voltage, not a power"),
+        ("grid.column_frequency", "{centre: 95 MHz, step: 10 MHz}", "the lowest of the 20 tones is at 0 Hz"),
         ("grid.column_frequency.table", "[98 MHz, 100 MHz]", "there are 2 tones for 20 sites"),
         ("grid.column_frequency.table", "[98 MHz, 102 MHz, 100 MHz]", "table: the tones neither rise nor f"),
     ],

@@ -48,6 +48,7 @@ def plain(text: str) -> list[object]:
     [
         ("[3, 5]", [3, 5]),
         ("{linspace: [50 um/ms, 200 um/ms, 4]}", ["50 um/ms", "100 um/ms", "150 um/ms", "200 um/ms"]),
+        ("{linspace: [0.05 ms, 60 us, 2]}", ["0.05 ms", "0.06 ms"]),
         ("{linspace: [3, 15, 5]}", [3, 6, 9, 12, 15]),
         ("{linspace: [0, 0.3, 4]}", [0.0, 0.1, 0.2, 0.3]),
         ("{range: [60 ms, 200 ms, 50 ms]}", ["60 ms", "110 ms", "160 ms"]),

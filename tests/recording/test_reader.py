@@ -123,6 +123,11 @@ def test_a_shot_written_again_counts_once(tmp_path: Path) -> None:
     shot.verify()
 
 
+def test_a_run_on_another_computer_is_taken_to_be_running(run_dir: Path) -> None:
+    rewrite_json(run_dir / "STATE", state="running", started=1.0, host="another")
+    assert open_run(run_dir).status == "running"
+
+
 def test_a_run_whose_process_is_gone_has_failed(run_dir: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         rewrite_json(run_dir / "STATE", state="running", pid=child.pid, started=0.0)
