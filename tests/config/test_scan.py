@@ -11,8 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 from labseq.config.addresses import Override
 from labseq.config.document import Document
-from labseq.config.scan import Scan, read_scan
-from labseq.config.scan_values import MAX_POINTS, values_of
+from labseq.config.scan import MAX_POINTS, Scan, read_scan, values_of
 from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
 
