@@ -145,6 +145,9 @@ class DeviceStep(Step):
                 device.check_command(self.settings.do, **self.settings.arguments)
             except LabseqError as error:
                 return {"do": str(error)}
+            except Exception as error:  # noqa: BLE001 - of the driver, for example an unknown argument
+                what = f"check_command() raised {type(error).__name__}: {error}"
+                return {"do": f"{self.settings.name}: {what}"}
         return {}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
@@ -209,8 +212,6 @@ class WaitStep(Step):
 
 class FollowStep(Step):
     """Waits for the start signal of another control system."""
-
-    device_setting = "device"
 
     def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
         self.signal = signal

@@ -287,7 +287,8 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
     if name in able:
         return name, able[name]
     if name:
-        raise ConfigError(f"no other control system leads through '{name}'")
+        what = f"no other control system leads through '{name}'"
+        raise ConfigError(Problem(what, expected=one_of(list(able))) if able else what)
     if not able:
         what = "the profile has no device through which another control system leads"
         hint = (

@@ -48,9 +48,15 @@ def check_steps(assembly: Assembly, points: Iterable[Point], build: Callable[[Po
         devices = dict(lab.hardware())
         for spec, (name, step) in zip(assembly.sequence.shot, point.steps, strict=True):
             if offers(step, "check_devices"):
-                found = guard.call(f"step '{name}'", lab.timeouts.call_s, step.check_devices, devices)
-                for setting, what in found.items():
-                    problem = assembly.document.problem((*spec.loc, setting), what)
+                try:
+                    found = guard.call(f"step '{name}'", lab.timeouts.call_s, step.check_devices, devices)
+                    said = {str(setting): str(what) for setting, what in dict(found).items()}
+                except LabseqError as failure:
+                    said = {"": str(failure)}
+                except (TypeError, ValueError):
+                    said = {"": f"check_devices() of step '{name}' returned no mapping"}
+                for setting, what in said.items():
+                    problem = assembly.document.problem((*spec.loc, setting) if setting else spec.loc, what)
                     problems[str(problem)] = problem
     guard.end()
     if problems:
@@ -317,7 +323,10 @@ def _deadline_warnings(
     for number, step in enumerate(steps):
         if not waits[number]:
             continue
-        name, leader = find_leader(dict(lab.hardware()), step.device)
+        try:
+            name, leader = find_leader(dict(lab.hardware()), step.device)
+        except ConfigError:  # no wait for a signal: another step's own attribute
+            continue
         until = next((n for n in range(number + 1, len(steps)) if waits[n]), None)
         longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
         if longest_s > leader.deadline_s:

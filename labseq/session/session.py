@@ -75,7 +75,7 @@ class Session:
         cls,
         sequence: str | Path,
         *,
-        profile: str | None = None,
+        profile: str | Path | None = None,
         shots: int | None = None,
         seed: int | None = None,
         overrides: Sequence[str] = (),

@@ -163,7 +163,7 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
         ),
         ([], "fast", "in a full dry run it says `go` itself, in a fast one it is missing"),
         (["shot.0.wait.device=shutter"], "off", "no other control system leads through 'shutter'"),
-        (["shot.0.wait.device=artiq"], "off", "has no device 'artiq'; expected one of 'leader', 'shutter'"),
+        (["shot.0.wait.device=artiq"], "off", "leads through 'artiq'; expected 'leader'"),
     ],
 )
 def test_who_cannot_lead_is_reported_before_anything_is_opened(

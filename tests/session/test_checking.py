@@ -102,3 +102,48 @@ def test_a_planner_that_fails_is_a_warning(tmp_path: Path):
     (warning,) = check(labseq.Session.open(path)).warnings
     assert "raised KeyError: 'typo'" in warning.what
     assert warning.line == next(i for i, line in enumerate(text.splitlines(), 1) if "broken" in line)
+
+
+STEPS = """
+LABSEQ_API = 1
+from labseq.plugin import Device, Step, TimelineEntry, hookimpl
+
+
+class Shutter(Device):
+    def open(self): ...
+    def close(self): ...
+    def safe_state(self): ...
+    def describe(self): return {}
+    def command(self, name, **arguments): ...
+    def read(self, name): ...
+    def check_command(self, name, *, power=1): ...
+
+
+class Choosy(Step):
+    def __init__(self, settings): ...
+    def plan_timeline(self, context): return []
+    def run(self, shot): ...
+    def check_devices(self, devices): return None
+
+
+@hookimpl
+def labseq_register(registry):
+    registry.device("clumsy", lambda settings, context: Shutter())
+    registry.step("choosy", lambda settings: Choosy(settings))
+"""
+
+
+def test_a_driver_or_step_that_fails_to_check_a_step_has_the_place_of_the_step(tmp_path: Path):
+    (tmp_path / "mine.py").write_text(STEPS, "utf-8")
+    text = COMPACT.read_text("utf-8").partition("shot:")[0]
+    text += f"plugin_folders: [{tmp_path.as_posix()}]\nshot:\n  - image: {{}}\n  - choosy: {{}}\n"
+    text += "  - device: {name: shutter, do: open, arguments: {volts: 3}}\n"
+    (tmp_path / "s.yaml").write_text(text, "utf-8")
+    session = labseq.Session.open(tmp_path / "s.yaml", overrides=["profile.devices={shutter: {use: clumsy}}"])
+    with pytest.raises(labseq.ConfigError) as caught:
+        check(session)
+    first, second = (str(problem) for problem in caught.value.problems)
+    line = text[: text.index("- choosy")].count("\n") + 1
+    assert f"s.yaml:{line}:13: check_devices() of step 'choosy' returned no mapping" in first
+    assert f"s.yaml:{line + 1}:33: shutter: check_command() raised TypeError" in second
+    assert "'volts'" in second
