@@ -60,10 +60,10 @@ def test_what_to_install(case: tuple[str, str, str], monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises((LabseqError, BadFramesError, ModuleNotFoundError)) as caught:
         NEEDS[case]()
-    told = str(caught.value)
-    assert f"labseq[{extra}]" in told
-    assert "install" in told
-    assert distribution in told.lower()
+    reported = str(caught.value)
+    assert f"labseq[{extra}]" in reported
+    assert "install" in reported
+    assert distribution in reported.lower()
 
 
 def test_every_package_of_every_extra_is_tried() -> None:

@@ -49,7 +49,7 @@ def hold_program(
         grid: The grid of sites.
         motion: How the tweezers move: ramps, overheads, and limits.
         sites: bool (n_rows, n_cols), the sites to hold.
-        offset_m: How far beside its site each tweezer shall stand, along a1 (the columns' tones)
+        offset_m: Offset of each tweezer from its site, along a1 (the columns' tones)
             and a2 (the rows'): (2,) for all, or (n_rows, n_cols, 2).
         hold_s: Time between the ramps, in seconds; 0 for none.
         drop_off_s: Duration of the drop-off, in seconds; by default the motion's.

@@ -1,7 +1,8 @@
 """Recorded runs: writes and reads a folder per run with one HDF5 file per shot."""
 
 from labseq.files import data_root
-from labseq.recording.active import (
+from labseq.recording.columns import figures_in
+from labseq.recording.markers import (
     clear_active,
     find_dead_run,
     lock_files,
@@ -9,7 +10,6 @@ from labseq.recording.active import (
     marker_roots,
     runs_in_progress,
 )
-from labseq.recording.columns import figures_in
 from labseq.recording.reader import Run, open_run
 from labseq.recording.shot import Shot
 from labseq.recording.writer import RunWriter

@@ -21,7 +21,7 @@ from labseq.errors import RecordingError
 from labseq.files import LineLog, Lock, Process, explained, read_file, sync_folder, whole_lines, write_file
 from labseq.plain import dumps, parse_object
 from labseq.recording import folders
-from labseq.recording.active import ACTIVE_FOLDER, Marker, markers_in
+from labseq.recording.markers import ACTIVE_FOLDER, Marker, markers_in
 from labseq.recording.run_file import (
     STATUSES,
     OtherFormatError,

@@ -57,14 +57,14 @@ def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "cycle", "told"),
+    ("number", "cycle", "reported"),
     [
         (3, None, "--shot: the run has no shot 3; expected one from 1 to 2"),
         (1, 2, "has no cycle 2; expected one from 1 to 1"),
         (2, 1, "has no cycle 1; expected a shot that rearranges"),
     ],
 )
-def test_what_is_not_there_is_told(write: Write, number: int, cycle: int | None, told: str) -> None:
+def test_what_is_not_there_is_told(write: Write, number: int, cycle: int | None, reported: str) -> None:
     run = write([make_shot(0), make_shot(1, n_cycles=0)])
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=reported):
         shot_picture(run, number, cycle)

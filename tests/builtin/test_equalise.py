@@ -297,9 +297,9 @@ def test_too_much_noise_ends_the_loop_and_names_the_averages_needed() -> None:
     array = Array(6, noise=0.1)
     with pytest.raises(
         DeviceError, match=r"too much noise: 20 averages leave .*; about \d+ averages"
-    ) as told:
+    ) as reported:
         begin(array, EqualiseSettings(max_averages=20))
-    needed = int(str(told.value).split("about ")[1].split()[0])
+    needed = int(str(reported.value).split("about ")[1].split()[0])
     again = Array(6, noise=0.1)
     with pytest.raises(DeviceError, match="too much noise"):
         begin(again, EqualiseSettings(max_averages=needed // 2))

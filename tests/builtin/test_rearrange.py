@@ -89,8 +89,8 @@ def test_a_batch_that_does_not_fit_is_not_started():
     (cycle,) = rig.record().cycles
     assert (cycle.plan.n_batches, cycle.n_batches_played, cycle.moves_s) == (1, 0, 0.0)
     assert not rig.lab.calls.of("mobile_tweezers.play")
-    (told,) = rig.observer.of("window_too_short")
-    assert (told["n_batches"], told["n_batches_played"]) == (1, 0)
+    (reported,) = rig.observer.of("window_too_short")
+    assert (reported["n_batches"], reported["n_batches_played"]) == (1, 0)
 
 
 class LatePlanner(ScriptedPlanner):

@@ -113,8 +113,8 @@ def test_a_wrong_expression_is_reported_with_its_place(text: str, message: str) 
 
 def test_a_circle_and_what_depends_on_it_is_reported_once() -> None:
     more = "a: = b + 1\nb: = c\nc: = 2 * a\n"
-    (told,) = refused("= a", more).splitlines()
-    assert told.endswith("this is a circular reference: a -> b -> c -> a")
+    (reported,) = refused("= a", more).splitlines()
+    assert reported.endswith("this is a circular reference: a -> b -> c -> a")
 
 
 @pytest.mark.parametrize("wrong", ["= b +", "= nothing", "= 1 s + 1"])

@@ -111,8 +111,8 @@ def test_a_path_of_a_sequence_is_taken_as_it_is(path: str) -> None:
 
 def test_a_packaged_sequence_is_not_far(shelves: Path) -> None:
     (shelves / "packaged" / "kagome.yaml").touch()
-    told = refused_sequence("sequences/kagome.yaml")
-    assert told == (
+    reported = refused_sequence("sequences/kagome.yaml")
+    assert reported == (
         f"{Path('sequences/kagome.yaml')}: there is no such file; say 'kagome' for the one that comes with "
         "labseq, or copy it by 'labseq demo --copy .'"
     )

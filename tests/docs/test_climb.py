@@ -27,10 +27,10 @@ def test_the_scan_of_the_page_is_that_of_the_sequence() -> None:
 
 def test_the_climb_of_the_page(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     check_sequence(SEQUENCE, PROFILE, (), "off", as_json=False)
-    told = capfd.readouterr().out
-    assert "planner.degree_of_parallelism from 2 to 15" in told
-    assert "points chosen during the run by climb, at most 30, 5 shots of each" in told
-    assert "at most 30 points, 150 shots" in told
+    reported = capfd.readouterr().out
+    assert "planner.degree_of_parallelism from 2 to 15" in reported
+    assert "points chosen during the run by climb, at most 30, 5 shots of each" in reported
+    assert "at most 30 points, 150 shots" in reported
     few = ["repeats=2", "scan.points=12"]
     with labseq.Session.open(SEQUENCE, profile=PROFILE, seed=1, overrides=few, output=tmp_path) as session:
         run = session.run()

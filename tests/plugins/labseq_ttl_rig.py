@@ -42,7 +42,7 @@ class Rig:
 
     @property
     def played(self) -> list[tuple[LineProgram, float]]:
-        """What the world was told of the lines, and when."""
+        """What the simulation received of the lines, and when."""
         plays = [call.args for call in self.world.calls if call.method == "play"]
         return [(args[1], args[2]) for args in plays]
 

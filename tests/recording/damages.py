@@ -50,7 +50,7 @@ def lines_of(root: Path) -> list[bytes]:
     return sorted(line for line in found if line)
 
 
-def told(report: Report) -> list[tuple[str, str]]:
+def reported(report: Report) -> list[tuple[str, str]]:
     return [(one.what, one.where.name) for one in report.findings]
 
 

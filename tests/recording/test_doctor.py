@@ -36,9 +36,9 @@ from .damages import (
     lost_file,
     lost_line,
     part_left,
+    reported,
     rewrite_state,
     shot_of_another_run,
-    told,
     torn_events,
     write_whole_run,
 )
@@ -61,13 +61,13 @@ def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable
     rows = open_run(run_dir).to_dataframe()
     plant(run_dir)
     before, lines = contents(root), lines_of(root)
-    only_told = examine(root, dry_run=True)
-    assert only_told.findings
-    assert all(one.left for one in only_told.findings)
+    only_reported = examine(root, dry_run=True)
+    assert only_reported.findings
+    assert all(one.left for one in only_reported.findings)
     assert (contents(root), lines_of(root)) == (before, lines)
     assert not list(root.rglob("quarantine"))
     report = examine(root)
-    assert told(report) == told(only_told)
+    assert reported(report) == reported(only_reported)
     assert not any(one.left for one in report.findings), report.findings
     assert {*before} <= {*contents(root)} | {b"", b"\0\0"}
     assert {*lines} <= {*lines_of(root)}
@@ -103,7 +103,7 @@ def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable
 )
 def test_a_damage_is_named(run_dir: Path, plant: Callable[[Path], None], what: str, where: str) -> None:
     plant(run_dir)
-    assert (what, where) in told(examine(run_dir, dry_run=True))
+    assert (what, where) in reported(examine(run_dir, dry_run=True))
 
 
 def test_a_whole_run_is_left_as_it_is(run_dir: Path) -> None:
@@ -154,7 +154,7 @@ def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> 
     rows = [json.loads(line) for line in (run_dir / "index.jsonl").read_bytes().splitlines()]
     rows[-1]["sha256"] = hashlib.sha256(later.read_bytes()).hexdigest()
     (run_dir / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
-    assert told(examine(run_dir)) == [("no line in the index", "shot_000001.h5")]
+    assert reported(examine(run_dir)) == [("no line in the index", "shot_000001.h5")]
     assert not open_run(run_dir).shots[1].success
 
 
@@ -202,7 +202,9 @@ def test_a_run_without_shots_or_run_file_goes_to_the_quarantine_of_its_day(run_d
     report = examine(root)
     assert report.in_progress == [dead]  # it may just be being made
     os.utime(dead, (LONG_AGO, LONG_AGO))
-    assert told(examine(root)) == [("the run died while its folder was made; it holds no shots", "0002_dead")]
+    assert reported(examine(root)) == [
+        ("the run died while its folder was made; it holds no shots", "0002_dead")
+    ]
     assert (run_dir.parent / "quarantine" / "0002_dead" / "STATE").exists()
     assert examine(root).findings == []
 
@@ -270,7 +272,7 @@ def test_a_run_that_somebody_goes_on_with_is_not_touched(run_dir: Path) -> None:
         assert other.stdout is not None
         other.stdout.readline()
         assert examine(run_dir).in_progress == [run_dir]
-    found = told(examine(run_dir))  # it was killed, or so its note says
+    found = reported(examine(run_dir))  # it was killed, or so its note says
     assert found[-1] == ("no line in the index", "shot_000001.h5")
 
 
@@ -294,7 +296,7 @@ def test_claims_and_half_written_marks_are_moved_away(run_dir: Path) -> None:
     assert examine(root).findings == []  # somebody may be at it
     for path in (claim, part):
         os.utime(path, (LONG_AGO, LONG_AGO))
-    assert [name for _, name in told(examine(root))] == [".0007.claim", "lab.json.part"]
+    assert [name for _, name in reported(examine(root))] == [".0007.claim", "lab.json.part"]
     assert examine(root).findings == []
 
 

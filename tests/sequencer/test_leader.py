@@ -134,8 +134,8 @@ def test_a_transient_failure_is_reported_after_the_devices_are_safe() -> None:
     made = rig(fail_on={"camera.read": [TransientError("a frame was lost", "camera"), None]})
     made.run()
     names = made.lab.calls.names("leader", "camera", "mobile_tweezers")
-    told = [n for n, name in enumerate(names) if name == "leader.report"][1]
-    assert names[told - 2 : told] == ["mobile_tweezers.safe_state", "camera.safe_state"]
+    reported = [n for n, name in enumerate(names) if name == "leader.report"][1]
+    assert names[reported - 2 : reported] == ["mobile_tweezers.safe_state", "camera.safe_state"]
 
 
 def test_a_failure_is_reported_after_all_devices_are_safe_and_before_they_are_closed() -> None:
@@ -144,8 +144,8 @@ def test_a_failure_is_reported_after_all_devices_are_safe_and_before_they_are_cl
         made.run()
     assert "cable" in reason(made)
     names = made.lab.calls.names()
-    told = len(names) - 1 - names[::-1].index("leader.report")
-    assert names.index("static_tweezers.safe_state") < told < names.index("leader.close")
+    reported = len(names) - 1 - names[::-1].index("leader.report")
+    assert names.index("static_tweezers.safe_state") < reported < names.index("leader.close")
     assert made.record().readings["leader.answer"] == ["failed"]
 
 
@@ -224,7 +224,7 @@ def test_signals_and_answers_are_in_the_log() -> None:
         {"shot": 0, "device": "leader", "signal": "go", "timeout_s": 10.0}
     ]
     assert [said["text"] for said in made.observer.of("leader_signal")] == ["go 1"]
-    assert [told["text"] for told in made.observer.of("leader_answered")] == ["ready"]
+    assert [reported["text"] for reported in made.observer.of("leader_answered")] == ["ready"]
 
 
 def test_lines_stay_idle_while_it_waits() -> None:

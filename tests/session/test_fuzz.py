@@ -1,4 +1,4 @@
-"""Mutated files, all the way to a run that could start: it can, or the user is told why not."""
+"""Mutated files, all the way to a run that could start: it can, or the user reads why not."""
 
 from pathlib import Path
 

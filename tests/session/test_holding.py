@@ -80,17 +80,17 @@ def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
 
 def test_a_run_locks_its_devices_with_its_name() -> None:
     class Looking(RecordingObserver):
-        told = ""
+        reported = ""
 
         def event(self, name: str, values: object) -> None:
             if name == "run_started":
                 with pytest.raises(DeviceError) as caught:
                     check_devices("./p.yaml")
-                self.told = str(caught.value)
+                self.reported = str(caught.value)
 
     looking = Looking()
     done = run(looking)
-    assert f"in use by the run {done.path} (process {os.getpid()} on " in looking.told
+    assert f"in use by the run {done.path} (process {os.getpid()} on " in looking.reported
 
 
 def test_devices_are_not_tested_while_they_are_in_use(held: None) -> None:

@@ -134,18 +134,18 @@ def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
     ]
     seen = RecordingObserver()
     path = sequence(tmp_path, policy={"checks": checks})
-    told = "reading.laser.power_w is 0.35 on the mean of the last 2 shots; it should be at most 0.25"
+    reported = "reading.laser.power_w is 0.35 on the mean of the last 2 shots; it should be at most 0.25"
     with pytest.raises(CheckFailedError) as caught:
         run(path, seen)
     assert (str(caught.value), caught.value.value, caught.value.exit_code) == (
-        told, "reading.laser.power_w", 3
+        reported, "reading.laser.power_w", 3
     )  # fmt: skip
     warnings = [event["text"] for event in seen.of("warning")]
     assert len(warnings) == 4  # one a shot, before the run ends
     assert "it should be at least 2" in warnings[0]
     (folder,) = [path.parent for path in (tmp_path / "data").rglob("run.json")]
     stopped = labseq.open_run(folder)
-    assert (stopped.status, stopped.error) == ("failed", f"CheckFailedError: {told}")
+    assert (stopped.status, stopped.error) == ("failed", f"CheckFailedError: {reported}")
     assert len(stopped.shots) == 5
 
 
@@ -168,9 +168,9 @@ def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
     )
     path.write_text(text, encoding="utf-8")
     with labseq.Session.open(path) as session:
-        told = [str(problem) for problem in check(session).warnings]
+        reported = [str(problem) for problem in check(session).warnings]
     what = "the step takes up to 500 ms, longer than its timeout of 400 ms; expected more than 500 ms"
-    assert f"{path}:10:23: {what}" in told
+    assert f"{path}:10:23: {what}" in reported
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ class LoadsNothing(TinyWorld):
 
 
 class KeepsAtoms(TinyWorld):
-    """Loading sets every site anew, so that frames do not tell."""
+    """Loading fills every site again, so that frames show nothing of it."""
 
     def begin_shot(self) -> None:
         pass
