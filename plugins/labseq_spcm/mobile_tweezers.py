@@ -236,10 +236,13 @@ class SpcmMobileTweezers(MobileTweezers):
                 idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
                 self._clock.sleep(min(deadline_s - now_s, mode.max_wait_s, idle_s))
                 if self._due_s is None:
-                    raise DeviceError(self._name, "stopped by safe_state() while it played")
+                    break
         except (DeviceError, TransientError):
-            self.safe_state()
-            raise
+            if self._due_s is not None:
+                self.safe_state()
+                raise
+        if self._due_s is None:  # by another thread: the card's own errors then come from that
+            raise DeviceError(self._name, "stopped by safe_state() while it played")
         self._due_s = None
 
     def _timeout(self, card: AwgCard, timeout_s: float) -> DeviceTimeoutError:

@@ -20,8 +20,10 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from labseq_spcm.dds import Dds
 from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, vendor_library_found
 
@@ -99,6 +101,25 @@ def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
         assert not lab.card.running
         assert lab.card.outputs_on == (False, False)
         lab.tweezers.prepare(lab.program())
+
+
+@pytest.mark.parametrize(("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("dds", Dds)])
+def test_a_wait_during_which_another_thread_makes_the_card_safe_is_no_end_of_the_program(
+    driver: Any, mode: str, player: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished = player.finished
+    with driver(mode) as lab:
+        lab.tweezers.prepare(lab.program())
+        lab.tweezers.play()
+
+        def after_safe_state(self: Any) -> bool:
+            lab.tweezers.safe_state()
+            return finished(self)
+
+        monkeypatch.setattr(player, "finished", after_safe_state)
+        with pytest.raises(DeviceError, match=r"stopped by safe_state\(\) while it played"):
+            lab.tweezers.wait(1.0)
+        assert lab.card.outputs_on == (False, False)
 
 
 class TestSettings:
