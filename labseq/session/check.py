@@ -47,20 +47,27 @@ def check_steps(assembly: Assembly, points: Iterable[Point], build: Callable[[Po
         lab = labs.get(id(point.hardware)) or labs.setdefault(id(point.hardware), build(point))
         devices = dict(lab.hardware())
         for spec, (name, step) in zip(assembly.sequence.shot, point.steps, strict=True):
-            if offers(step, "check_devices"):
-                try:
-                    found = guard.call(f"step '{name}'", lab.timeouts.call_s, step.check_devices, devices)
-                    said = {str(setting): str(what) for setting, what in dict(found).items()}
-                except LabseqError as failure:
-                    said = {"": str(failure)}
-                except (TypeError, ValueError):
-                    said = {"": f"check_devices() of step '{name}' returned no mapping"}
-                for setting, what in said.items():
-                    problem = assembly.document.problem((*spec.loc, setting) if setting else spec.loc, what)
-                    problems[str(problem)] = problem
+            for setting, what in _wrong_settings(guard, lab.timeouts.call_s, name, step, devices).items():
+                problem = assembly.document.problem((*spec.loc, setting) if setting else spec.loc, what)
+                problems[str(problem)] = problem
     guard.end()
     if problems:
         raise ConfigError([*problems.values()])
+
+
+def _wrong_settings(
+    guard: Guard, timeout_s: float, name: str, step: Step, devices: Mapping[str, object]
+) -> dict[str, str]:
+    """Setting -> what is wrong with it, as a step says; "" for a step that fails to say it."""
+    if not offers(step, "check_devices"):
+        return {}
+    try:
+        found = guard.call(f"step '{name}'", timeout_s, step.check_devices, devices)
+        return {str(setting): str(what) for setting, what in dict(found).items()}
+    except LabseqError as failure:
+        return {"": str(failure)}
+    except (TypeError, ValueError):
+        return {"": f"check_devices() of step '{name}' returned no mapping"}
 
 
 def timeout_warnings(
