@@ -246,13 +246,24 @@ class InvalidPlanError(PlanError):
         batch: Index of the batch, from 0; -1 if the plan as a whole is wrong. The message counts from 1.
         move: Index of the atom move within the batch, from 0, or -1. The message counts from 1.
         detail: The error, with the sites.
+        site: Row and column of the site that the rule is broken at; None if there is no particular one.
     """
 
-    def __init__(self, rule: str, detail: str, *, batch: int = -1, move: int = -1, planner: str = "") -> None:
+    def __init__(
+        self,
+        rule: str,
+        detail: str,
+        *,
+        batch: int = -1,
+        move: int = -1,
+        planner: str = "",
+        site: tuple[int, int] | None = None,
+    ) -> None:
         self.rule = rule
         self.batch = batch
         self.move = move
         self.detail = detail
+        self.site = site
         where = f"batch {batch + 1}" if batch >= 0 else "plan"
         if move >= 0:
             where += f", atom move {move + 1}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from labseq.config.addresses import Override, split_overrides
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
-from labseq.guard import StopFlag
+from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
 from labseq.model import (
     CalibrationEntry,
@@ -230,6 +230,7 @@ def replay_plans(
         RecordingError: The shot cannot be read.
     """
     found: list[ReplayedPlan] = []
+    guard = Guard()
     for cycle in shot.cycles:
         seen = image_before(cycle, shot.images)
         if seen is None:
@@ -238,7 +239,7 @@ def replay_plans(
         replayed, same, failure = None, False, ""
         try:
             start_s = perf_counter()
-            plan = call_planner(planner, name, seen.occupancy, shot.target)
+            plan = call_planner(planner, name, seen.occupancy, shot.target, guard)
             planning_s = perf_counter() - start_s
             report = check_plan(plan, seen.occupancy, shot.target, degree_of_parallelism, grid, motion, name)
             replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), is_same(plan, cycle.plan)

@@ -52,7 +52,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         check_picture(output.png, source.occupancy.shape)
     if source.occupancy.size <= INTERPRETED_SITES:
         interpret()
-    moves = plan_moves(request, source, announce=report_compiling)
+    moves = plan_moves(request, source, announce=report_compiling, keep_refused=True)
     if output.png is not None:
         _draw(moves, output.png)
     if output.json != STDOUT:
@@ -62,10 +62,14 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     say(*(f"warning: {text}" for text in warnings(moves, request)), stream=sys.stderr)
     if output.json == STDOUT:
         write(moves.as_dict())
+    if moves.refused is not None:
+        raise moves.refused
 
 
 def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
-    """Warnings for the user about a valid plan."""
+    """Warnings for the user about a valid plan; none of a refused one."""
+    if moves.refused is not None:
+        return []
     texts: list[str] = []
     asked, used = request.degree_of_parallelism, moves.degree_of_parallelism
     if asked is not None and asked != used:
@@ -91,17 +95,15 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
 def _draw(moves: PlannedMoves, path: Path) -> None:
     from labseq.pictures.plans import PlanDrawing, save_plan
 
-    drawing = PlanDrawing(
-        title(moves), moves.source, moves.grid, moves.occupancy, moves.target, moves.plan, moves.report
-    )
-    save_plan(path, drawing)
+    what = moves.grid, moves.occupancy, moves.target, moves.plan, moves.report, moves.refused
+    save_plan(path, PlanDrawing(title(moves), moves.source, *what))
 
 
 def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[list[Text]]:
-    """Describe and draw each batch."""
+    """Describe and draw each batch; of a refused plan, those before the refused one."""
     plan, report, shape = moves.plan, moves.report, moves.grid.shape
     arrays = occupancies(plan, moves.occupancy)
-    for i, batch in enumerate(plan.batches):
+    for i, batch in enumerate(plan.batches[: len(report.batch_end_s)]):
         stays = on_grid(batch.to_sites, shape)
         n_ejected = int(np.count_nonzero(~stays))
         parts = [
@@ -117,6 +119,32 @@ def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[
             *(Text(f"  {line}") for line in moves_text(batch, shape, arrow)),
             *canvas.lines(("before", "after"), arrays[i : i + 2], marked),
         ]
+
+
+def refused_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> list[Text]:
+    """Describe and draw the refused batch and the place of its mistake; nothing for a valid plan."""
+    error, plan, shape = moves.refused, moves.plan, moves.grid.shape
+    if error is None:
+        return []
+    batch = plan.batch(error.batch)
+    sites = batch.from_sites, batch.to_sites
+    titles = "moves from", "moves to"
+    if error.move >= 0:
+        sites = batch.from_sites[[error.move]], batch.to_sites[[error.move]]
+        titles = f"atom move {error.move} from", f"atom move {error.move} to"
+    elif error.site is not None:
+        sites = batch.from_sites, np.array([error.site], np.int16)
+        titles = "moves from", "site that breaks the rule"
+    marked = [one[on_grid(one, shape)] for one in sites]
+    atoms = moves.report.predicted
+    ways = zip(map(tuple, batch.from_sites.tolist()), map(tuple, batch.to_sites.tolist()), strict=True)
+    return [
+        Text.assemble((f"batch {error.batch} of {plan.n_batches}", "bold"), "  ", ("refused", "bold red")),
+        Text("  " + ", ".join(f"{start}{arrow}{goal}" for start, goal in ways)),
+        *canvas.lines(titles, (atoms, atoms), marked),
+        Text(f"rule '{error.rule}': {error.detail}", "red"),
+        Text(),
+    ]
 
 
 def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[str]:
@@ -163,13 +191,15 @@ def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
     canvas = ArrayPair(moves.target, shear, width, glyphs_for(console.encoding))
     _print(console, *map(Text, columns(subject(moves))), Text())
+    arrow = "→" if encodes(console.encoding, "→") else "->"
     if step:
-        arrow = "→" if encodes(console.encoding, "→") else "->"
         _print_steps(console, batch_lines(moves, canvas, arrow))
     before, after = moves.occupancy, moves.report.predicted
-    _print(console, *canvas.lines(("before", "after"), (before, after)), Text())
+    end = "after" if moves.refused is None else f"before batch {moves.refused.batch}"
+    _print(console, *canvas.lines(("before", end), (before, after)), Text())
     if key := canvas.key(before, after):
         _print(console, key, Text())
+    _print(console, *refused_lines(moves, canvas, arrow))
     _print(console, *map(Text, columns(totals(moves))))
 
 
@@ -197,12 +227,14 @@ def _print(console: Console, *lines: Text) -> None:
 
 def title(moves: PlannedMoves) -> str:
     """The plan on one line."""
-    plan = moves.plan
+    plan, refused = moves.plan, moves.refused
     parts = [
         moves.target.name,
         "1 batch" if plan.n_batches == 1 else f"{plan.n_batches} batches",
         plural(plan.n_atom_moves, "atom move"),
-        format_quantity(moves.report.duration_s, "time"),
+        format_quantity(moves.report.duration_s, "time")
+        if refused is None
+        else f"refused in batch {refused.batch}",
     ]
     return f"{moves.planner}, degree of parallelism {moves.degree_of_parallelism}: {', '.join(parts)}"
 
@@ -227,6 +259,9 @@ def totals(moves: PlannedMoves) -> list[tuple[str, str]]:
     """The plan in numbers."""
     plan, report = moves.plan, moves.report
     n_atoms = moves.target.n_atoms
+    if moves.refused is not None:
+        valid = f"{plan.n_batches}, of which {moves.refused.batch} come before the refused one"
+        return [("batches", valid), ("atom moves", str(plan.n_atom_moves))]
     rows = [
         ("batches", str(plan.n_batches)),
         ("atom moves", str(plan.n_atom_moves)),

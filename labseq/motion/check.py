@@ -61,6 +61,8 @@ FAULTS: Final[Mapping[str, tuple[str, str]]] = {
     "INNER_EJECTION": ("ejection", "an atom would be ejected over the one on {site}; eject that one first"),
 }
 """Faults of :mod:`labseq.motion.check_kernels`: name -> rule, wording."""
+_AT_A_SITE: Final = {"INNER_EJECTION", *(name for name, (_, text) in FAULTS.items() if "{site}" in text)}
+"""The faults whose two numbers are a site."""
 
 
 _INTEGERS: Final = (int, np.integer)
@@ -161,7 +163,7 @@ def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, plann
     if not isinstance(dop, _INTEGERS):
         raise LimitError("the degree of parallelism", repr(dop), "a whole number, at least 1")
     if not isinstance(plan, Plan):
-        what, came = "a Plan", plan
+        what, came = "a Plan (labseq.plugin.Plan.from_batches makes one)", plan
     elif not isinstance(target, TargetPattern):
         what, came = "a TargetPattern as target", target
     elif grid is not None and not isinstance(grid, SiteGrid):
@@ -186,7 +188,8 @@ def _raise_plan_error(
     from labseq.motion import check_kernels
 
     batch, move, a, b = (int(number) for number in where)
-    rule, wording = next(FAULTS[name] for name in FAULTS if getattr(check_kernels, name) == fault)
+    name = next(name for name in FAULTS if getattr(check_kernels, name) == fault)
+    rule, wording = FAULTS[name]
     row = col = to_row = to_col = -1  # only used in messages about an atom move
     if move >= 0:
         row, col, to_row, to_col = plan.moves[plan.batch_offsets[batch] + move].tolist()
@@ -202,4 +205,5 @@ def _raise_plan_error(
         n_cols=shape[1],
         slots=slots,
     )
-    raise InvalidPlanError(rule, detail, batch=batch, move=move, planner=planner)
+    site = (a, b) if name in _AT_A_SITE else None
+    raise InvalidPlanError(rule, detail, batch=batch, move=move, planner=planner, site=site)

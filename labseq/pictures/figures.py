@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import ConfigError, Problem
 from labseq.files import whole_file
-from labseq.model import Plan, SiteGrid
+from labseq.model import SiteGrid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -190,11 +190,6 @@ def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float6
     """
     axes = grid.axes / grid.spacing_m
     return sites[..., 1:] * axes[0] + sites[..., :1] * axes[1]
-
-
-def extent_of(plan: Plan, grid: SiteGrid) -> Extent:
-    """The extent of a plan: all sites, and the places to which atoms are ejected."""
-    return extent_of_sites(plan.moves[:, 2:], grid)
 
 
 def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:

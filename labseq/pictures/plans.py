@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import ConfigError, Problem
+from labseq.errors import ConfigError, InvalidPlanError, Problem
 from labseq.model import Batch, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.pictures.figures import (
     POINTS_PER_INCH,
     MarkerStyle,
     Sheet,
     check_place,
-    extent_of,
+    extent_of_sites,
     make_figure,
     place_sites,
     plan_timelines,
@@ -165,7 +166,7 @@ def occupancies(plan: Plan, occupancy: Occupancy) -> list[Occupancy]:
     before = [occupancy]
     for batch in plan.batches:
         atoms = before[-1].copy()
-        atoms[tuple(batch.from_sites.T)] = False
+        atoms[tuple(batch.from_sites[on_grid(batch.from_sites, occupancy.shape)].T)] = False
         atoms[tuple(batch.to_sites[on_grid(batch.to_sites, occupancy.shape)].T)] = True
         before.append(atoms)
     return before
@@ -197,6 +198,9 @@ RESERVOIR_LOOK: Final = MarkerStyle("atom in the reservoir", "o", 0.5, RESERVOIR
 EMPTY_LOOK: Final = MarkerStyle("empty site", "o", 0.14, DOT, DOT)
 MISSING_LOOK: Final = MarkerStyle("target site that stays empty", "o", 0.62, "white", DEFECT)
 EJECTED_LOOK: Final = MarkerStyle("ejected", "X", 0.55, DEFECT, DEFECT)
+WRONG_LOOK: Final = MarkerStyle("refused", "D", 0.95, "none", DEFECT)
+ATTEMPTED: Final = "0.25"
+"""Colour of moves of a refused batch that break no rule themselves."""
 
 
 def paint_sites(
@@ -377,7 +381,7 @@ COLOURS: Final = ("plasma", 0.0, 0.82)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanDrawing:
-    """What is drawn: a checked plan, the occupancy before it, and two lines of text at the top."""
+    """What is drawn: a plan, the occupancy before it, two lines of text at the top, and what is wrong."""
 
     title: str
     source: str
@@ -386,6 +390,18 @@ class PlanDrawing:
     target: TargetPattern
     plan: Plan
     report: PlanReport
+    refused: InvalidPlanError | None = None
+
+    @property
+    def refused_batch(self) -> Batch | None:
+        """The batch that breaks a rule, with sites far outside of the grid moved closer to it."""
+        if self.refused is None:
+            return None
+        batch, most = self.plan.batch(self.refused.batch), np.array(self.grid.shape) + 1
+        starts, goals = (
+            np.clip(one, -2, most).astype(np.int16) for one in (batch.from_sites, batch.to_sites)
+        )
+        return Batch(starts, goals)
 
 
 def check_picture(path: Path, shape: tuple[int, int]) -> None:
@@ -404,6 +420,8 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
 def save_plan(path: Path, drawing: PlanDrawing) -> None:
     """Draw the array before and after, and between them a panel for each batch or some of them.
 
+    A plan that was refused is drawn up to the refused batch, with what is wrong in it.
+
     Raises:
         ConfigError: The file cannot be written.
     """
@@ -412,45 +430,84 @@ def save_plan(path: Path, drawing: PlanDrawing) -> None:
 
 
 def _draw(drawing: PlanDrawing) -> Figure:
-    plan, grid = drawing.plan, drawing.grid
+    grid, refused = drawing.grid, drawing.refused_batch
+    if drawing.refused is not None:
+        drawing = replace(drawing, plan=drawing.plan.first(drawing.refused.batch))
+    plan = drawing.plan
+    others = (
+        [plan.moves[:, 2:]] if refused is None else [plan.moves[:, 2:], refused.to_sites, refused.from_sites]
+    )
     panels = make_panels(batch_lines(plan))
-    sheet = plan_timelines(extent_of(plan, grid), len(panels) + 2)
+    extent = extent_of_sites(np.concatenate(others), grid)
+    sheet = plan_timelines(extent, len(panels) + 1 + len(others[:2]))
     figure = make_figure(sheet.width_in, sheet.height_in)
     looks = _fill(figure, sheet, drawing, panels)
+    if refused is not None:
+        looks += _paint_refused(figure, sheet, drawing, refused, len(panels) + 1)
     _write_head(figure, sheet, drawing, looks)
     if len(panels) < plan.n_batches:
         _colour_bar(figure, sheet, "batches of a panel", ("first", "last"))
     elif panels:
-        _colour_bar(figure, sheet, "batch", ("1", str(plan.n_batches)))
+        _colour_bar(figure, sheet, "batch", ("0", str(plan.n_batches - 1)))
     return figure
 
 
 def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel]) -> list[MarkerStyle]:
-    """Paint all panels; return the marks that the key explains."""
-    plan, grid, target = drawing.plan, drawing.grid, drawing.target
-    n_rows, n_cols = grid.shape
-    edge = place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)
-    before = occupancies(plan, drawing.occupancy)
+    """Paint all panels of valid batches; return the marks that the key explains."""
+    grid, target, refused = drawing.grid, drawing.target, drawing.refused
+    before = occupancies(drawing.plan, drawing.occupancy)
     shown = [before[0], *(before[panel.first] for panel in panels), before[-1]]
+    filled = f"after: {target.n_atoms - drawing.report.n_defects} of {target.n_atoms} target sites filled"
     titles = [
         f"before: {int(before[0].sum())} atoms",
         *(panel.title for panel in panels),
-        f"after: {target.n_atoms - drawing.report.n_defects} of {target.n_atoms} target sites filled",
+        filled if refused is None else f"batch {refused.batch}: refused",
     ]
     looks: dict[MarkerStyle, None] = {}
     for i, (atoms, title) in enumerate(zip(shown, titles, strict=True)):
         axes = figure.add_axes(sheet.place(i))
-        final = i == len(shown) - 1
+        final = i == len(shown) - 1 and refused is None
         looks |= dict.fromkeys(paint_sites(axes, sheet, grid, atoms, target, final=final))
-        frame(axes, sheet, title, edge)
+        frame(axes, sheet, title, _corners(grid))
         if 0 < i <= len(panels):
-            _paint_panel(axes, sheet, drawing, panels[i - 1], alone=len(panels) == plan.n_batches)
+            _paint_panel(axes, sheet, drawing, panels[i - 1], alone=len(panels) == drawing.plan.n_batches)
         elif i == 0:
             paint_numbers(axes, grid)
             _scale_bar(axes, sheet, grid)
     if drawing.occupancy.sum() > before[-1].sum():
         looks[EJECTED_LOOK] = None
     return list(looks)
+
+
+def _corners(grid: SiteGrid) -> NDArray[np.float64]:
+    n_rows, n_cols = grid.shape
+    return place_sites(np.array([[0, 0], [0, n_cols], [n_rows, n_cols], [n_rows, 0]]) - 0.5, grid)
+
+
+def _paint_refused(
+    figure: Figure, sheet: Sheet, drawing: PlanDrawing, batch: Batch, index: int
+) -> list[MarkerStyle]:
+    """Paint what is wrong into the panel of the refused batch, and write it beside it."""
+    axes, error, grid = figure.axes[index], drawing.refused, drawing.grid
+    assert error is not None
+    axes.title.set_color(DEFECT)
+    paint_numbers(axes, grid)
+    moves = np.concatenate([batch.from_sites, batch.to_sites], axis=1)
+    wrong = (
+        np.arange(len(moves)) == error.move if error.move >= 0 else np.full(len(moves), error.site is None)
+    )
+    goes = (batch.from_sites != batch.to_sites).any(axis=1)
+    colours = np.where(wrong, DEFECT, ATTEMPTED)
+    paint_moves(axes, sheet, grid, moves[goes], colours[goes])
+    sites = moves[wrong & ~goes, :2] if error.site is None else np.array([error.site])
+    x, y = place_sites(np.clip(sites, -2, np.array(grid.shape) + 1), grid).T
+    axes.plot(x, y, **WRONG_LOOK.keywords(sheet.site_in), zorder=5)
+    left, bottom, width, height = sheet.place(index + 1)
+    per_line = max(20, int(width * sheet.width_in * POINTS_PER_INCH / 5))
+    text = "\n".join(wrap(str(error), per_line))
+    plain: dict[str, Any] = {"va": "top", "parse_math": False}
+    figure.text(left + 0.05 * width, bottom + 0.9 * height, text, fontsize=9, color=DEFECT, **plain)
+    return [WRONG_LOOK] if len(sites) else []
 
 
 def _paint_panel(axes: Axes, sheet: Sheet, drawing: PlanDrawing, panel: Panel, *, alone: bool) -> None:

@@ -118,7 +118,9 @@ def parse_text(data: bytes, name: str) -> Occupancy:
         if len(row) != len(rows[0]):
             what = f"this row has {len(row)} sites"
             expected = f"{len(rows[0])}, as in line {filled[0] + 1}"
-            raise ConfigError(Problem(what, name, i + 1, 1, expected))
+            columns = [n for n, character in enumerate(lines[i], start=1) if character in _CHARACTERS]
+            column = columns[len(rows[0])] if len(row) > len(rows[0]) else len(lines[i].rstrip()) + 1
+            raise ConfigError(Problem(what, name, i + 1, column, expected))
     return _checked(np.array(rows, np.bool_), name)
 
 

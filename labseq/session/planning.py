@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,11 +18,13 @@ from labseq.config.document import Document, plugin_paths
 from labseq.config.plan_file import PlanFile, parse_plan
 from labseq.config.profile import load_profile
 from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
-from labseq.errors import ConfigError, LabseqError, LimitError, PlanError, Problem
+from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
+from labseq.guard import Guard
 from labseq.messages import clean, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
+from labseq.plugins.calls import error_location, format_error
 from labseq.roles import Context, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, load_plugins, resolve
 from labseq.session.lab import construct, parallelism_of
@@ -238,7 +242,8 @@ class PlannedMoves:
         degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
         seed: Seed of all random numbers, drawn or given; None if there is none.
         plan: The plan.
-        report: Result of the check.
+        report: Result of the check; of a refused plan, that of the batches before the refused one.
+        refused: The rule that the plan breaks in a batch; None for a valid plan.
     """
 
     source: str
@@ -252,6 +257,7 @@ class PlannedMoves:
     seed: int | None
     plan: Plan
     report: PlanReport
+    refused: InvalidPlanError | None = None
 
     @property
     def n_missing_atoms(self) -> int:
@@ -275,7 +281,7 @@ class PlannedMoves:
 
     def as_dict(self) -> dict[str, Any]:
         """Everything, JSON-ready; occupancies as rows of 0 and 1, ejected atoms at sites off the grid."""
-        grid, report = self.grid, self.report
+        grid, report, refused = self.grid, self.report, self.refused
         return {
             "planner": self.planner,
             "grid": {
@@ -297,6 +303,7 @@ class PlannedMoves:
                 for b in self.plan.batches
             ],
             "predicted": _bits(report.predicted),
+            "refused": refused and {"batch": refused.batch, "move": refused.move, "why": str(refused)},
         }
 
 
@@ -305,6 +312,7 @@ def plan_moves(
     source: Source | None = None,
     *,
     announce: Callable[[str], None] = lambda _: None,
+    keep_refused: bool = False,
 ) -> PlannedMoves:
     """Plan once, and check the plan as a run does.
 
@@ -312,6 +320,7 @@ def plan_moves(
         request: The arguments.
         source: Its occupancy, if it has been read already.
         announce: Called with the name of a module before its kernels are compiled.
+        keep_refused: Whether a plan that breaks a rule in one of its batches is returned, too.
 
     Raises:
         ConfigError: The request has an error; says what was expected.
@@ -328,8 +337,14 @@ def plan_moves(
     planner: Planner = made["planner"]
     dop = parallelism_of(inputs.planner, planner, motion)
     with announcing(announce):
-        plan = call_planner(planner, request.planner, occupancy, target)
-        report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
+        plan, refused = call_planner(planner, request.planner, occupancy, target), None
+        try:
+            report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
+        except InvalidPlanError as error:
+            if not keep_refused or error.batch < 0:
+                raise
+            refused, before = error, plan.first(error.batch)
+            report = check_plan(before, occupancy, target, dop, grid, motion, request.planner)
     return PlannedMoves(
         source=source.label,
         occupancy=occupancy,
@@ -342,23 +357,46 @@ def plan_moves(
         seed=seed,
         plan=plan,
         report=report,
+        refused=refused,
     )
 
 
-def call_planner(planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern) -> Plan:
+MAX_PLAN_S: Final = 60.0
+"""Maximum time for a plan outside of a run, whose kernels may be interpreted."""
+
+
+def call_planner(
+    planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern, guard: Guard | None = None
+) -> Plan:
     """Call a planner with a copy of the occupancy, in case the planner changes its input.
 
+    Args:
+        planner: The planner.
+        name: Its name.
+        occupancy: bool (n_rows, n_cols).
+        target: The target pattern.
+        guard: Calls it; without one, a new one.
+
     Raises:
-        PlanError: The planner raised; names the planner.
+        PlanError: The planner raised, or did not return in time; names the planner.
     """
-    try:
-        return planner.plan(occupancy.copy(), target)
-    except PlanError as error:
-        raise error if error.planner else PlanError(str(error), name) from error
-    except LabseqError:
-        raise
-    except Exception as error:
-        raise PlanError(f"plan() raised {type(error).__name__}: {error}", name) from error
+    guard = guard or Guard()
+    call = guard.run("planner", MAX_PLAN_S, partial(planner.plan, occupancy.copy(), target))
+    if call is None:
+        text = f"plan() did not return within {MAX_PLAN_S:.3g} s and was abandoned"
+        in_a_run = "a run waits for 'timeouts: {plan: ...}' of its profile, 5 s by default"
+        raise PlanError(f"{text}; {in_a_run}", name)
+    error = call.error
+    if error is None:
+        return call.result
+    if isinstance(error, LabseqError):
+        is_named = not isinstance(error, PlanError) or error.planner
+        raise error if is_named else PlanError(str(error), name) from error
+    home = getattr(sys.modules.get(type(planner).__module__), "__file__", None)
+    place = error_location(error, Path(home) if home else None)
+    raise PlanError(
+        f"plan() raised {format_error(error)}" + (f" ({place})" if place else ""), name
+    ) from error
 
 
 def changed_settings(settings: Settings | None) -> dict[str, Any]:

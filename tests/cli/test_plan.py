@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from PIL import Image
 from rich.text import Text
 
 from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, totals, warnings
@@ -140,6 +141,98 @@ def test_a_planner_that_leaves_defects_and_surplus_is_reported(
         f"the plan leaves {moves.report.n_surplus} atoms on sites that must be empty",
     ]
     assert ("surplus", f"{moves.report.n_surplus} atoms on sites that must be empty") in totals(moves)
+
+
+BROKEN = """
+import labseq
+from labseq.plugin import Planner, Settings, hookimpl
+
+LABSEQ_API = 1
+SECOND = {
+    "diagonal": ([(0, 0)], [(2, 1)]),
+    "outside": ([(1, 1)], [(1, 3000)]),
+    "waits": ([(0, 0)], [(0, 0)]),
+    "empty": ([], []),
+    "over": ([(0, 2)], [(0, -1)]),
+}
+
+
+class BrokenSettings(Settings):
+    kind: str = "raises"
+
+
+class Broken(Planner):
+    def __init__(self, settings, context):
+        self.degree_of_parallelism = 4
+        self.kind = settings.kind
+
+    def plan(self, occupancy, target):
+        batches = [([(1, 1)], [(1, 0)]), SECOND[self.kind], ([(1, 0)], [(1, 1)])]
+        return labseq.Plan.from_batches(batches)
+
+
+@hookimpl
+def labseq_register(registry):
+    registry.planner("broken", Broken, BrokenSettings)
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "move", "why", "way"),
+    [
+        ("diagonal", 0, "(0, 0) -> (2, 1) changes row and column", "(0, 0)->(2, 1)"),
+        ("outside", 0, "the goal (1, 3000) is neither on the grid", "(1, 1)->(1, 3000)"),
+        ("waits", 0, "(0, 0) -> (0, 0) goes nowhere", "(0, 0)->(0, 0)"),
+        ("empty", -1, "it has no atom moves; leave it out", "refused"),
+        ("over", -1, "an atom would be ejected over the one on (0, 0)", "(0, 2)->(0, -1)"),
+    ],
+)
+def test_a_refused_plan_is_shown_up_to_its_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Any, kind: str, move: int, why: str, way: str
+) -> None:
+    (tmp_path / "broken.py").write_text(BROKEN, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    png, saved = tmp_path / "a.png", tmp_path / "a.json"
+    command = ["plan", "random:6x6@0.6", "--seed=1", "--target=compact:3x3", "--planner=broken"]
+    code, out, err = call(*command, f"--set=kind={kind}", f"--json={saved}", f"--png={png}")
+    assert code == 1
+    assert why in err
+    document = json.loads(saved.read_text("utf-8"))
+    assert len(document["batches"]) == 3
+    assert document["refused"].items() >= {"batch": 1, "move": move}.items()
+    assert why in document["refused"]["why"]
+    assert document["predicted"][1][:2] == [1, 0]
+    text = out.replace("→", "->")
+    assert "batch 1 of 3  refused" in text
+    assert why in text
+    assert way in text
+    pixels = np.asarray(Image.open(png).convert("RGB")).astype(int)
+    assert np.count_nonzero(np.abs(pixels - (0xC8, 0x10, 0x2E)).max(axis=2) < 12) > 500
+
+
+def test_a_planner_that_fails_or_hangs_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Any
+) -> None:
+    path = tmp_path / "broken.py"
+    path.write_text(BROKEN, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    command = ["plan", "random:6x6@0.6", "--target=compact:3x3", "--planner=broken"]
+    code, _, err = call(*command)
+    line = BROKEN.splitlines().index(
+        "        batches = [([(1, 1)], [(1, 0)]), SECOND[self.kind], ([(1, 0)], [(1, 1)])]"
+    )
+    assert (code, err) == (
+        1,
+        f"error: planner 'broken': plan() raised KeyError: 'raises' ({path}:{line + 1})\n",
+    )
+    path.write_text(
+        BROKEN.replace("        batches = ", "        import time; time.sleep(1)\n        batches = "),
+        "utf-8",
+    )
+    monkeypatch.setattr("labseq.session.planning.MAX_PLAN_S", 0.01)
+    code, _, err = call(*command)
+    assert code == 1
+    assert "plan() did not return within 0.01 s and was abandoned; a run waits for 'timeouts: {plan: " in err
 
 
 def test_json_in_a_file_is_printed_with_the_report(

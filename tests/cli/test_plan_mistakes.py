@@ -17,7 +17,15 @@ COMPACT = ("--target", "compact:15x15")
 BAD = [
     (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a .npy file, a text file"),
     (["complex.npy", *COMPACT], "complex.npy: it holds an array of shape (2, 2) and type complex128"),
-    (["ragged.txt", *COMPACT], "ragged.txt:2:1: this row has 2 sites; expected 3, as in line 1"),
+    (["ragged.txt", *COMPACT], "ragged.txt:2:3: this row has 2 sites; expected 3, as in line 1"),
+    (
+        ["long.txt", *COMPACT],
+        "long.txt:2:7: this row has 4 sites; expected 3, as in line 1\n    2 | # . # #\n      |       ^",
+    ),
+    (
+        ["letter.txt", *COMPACT],
+        "letter.txt:2:5: 'o' is no site; expected 0 or '.' for an empty site, 1 or '#'",
+    ),
     (["random:20x@0.75", *COMPACT], "random:20x@0.75: this is no occupancy; expected random:ROWSxCOLS@P"),
     (["text.h5#1", *COMPACT], "text.h5: "),
     ([RANDOM], "--target is missing; expected a pattern such as kagome:15x15"),
@@ -39,6 +47,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bad")
     np.save(folder / "complex.npy", np.ones((2, 2), complex))
     (folder / "ragged.txt").write_text("101\n10\n", "utf-8")
+    (folder / "long.txt").write_text("# . #\n# . # #\n", "utf-8")
+    (folder / "letter.txt").write_text("# . #\n# . o\n", "utf-8")
     (folder / "text.h5").write_text("no HDF5", "utf-8")
     return folder
 

@@ -22,7 +22,7 @@ from labseq.pictures.figures import (
     Extent,
     cell,
     check_place,
-    extent_of,
+    extent_of_sites,
     make_figure,
     neighbours,
     outline,
@@ -117,7 +117,7 @@ def test_a_panel_shows_every_site_and_where_atoms_are_ejected(grid: SiteGrid) ->
     n_rows, n_cols = grid.shape
     plan = Plan.from_batches([([(0, 0)], [(-1, 0)]), ([(n_rows - 1, n_cols - 1)], [(n_rows - 1, n_cols)])])
     for shown in (plan, Plan.from_batches([])):
-        extent = extent_of(shown, grid)
+        extent = extent_of_sites(shown.moves[:, 2:], grid)
         sites = np.argwhere(np.ones(grid.shape))
         x, y = place_sites(np.concatenate([sites, shown.moves[:, 2:]]), grid).T
         assert (extent.left, extent.right) == pytest.approx((x.min() - MARGIN, x.max() + MARGIN))

@@ -120,7 +120,7 @@ def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, b
     ("text", "words"),
     [
         (b"", "mine: it is empty"),
-        (b"101\n01\n", "mine:2:1: this row has 2 sites; expected 3, as in line 1"),
+        (b"101\n01\n", "mine:2:3: this row has 2 sites; expected 3, as in line 1"),
         (b"\n101\n\n101", "mine:3:1: this row has 0 sites; expected 3, as in line 2"),
         (b"102\n", "mine:1:3: '2' is no site; expected 0 or '.'"),
         (b"10\n1\x00\n", r"mine:2:2: '\x00' is no site"),
