@@ -28,7 +28,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from labseq import Run, Session, ShotRecord, open_run
-from labseq.analysis.statistics import Rate, Statistics, statistics_of
+from labseq.analysis.statistics import Statistics, statistics_of
+from labseq.model.estimate import Rate
 from labseq.recording.points import scan_points
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.analysis.statistics import Estimated
 from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
-from labseq.model.estimate import Estimate
+from labseq.model.estimate import Estimate, Estimated
 from labseq.pictures.figures import DARK, LIGHT, ORANGE, RED, cell, outline, place_sites
 from labseq.units import format_quantity
 

@@ -27,7 +27,7 @@ from labseq.analysis.charts import (
     points_of,
 )
 from labseq.analysis.scanned import Axis, Scanned, is_geometric, numbers_of, scanned
-from labseq.analysis.statistics import CycleStatistics, Estimated, Rate, Statistics, statistics_of
+from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.analysis.survival import Survival, SurvivalCounts, steps_that_load
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
@@ -35,7 +35,7 @@ from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean
 from labseq.model import CalibrationEntry, SiteGrid, TargetPattern
-from labseq.model.estimate import mean
+from labseq.model.estimate import Estimated, Rate, mean
 from labseq.pictures.figures import make_figure, save_figure
 from labseq.recording import Run, Shot
 from labseq.roles import Context

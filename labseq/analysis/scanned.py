@@ -9,8 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from labseq.analysis.statistics import CycleStatistics, Estimated, Statistics, statistics_of
+from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.messages import clean
+from labseq.model.estimate import Estimated
 from labseq.recording import Run
 from labseq.recording.points import scan_points
 

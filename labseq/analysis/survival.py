@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.analysis.statistics import Rate
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Occupancy
+from labseq.model.estimate import Rate
 from labseq.pictures.plans import on_grid
 from labseq.recording import Run, Shot
 

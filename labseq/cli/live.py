@@ -19,12 +19,11 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from labseq.analysis.statistics import jeffreys
 from labseq.cli.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, best_text, event_text
 from labseq.console.text import clock_time, count_of, plural
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
-from labseq.model.estimate import Estimate, mean
+from labseq.model.estimate import Estimate, jeffreys, mean
 from labseq.recording.points import SCANNER, ChosenPoints
 from labseq.units import format_quantity
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, Final
 
-from labseq.analysis.statistics import CycleStatistics, Rate, Statistics, statistics_of
+from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.console.text import columns, count_of, plural
 from labseq.messages import clean
-from labseq.model.estimate import Estimate
+from labseq.model.estimate import Estimate, Rate
 from labseq.recording import Run
 from labseq.recording.points import scan_points
 from labseq.units import format_quantity

@@ -1,10 +1,10 @@
-"""Means with errors."""
+"""Means and rates with errors."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,3 +66,63 @@ def mean(values: ArrayLike) -> Estimate:
         return Estimate(math.nan, math.nan)
     error = float(array.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
     return Estimate(float(array.mean()), error)
+
+
+ONE_SIGMA: Final = math.erf(math.sqrt(0.5))
+"""Probability within one standard deviation of a normal distribution, 68.3 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """A rate: ``n`` events in ``n_trials`` trials."""
+
+    n: int
+    n_trials: int
+
+    @property
+    def value(self) -> float:
+        """The fraction; nan without trials."""
+        return self.n / self.n_trials if self.n_trials else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its 1 sigma interval, see :func:`jeffreys`."""
+        return jeffreys(self.n, self.n_trials)
+
+
+Estimated: TypeAlias = Estimate | Rate
+"""A mean with its standard error, or a rate with its Jeffreys interval."""
+
+
+def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, float]:
+    """The equal-tailed interval of a probability, with Jeffreys' prior.
+
+    Between the quantiles of the beta distribution with ``n + 1/2`` and ``n_trials - n + 1/2``. The
+    lower end is 0 without any event, and the upper end is 1 if every trial is one (Brown, Cai, DasGupta,
+    Statist. Sci. 16, 101, 2001).
+
+    Args:
+        level: Probability of the interval, between 0 and 1.
+
+    Returns:
+        Its lower and upper end; 0 and 1 without trials.
+
+    Raises:
+        ValueError: ``n`` is negative, or more than ``n_trials``.
+
+    Example:
+        >>> [round(end, 4) for end in jeffreys(33, 100)]
+        [0.2849, 0.3785]
+        >>> [round(end, 4) for end in jeffreys(0, 10)]
+        [0.0, 0.0923]
+    """
+    if not 0 <= n <= n_trials:
+        raise ValueError(f"{n} of {n_trials}; expected at least 0, and at most all")
+    if not n_trials:
+        return 0.0, 1.0
+    from scipy.special import betaincinv  # takes 0.3 s to import
+
+    a, b, tail = n + 0.5, n_trials - n + 0.5, (1.0 - level) / 2
+    low = float(betaincinv(a, b, tail)) if n else 0.0
+    high = float(betaincinv(a, b, 1.0 - tail)) if n < n_trials else 1.0
+    return low, high

@@ -23,10 +23,9 @@ from labseq.analysis.charts import (
     points_of,
 )
 from labseq.analysis.overview import RunPicture
-from labseq.analysis.statistics import Rate
 from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
-from labseq.model.estimate import Estimate
+from labseq.model.estimate import Estimate, Rate
 from labseq.pictures.figures import RED, make_figure
 
 NAN = math.nan

@@ -18,8 +18,8 @@ from labseq.analysis.charts import (
     draw_trend,
 )
 from labseq.analysis.overview import RunPicture, overview, picture_of
-from labseq.analysis.statistics import jeffreys
 from labseq.errors import ConfigError
+from labseq.model.estimate import jeffreys
 from labseq.recording import Run, open_run
 
 from .records import make_shot

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from labseq.analysis.statistics import Rate
 from labseq.analysis.survival import Survival, expected, steps_that_load
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport
+from labseq.model.estimate import Rate
 from labseq.recording import Run
 
 from .records import make_shot

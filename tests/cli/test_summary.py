@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from labseq.analysis.statistics import CycleStatistics, Rate, Statistics
+from labseq.analysis.statistics import CycleStatistics, Statistics
 from labseq.cli.summary import NOT_JUDGED, cycle_table, statistics_rows
-from labseq.model.estimate import Estimate
+from labseq.model.estimate import Estimate, Rate
 
 UNKNOWN = Estimate(math.nan, math.nan)
 CYCLE = CycleStatistics(

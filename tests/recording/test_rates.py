@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.stats import beta
 
-from labseq.analysis.statistics import Rate, jeffreys
+from labseq.model.estimate import Rate, jeffreys
 
 
 @settings(max_examples=30)

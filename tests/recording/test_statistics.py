@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.analysis.statistics import Rate, statistics_of
+from labseq.analysis.statistics import statistics_of
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
+from labseq.model.estimate import Rate
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.run_file import summarise, summary_of
 
