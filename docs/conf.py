@@ -1,17 +1,12 @@
 """Sphinx configuration."""
 
-import sys
-from pathlib import Path
-
 import labseq
-
-sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "labseq"
 author = "the labseq developers"
 release = labseq.__version__
-extensions = ["myst_parser", "labseq_reference"]
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_block"]
+extensions = ["myst_parser"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build"]

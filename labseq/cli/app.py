@@ -34,7 +34,14 @@ from labseq.console.options import (
     run_argument,
 )
 from labseq.queue.commands import queue
-from labseq.scaffold.commands import NEW_EXAMPLES, SCHEMA_EXAMPLES, new, schema
+from labseq.scaffold.commands import (
+    EXPLAIN_EXAMPLES,
+    NEW_EXAMPLES,
+    SCHEMA_EXAMPLES,
+    explain,
+    new,
+    schema,
+)
 
 RUN_EXAMPLES: Final = """\b
 Examples:
@@ -295,6 +302,9 @@ def doctor(
 
 app.command(epilog=NEW_EXAMPLES, short_help="Make a plugin, sequence or profile that runs at once.")(new)
 app.command(epilog=SCHEMA_EXAMPLES, short_help="Write the JSON schema of files, for editors.")(schema)
+app.command(epilog=EXPLAIN_EXAMPLES, short_help="Explain a key, a step, a plugin, a command, an error.")(
+    explain
+)
 
 
 @app.command(short_help="List the plugins and what they offer.")

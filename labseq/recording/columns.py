@@ -38,12 +38,13 @@ _DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
 """Columns that are computed from a line of the index: description, function."""
 
 _FIELDS: Final = tuple(field for field in schema.SHOT if field.in_index and field.name != "error")
-_DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
+DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
     name: description for name, (description, _) in _DERIVED.items()
 }
+"""Column of every run -> its description."""
 _TEXTS: Final = frozenset({"file", *(field.name for field in _FIELDS if field.dtype == "text")})
 
-FIGURES: Final = tuple(name for name in _DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
+FIGURES: Final = tuple(name for name in DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
 """Columns of every run that are numerical results of a shot."""
 
 
@@ -59,6 +60,12 @@ _GROUPS: Final[Mapping[str, Callable[[_Row], Mapping[str, Any]]]] = {
     "calibration.": lambda row: row["calibrations"],
 }
 """Prefix of the columns that differ from run to run -> their values in a line of the index."""
+GROUPS: Final = {
+    "stage.": "sum of this stage on the session's clock",
+    "reading.": "read from a device during the shot, SI",
+    "calibration.": "id of the calibration in use",
+}
+"""Prefix of such columns -> their description."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +95,9 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     fixed = [_fixed(row) for row in rows]
     columns = [
         Column(name, _array([values[name] for values in fixed], text=name in _TEXTS), unit_of(name), about)
-        for name, about in _DESCRIPTIONS.items()
+        for name, about in DESCRIPTIONS.items()
     ]
-    taken = {*_DESCRIPTIONS}
+    taken = {*DESCRIPTIONS}
     written = _units_of_scan(run.scan)
     for prefix, values_of in _GROUPS.items():
         groups = [values_of(row) for row in rows]
@@ -106,13 +113,10 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
 
 
 def _description(prefix: str, name: str, *, scanned: bool) -> str:
-    if prefix == "stage.":
-        return "sum of this stage on the session's clock"
-    if prefix == "calibration.":
-        return "id of the calibration in use"
-    if prefix == "reading.":
-        simulated = name.startswith(SIMULATION)
-        return f"{'true value in the simulation' if simulated else 'read from a device during the shot'}, SI"
+    if prefix == "reading." and name.startswith(SIMULATION):
+        return "true value in the simulation, SI"
+    if prefix:
+        return GROUPS[prefix]
     return f"{'scanned' if scanned else 'set for the run'}, SI"
 
 

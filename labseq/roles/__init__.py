@@ -34,7 +34,7 @@ from labseq.roles.hardware import (
     leaders,
     offers,
 )
-from labseq.roles.shot import Clock, Context, NeverStopped, RunObserver, Shot, Step, StepContext
+from labseq.roles.shot import EVENTS, Clock, Context, NeverStopped, RunObserver, Shot, Step, StepContext
 from labseq.roles.simulation import (
     WHOLE_SENSOR,
     ReceivesOutput,
@@ -45,6 +45,7 @@ from labseq.roles.simulation import (
 )
 
 __all__ = [
+    "EVENTS",
     "WHOLE_SENSOR",
     "Analysis",
     "Camera",

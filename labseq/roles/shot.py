@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, Final, ParamSpec, Protocol, TypeVar
 
 from labseq.model import (
     CalibrationEntry,
@@ -370,9 +370,43 @@ class Step(ABC):
         return {}
 
 
+EVENTS: Final = {
+    "run_starting": "the run has its folder; its devices are opened next",
+    "compiling": "kernels are compiled, which happens once on each computer",
+    "compiled": "they are, with the time it took",
+    "settling": "labseq waits for a device to settle, such as a camera that cools down",
+    "run_started": "all devices are open",
+    "state": "the state of the run has changed: opening, idle, armed, playing, ...",
+    "shot_started": "an attempt at a shot begins",
+    "stage": "a stage of a step has ended, with its duration and its budget",
+    "image": "an image was taken, with the occupancy found on it",
+    "cycle": "a cycle of a rearrangement has ended",
+    "over_budget": "a stage took longer than its budget",
+    "too_few_atoms": "there are fewer atoms than the target needs",
+    "window_too_short": "not all batches of a plan fitted into the window",
+    "ramped": "the static tweezers have another depth",
+    "device_command": "a device carried out a command",
+    "step_repeated": "a step failed and is repeated, by its policy",
+    "leader_awaited": "labseq waits for a signal of the external control system",
+    "leader_signal": "the signal has come",
+    "leader_answered": "labseq has answered it",
+    "leader_event": "what else the link to the external control system reports",
+    "shot_repeated": "an attempt failed, and the shot is taken again",
+    "shot_finished": "a shot is on disk, complete or not",
+    "shots_skipped": "a policy skipped shots, with the reason",
+    "scan_point": "a shot of an adaptive scan is on disk: the point so far, and the best one",
+    "scan_ended": "the scanner chose no further point",
+    "warning": "something that the user should know; the run goes on",
+    "safe_state": "a device was brought to its safe state, or could not be",
+    "closed": "a device was closed, or could not be",
+    "run_finished": "the run has ended, in whatever way; all devices are in their safe state",
+}
+"""Event of a run -> what has happened."""
+
+
 class RunObserver(Protocol):
     """Receives the events of a run: the live view, a log. Its failures never stop the run."""
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Receive an event: "run_started", "shot_started", "stage", "image", ..."""
+        """Receive an event, one of :data:`EVENTS`."""
         ...

@@ -1,1 +1,1 @@
-"""`labseq new` and the schemas of files for editors."""
+"""`labseq new`, the schemas of files for editors, and the reference."""

@@ -1,4 +1,4 @@
-"""The commands `labseq new` and `labseq schema`."""
+"""The commands `labseq new`, `labseq schema` and `labseq explain`."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -17,6 +17,21 @@ SCHEMA_EXAMPLES: Final = """\b
 Examples:
   labseq schema sequence -o .labseq/sequence.schema.json
   labseq schema profile --plugins my_plugins
+"""
+PluginFolders = Annotated[
+    list[Path] | None,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of plugins to include; may be given several times. Default: the folder plugins, if it "
+        "exists.",
+    ),
+]
+EXPLAIN_EXAMPLES: Final = """\b
+Examples:
+  labseq explain
+  labseq explain step rearrange
+  labseq explain profile.camera
+  labseq explain psca
 """
 
 
@@ -79,16 +94,30 @@ def schema(
             "--output", "-o", metavar="FILE", help="Write the schema to this file instead of stdout."
         ),
     ] = None,
-    plugins: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of plugins whose settings the schema includes; may be given several times. Default: "
-            "the folder plugins, if it exists.",
-        ),
-    ] = None,
+    plugins: PluginFolders = None,
 ) -> None:
     """Write the JSON schema of sequences or profiles for editors, with the settings of every plugin."""
     from labseq.scaffold.terminal import write_schema
 
     write_schema(kind, output, plugins)
+
+
+def explain(
+    context: typer.Context,
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="WHAT",
+            help="Words such as step image, profile.camera or psca; without any, what there is to explain.",
+            show_default=False,
+        ),
+    ] = None,
+    plugins: PluginFolders = None,
+) -> None:
+    """Explain a key of a file, a step, a plugin, a command, a figure, an error or a unit.
+
+    It is the text of the reference pages, with the plugins of this computer and of the folder plugins.
+    """
+    from labseq.scaffold.terminal import explain_topic
+
+    explain_topic(" ".join(what or ()), plugins, context.find_root().command)

@@ -1,18 +1,25 @@
-"""`labseq new` and `labseq schema`: check the arguments, make the files, print what was made."""
+"""`labseq new`, `labseq schema` and `labseq explain`: make files, print what is known."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, Final
 
 from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
+from labseq.plugins import PluginHost
 from labseq.registry import KINDS
 from labseq.scaffold.new import PLUGINS, CreatedFiles, make_file, make_plugin
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, SCHEMA_FOLDER, schema_text
 from labseq.session.chosen import load_plugins
+
+MAX_WIDTH: Final = 110
+"""Widest line of an explanation."""
 
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
@@ -52,9 +59,7 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
     if kind not in FILE_KINDS:
         what = f"there is no schema of a '{clean(kind)}'"
         raise ConfigError(Problem(what, expected=listing(FILE_KINDS), hint=did_you_mean(kind, FILE_KINDS)))
-    if plugins is None:
-        plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
-    text = schema_text(kind, load_plugins(plugins).registry)
+    text = schema_text(kind, _host(plugins).registry)
     if output is None:
         say(text.rstrip())
         return
@@ -63,3 +68,35 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
             output.parent.mkdir(exist_ok=True)
     write_text(output, text)
     say(f"wrote {output}")
+
+
+def explain_topic(what: str, plugins: Sequence[Path] | None, program: Any) -> None:
+    """Print what is known of a key, a plugin, a command, ...; without a name, what there is to explain.
+
+    Args:
+        program: The command ``labseq``, as typer sees it.
+
+    Raises:
+        ConfigError: There is no such thing.
+    """
+    from labseq.scaffold.reference import find, overview, plain, topics
+
+    host = _host(plugins)
+    for info in (one for one in host.infos if one.state == "failed"):
+        say(f"warning: plugin '{info.name}' did not load: {info.reason}", stream=sys.stderr)
+    found = topics(host.registry, program)
+    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    names = find(found, what) if what else []
+    if len(names) == 1:
+        say(names[0], "", *plain(found[names[0]].blocks(), width))
+    elif names:
+        say(f"{what} can be:", "", *plain(overview(found, names), width))
+    else:
+        say("labseq explain WHAT, for example labseq explain step image", "", *plain(overview(found), width))
+
+
+def _host(plugins: Sequence[Path] | None) -> PluginHost:
+    """The plugins: the installed ones, and those in folders."""
+    if plugins is None:
+        plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
+    return load_plugins(plugins)

@@ -92,3 +92,37 @@ def test_schema_knows_the_plugins_of_a_folder(capsys: pytest.CaptureFixture[str]
 def test_mistakes_with_schemas(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of("schema", *arguments) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ([], r"  step  +check_overlay.*  command  +the commands"),
+        (["step", "image"], r"^step image\n\nTakes an image.*  exposure  +exposure time .*default: 45 ms"),
+        (["profile.camera"], r"The plugins.*  virtual  +Frames of the simulation"),
+        (["psca"], r"^planner psca\n.*  degree_of_parallelism  "),
+        (["exposure"], r"^exposure can be:.*  step image exposure\s+exposure time.*step rearrange exposure"),
+        (["figure", "filling"], r"^figure filling_fraction\n"),
+        (["command", "bench", "planners"], r"labseq bench planners \[OPTIONS\]"),
+        (["role", "camera"], r"^role Camera\n.*read\(timeout_s: float\) -> Frame\n    Wait for the oldest"),
+        (["spiral"], r"^planner spiral\n"),
+    ],
+)
+def test_an_explanation(words: list[str], shown: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "plugins").mkdir()
+    hook = "@hookimpl\ndef labseq_register(registry):\n    registry.planner('spiral', object)\n"
+    text = f"from labseq.plugin import hookimpl\nLABSEQ_API = 1\n\n{hook}"
+    (here / "plugins" / "spirals.py").write_text(text)
+    assert code_of("explain", *words) == 0
+    out, err = capsys.readouterr()
+    assert re.search(shown, out, re.DOTALL), out
+    assert (max(map(len, out.splitlines())) <= 110, err) == (True, "")
+
+
+def test_nothing_of_that_name_to_explain(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "plugins").mkdir()
+    (here / "plugins" / "broken.py").write_text("LABSEQ_API = 1\n1 / 0\n")
+    assert code_of("explain", "stpe", "image") == 2
+    err = capsys.readouterr().err
+    assert "warning: plugin 'broken' did not load: ZeroDivisionError" in err
+    assert "there is nothing called 'stpe image' to explain; did you mean 'step image'?" in err

@@ -1,0 +1,235 @@
+"""Write the generated parts of the reference pages: between the comments ``reference: ...`` and ``end``.
+
+    python docs/make_reference.py
+
+They are Markdown as the rest of the page; what they contain is in ``labseq.scaffold.reference``. The
+comment names the part and its arguments: ``settings profile grid``, ``plugins camera``, ``command run``.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Mapping
+from functools import cache
+from inspect import signature
+from pathlib import Path
+from typing import Any, Final
+
+import typer
+
+import labseq
+from labseq import builtin
+from labseq.cli.app import app
+from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
+from labseq.registry import KINDS, Registry
+from labseq.scaffold import reference
+from labseq.scaffold.reference import Block, Code, Table, definition, docstring, summary
+from labseq.testing import SUITES, fakes, strategies
+from labseq.testing.contracts import HardwareContract
+
+DOCS: Final = Path(__file__).parent
+PART: Final = re.compile(r"<!-- reference: (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
+"""A generated part of a page: its name and arguments, and its text."""
+PROGRAM: Final[Any] = typer.main.get_command(app)
+
+_SCRIPTS: Final = (
+    "open_run",
+    "Session.open",
+    "Session.resume",
+    "make_planner",
+    "make_target",
+    "check_plan",
+    "tone_program",
+    "render",
+    "as_occupancy",
+)
+"""What a script or a notebook calls."""
+_ALIASES: Final = {
+    "FilePath": "a path in a settings model, relative to the file that holds it",
+    "LABSEQ_API": "version of the interface that plugins are written for",
+    "Occupancy": "a boolean array (rows, columns): which sites hold an atom",
+    "RfSpan": "`RfSamples` or `RfTones`",
+    "Trigger": "how an exposure starts: `internal`, `software` or `external`",
+    "hookimpl": "marks a function as the implementation of a hook",
+    **dict.fromkeys(
+        ("Angle", "Duration", "Fraction", "Frequency", "Length", "Speed", "Temperature", "Voltage"),
+        "a quantity in a settings model: with a unit in the file, SI inside",
+    ),
+}
+"""Names whose docstring is not their own."""
+_GIVEN: Final = {"self", "device", "shape", "seed", "kind", "duration_s"}
+"""Arguments of what a plugin's test may override; methods with others serve the suite itself."""
+
+
+def current(page: str) -> str:
+    """The text of a page with its generated parts as they are now."""
+    return PART.sub(lambda part: f"<!-- reference: {part[1]} -->\n\n{text_of(part[1])}\n\n<!-- end -->", page)
+
+
+def text_of(part: str) -> str:
+    """The Markdown of a part.
+
+    Raises:
+        LookupError: There is no such part.
+    """
+    name, *arguments = part.split()
+    return reference.markdown(PARTS[name](*arguments))
+
+
+@cache
+def registry() -> Registry:
+    """What labseq's own plugins offer: not what happens to be installed beside them."""
+    host = PluginHost()
+    host.load_builtin(builtin)
+    project = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))
+    for module in project["project"]["entry-points"][ENTRY_POINT_GROUP].values():
+        host.load_builtin(importlib.import_module(module))
+    return host.registry
+
+
+def settings(kind: str, *names: str) -> list[Block]:
+    """The keys of a file, of a part of it, or of a plugin; "top" leaves out those of its parts."""
+    if kind in KINDS:
+        return [reference.settings(registry().get(kind, *names).settings_model)]
+    keys = [name for name in names if name != "top"]
+    return [reference.file_settings(kind, *keys, top="top" in names)]
+
+
+def command(*names: str) -> list[Block]:
+    """A command; without a name, the options of all."""
+    found = dict(reference.commands_below(PROGRAM))[names] if names else PROGRAM
+    return reference.command(names, found)
+
+
+def contract(kind: str) -> list[Block]:
+    """A suite: what it is told by a plugin's test, and a row for each promise of its own."""
+    suite = {**SUITES, "hardware": HardwareContract}[kind]
+    own = [one for one in _members(suite) if one.__name__ not in _inherited(suite)]
+    hooks = [one for one in own if not hasattr(one, "promise") and {*signature(one).parameters} <= _GIVEN]
+    rows = [(one.promise, f"`{one.__name__}`", summary(one)) for one in own if hasattr(one, "promise")]
+    blocks: list[Block] = [f"`{suite.__name__}`", docstring(suite)]
+    blocks += ["May be overridden:", *map(definition, hooks)] if hooks else []
+    return [*blocks, Table(("promise", "test", "tried"), rows)]
+
+
+def _members(suite: type[Any]) -> list[Any]:
+    """Public methods in the order of the source, those of its own first."""
+    found: dict[str, Any] = {}
+    for of in suite.__mro__:
+        for name, one in vars(of).items():
+            if inspect.isfunction(one) and not name.startswith("_") and name != "factory":
+                found.setdefault(name, one)
+    return list(found.values())
+
+
+def _inherited(suite: type[Any]) -> set[str]:
+    """What another suite is documented with: the promises of all hardware."""
+    if suite is HardwareContract or not issubclass(suite, HardwareContract):
+        return set()
+    return {one.__name__ for one in _members(HardwareContract)}
+
+
+def strategy_list() -> list[Block]:
+    """A definition per hypothesis strategy."""
+    found = reference.public(strategies, inspect.isfunction)
+    return [definition(one) for one in found if one.__module__ == strategies.__name__]
+
+
+def fake_list() -> list[Block]:
+    """A row per fake."""
+    return [_summaries("name", {name: getattr(fakes, name) for name in fakes.__all__})]
+
+
+def scripts() -> list[Block]:
+    """A definition for each function that scripts call."""
+    return [definition(_find(name), name=f"labseq.{name}") for name in _SCRIPTS]
+
+
+def names() -> list[Block]:
+    """All public names in a table."""
+    public = sorted(name for names in vars(labseq)["_HOMES"].values() for name in names)
+    return [_summaries("`labseq.`", {name: _find(name) for name in public})]
+
+
+def _summaries(title: str, found: Mapping[str, Any]) -> Table:
+    rows = [
+        (f"`{name}`", _ALIASES.get(name) or summary(one).removesuffix(".")) for name, one in found.items()
+    ]
+    return Table((title, "what it is"), rows)
+
+
+def _find(name: str) -> Any:
+    found: Any = labseq
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found
+
+
+def source(path: str, name: str = "") -> list[Block]:
+    """A Python file of the repository, or one class of it."""
+    text = (DOCS.parent / path).read_text("utf-8")
+    if name:
+        found = next(one for one in ast.parse(text).body if getattr(one, "name", "") == name)
+        text = ast.get_source_segment(text, found) or ""
+    return [Code("python", text.rstrip())]
+
+
+def role(name: str) -> list[Block]:
+    """A role and its methods."""
+    return reference.role(reference.roles_by_name()[name])
+
+
+def plugins(kind: str) -> list[Block]:
+    """A section for each plugin of a kind."""
+    return reference.registered(registry(), kind)
+
+
+PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
+    "settings": settings,
+    "plugins": plugins,
+    "command": command,
+    "role": role,
+    "contract": contract,
+    "strategies": strategy_list,
+    "fakes": fake_list,
+    "scripts": scripts,
+    "names": names,
+    "source": source,
+    "units": reference.units,
+    "registry": reference.registry_methods,
+    "hooks": reference.hooks,
+    "errors": reference.error_list,
+    "error-tree": reference.error_tree,
+    "exit-codes": reference.exit_codes,
+    "plan-rules": reference.plan_rules,
+    "events": reference.events,
+    "figures": reference.figures,
+    "datasets": reference.datasets,
+    "columns": reference.columns,
+    "attributes": reference.attributes,
+    "index": reference.index_keys,
+}
+"""Name of a part -> makes it."""
+
+
+def pages() -> list[Path]:
+    """The pages with generated parts."""
+    return [path for path in sorted(DOCS.rglob("*.md")) if PART.search(path.read_text("utf-8"))]
+
+
+def main() -> None:
+    """Write all pages."""
+    for path in pages():
+        text = path.read_text("utf-8")
+        if (made := current(text)) != text:
+            path.write_text(made, "utf-8", newline="\n")
+            sys.stdout.write(f"written: {path.relative_to(DOCS.parent)}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,663 @@
+"""The reference: every key, plugin, command, role, event and field of a file, as topics.
+
+A topic is a list of blocks, which :func:`markdown` writes for the pages and :func:`plain` for the terminal.
+The names of topics are words: ``step image``, ``profile grid spacing``, ``command bench planners``.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from signal import SIGINT, SIGTERM
+from typing import Any, Final, TypeAlias, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from labseq import builtin, errors, hookspecs, roles
+from labseq.config.profile import ProfileSpec
+from labseq.config.scan import AdaptiveChoice
+from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec, StepPolicySettings
+from labseq.config.validation import models_at
+from labseq.console.errors import EXIT_CODES, exit_code_of
+from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
+from labseq.messages import clean, closest
+from labseq.registry import KINDS, Entry, Registry
+from labseq.roles import EVENTS
+from labseq.scaffold.words import default_of, value_of
+from labseq.settings import Choice
+from labseq.units import EXAMPLES, UNITS, unit_names
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of Markdown cells; the first cell of a row is its name, the last its meaning."""
+
+    header: tuple[str, ...]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """A name, or how a function is called, and its text."""
+
+    term: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """Lines to be copied."""
+
+    language: str
+    text: str
+
+
+Block: TypeAlias = str | Table | Definition | Code
+"""A text is Markdown: paragraphs and lists."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """Something that can be looked up.
+
+    Attributes:
+        about: What it is, on one line.
+        blocks: Makes all that is known of it.
+    """
+
+    about: str
+    blocks: Callable[[], list[Block]]
+
+
+# How topics are written
+
+
+def markdown(blocks: Iterable[Block]) -> str:
+    """Blocks as a part of a page."""
+    return "\n\n".join(map(_markdown, blocks))
+
+
+def _markdown(block: Block) -> str:
+    if isinstance(block, Table):
+        lines = [block.header, ["---"] * len(block.header), *block.rows]
+        cells = [[cell.replace("|", r"\|") for cell in line] for line in lines]
+        return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    if isinstance(block, Definition):
+        return f"- `{block.term}`\n\n{textwrap.indent(block.text, '  ')}"
+    return block if isinstance(block, str) else f"```{block.language}\n{block.text}\n```"
+
+
+def plain(blocks: Iterable[Block], width: int) -> list[str]:
+    """Blocks as lines of a terminal."""
+    return [line for block in blocks for line in (*_plain(block, width), "")][:-1]
+
+
+def _plain(block: Block, width: int) -> list[str]:
+    if isinstance(block, Table):
+        return _plain_table(block, width)
+    if isinstance(block, Definition):
+        return [*_wrapped(block.term, width, "", "    "), *_plain_text(block.text, width, "    ")]
+    return (
+        _plain_text(block, width) if isinstance(block, str) else textwrap.indent(block.text, "  ").split("\n")
+    )
+
+
+def _plain_text(text: str, width: int, indent: str = "") -> list[str]:
+    lines: list[str] = []
+    for paragraph in text.split("\n\n"):
+        is_list = paragraph.startswith("- ")
+        parts = paragraph.split("\n") if is_list else [paragraph]
+        lines += ["", *(line for one in parts for line in _wrapped(one, width, indent, "  " * is_list))]
+    return lines[1:]
+
+
+def _plain_table(table: Table, width: int) -> list[str]:
+    """The name of each row, beside it what it means, and then the cells between them."""
+    rows = [list(map(_unmarked, row)) for row in table.rows]
+    room = min(max((len(row[0]) for row in rows), default=0), 26)
+    lines: list[str] = []
+    for name, *between, meaning in rows:
+        titled = zip(table.header[1:], between, strict=False)
+        facts = ", ".join(_fact(title, cell) for title, cell in titled if cell)
+        about = f"{meaning} ({facts})" if facts and meaning else meaning or facts
+        found = _wrapped(about, width, " " * (room + 4)) or [""]
+        is_beside = len(name) <= room
+        first = f"  {name}".ljust(room + 4) + found[0].lstrip() if is_beside else f"  {name}"
+        lines += [first.rstrip(), *found[is_beside:]]
+    return lines
+
+
+def _fact(title: str, cell: str) -> str:
+    if title != "default":
+        return cell
+    return {"required": "required", "none": "may be left out"}.get(cell, f"default: {cell}")
+
+
+def _wrapped(text: str, width: int, indent: str, hang: str = "") -> list[str]:
+    clear = _unmarked(" ".join(text.split()))
+    return textwrap.wrap(
+        clear,
+        max(width, 40),
+        initial_indent=indent,
+        subsequent_indent=indent + hang,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _unmarked(text: str) -> str:
+    return re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", text).replace("`", "")
+
+
+# Settings: files, and what plugins offer
+
+FILES: Final[Mapping[str, type[BaseModel]]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
+"""Kind of file -> its model."""
+_CHOSEN: Final = {"target": "pattern", "devices": "device", "shot": "step", "scan": "scanner"}
+"""Key that names plugins -> their kind, if that is not the key itself."""
+_ADDED_BY_LOADER: Final[Mapping[tuple[type[BaseModel], str], str]] = {
+    (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`"
+}
+"""Keys that the model needs and the loader adds, with their defaults."""
+_KEY_HEADER: Final = ("key", "value", "default", "meaning")
+_NO_SETTINGS: Final = "It takes no settings."
+
+
+def settings(model: type[BaseModel] | None, *, top: bool = False) -> Block:
+    """A row per key; the keys of a mapping follow it as ``mapping.key``.
+
+    Args:
+        top: Leave out the keys of mappings.
+    """
+    rows = [_row(key, owner, field) for key, owner, field in _keys_of(model, top=top)]
+    return Table(_KEY_HEADER, rows) if rows else _NO_SETTINGS
+
+
+def file_settings(kind: str, *names: str, top: bool = False) -> Block:
+    """The keys of a file, or of the mapping of one of its keys.
+
+    Raises:
+        LookupError: There is no such key, or it has no keys of its own.
+    """
+    found = [StepPolicySettings] if names == ("shot", "policy") else models_at(FILES[kind], names)
+    if len(found) != 1 or (names and found == [FILES[kind]]):
+        raise LookupError(f"'{' '.join((kind, *names))}' has no keys of its own")
+    return settings(found[0], top=top)
+
+
+def _keys_of(
+    model: type[BaseModel] | None, *, top: bool = False, prefix: str = ""
+) -> Iterator[tuple[str, type[BaseModel], FieldInfo]]:
+    """Every key of a model as a file spells it, whose key it is, and its field."""
+    for name, field in (model.model_fields if model is not None else {}).items():
+        key = prefix + (field.validation_alias if isinstance(field.validation_alias, str) else name)
+        yield key, model, field  # pyright: ignore[reportReturnType]
+        inner = _inner_model(field)
+        if inner is not None and not top:
+            named = ".NAME" if _is_by_name(field) else ""
+            yield from _keys_of(inner, prefix=f"{key}{named}.")
+
+
+def _inner_model(field: FieldInfo) -> type[BaseModel] | None:
+    """The model of a mapping, unless it is a plugin's choice, whose settings are its own."""
+    found = [field.annotation, *get_args(field.annotation)]
+    models = [one for one in found if isinstance(one, type) and issubclass(one, BaseModel)]
+    return next((one for one in models if not issubclass(one, Choice)), None)
+
+
+def _is_by_name(field: FieldInfo) -> bool:
+    return any(get_origin(one) is dict for one in (field.annotation, *get_args(field.annotation)))
+
+
+def _row(key: str, owner: type[BaseModel], field: FieldInfo) -> tuple[str, ...]:
+    default = _ADDED_BY_LOADER.get((owner, key)) or default_of(field)
+    if _inner_model(field) is not None and not field.is_required() and field.default is not None:
+        default = "as below"
+    return f"`{key}`", value_of(field), default, field.description or ""
+
+
+def entry_blocks(entry: Entry) -> list[Block]:
+    """What a plugin offers under a name: what it is, where it comes from, its settings."""
+    return [_about_entry(entry), settings(entry.settings_model)]
+
+
+def _about_entry(entry: Entry) -> str:
+    text = summary(entry.factory, entry.settings_model)
+    return text if entry.origin == builtin.__name__ else f"{text} From the plugin `{entry.origin}`.".lstrip()
+
+
+def registered(registry: Registry, kind: str, heading: str = "###") -> list[Block]:
+    """A section for everything that is registered for a kind of plugin."""
+    blocks: list[Block] = []
+    for entry in (one for one in registry.entries() if one.kind == kind):
+        blocks += [f"{heading} {kind.replace('_', ' ').capitalize()} `{entry.name}`", *entry_blocks(entry)]
+    return blocks or [f"labseq itself brings no {kind}."]
+
+
+def units() -> list[Block]:
+    """A row per dimension, with its units."""
+    rows = [(one, f"`{EXAMPLES[one]}`", ", ".join(f"`{unit}`" for unit in unit_names(one))) for one in UNITS]
+    return [Table(("quantity", "example", "units"), rows)]
+
+
+# Docstrings
+
+_TITLES: Final = {"Args": "Arguments", "Attributes": "Fields"}
+_SECTION: Final = re.compile(r"^(Args|Attributes|Example|Raises|Returns):$", re.MULTILINE)
+_ITEM: Final = re.compile(r"^(\*{0,2}\w+): ", re.MULTILINE)
+
+
+def summary(*documented: object) -> str:
+    """The first paragraph of the first docstring that there is, on one line."""
+    own = (one for one in documented if inspect.isroutine(one) or isinstance(one, type))
+    texts = (" ".join(_parts(one)[""].partition("\n\n")[0].split()) for one in own)
+    return next(filter(None, texts), "")
+
+
+def docstring(documented: object) -> str:
+    """A docstring as Markdown, without its examples: its text, then a list for each section."""
+    texts: list[str] = []
+    for title, text in _parts(documented).items():
+        if not title:
+            texts.append(text)
+        elif title != "Example":
+            texts.append(f"{_TITLES.get(title, title)}:\n\n{_items(text)}")
+    return "\n\n".join(texts)
+
+
+def _parts(documented: object) -> dict[str, str]:
+    """The text of a Google-style docstring by section; the text before them is ""."""
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(documented) or "").replace("``", "`")
+    before, *sections = _SECTION.split(text)
+    bodies = [textwrap.dedent(body.strip("\n")) for body in sections[1::2]]
+    return {"": before.strip(), **dict(zip(sections[::2], bodies, strict=True))}
+
+
+def _items(text: str) -> str:
+    items = [" ".join(item.split()) for item in re.split(r"\n(?=\S)", text.strip())]
+    if not all(_ITEM.match(item) for item in items):
+        return text
+    return "\n".join(_ITEM.sub(r"- `\1`: ", item, count=1) for item in items)
+
+
+def definition(function: Callable[..., Any], *, is_value: bool = False, name: str = "") -> Definition:
+    """How a function is called, and its docstring.
+
+    Args:
+        is_value: Whether it is a property.
+        name: What it is called by, where that is not its own name.
+    """
+    found = inspect.signature(function)
+    arguments = [one for key, one in found.parameters.items() if key != "self"]
+    text = str(found.replace(parameters=arguments)).replace("'", "").replace("Ellipsis", "...")
+    called = f": {text.partition(' -> ')[2]}" if is_value else text.removesuffix(" -> None")
+    return Definition((name or function.__name__) + called, docstring(function))
+
+
+def public(module: Any, is_kind: Callable[[object], bool]) -> list[Any]:
+    """What a module, or a package with its modules, defines for others, in the order of the source."""
+    found = [one for name, one in vars(module).items() if is_kind(one) and not name.startswith("_")]
+    home = module.__name__
+    return [one for one in found if one.__module__ == home or one.__module__.startswith(f"{home}.")]
+
+
+# Roles, hooks, errors, events
+
+
+def roles_by_name() -> dict[str, type]:
+    """Name -> role."""
+    return {one.__name__: one for one in public(roles, inspect.isclass)}
+
+
+def role(found: type) -> list[Block]:
+    """What a role is, and a definition per method."""
+    shared = [base.__name__ for base in found.__bases__ if base.__name__ in roles_by_name()]
+    blocks: list[Block] = [docstring(found)]
+    blocks += [f"All that `{', '.join(shared)}` asks for, and:"] if shared else []
+    for member in vars(found).values():
+        function = member.fget if isinstance(member, property) else member
+        if inspect.isfunction(function) and not function.__name__.startswith("_"):
+            blocks.append(definition(function, is_value=isinstance(member, property)))
+    return blocks
+
+
+def hooks() -> list[Block]:
+    """A definition per hook."""
+    return [definition(hook) for hook in public(hookspecs, inspect.isfunction)]
+
+
+def registry_methods() -> list[Block]:
+    """A definition for each method by which a plugin offers something."""
+    return [definition(getattr(Registry, kind), name=f"registry.{kind}") for kind in KINDS]
+
+
+def errors_by_name() -> dict[str, type[LabseqError]]:
+    """Name -> error, each after the one that it is a kind of."""
+
+    def walk(error: type[LabseqError]) -> Iterator[type[LabseqError]]:
+        yield error
+        for kind in _kinds_of(error):
+            yield from walk(kind)
+
+    return {error.__name__: error for error in walk(LabseqError)}
+
+
+def error(found: type[LabseqError]) -> Definition:
+    """An error, its fields and its exit code."""
+    code = str(found.exit_code)
+    if found is StopRequested:
+        code = " or ".join(str(exit_code_of(StopRequested(number))) for number in (SIGINT, SIGTERM))
+    return Definition(found.__name__, f"{docstring(found)}\n\nExit code {code}.")
+
+
+def error_list() -> list[Block]:
+    """A definition per error, in the order of the tree, and of the problems that they hold."""
+    return [*map(error, errors_by_name().values()), Definition(Problem.__name__, docstring(Problem))]
+
+
+def error_tree() -> list[Block]:
+    """Every error below the one that it is a kind of."""
+    return [Code("text", "\n".join(_branch(LabseqError, "")))]
+
+
+def _kinds_of(found: type[LabseqError]) -> list[type[LabseqError]]:
+    return [kind for kind in found.__subclasses__() if kind.__module__ == errors.__name__]
+
+
+def _branch(found: type[LabseqError], indent: str) -> Iterator[str]:
+    others = [b.__name__ for b in found.__bases__ if not issubclass(b, LabseqError) and b is not Exception]
+    yield f"{indent}{found.__name__}" + (f" (also a {', '.join(others)})" if others else "")
+    for kind in _kinds_of(found):
+        yield from _branch(kind, f"{indent}    ")
+
+
+def exit_codes() -> list[Block]:
+    """A row per exit code."""
+    return [Table(("code", "meaning"), [*EXIT_CODES.items()])]
+
+
+def plan_rules() -> list[Block]:
+    """The rules that every plan is checked against."""
+    from labseq.motion import RULES
+
+    return [_named("rule", RULES)]
+
+
+def events() -> list[Block]:
+    """A row per event of a run."""
+    return [_named("event", EVENTS)]
+
+
+def _named(title: str, found: Mapping[str, str]) -> Table:
+    return Table((title, "meaning"), [(f"`{name}`", about) for name, about in found.items()])
+
+
+# The shot's file
+
+_TYPES: Final = {"i2": "int16", "i4": "int32", "f8": "float64", "?": "bool"}
+
+
+def datasets() -> list[Block]:
+    """A row per dataset of a shot's file."""
+    from labseq.recording import schema
+
+    rows = [
+        (f"`/entry/{one.path}`", one.dtype, one.axes, one.units, one.description) for one in schema.datasets()
+    ]
+    return [Table(("path", "type", "axes", "unit", "description"), rows)]
+
+
+def columns() -> list[Block]:
+    """A table for each table of the file, with a row per column."""
+    from labseq.recording import schema
+
+    blocks: list[Block] = []
+    for one in schema.TABLES:
+        rows = [
+            (f"`{of.name}`", _TYPES.get(of.dtype, of.dtype), of.units, of.description) for of in one.columns
+        ]
+        blocks += [f"`/entry/{one.path}`: {one.description}."]
+        blocks += [Table(("column", "type", "unit", "description"), rows)]
+    return blocks
+
+
+def attributes() -> list[Block]:
+    """A row per attribute: those of every dataset first."""
+    from labseq.recording import schema
+
+    rows = [("every dataset", f"`{name}`", "text", about) for name, about in schema.EVERYWHERE.items()]
+    for path, found in schema.attributes().items():
+        rows += [(f"`{path}`", f"`{name}`", kind, about) for name, (kind, about) in found.items()]
+    return [Table(("of", "attribute", "type", "description"), rows)]
+
+
+def index_keys() -> list[Block]:
+    """A row per value that a shot's line in the index has of the shot's record."""
+    from labseq.recording import schema
+
+    rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.SHOT if field.in_index]
+    return [Table(("key", "type", "description"), rows)]
+
+
+def figures() -> list[Block]:
+    """A row per figure of a shot, which a scan can optimise and a policy can watch."""
+    from labseq.recording.columns import DESCRIPTIONS, FIGURES, GROUPS
+
+    rows = {name: DESCRIPTIONS[name] for name in FIGURES}
+    return [_named("figure", rows | {f"{prefix}NAME": about for prefix, about in GROUPS.items()})]
+
+
+# Commands
+
+_LIMIT: Final = re.compile(r"x(>=|<=|>|<)(\S+)")
+_LIMIT_WORDS: Final = {">=": "At least", "<=": "At most", ">": "More than", "<": "Less than"}
+
+
+def command(names: Sequence[str], found: Any) -> list[Block]:
+    """Usage, arguments, options and examples of a command.
+
+    Args:
+        names: ["bench", "planners"]; none for the options of all commands.
+        found: The command, as typer sees it.
+    """
+    arguments = [one for one in found.params if one.param_type_name == "argument"]
+    options = [one for one in found.params if one.param_type_name == "option"]
+    usage = ["labseq", *names, *map(_argument_name, arguments)]
+    usage += (["COMMAND", "..."] if hasattr(found, "commands") else []) + (["[OPTIONS]"] if options else [])
+    blocks: list[Block] = [Code("text", " ".join(usage)), found.help]
+    for title, spell, params in (("argument", _argument_name, arguments), ("option", _option_name, options)):
+        rows = [(f"`{spell(one)}`", _meaning(found, one)) for one in params]
+        blocks += [Table((title, "meaning"), rows)] if rows else []
+    examples = [line.strip() for line in (found.epilog or "").splitlines() if "labseq " in line]
+    return [*blocks, Code("console", "\n".join(examples))] if examples else blocks
+
+
+def commands_below(found: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command below the program or a group, with its names."""
+    for name, one in getattr(found, "commands", {}).items():
+        yield (*names, name), one
+        yield from commands_below(one, (*names, name))
+
+
+def _argument_name(argument: Any) -> str:
+    name = (argument.metavar or argument.name).strip("[]{}").upper()
+    return name if argument.required else f"[{name}]"
+
+
+def _option_name(option: Any) -> str:
+    spellings = ", ".join(sorted([*option.opts, *option.secondary_opts], key=len))
+    if option.is_flag or option.count:
+        return spellings
+    value = option.metavar or "VALUE"
+    return spellings + value if value.startswith("[=") else f"{spellings} {value}"
+
+
+def _meaning(found: Any, parameter: Any) -> str:
+    """The help with its limits and default in words."""
+    import typer
+
+    text: str = parameter.get_help_record(typer.Context(found))[1]
+    text, _, extra = text.rstrip("]").partition("  [")
+    for one in filter(None, extra.split("; ")):
+        if limit := _LIMIT.fullmatch(one):
+            text += f" {_LIMIT_WORDS[limit[1]]} {limit[2]}."
+        elif one.startswith("default: "):
+            text += f" Default: `{one.removeprefix('default: ')}`."
+    return text
+
+
+# What can be looked up
+
+_TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
+    "unit": ("quantities and their units", units),
+    "figure": ("numbers of each shot: to plot, to optimise in a scan, to watch in a policy", figures),
+    "field": ("what a shot's HDF5 file has, /entry left out", datasets),
+    "column": ("columns of the tables in a shot's HDF5 file", columns),
+    "index": ("what a line of index.jsonl has", index_keys),
+    "event": ("what happens in a run, as in events.jsonl", events),
+    "rule": ("rules that every plan is checked against", plan_rules),
+    "exit": ("exit codes of the commands", exit_codes),
+}
+"""First word of topics -> what they are, and a table with a row for each of them."""
+_LISTED: Final = {
+    "command": "the commands: their arguments and options",
+    "role": "the methods of a plugin's class, and what they promise",
+    "error": "the errors, with their fields",
+}
+"""First word of topics -> what they are; each of them is a topic of its own."""
+
+
+def topics(registry: Registry, program: Any) -> dict[str, Topic]:
+    """Everything that can be looked up, by name.
+
+    Args:
+        registry: The loaded plugins.
+        program: The command ``labseq``, as typer sees it.
+    """
+    found: dict[str, Topic] = {}
+    for kind, model in FILES.items():
+        found[kind] = Topic(f"the keys of a {kind}", partial(_blocks, settings, model, top=True))
+        found |= _file_topics(kind, registry)
+    for kind, group in groupby(registry.entries(), key=lambda entry: entry.kind):
+        entries = list(group)
+        found[kind] = Topic(", ".join(one.name for one in entries), partial(_offered, entries))
+        for entry in entries:
+            found[f"{kind} {entry.name}"] = Topic(_about_entry(entry), partial(entry_blocks, entry))
+            found |= _key_topics((kind, entry.name), entry.settings_model)
+    for name, (about, table) in _TABLES.items():
+        found |= {name: Topic(about, table), **dict(_row_topics(name, table()))}
+    own = {f"role {name}": Topic(summary(one), partial(role, one)) for name, one in roles_by_name().items()}
+    own |= {
+        f"error {one}": Topic(summary(e), partial(_blocks, error, e)) for one, e in errors_by_name().items()
+    }
+    for names, one in commands_below(program):
+        about = one.get_short_help_str(200)
+        own[f"command {' '.join(names)}"] = Topic(about, partial(command, names, one))
+    for name, about in _LISTED.items():
+        rows = {key.partition(" ")[2]: one.about for key, one in own.items() if key.startswith(f"{name} ")}
+        found[name] = Topic(about, partial(_blocks, _named, name, rows))
+    return found | own | {"hook": Topic("functions of a plugin that labseq calls", hooks)}
+
+
+def _blocks(make: Callable[..., Block], *arguments: Any, **options: Any) -> list[Block]:
+    return [make(*arguments, **options)]
+
+
+def _offered(entries: Iterable[Entry]) -> list[Block]:
+    return [_named("name", {entry.name: _about_entry(entry) for entry in entries})]
+
+
+def _row_topics(name: str, blocks: Iterable[Block]) -> Iterator[tuple[str, Topic]]:
+    """A topic for each row of the tables."""
+    for table in (one for one in blocks if isinstance(one, Table)):
+        for row in table.rows:
+            key = _unmarked(row[0]).removeprefix("/entry/")
+            yield f"{name} {key}", Topic(_unmarked(row[-1]), partial(_blocks, Table, table.header, [row]))
+
+
+def _key_topics(names: tuple[str, ...], model: type[BaseModel] | None) -> dict[str, Topic]:
+    return {
+        " ".join((*names, *key.replace(".NAME", "").split("."))): Topic(
+            field.description or "", partial(_key_blocks, key, owner, field)
+        )
+        for key, owner, field in _keys_of(model)
+    }
+
+
+def _key_blocks(
+    key: str, owner: type[BaseModel], field: FieldInfo, further: Iterable[Block] = ()
+) -> list[Block]:
+    """The row of a key, those of the mapping that it holds, and what else there is."""
+    inner = _inner_model(field)
+    rows = [_row(key, owner, field)]
+    rows += [_row(f"{key}.{name}", of, one) for name, of, one in _keys_of(inner)]
+    return [Table(_KEY_HEADER, rows), *further]
+
+
+def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
+    """The keys of a file; those that name a plugin with the plugins that there are."""
+    found = _key_topics((kind,), FILES[kind])
+    for key, owner, field in _keys_of(FILES[kind], top=True):
+        chosen = key if key in KINDS else _CHOSEN.get(key, "")
+        if not chosen:
+            continue
+        models = [AdaptiveChoice] if key == "scan" else models_at(FILES[kind], (key,))
+        found |= _key_topics((kind, key), next((m for m in models if issubclass(m, Choice)), None))
+        further = partial(_choice_blocks, models, [e for e in registry.entries() if e.kind == chosen])
+        found[f"{kind} {key}"] = Topic(
+            field.description or "", lambda a=(key, owner, field), more=further: _key_blocks(*a, more())
+        )
+    return found | _key_topics((kind, "shot", "policy"), StepPolicySettings if kind == "sequence" else None)
+
+
+def _choice_blocks(models: Sequence[type[BaseModel]], entries: Sequence[Entry]) -> list[Block]:
+    """The keys beside the name of a plugin, and the plugins."""
+    own = [settings(model) for model in models if issubclass(model, Choice)]
+    return [*own, "The plugins, with settings of their own:", *_offered(entries)]
+
+
+def overview(found: Mapping[str, Topic], names: Iterable[str] | None = None) -> list[Block]:
+    """A row for each of these topics; by default for those with a name of one word."""
+    chosen = [name for name in found if " " not in name] if names is None else names
+    return [_named("name", {name: found[name].about for name in chosen})]
+
+
+def find(found: Mapping[str, Topic], what: str) -> list[str]:
+    """The names of the topics that a user means.
+
+    Args:
+        what: Words, with spaces or dots between: "step image", "profile.camera", "psca".
+
+    Returns:
+        One name; several if the words end or begin several names.
+
+    Raises:
+        ConfigError: There is no such topic.
+    """
+    words = _folded(what)
+    folded = {_folded(name): name for name in found}
+    if words in folded:
+        return [folded[words]]
+    ending = [name for key, name in folded.items() if key[-len(words) :] == words]
+    begun = [name for key, name in folded.items() if len(key) == len(words) and _begins(key, words)]
+    if ending or begun:
+        return ending or begun
+    near = closest(" ".join(words), (" ".join(key) for key in folded)) or closest(
+        words[-1] if words else "", (key[-1] for key in folded)
+    )
+    hint = f"did you mean '{near}'?" if near else "`labseq explain` lists what there is"
+    raise ConfigError(Problem(f"there is nothing called '{clean(what)}' to explain", hint=hint))
+
+
+def _begins(key: tuple[str, ...], words: tuple[str, ...]) -> bool:
+    return key[:-1] == words[:-1] and key[-1].startswith(words[-1])
+
+
+def _folded(name: str) -> tuple[str, ...]:
+    return tuple(name.lower().replace("-", "_").replace(".", " ").split())
