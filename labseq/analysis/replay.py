@@ -116,7 +116,7 @@ class ReplayedImages:
                 self.n_without_frame += 1
                 continue
             try:
-                occupancy, confidence = detector.detect(image.frame)
+                occupancy, confidence, *_ = detector.detect(image.frame)
                 seen = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
                 certainty = float(np.mean(confidence))
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything

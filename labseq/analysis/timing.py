@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
 from labseq.model import StageTiming
-from labseq.model.records import OVERSHOOT_S
+from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.recording import Run, Shot
 
 ORDER: Final = (
@@ -24,8 +24,6 @@ ORDER: Final = (
 """The stages of a shot in order; unknown ones come last."""
 WRITE: Final = "write"
 """Name of the stage of writing: from the end of a shot to the event that reports it as written."""
-STEP: Final = "step "
-"""Prefix of the names of whole steps."""
 
 Quantiles = tuple[float, float]
 
@@ -35,7 +33,7 @@ class StageStatistics:
     """Durations of a stage over many shots.
 
     Attributes:
-        stage: Its name: "expose", "plan", ..., "write", or "step 2 rearrange" for a whole step.
+        stage: Its name: "expose", "plan", ..., "write", or "step_2_rearrange" for a whole step.
         n: Number of times that it was recorded.
         n_per_shot: Mean number of times in a shot.
         budget_s: Median budget; that of "play" is the length of each program; NaN without one.

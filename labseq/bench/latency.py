@@ -17,7 +17,7 @@ from labseq.errors import ConfigError, LimitError, Problem
 from labseq.guard import stop_on_signals
 from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
 from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
-from labseq.roles import Detector, Planner, Shot, Step, StepContext
+from labseq.roles import Detection, Detector, Planner, Shot, Step, StepContext
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
@@ -227,7 +227,7 @@ class _Timed:
         self._planner = planner
         self.detect_s = self.plan_s = 0.0
 
-    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
+    def detect(self, frame: Frame) -> Detection:
         start_s = time.perf_counter()
         answer = self._detector.detect(frame)
         self.detect_s = time.perf_counter() - start_s

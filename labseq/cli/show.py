@@ -18,6 +18,7 @@ from labseq.console.runs import chosen_run
 from labseq.console.text import columns, percent, settings_text
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
+from labseq.model.records import STEP
 from labseq.recording import Run, Shot
 from labseq.units import format_quantity
 
@@ -137,7 +138,7 @@ def shot_time_s(shot: Shot) -> float:
     """Duration of the steps of a shot, in seconds; 0 if its line of the index is damaged."""
     found = shot.row.get("stage_s")
     stages = cast("Mapping[str, object]", found) if isinstance(found, dict) else {}
-    steps_s = [s for name, s in stages.items() if name.startswith("step ")]
+    steps_s = [s for name, s in stages.items() if name.startswith(STEP)]
     return math.fsum(s for s in steps_s if isinstance(s, float | int))
 
 

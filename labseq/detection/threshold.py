@@ -50,7 +50,7 @@ class ComparingDetector(ABC):
         self._width = width
         self._known = known_sites(settings, context)
         self._corners = region_corners(self._known, settings.region)
-        self._thresholds, self._thresholds_source = known_thresholds(threshold, self.signal_unit, context)
+        self.thresholds, self._thresholds_source = known_thresholds(threshold, self.signal_unit, context)
 
     @property
     def sites_px(self) -> NDArray[np.float64]:
@@ -61,19 +61,20 @@ class ComparingDetector(ABC):
         """Where its sites and thresholds come from."""
         return {"sites": self._known.source, "thresholds": self._thresholds_source}
 
-    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
+    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32], NDArray[np.float64]]:
         """Find the atoms.
 
         Returns:
-            The occupancy, bool (n_rows, n_cols), and the confidence per site,
-            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
+            The occupancy, bool (n_rows, n_cols); the confidence per site, float32 (n_rows, n_cols), 0 at
+            the threshold and 1 for certainty; and the signals that were compared with the thresholds.
 
         Raises:
             DeviceError: The frame is not of the size that the sites belong to.
         """
-        distance = self.signals(frame) - self._thresholds
+        signals = self.signals(frame)
+        distance = signals - self.thresholds
         confidence = np.tanh(np.abs(distance) / self._width).astype(np.float32)
-        return distance > 0.0, confidence
+        return distance > 0.0, confidence, signals
 
     @abstractmethod
     def signals(self, frame: Frame) -> NDArray[np.float64]:
@@ -195,7 +196,7 @@ class ThresholdDetector(ComparingDetector):
         """
         image = checked_image(frame, self._known, self._name)
         counts = image.take(self._pixels).sum(axis=0, dtype=np.uint32)
-        return counts.reshape(self._thresholds.shape) - self._dark
+        return counts.reshape(self.thresholds.shape) - self._dark
 
     def _region_pixels(self, settings: ThresholdSettings) -> NDArray[np.int64]:
         """Flat indices of the regions' pixels, int64 (pixels of a region, n_sites)."""

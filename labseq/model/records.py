@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
@@ -18,6 +18,25 @@ RunStatus = Literal["running", "complete", "stopped", "failed"]
 
 OVERSHOOT_S: Final = 1e-3
 """What a real clock may overshoot a wait by, in seconds."""
+
+STEP: Final = "step_"
+"""Prefix of the stage of a whole step: "step_2_rearrange"."""
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Number those names that occur more than once, from 0.
+
+    Example:
+        >>> unique_names(["load", "image", "rearrange", "image"])
+        ('load', 'image_0', 'rearrange', 'image_1')
+    """
+    found: list[str] = []
+    for i, name in enumerate(names):
+        unique = f"{name}_{names[:i].count(name)}" if names.count(name) > 1 else name
+        while unique in found or (unique != name and unique in names):
+            unique += "_"
+        found.append(unique)
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +85,9 @@ class ImageRecord:
             of an ``image`` step.
         t_start_s: Start of the exposure, from the start of the shot.
         exposure_s: Exposure time, in seconds.
+        name: Name of the image, unique in the shot and the same in every shot.
+        signal: float64 (n_rows, n_cols), what the detector compared with its thresholds; None if it does not
+            report it.
     """
 
     frame: Frame | None
@@ -75,11 +97,8 @@ class ImageRecord:
     cycle: int
     t_start_s: float
     exposure_s: float
-
-    @property
-    def event(self) -> str:
-        """What it shows: "image", or "cycle_3" for the image that ended cycle 3."""
-        return f"cycle_{self.cycle}" if self.cycle else "image"
+    name: str = "image"
+    signal: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +157,10 @@ class ShotRecord:
         parameters: What differs from the files in this shot: address -> value.
         calibrations: Those in use: kind -> id.
         atom_events: What a simulation reports about the atoms: name -> structured array.
+        thresholds: float64 (n_rows, n_cols), there is an atom where the signal of an image exceeds them; None
+            if the detector does not report them.
+        sites_px: float64 (n_rows, n_cols, 2), (y, x) of the sites on the frames, in pixels; None likewise.
+        signal_unit: Unit of signals and thresholds: "counts"; "" likewise.
     """
 
     shot_index: int
@@ -158,6 +181,9 @@ class ShotRecord:
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     atom_events: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+    thresholds: NDArray[np.float64] | None = None
+    sites_px: NDArray[np.float64] | None = None
+    signal_unit: str = ""
 
     @property
     def n_images(self) -> int:
@@ -205,6 +231,7 @@ class RunRecord:
         lattice: Lattice of the grid.
         scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
         calibrations: Those in use: kind -> id.
+        steps: Names of the steps, in order; each is unique.
         resumed: How it was resumed after it had ended early, in order: ``t_utc``, ``first_shot``,
             ``changes`` that were accepted (each ``what``, ``was`` and ``now``) and ``provenance``.
     """
@@ -229,6 +256,7 @@ class RunRecord:
     lattice: str
     scan: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
+    steps: tuple[str, ...] = ()
     resumed: tuple[Mapping[str, Any], ...] = ()
 
 

@@ -31,7 +31,7 @@ from labseq.recording.shot import Shot
 from labseq.recording.tables import facts_of
 
 FORMAT: Final = "labseq-archive"
-FORMAT_VERSION: Final = "2.0"
+FORMAT_VERSION: Final = "3.0"
 
 _SHARED: Final = ("target", "run")
 _WORTH_PACKING: Final = 1024

@@ -10,6 +10,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.model.records import STEP
 from labseq.plain import dumps
 from labseq.recording import schema
 from labseq.recording.reader import Run
@@ -151,7 +152,7 @@ def _last(values: Sequence[Any] | None) -> Any:
 
 
 def _duration_s(stage_s: Mapping[str, float | None]) -> float | None:
-    steps = [seconds for name, seconds in stage_s.items() if name.startswith("step ") and seconds is not None]
+    steps = [seconds for name, seconds in stage_s.items() if name.startswith(STEP) and seconds is not None]
     return math.fsum(steps) if steps else None
 
 

@@ -46,6 +46,8 @@ def write_fields(node: Any, fields: Sequence[Field], record: Any) -> None:
 def _attribute(field: Field, value: Any) -> Any:
     if field.dtype == "integer":
         return np.int64(value) if -(2**63) <= value < 2**63 else str(value)
+    if field.dtype == "texts":
+        return np.array(list(map(plain_text, value)), _STRING)
     return value if field.dtype == "text" else np.dtype(field.dtype).type(value)
 
 
@@ -53,8 +55,11 @@ def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
     """Read attributes: attribute of the record -> plain value; those of a newer minor format are ignored."""
     found: dict[str, Any] = {}
     for field in (field for field in fields if field.name in node.attrs):
-        value = node.attrs[field.name]
-        value = value.item() if isinstance(value, np.generic) else value
+        value: Any = node.attrs[field.name]
+        if isinstance(value, np.generic):
+            value = value.item()
+        elif field.dtype == "texts":
+            value = tuple(value)
         found[field.attribute] = int(value) if field.dtype == "integer" else value
     return found
 
@@ -77,17 +82,27 @@ def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
     }
 
 
-def write_array(group: Any, path: str, values: Any) -> Any:
-    """Add an array of :data:`ARRAYS` under the last part of its path."""
+def write_array(group: Any, path: str, values: Any, units: str | None = None) -> Any:
+    """Add an array of :data:`ARRAYS` under the last part of its path; ``units`` replace the schema's."""
     what = ARRAYS[path]
     dataset = group.create_dataset(path.rpartition("/")[2], data=np.asarray(values, what.dtype))
-    describe(dataset, what)
+    describe(dataset, what, units)
     return dataset
 
 
-def describe(dataset: Any, what: Dataset) -> None:
-    """Add the attributes for the description and the unit of a dataset."""
-    set_attributes(dataset, {"units": what.units, "description": what.description})
+def describe(dataset: Any, what: Dataset, units: str | None = None) -> None:
+    """Add the attributes for the description, the unit and the axes of a dataset."""
+    set_attributes(
+        dataset, {"units": what.units if units is None else units, "description": what.description}
+    )
+    labels, space = _texts(what.axes)
+    _add_text(dataset, "DIMENSION_LABELS", labels, space)
+
+
+@cache
+def _texts(axes: str) -> tuple[Any, Any]:
+    names = np.array(axes.split(", "), _STRING)
+    return names, h5s.create_simple(names.shape)
 
 
 def write_table(group: Any, table: Table, rows: NDArray[Any], name: str = "") -> None:

@@ -31,7 +31,8 @@ SIMULATION: Final = "simulation."
 
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 
-_LAST_VERSION_OF_FORMAT_1: Final = "0.1.0"
+_READ_BY: Final = {1: "labseq 0.1.0", 2: "the development version of labseq 0.2.0 that wrote it"}
+"""Older major version of the format -> the labseq that reads it."""
 _MAX_TEXT: Final = 80
 _MAX_DEPTH: Final = 4
 
@@ -48,8 +49,8 @@ def check_version(path: Path, found: str, known: str) -> None:
             path, f"has the format version '{found}'; expected one like {known}; it is damaged"
         )
     if major != known.partition(".")[0]:
-        older = int(major) < int(known.partition(".")[0])
-        advice = f"use labseq {_LAST_VERSION_OF_FORMAT_1} to read it" if older else "update labseq"
+        reader = _READ_BY.get(int(major), "")
+        advice = f"use {reader} to read it" if reader else "update labseq"
         raise OtherFormatError(path, f"has format version {found}, this labseq reads {known}; {advice}")
 
 

@@ -7,7 +7,8 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       target                    fill, clear (row, col)
       camera/<name>             images (n, y, x), t_s (n,) and the table of frames
       images_view               NXdata: what viewers open by default
-      detection                 occupancy (n, row, col), confidence, t_s and the table of images
+      detection                 occupancy (n, row, col), confidence, signal, t_s and the table of images;
+                                threshold (row, col), sites_px (row, col, yx)
       rearrangement             tables of moves, batches and cycles; predicted (cycle, row, col)
       timing                    table of the stages
       atom_events               tables of the events of the atoms in a simulation
@@ -31,11 +32,11 @@ from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.plain import plain_text
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "2.0"
+FORMAT_VERSION: Final = "3.0"
 """major.minor; a newer minor version only adds things, another major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
-RUN_FORMAT_VERSION: Final = "2.0"
+RUN_FORMAT_VERSION: Final = "3.0"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
 """HDF5 features that files may use; these are read by the most programs."""
@@ -63,7 +64,7 @@ class Field:
 
     Attributes:
         name: Name of the attribute, dataset or column in the file.
-        dtype: numpy's name of its type, "text" (UTF-8), "json", or "integer" (text beyond 64 bits).
+        dtype: numpy's name of its type, "text" (UTF-8), "texts", "json", or "integer" (text beyond 64 bits).
         description: What it is.
         source: Attribute of the record that it is read from, dotted, if it is not ``name``; or a
             function of the record.
@@ -196,6 +197,7 @@ RUN: Final = (
     Field("record_frames", "text", "which frames are kept: all, last or none"),
     Field("target", "text", "name of the target pattern", "target.name"),
     Field("lattice", "text", "lattice of the grid"),
+    Field("steps", "texts", "names of the steps of a shot, in order"),
     Field("grid_spacing_m", "float64", "spacing of the sites, in m"),
     Field("sequence_sha256", "text", "SHA-256 of the sequence file"),
     Field("profile_sha256", "text", "SHA-256 of the hardware profile"),
@@ -225,7 +227,9 @@ IMAGES: Final = Table(
         Field("cycle", "i4", "rearrangement cycle that it ended, from 1; 0 for that of an image step"),
         Field("t_start_s", "f8", "start of the exposure, from the start of the shot"),
         Field("exposure_s", "f8", "exposure time"),
-        Field("event", "text", "what it is: image, or cycle_3 for the one that ended cycle 3"),
+        Field(
+            "name", "text", "its name, the same in every shot: that of its step, with the cycle that it ended"
+        ),
     ),
 )
 """Of :class:`ImageRecord`."""
@@ -420,6 +424,9 @@ class Dataset:
     units: str = ""
 
 
+OF_DETECTOR: Final = "of the detector"
+"""Units that the detector gives: counts, log-odds."""
+
 ARRAYS: Final[Mapping[str, Dataset]] = {
     array.path: array
     for array in (
@@ -435,6 +442,17 @@ ARRAYS: Final[Mapping[str, Dataset]] = {
         Dataset("detection/occupancy", "uint8", "image, row, col", "1 where the detector saw an atom"),
         Dataset(
             "detection/confidence", "float32", "image, row, col", "the detector's confidence in each site"
+        ),
+        Dataset(
+            "detection/signal",
+            "float64",
+            "image, row, col",
+            "what the detector compared with the threshold; there is an atom where it is larger",
+            OF_DETECTOR,
+        ),
+        Dataset("detection/threshold", "float64", "row, col", "threshold of the signal", OF_DETECTOR),
+        Dataset(
+            "detection/sites_px", "float64", "row, col, yx", "place of each site on the frames: y, x", "px"
         ),
         Dataset(
             "detection/t_s", "float64", "image", "start of the exposure, from the start of the shot", "s"
@@ -501,6 +519,7 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
         "/entry/detection": ("NX_class", "signal", "auxiliary_signals", "axes"),
         "/entry/detection/occupancy": ("interpretation",),
         "/entry/detection/confidence": ("interpretation",),
+        "/entry/detection/signal": ("interpretation",),
     }
     root = {
         "format": ("text", FORMAT),
@@ -516,7 +535,9 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
 
 
 EVERYWHERE: Final[Mapping[str, str]] = {
-    "units": "unit of the numbers, SI or adu, empty where there is none; of a table that of each column",
+    "units": "unit of the numbers, SI, px, adu or the detector's, empty for none; of a table that of each "
+    "column",
+    "DIMENSION_LABELS": "arrays only: name of each axis (`dims[0].label` in h5py)",
     "description": "what the dataset is",
     "descriptions": "tables only: what each column is",
     "content_type": "texts only: application/json or text/plain",

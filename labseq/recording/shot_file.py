@@ -142,11 +142,20 @@ def _encode_common(run: RunRecord, run_id: str) -> bytes:
 def _write_detection(group: Any, shot: ShotRecord, grid_shape: tuple[int, int]) -> None:
     nexus = {"NX_class": "NXdata", "signal": "occupancy", "auxiliary_signals": ["confidence"], "axes": _AXES}
     set_attributes(group, nexus)
-    for name in ("occupancy", "confidence"):
+    names = ["occupancy", "confidence"]
+    if any(image.signal is not None for image in shot.images):
+        names.append("signal")
+    for name in names:
         values = [getattr(image, name) for image in shot.images]
-        stack = np.array(values, schema.ARRAYS[f"detection/{name}"].dtype)
-        dataset = write_array(group, f"detection/{name}", stack.reshape(len(values), *grid_shape))
-        set_attributes(dataset, {"interpretation": "image"})
+        if name == "signal":  # nan for an image without
+            values = [np.full(grid_shape, np.nan) if value is None else value for value in values]
+        stack = np.array(values, schema.ARRAYS[f"detection/{name}"].dtype).reshape(len(values), *grid_shape)
+        units = shot.signal_unit if name == "signal" else None
+        set_attributes(write_array(group, f"detection/{name}", stack, units), {"interpretation": "image"})
+    if shot.thresholds is not None:
+        write_array(group, "detection/threshold", shot.thresholds, shot.signal_unit)
+    if shot.sites_px is not None:
+        write_array(group, "detection/sites_px", shot.sites_px)
     write_array(group, "detection/t_s", [image.t_start_s for image in shot.images])
     write_table(group, schema.IMAGES, schema.IMAGES.rows(shot.images))
 
@@ -249,6 +258,7 @@ def _record(entry: Any) -> ShotRecord:
     return ShotRecord(
         **{name: value for name, value in values.items() if name in taken},
         images=_images(entry["detection"]),
+        **_detector(entry["detection"]),
         cycles=schema.cycles_of(
             {name: cycles[name][()] for name in ("cycles", "batches", "moves")}, cycles["predicted"][()]
         ),
@@ -260,7 +270,20 @@ def _record(entry: Any) -> ShotRecord:
 def _images(group: Any) -> list[ImageRecord]:
     occupancies: NDArray[np.bool_] = group["occupancy"][()].astype(np.bool_)
     known = schema.IMAGES.arguments(ImageRecord, group["images"][()])
+    signals = group["signal"][()] if "signal" in group else [None] * len(known)
     return [
-        ImageRecord(frame=None, occupancy=occupancy, confidence=confidence, **values)
-        for occupancy, confidence, values in zip(occupancies, group["confidence"][()], known, strict=True)
+        ImageRecord(frame=None, occupancy=occupancy, confidence=confidence, signal=signal, **values)
+        for occupancy, confidence, signal, values in zip(
+            occupancies, group["confidence"][()], signals, known, strict=True
+        )
     ]
+
+
+def _detector(group: Any) -> dict[str, Any]:
+    """What the detector reported about itself in a shot: arguments of its record."""
+    found: dict[str, Any] = {
+        argument: group[name][()]
+        for argument, name in (("thresholds", "threshold"), ("sites_px", "sites_px"))
+        if name in group
+    }
+    return found | ({"signal_unit": group["threshold"].attrs["units"]} if "threshold" in group else {})

@@ -14,6 +14,7 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 
 from labseq.roles.deciding import (
     Analysis,
+    Detection,
     Detector,
     NeedsWarmUp,
     Planner,
@@ -51,6 +52,7 @@ __all__ = [
     "Camera",
     "Clock",
     "Context",
+    "Detection",
     "Detector",
     "Device",
     "Hardware",

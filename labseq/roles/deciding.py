@@ -7,7 +7,7 @@ derived from the role's class.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,15 +40,22 @@ class Planner(Protocol):
         ...
 
 
+Detection: TypeAlias = (
+    tuple[Occupancy, NDArray[np.float32]] | tuple[Occupancy, NDArray[np.float32], NDArray[np.float64]]
+)
+"""Occupancy and confidence of each site; and, if the detector has one, the signal that it was decided by."""
+
+
 class Detector(Protocol):
     """Turns a frame into an occupancy."""
 
-    def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
+    def detect(self, frame: Frame) -> Detection:
         """Find the atoms.
 
         Returns:
-            The occupancy, bool (n_rows, n_cols), and the confidence per site,
-            float32 (n_rows, n_cols), 0 at the threshold and 1 for certainty.
+            The occupancy, bool (n_rows, n_cols), and the confidence per site, float32 (n_rows, n_cols),
+            0 at the threshold and 1 for certainty. A detector that decides by a threshold adds the signal
+            of each site, float64 (n_rows, n_cols), which is then recorded with the image.
         """
         ...
 
@@ -166,7 +173,10 @@ class NeedsWarmUp(Protocol):
 
 @runtime_checkable
 class ReportsSignals(Protocol):
-    """A detector that reports the values it compares with its thresholds, so that they can be calibrated."""
+    """A detector that reports the signals it compares with its thresholds.
+
+    Its thresholds can be calibrated, and they are recorded together with its sites in each shot's file.
+    """
 
     @property
     def signal_unit(self) -> str:
@@ -176,6 +186,11 @@ class ReportsSignals(Protocol):
     @property
     def sites_px(self) -> NDArray[np.float64]:
         """Positions of the sites on the frame, float64 (n_rows, n_cols, 2), (y, x) in pixels."""
+        ...
+
+    @property
+    def thresholds(self) -> NDArray[np.float64]:
+        """There is an atom where the signal exceeds the threshold, float64 (n_rows, n_cols)."""
         ...
 
     def signals(self, frame: Frame) -> NDArray[np.float64]:

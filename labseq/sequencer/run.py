@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol
 from labseq.errors import LabseqError, StopRequested
 from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.model import ShotRecord, TimelineEntry
-from labseq.model.records import ShotStatus
+from labseq.model.records import ShotStatus, unique_names
 from labseq.roles import RunObserver, Step, StepContext, offers
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
 from labseq.sequencer.leader import Emit, LeaderAnswers
@@ -360,9 +360,11 @@ class Sequencer:
         shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.start)
         shot.poll()
         shot.check_interlocks()
+        images = unique_names([name for name, _ in self._steps])
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
-            with shot.of_step(number, name, self._policy.of_step(number), self._budgets[number]):
+            policy, budget_s = self._policy.of_step(number), self._budgets[number]
+            with shot.of_step(number, name, policy, budget_s, images[number]):
                 self._run_step(shot, number, name, step)
         shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
         shot.record_truth()

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
 from labseq.errors import ConfigError, DeviceError, InterlockError, OverBudgetError, StepTimeoutError
 from labseq.guard import DRIVER_MARGIN_S, Guard
 from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
-from labseq.model.records import OVERSHOOT_S
-from labseq.roles import Device, offers
+from labseq.model.records import OVERSHOOT_S, STEP
+from labseq.roles import Device, ReportsSignals, offers
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
@@ -152,6 +153,7 @@ class RunningShot:
         self.call_timeout_s = lab.timeouts.call_s
         self.plan_timeout_s = lab.timeouts.plan_s
         self.in_step = False
+        self._image_name = "image"
         self.stages = Stages(lab, record, emit)
         self.start_s = self.stages.start_s
         self.leaders = LeaderAnswers(lab, guard, record, emit)
@@ -169,15 +171,24 @@ class RunningShot:
         return self.clock.now() - self.start_s
 
     @contextmanager
-    def of_step(self, number: int, name: str, policy: StepPolicy, budget_s: float) -> Generator[None]:
+    def of_step(
+        self, number: int, name: str, policy: StepPolicy, budget_s: float, images: str = ""
+    ) -> Generator[None]:
         """Context manager around a step: the stages, images and failures within belong to it.
+
+        Args:
+            number: Its index.
+            name: Its name.
+            policy: Its policy.
+            budget_s: What it may take.
+            images: Beginning of the names of its images; by default its name.
 
         Raises:
             OverBudgetError: It took longer than its budget, and its policy does not allow that.
         """
-        self.in_step = True
+        self.in_step, self._image_name = True, images or name
         self.stages.begin_step(number, name, policy)
-        with self.stage(f"step {number} {name}", budget_s):
+        with self.stage(f"{STEP}{number}_{name}", budget_s):
             yield
         self.stages.policy, self.in_step = StepPolicy(), False
 
@@ -201,11 +212,20 @@ class RunningShot:
         return self._guard.call(owner, timeout_s, function, *args, **kwargs)
 
     def poll(self) -> None:
-        """Record the values that are read from devices at the start of a shot."""
+        """Record the values that are read at the start of a shot: from devices, and the thresholds."""
         for name, device in self.lab.hardware():
             if offers(device, "poll"):
                 values = self.call(name, self.call_timeout_s, device.poll)
                 self.record.readings.update({f"{name}.{value}": read for value, read in values.items()})
+        self.call("detector", self.call_timeout_s, self._record_thresholds)
+
+    def _record_thresholds(self) -> None:
+        """Record sites, thresholds and their unit, if the detector reports them."""
+        detector, record, shape = self.lab.detector, self.record, self.grid.shape
+        if isinstance(detector, ReportsSignals):
+            record.thresholds = np.array(detector.thresholds, np.float64).reshape(shape)
+            record.sites_px = np.array(detector.sites_px, np.float64).reshape(*shape, 2)
+            record.signal_unit = str(detector.signal_unit)
 
     def check_interlocks(self) -> None:
         """Check the interlocks of every device; see ``labseq.plugin.Shot``."""
@@ -266,14 +286,21 @@ class RunningShot:
             raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
         with self.stage("detect", cycle=cycle):
             answer = self.call("detector", timeout_s, self.lab.detector.detect, frame)
-        occupancy, confidence = self._detected(answer)
+        occupancy, confidence, signal = self._detected(answer)
         self.occupancy, self.frame = occupancy, frame
-        image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s)
+        name = self._name_of_image(cycle)
+        image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s, name, signal)
         self.record.images.append(image)
         if cycle and not self.record.seen_defect_free_cycle and self.target.is_met_by(occupancy):
             self.record.seen_defect_free_cycle = cycle
         self._emit("image", {"image": image, "filling_fraction": self.target.filling_fraction(occupancy)})
         return occupancy
+
+    def _name_of_image(self, cycle: int) -> str:
+        """A name that no other image of the shot has: that of the step, with the cycle or a number."""
+        name = f"{self._image_name}_cycle_{cycle}" if cycle else self._image_name
+        taken = {image.name for image in self.record.images}
+        return next(one for n in itertools.count() if (one := f"{name}_{n}" if n else name) not in taken)
 
     def _expose(self, exposure_s: float, cycle: int) -> object:
         """Take a frame; the stage "read_out" begins at the end of the exposure."""
@@ -336,14 +363,17 @@ class RunningShot:
             events = self.call("simulation", timeout_s, simulation.atom_events, self.start_s)
             self.record.atom_events.update(events)
 
-    def _detected(self, answer: Any) -> tuple[Occupancy, Any]:
+    def _detected(self, answer: Any) -> tuple[Occupancy, Any, Any]:
+        """The detector's answer, checked: occupancy, confidence and, if it gives them, signals."""
         shape = self.grid.shape
-        if not (isinstance(answer, tuple) and len(answer) == 2):
+        if not (isinstance(answer, tuple) and len(cast("tuple[Any, ...]", answer)) in (2, 3)):
             raise DeviceError("detector", f"detect() returned {type(answer).__name__}; expected a pair")
-        occupancy, confidence = answer
-        for name, array, kind in (("occupancy", occupancy, "b"), ("confidence", confidence, "f")):
+        parts = cast("tuple[Any, ...]", answer)
+        for name, array, kind in zip(("occupancy", "confidence", "signals"), parts, "bff", strict=False):
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind != kind:
                 came = f"{getattr(array, 'dtype', type(array).__name__)} {getattr(array, 'shape', '')}"
-                wanted = "bool" if kind == "b" else "float32"
+                wanted = "bool" if kind == "b" else "float32" if name == "confidence" else "float64"
                 raise DeviceError("detector", f"the {name} is {came}; expected {wanted} {shape}")
-        return np.ascontiguousarray(occupancy), np.ascontiguousarray(confidence, np.float32)
+        occupancy, confidence, *signals = parts
+        signal = np.ascontiguousarray(signals[0], np.float64) if signals else None
+        return np.ascontiguousarray(occupancy), np.ascontiguousarray(confidence, np.float32), signal

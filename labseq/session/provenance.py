@@ -19,7 +19,7 @@ import labseq
 from labseq.calibration.store import encode_entry
 from labseq.errors import StopRequested
 from labseq.model import CalibrationEntry, RunRecord
-from labseq.model.records import RunStatus
+from labseq.model.records import RunStatus, unique_names
 from labseq.session.assembly import Assembly
 
 _GIT_TIMEOUT_S: Final = 5.0
@@ -136,6 +136,7 @@ def run_record(
         grid_spacing_m=hardware.grid.spacing_m,
         lattice=hardware.grid.lattice,
         scan=scan,
+        steps=unique_names([name for name, _ in assembly.steps]),
         calibrations={kind: entry.id for kind, entry in hardware.calibrations.items()},
     )
 

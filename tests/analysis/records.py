@@ -81,7 +81,7 @@ def make_shot(
     before[1, 1], before[0, 1] = False, True
     after = target().fill.copy()
     after[tuple(np.argwhere(after)[-n_defects:].T)] = n_defects == 0
-    timing = [StageTiming("step 0 load", 0, 0, 0.0, 0.5, 0.001, 0.5)]
+    timing = [StageTiming("step_0_load", 0, 0, 0.0, 0.5, 0.001, 0.5)]
     images = [image(before, 1, 0, 0.5, kept=kept)]
     cycles: list[CycleRecord] = []
     for cycle in range(1, n_cycles + 1):
@@ -92,7 +92,7 @@ def make_shot(
         timing.append(StageTiming("plan", 2, cycle, 0.55, 0.0, 0.002))
         timing.append(StageTiming("move", 2, cycle, 0.55, 0.02 * cycle, 0.003, 0.03))
         images.append(image(after, 2, cycle, 0.6 + 0.1 * cycle))
-    timing.append(StageTiming("step 2 rearrange", 2, 0, 0.55, 0.5, 0.01, 0.6))
+    timing.append(StageTiming("step_2_rearrange", 2, 0, 0.55, 0.5, 0.01, 0.6))
     if judged:
         images.append(image(after, 3, 0, 1.8))
     shot = ShotRecord(index, 0, 7, START, "2026-11-20T10:00:01+00:00", "complete")

@@ -42,7 +42,7 @@ class Case:
         self.out = np.empty((2, CHUNK), np.int16)
 
     def program(self) -> ToneProgram:
-        occupancy, _ = self.detector.detect(self.frame)
+        occupancy, *_ = self.detector.detect(self.frame)
         plan = self.planner.plan(occupancy, self.target)
         check_plan(plan, occupancy, self.target, self.dop, GRID, self.motion)
         return tone_program(plan, GRID, self.motion)

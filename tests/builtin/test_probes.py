@@ -108,7 +108,7 @@ def test_the_timeline_is_that_of_all_sites(which: Any, least: float) -> None:
     assert bar.duration_s == pytest.approx(13e-3 + 4 * (0.5e-3 + 60e-6 + 0.2e-3 + 5e-6))
     assert bar.min_duration_s == least * bar.duration_s
     sink = run(step, lab)
-    (took,) = [t for t in sink.shots[0].timing if t.stage == "step 1 probe"]
+    (took,) = [t for t in sink.shots[0].timing if t.stage == "step_1_probe"]
     assert took.duration_s == pytest.approx(bar.duration_s)
 
 

@@ -151,7 +151,7 @@ def test_its_timeline_may_be_left_out() -> None:
     probe, image = step.plan_timeline(lab.step_context)
     assert (probe.min_duration_s, image.min_duration_s, image.n_images) == (0.0, 0.0, 1)
     shots, _ = run(lab, [("check", step)])
-    (took,) = [t for t in shots[0].timing if t.stage == "step 1 check"]
+    (took,) = [t for t in shots[0].timing if t.stage == "step_1_check"]
     assert took.duration_s == pytest.approx(probe.duration_s + image.duration_s)
 
 

@@ -119,7 +119,7 @@ class Signals:
             world.begin_shot()
             world.load(0.0, 0.5)
             before = world.truth()
-            seen, _ = self.detector.detect(world.expose(0.5, 45e-3))
+            seen, *_ = self.detector.detect(world.expose(0.5, 45e-3))
             atoms, empty = before & world.truth(), ~before
             errors += np.count_nonzero(atoms & ~seen), np.count_nonzero(empty & seen)
             cases += np.count_nonzero(atoms), np.count_nonzero(empty)

@@ -97,7 +97,7 @@ def make_shot(
     shot.success, shot.seen_defect_free_cycle, shot.filling_fraction = success, seen, filling
     shot.status, shot.error = status, error
     shot.t_end_utc = "2026-01-02T03:04:07+00:00"
-    shot.timing.append(StageTiming("step 0 load", 0, 0, 0.0, 1.9, 0.01))
+    shot.timing.append(StageTiming("step_0_load", 0, 0, 0.0, 1.9, 0.01))
     return shot
 
 

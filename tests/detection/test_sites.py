@@ -129,7 +129,7 @@ def test_atoms_are_found_at_calibrated_sites(make: Maker) -> None:
     image = np.full((64, 96), 522.0)
     for place_y, place_x in PLACES[atoms]:
         image += 400 * np.exp(-((y - place_y) ** 2 + (x - place_x) ** 2) / (2 * 1.2**2))
-    occupancy, _ = make(calibrated_sites()).detect(Frame(image.astype(np.uint16), 0.045, 0.0))
+    occupancy, *_ = make(calibrated_sites()).detect(Frame(image.astype(np.uint16), 0.045, 0.0))
     np.testing.assert_array_equal(occupancy, atoms)
 
 

@@ -45,7 +45,7 @@ def nowhere() -> NDArray[np.bool_]:
 
 
 def test_counts_at_the_threshold_are_no_atom_and_no_confidence() -> None:
-    occupancy, confidence = detector().detect(frame(checkerboard(), counts=50))
+    occupancy, confidence, *_ = detector().detect(frame(checkerboard(), counts=50))
     assert not occupancy.any()
     assert (confidence[checkerboard()] == 0).all()
 
@@ -64,8 +64,8 @@ def test_the_offset_counts_for_each_pixel_of_the_region() -> None:
 
 
 def test_a_disc_leaves_out_the_corners() -> None:
-    square, _ = detector(shape="square").detect(frame(checkerboard()))
-    disc, _ = detector(shape="disc").detect(frame(checkerboard()))
+    square, *_ = detector(shape="square").detect(frame(checkerboard()))
+    disc, *_ = detector(shape="disc").detect(frame(checkerboard()))
     assert square.any()
     assert not disc.any()
 
@@ -78,6 +78,6 @@ def test_saturated_regions_do_not_overflow() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (64, 48)])
 def test_it_sees_nothing_on_any_frame(shape: tuple[int, int]) -> None:
     detector = BlindDetector(None, Context("detector", SiteGrid(3, 4)))
-    occupancy, confidence = detector.detect(Frame(np.full(shape, 65535, np.uint16), 0.1, 0.0, "camera"))
+    occupancy, confidence, *_ = detector.detect(Frame(np.full(shape, 65535, np.uint16), 0.1, 0.0, "camera"))
     assert (occupancy.shape, occupancy.dtype, occupancy.any()) == ((3, 4), np.bool_, False)
     assert (confidence.shape, confidence.dtype, confidence.any()) == ((3, 4), np.float32, False)

@@ -78,7 +78,7 @@ PATTERNS = st.lists(st.booleans(), min_size=12, max_size=12).map(lambda x: np.ar
 @settings(max_examples=10)
 @given(PATTERNS, st.sampled_from([GRID, CLOSE, SQUARE]))
 def test_bright_sites_hold_atoms(atoms: Bools, grid: SiteGrid) -> None:
-    occupancy, confidence = detector(grid).detect(frame(mean_image(atoms, grid)))
+    occupancy, confidence, *_ = detector(grid).detect(frame(mean_image(atoms, grid)))
     np.testing.assert_array_equal(occupancy, atoms)
     assert occupancy.flags.c_contiguous
     assert (confidence > 0.99).all()
@@ -117,7 +117,7 @@ def test_the_confidence_is_the_probability_of_being_right() -> None:
     known = detector()
     image = np.random.default_rng(5).integers(480, 800, (60, 90), np.uint16)
     log_odds = known.signals(frame(image))
-    _, confidence = known.detect(frame(image))
+    _, confidence, *_ = known.detect(frame(image))
     probability = 1 / (1 + np.exp(-np.abs(log_odds)))
     np.testing.assert_allclose(confidence, 2 * probability - 1, rtol=1e-5)
 
@@ -125,7 +125,7 @@ def test_the_confidence_is_the_probability_of_being_right() -> None:
 def test_log_odds_at_the_threshold_are_no_atom_and_no_confidence() -> None:
     image = mean_image(np.eye(3, 4, dtype=np.bool_))
     log_odds = detector().signals(frame(image))
-    occupancy, confidence = detector(threshold=tuple(map(tuple, log_odds.tolist()))).detect(frame(image))
+    occupancy, confidence, *_ = detector(threshold=tuple(map(tuple, log_odds.tolist()))).detect(frame(image))
     assert not occupancy.any()
     assert (confidence == 0).all()
 

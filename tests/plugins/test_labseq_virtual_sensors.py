@@ -85,7 +85,7 @@ def count_errors(
         frame = simulation.expose(0.5, EXPOSURE_S)
         atoms = ~empty & simulation.truth()
         for row, detector in zip(counts, detectors, strict=True):
-            seen, _ = detector.detect(frame)
+            seen, *_ = detector.detect(frame)
             row += (atoms & ~seen).sum(), atoms.sum(), (seen & empty).sum(), empty.sum()
     return counts
 

@@ -56,6 +56,7 @@ def make_run(**changes: Any) -> RunRecord:
         record_frames="all",
         grid_spacing_m=4.49e-6,
         lattice="triangular",
+        steps=("load", "image_0", "rearrange", "image_1"),
     )
     return dataclasses.replace(run, **changes)
 
@@ -89,6 +90,8 @@ def _image(number: int, cycle: int, rng: np.random.Generator, frame_shape: tuple
         cycle=cycle,
         t_start_s=0.1 * number,
         exposure_s=0.0451,
+        name=f"image_{number}",
+        signal=rng.normal(1000.0, 500.0, SHAPE),
     )
 
 
@@ -123,6 +126,9 @@ def make_shot(
         readings={"laser": {"power_w": 0.1, "locked": True}},
         parameters={"shot.2.rearrange.window": 0.06, "ümlaut": [1, None]},
         calibrations={"sites": "f102b3cd999c", "overlay": "a18d1601661e"},
+        thresholds=rng.random(SHAPE),
+        sites_px=rng.random((*SHAPE, 2)),
+        signal_unit="counts",
     )
     return dataclasses.replace(shot, **changes)
 

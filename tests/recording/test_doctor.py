@@ -229,7 +229,7 @@ def test_a_run_file_that_cannot_be_read_is_left(run_dir: Path, content: bytes) -
 def test_a_shot_of_a_newer_labseq_is_left(run_dir: Path) -> None:
     lost_line(run_dir)
     with h5py.File(run_dir / "shots" / "shot_000001.h5", "r+") as file:
-        file.attrs["format_version"] = "3.0"
+        file.attrs["format_version"] = "4.0"
     (found,) = examine(run_dir).findings
     assert found.left
     assert "update labseq" in found.done

@@ -169,23 +169,23 @@ def test_a_damaged_target_is_explained(run_dir: Path) -> None:
 
 
 def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
-    rewrite_json(run_dir / "run.json", format_version="2.9")  # a newer minor version only adds things
+    rewrite_json(run_dir / "run.json", format_version="3.9")  # a newer minor version only adds things
     open_run(run_dir)
-    rewrite_json(run_dir / "run.json", format_version="3.0")
+    rewrite_json(run_dir / "run.json", format_version="4.0")
     with pytest.raises(
-        RecordingError, match=r"has format version 3\.0, this labseq reads 2\.0; update labseq"
+        RecordingError, match=r"has format version 4\.0, this labseq reads 3\.0; update labseq"
     ):
         open_run(run_dir)
     rewrite_json(run_dir / "run.json", format_version="1.3")
-    with pytest.raises(RecordingError, match=r"format version 1\.3, .* 2\.0; use labseq 0\.1\.0 to read it"):
+    with pytest.raises(RecordingError, match=r"format version 1\.3, .* 3\.0; use labseq 0\.1\.0 to read it"):
         open_run(run_dir)
 
 
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"format_version": "3.0"}, r"has format version 3\.0, this labseq reads 2\.0; update labseq"),
-        ({"format_version": "x"}, "has the format version 'x'; expected one like 2.0"),
+        ({"format_version": "4.0"}, r"has format version 4\.0, this labseq reads 3\.0; update labseq"),
+        ({"format_version": "x"}, "has the format version 'x'; expected one like 3.0"),
         ({"format": "nexus"}, "is not a shot's file of labseq"),
     ],
 )

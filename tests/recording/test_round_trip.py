@@ -59,6 +59,8 @@ def images(draw: st.DrawFn, shape: tuple[int, int]) -> ImageRecord:
         draw(st.integers(0, 99)),
         draw(real),
         draw(real),
+        draw(text),
+        draw(arrays(np.float64, shape)),
     )
 
 
@@ -99,6 +101,9 @@ def shots(draw: st.DrawFn, shape: tuple[int, int]) -> ShotRecord:
         readings=draw(values),
         parameters=draw(values),
         calibrations=draw(st.dictionaries(st.sampled_from(list[str](CALIBRATION_KINDS)), text)),
+        thresholds=draw(arrays(np.float64, shape)),
+        sites_px=draw(arrays(np.float64, (*shape, 2))),
+        signal_unit=draw(text),
     )
 
 

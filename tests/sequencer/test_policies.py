@@ -245,15 +245,15 @@ def test_a_step_that_never_ends_is_given_up_and_calls_nothing_any_more() -> None
 def test_a_stage_over_its_budget_follows_its_policy(then: Any, statuses: list[str]) -> None:
     made = Rig(steps=(("slow", Slow(0.3, 0.1)),), policy=RunPolicy(steps=(StepPolicy(over_budget=then),)))
     if then == "stop":
-        with pytest.raises(OverBudgetError, match="'step 0 slow' took 300 ms; its budget is 100 ms"):
+        with pytest.raises(OverBudgetError, match="'step_0_slow' took 300 ms; its budget is 100 ms"):
             made.run()
         assert made.made_safe() == SAFE_ORDER
     else:
         made.run()
     assert [shot.status for shot in made.sink.shots] == statuses
     warnings = [event["text"] for event in made.observer.of("warning")]
-    assert warnings == (["shot 1: 'step 0 slow' took 300 ms; its budget is 100 ms"] if then == "warn" else [])
-    (first, *_) = [timing for timing in made.sink.shots[0].timing if timing.stage == "step 0 slow"]
+    assert warnings == (["shot 1: 'step_0_slow' took 300 ms; its budget is 100 ms"] if then == "warn" else [])
+    (first, *_) = [timing for timing in made.sink.shots[0].timing if timing.stage == "step_0_slow"]
     assert first.over_budget
 
 
@@ -322,6 +322,6 @@ def test_a_step_that_does_not_know_how_long_it_takes_has_no_budget() -> None:
     strict = RunPolicy(steps=(StepPolicy(over_budget="stop"),))
     made = Rig(steps=(("unknown", Unknown(0.3)),), policy=strict)
     made.run()
-    (timing,) = [timing for timing in made.record().timing if timing.stage == "step 0 unknown"]
+    (timing,) = [timing for timing in made.record().timing if timing.stage == "step_0_unknown"]
     assert math.isnan(timing.budget_s)
     assert not timing.over_budget

@@ -46,7 +46,7 @@ def test_every_step_is_timed_against_its_budget():
     rig = Rig(steps=(LOAD, IMAGE, ("pause", WaitStep(given(duration=0.2)))))
     rig.run()
     steps = {t.stage: t for t in rig.record().timing if t.stage.startswith("step")}
-    assert list(steps) == ["step 0 load", "step 1 image", "step 2 pause"]
+    assert list(steps) == ["step_0_load", "step_1_image", "step_2_pause"]
     assert [t.duration_s for t in steps.values()] == pytest.approx([0.5, 0.045, 0.2])
     assert [t.budget_s for t in steps.values()] == pytest.approx([0.5, 0.045, 0.2])
     assert not any(t.over_budget for t in steps.values())
@@ -143,7 +143,7 @@ def test_a_change_of_planner_and_steps_touches_no_device():
     rig.sequencer.change(rig.lab, (LOAD,), {})
     assert len(rig.lab.calls.names()) == done
     rig.sequencer.run([0])
-    assert [t.stage for t in rig.record().timing if t.stage.startswith("step")] == ["step 0 load"]
+    assert [t.stage for t in rig.record().timing if t.stage.startswith("step")] == ["step_0_load"]
     assert not rig.sequencer.shut_down()
 
 

@@ -15,7 +15,7 @@ from labseq.errors import LabseqError
 from labseq.model import Frame, ScanRange, ScanSpace, SiteGrid, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording.results import ResultsLog
-from labseq.roles import Analysis, Context, Detector, RecordedShot, Scanner
+from labseq.roles import Analysis, Context, Detection, Detector, RecordedShot, ReportsSignals, Scanner
 from labseq.testing.contracts.promises import (
     ContractViolation,
     doing,
@@ -59,7 +59,9 @@ class DetectorContract:
             "a saturated frame": _frame_of(np.full(self.frame_shape, 65535, np.uint16)),
         }
 
-    @promise("detect() gives bool (n_rows, n_cols) and float32 (n_rows, n_cols) between 0 and 1")
+    @promise(
+        "detect() gives bool (n_rows, n_cols), float32 (n_rows, n_cols) from 0 to 1, and perhaps signals"
+    )
     def test_gives_occupancy_and_confidence(self, factory: DetectorFactory) -> None:
         """On frames of every kind."""
         context = self.context()
@@ -67,19 +69,24 @@ class DetectorContract:
         for what, frame in self.frames().items():
             answer: Any = detector.detect(frame)
             assert isinstance(answer, tuple), f"detect() gave a {type(answer).__name__}"
-            occupancy, confidence = answer
+            occupancy, confidence, *signals = answer
             _require_array(f"on {what} the occupancy", occupancy, np.bool_, context.grid.shape)
             _require_array(f"on {what} the confidence", confidence, np.float32, context.grid.shape)
             assert np.all((confidence >= 0) & (confidence <= 1)), (
                 f"on {what} the confidence reaches from {confidence.min()} to {confidence.max()}"
             )
+            if signals:
+                _require_array(f"on {what} the signals", signals[0], np.float64, context.grid.shape)
+            if signals and isinstance(detector, ReportsSignals):
+                decided = signals[0] > detector.thresholds
+                assert np.array_equal(occupancy, decided), f"on {what} the signals decide otherwise"
 
     @promise("the same frame gives the same answer")
     def test_same_frame_same_answer(self, factory: DetectorFactory) -> None:
         """A second time, after other frames, and from a new instance."""
         detector = factory(self.context())
 
-        def answer_of(any_detector: Detector) -> tuple[NDArray[Any], NDArray[Any]]:
+        def answer_of(any_detector: Detector) -> Detection:
             return any_detector.detect(self.frames()["a noisy frame"])
 
         first = answer_of(detector)
@@ -89,7 +96,7 @@ class DetectorContract:
         again["after other frames"] = answer_of(detector)
         again["from a fresh instance"] = answer_of(factory(self.context()))
         for when, answer in again.items():
-            for name, was, now in zip(("occupancy", "confidence"), first, answer, strict=True):
+            for name, was, now in zip(("occupancy", "confidence", "signals"), first, answer, strict=False):
                 assert np.array_equal(was, now), f"the {name} is another {when}"
 
     @promise("an answer does not change after it was given")
@@ -101,7 +108,7 @@ class DetectorContract:
         before = [np.array(array) for array in answer]
         for frame in frames.values():
             detector.detect(frame)
-        for name, was, now in zip(("occupancy", "confidence"), before, answer, strict=True):
+        for name, was, now in zip(("occupancy", "confidence", "signals"), before, answer, strict=False):
             assert np.array_equal(was, now), f"the next frame overwrote the {name}"
 
     @promise("the frame is left untouched")
