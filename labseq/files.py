@@ -208,6 +208,10 @@ def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
 
 PROFILES: Final = "hardware_profiles"
 """Name of the folders of hardware profiles."""
+PLUGINS: Final = "plugins"
+"""Folder of a lab's own plugins. Their code runs only if a file or an option names the folder."""
+PLUGIN_PATH: Final = "LABSEQ_PLUGIN_PATH"
+"""Environment variable with further folders of plugins."""
 SEQUENCES: Final = "sequences"
 """Name of the folders of sequences."""
 

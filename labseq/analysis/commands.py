@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from labseq.console.options import Json, RunFolder
+from labseq.console.options import Json, Plugins, RunFolder
 
 REPLAY_EXAMPLES = """\b
 Examples:
@@ -64,6 +64,7 @@ def replay(
             "--output", "-o", metavar="FILE", help="Also write all results as JSON, image by image."
         ),
     ] = None,
+    _plugins: Plugins = None,
 ) -> None:
     """Pass a run's images to another planner or detector, and compare the results with the recorded ones.
 
@@ -94,6 +95,7 @@ def analyse(
     again: Annotated[
         bool, typer.Option("--again", help="Analyse all shots again, including those that have a result.")
     ] = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Analyse the shots of a run that have no result yet.
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from labseq.console.options import JsonFile, profile_names
+from labseq.console.options import JsonFile, Plugins, profile_names
 
 bench = typer.Typer(
     name="bench",
@@ -81,6 +81,7 @@ def planners(
         Path | None,
         typer.Option(metavar="FILE", help="Draw a histogram of the number of batches."),
     ] = None,
+    _plugins: Plugins = None,
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
     from labseq.bench.comparison import BenchRequest
@@ -117,6 +118,7 @@ def latency(
         typer.Option("--set", metavar="ADDRESS=VALUE", help="As for labseq run; may be given several times."),
     ] = None,
     json: JsonFile = None,
+    _plugins: Plugins = None,
 ) -> None:
     """Measure the time from the end of an exposure to the first light of the mobile tweezers.
 

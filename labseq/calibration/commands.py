@@ -11,6 +11,7 @@ from labseq.console.options import (
     Json,
     Output,
     Overrides,
+    Plugins,
     Seed,
     Shots,
     dry_run_mode,
@@ -132,6 +133,7 @@ def calibrate(
     dry_run: RunDry = None,
     force: Force = False,
     as_json: Json = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Calibrate a profile: take a run, analyse it, store the result, and use it unless it is worse."""
     from labseq.calibration.measure import CalibrationRequest

@@ -22,6 +22,7 @@ from labseq.console.options import (
     Json,
     Output,
     Overrides,
+    Plugins,
     Profile,
     ProfileArgument,
     Realtime,
@@ -137,6 +138,7 @@ def run(
     output: Output = None,
     as_json: Json = False,
     realtime: Realtime = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Run a sequence and record every shot."""
     from labseq.cli.run import run_sequence
@@ -160,6 +162,7 @@ def resume(
     ] = False,
     as_json: Json = False,
     realtime: Realtime = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Take the missing shots of a run that was stopped, failed or crashed."""
     from labseq.cli.run import resume_run
@@ -190,6 +193,7 @@ def run_queue(
     watch: Annotated[
         bool, typer.Option("--watch", help="Wait for new entries when the queue is empty, until stopped.")
     ] = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Run the queued entries one after the other; a run that was interrupted is resumed first."""
     from labseq.cli.run import run_session
@@ -205,6 +209,7 @@ def check(
     dry_run: DryRun = None,
     overrides: Overrides = None,
     as_json: Json = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Check a sequence: print every error and warning, the timeline and the limits. No device is opened."""
     from labseq.cli.check import check_sequence
@@ -310,18 +315,23 @@ app.command(epilog=EXPLAIN_EXAMPLES, short_help="Explain a key, a step, a plugin
 @app.command(short_help="List the plugins and what they offer.")
 def plugins(
     profile: Annotated[
-        str | None, profile_option("Look in this profile's plugin folders instead of ./plugins.")
+        str | None, profile_option("Also load the plugins in this profile's plugin folders.")
     ] = None,
     as_json: Json = False,
+    _plugins: Plugins = None,
 ) -> None:
-    """List the plugins: what each offers, where it comes from, and why it failed to load."""
+    """List the plugins: what each offers, where it comes from, and why it was not loaded."""
     from labseq.cli.devices import list_plugins
 
     list_plugins(profile, as_json=as_json)
 
 
 @app.command(short_help="Bring every device of a profile to its safe state.")
-def safe(profile: ProfileArgument, overrides: Overrides = None) -> None:
+def safe(
+    profile: ProfileArgument,
+    overrides: Overrides = None,
+    _plugins: Plugins = None,
+) -> None:
     """Open every device of a profile, bring it to its safe state, and close it."""
     from labseq.cli.devices import secure_profile
 
@@ -330,7 +340,11 @@ def safe(profile: ProfileArgument, overrides: Overrides = None) -> None:
 
 @app.command(short_help="Test every device of a profile: the first command of the day.")
 def devices(
-    profile: ProfileArgument, dry_run: DryRun = None, overrides: Overrides = None, as_json: Json = False
+    profile: ProfileArgument,
+    dry_run: DryRun = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Open each device of a profile in turn, identify and test it, make it safe and close it."""
     from labseq.cli.devices import show_devices

@@ -16,8 +16,6 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
 from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
-from labseq.registry import LOAD_S
-from labseq.scaffold.new import PLUGINS
 from labseq.session import CheckedDevice, DevicesReport, check_devices, load_plugins, make_profile_safe
 from labseq.session.chosen import DryRun
 from labseq.units import format_quantity
@@ -131,21 +129,24 @@ class _Lines:
 
 
 def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
-    """Print a table of the plugins, those in the folders of a profile or in ``plugins`` included."""
+    """Print a table of the plugins, those in the folders of a profile and those in ``./plugins`` included."""
     answer = stdout_to_stderr() if as_json else None
-    folders, max_wait_s = _folders(profile)
-    host = load_plugins(folders, max_wait_s=max_wait_s)
+    if profile is None:
+        host = load_plugins()
+    else:
+        document, spec = load_profile(profile, beside=Path())  # the plugins that it names need not exist
+        host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load)
     if answer is None:
         say(*plugins_table(host))
     else:
-        answer(as_line({"plugins": [_values(host, info) for info in host.infos]}))
+        answer(as_line({"plugins": [_values(host, info) for info in (*host.infos, *host.unused())]}))
 
 
 def plugins_table(host: PluginHost) -> list[str]:
     """A row per plugin; below the table the reasons why plugins failed to load, and notes."""
     rows = [("plugin", "state", "version", "origin", "offers")]
     remarks: list[str] = []
-    for info in host.infos:
+    for info in (*host.infos, *host.unused()):
         offers = ", ".join(_offers(host, info)) or "-"
         rows.append((info.name, info.state, info.version or "-", info.origin, offers))
         remarks += [f"{info.name}: {info.reason}"] if info.reason else []
@@ -160,11 +161,3 @@ def _offers(host: PluginHost, info: PluginInfo) -> list[str]:
 def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
     names = ("name", "state", "version", "origin", "source", "reason", "notes")
     return {**{name: getattr(info, name) for name in names}, "offers": _offers(host, info)}
-
-
-def _folders(profile: str | None) -> tuple[list[Path], float]:
-    """The profile's plugin folders and its load timeout; its plugins need not exist."""
-    if profile is None:
-        return [path for path in (Path(PLUGINS),) if path.is_dir()], LOAD_S
-    document, spec = load_profile(profile, beside=Path())
-    return plugin_paths(document, spec.plugin_folders), spec.timeouts.load

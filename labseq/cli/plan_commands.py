@@ -5,7 +5,7 @@ from typing import Annotated, Final
 
 import typer
 
-from labseq.console.options import JsonFile, profile_option
+from labseq.console.options import JsonFile, Plugins, profile_option
 
 PLAN_EXAMPLES: Final = """\b
 Examples:
@@ -88,6 +88,7 @@ def plan(
     png: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the plan, with an arrow for each atom move.")
     ] = None,
+    _plugins: Plugins = None,
 ) -> None:
     """Plan the moves for one occupancy, check the plan as a run does, and print or draw it.
 
@@ -140,6 +141,7 @@ def waveform(
         Path | None,
         typer.Option(metavar="FILE", help="Write the samples and the starts of the batches for numpy."),
     ] = None,
+    _plugins: Plugins = None,
 ) -> None:
     """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
     from labseq.bench.waveform import WaveformRequest

@@ -6,12 +6,15 @@ loaded, and errors are ignored.
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import typer
+
+from labseq.files import PLUGIN_PATH, PROFILES, data_root, packaged_profiles_dir
 
 _FILES: Final = ("sequence", "profile")
 _YAML: Final = (".yaml", ".yml")
@@ -38,8 +41,6 @@ def file_kinds(incomplete: str) -> list[str]:
 
 def profile_names(incomplete: str) -> list[str]:
     """Names of the profiles in ./hardware_profiles and of those that come with labseq."""
-    from labseq.files import PROFILES, packaged_profiles_dir
-
     found: set[str] = set()
     for folder in (Path(PROFILES), packaged_profiles_dir()):
         with suppress(OSError):
@@ -49,8 +50,6 @@ def profile_names(incomplete: str) -> list[str]:
 
 def run_folders(incomplete: str) -> list[str]:
     """Folders of runs, the newest first."""
-    from labseq.files import data_root
-
     with suppress(OSError):
         runs = sorted(data_root().glob("????-??-??/[0-9]*/run.json"), reverse=True)
         found = (str(path.parent) for path in runs)
@@ -80,6 +79,33 @@ def dry_run_mode(kind: DryRunKind | None) -> Literal["off", "full", "fast"]:
     return "off" if kind is None else kind.value  # pyright: ignore[reportReturnType]
 
 
+def _load_plugins_of(context: typer.Context, folders: list[Path]) -> None:
+    """Add folders to LABSEQ_PLUGIN_PATH until the command ends; its worker processes inherit them."""
+    if not folders:
+        return
+    before = os.environ.get(PLUGIN_PATH)
+    os.environ[PLUGIN_PATH] = os.pathsep.join([*map(str, folders), *([before] if before else [])])
+
+    def restore() -> None:
+        os.environ.pop(PLUGIN_PATH)
+        if before is not None:
+            os.environ[PLUGIN_PATH] = before
+
+    context.call_on_close(restore)
+
+
+Plugins = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--plugins",
+        metavar="DIR",
+        exists=True,
+        file_okay=False,
+        help="Also load the plugins in this folder; may be given several times.",
+        callback=_load_plugins_of,
+        expose_value=False,
+    ),
+]
 Profile = Annotated[
     str | None, profile_option("Hardware profile, instead of the one that the sequence names.")
 ]

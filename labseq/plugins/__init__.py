@@ -1,17 +1,19 @@
 """Finds and loads plugins, reports those that fail, and calls their code with a time limit.
 
-Entry points of the group ``labseq`` come first, then folders. A plugin that fails to load does not affect
-the others: it is reported, and is an error only if a sequence or profile uses it.
+Plugins come from entry points of the group ``labseq``, then from folders: those that the sequence names,
+those that the profile names, those of ``--plugins`` and those of LABSEQ_PLUGIN_PATH. No other code runs:
+``./plugins`` is only searched for a plugin that a message can advise. A plugin that fails to load does not
+affect the others: it is reported, and is an error only if a sequence or profile uses it.
 """
 
 from labseq.plugins.calls import LOCAL_PACKAGE, call_plugin
-from labseq.plugins.host import ENTRY_POINT_GROUP, PATH_VARIABLE, PluginHost, PluginInfo
+from labseq.plugins.host import ENTRY_POINT_GROUP, PluginHost, PluginInfo, plugin_files
 
 __all__ = [
     "ENTRY_POINT_GROUP",
     "LOCAL_PACKAGE",
-    "PATH_VARIABLE",
     "PluginHost",
     "PluginInfo",
     "call_plugin",
+    "plugin_files",
 ]

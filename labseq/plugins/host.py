@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 import os
+import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from inspect import signature
@@ -17,6 +19,7 @@ import pluggy
 
 from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.files import PLUGIN_PATH, PLUGINS
 from labseq.hookspecs import LABSEQ_API
 from labseq.plugins.calls import (
     call_plugin,
@@ -102,7 +105,41 @@ def _check_hook(key: str, function: Callable[..., object], owner: Owner) -> None
 
 
 ENTRY_POINT_GROUP: Final = "labseq"
-PATH_VARIABLE: Final = "LABSEQ_PLUGIN_PATH"
+
+
+def plugin_files(folder: Path) -> list[Path]:
+    """The modules in a folder of plugins, and the ``__init__.py`` of the packages in it.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    named = [path for path in sorted(folder.iterdir()) if not path.name.startswith((".", "_"))]
+    files = [path / "__init__.py" if path.is_dir() else path for path in named]
+    return [path for path in files if path.suffix == ".py" and path.is_file()]
+
+
+def plugin_name(path: Path) -> str:
+    """Name of the plugin in a file."""
+    return path.parent.name if path.name == "__init__.py" else path.stem
+
+
+def advice(kind: str, name: str, file: Path | None) -> str:
+    """What to add so that a plugin in ``./plugins``, or beside the file that names it, is loaded; or "".
+
+    The plugin is found in the text of the folder's files; none of them is run.
+    """
+    offers = re.compile(rf"\.{kind}\(\s*[\"']{re.escape(name)}[\"']")
+    for folder in [Path(PLUGINS)] + ([file.parent / PLUGINS] if file is not None else []):
+        with suppress(OSError, ValueError):  # the latter: another drive of Windows
+            for path in plugin_files(folder):
+                if not offers.search(path.read_text("utf-8", "replace")):
+                    continue
+                add = f"use --plugins {folder}"
+                if file is not None and file.is_file():
+                    relative = Path(os.path.relpath(folder, file.parent)).as_posix()
+                    add = f"add 'plugin_folders: [{relative}]' to {file.name}, or {add}"
+                return f"{path} offers it and is not loaded: {add}"
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +150,8 @@ class PluginInfo:
         name: Import name; without the prefix ``labseq_local.`` if the plugin is from a folder.
         origin: "built in", "installed" or the file it came from.
         version: Version of its distribution, or "".
-        state: "loaded" or "failed".
-        reason: Why it failed, or "".
+        state: "loaded", "failed" or, for one in ``./plugins`` that nothing names, "not loaded".
+        reason: Why it failed or was not loaded, or "".
         source: Its file or its distribution, as text; "" for labseq's own.
         notes: Text that it printed when it was loaded or in a constructor, a sentence each.
     """
@@ -122,7 +159,7 @@ class PluginInfo:
     name: str
     origin: str
     version: str = ""
-    state: Literal["loaded", "failed"] = "loaded"
+    state: Literal["loaded", "failed", "not loaded"] = "loaded"
     reason: str = ""
     source: str = ""
     notes: list[str] = field(default_factory=list[str])
@@ -157,6 +194,17 @@ class PluginHost:
         used = [info for info in self._infos.values() if info.name in self._used]
         return [f"plugin '{info.name}' ({info.source}): {note}" for info in used for note in info.notes]
 
+    def unused(self) -> list[PluginInfo]:
+        """The plugins in ``./plugins`` that were not loaded, because nothing names the folder."""
+        with suppress(OSError):
+            files = [path for path in plugin_files(Path(PLUGINS)) if self._is_new(path)]
+            reason = f"use --plugins {PLUGINS}; files name the folder in 'plugin_folders: [{PLUGINS}]'"
+            return [
+                PluginInfo(plugin_name(path), str(path), "", "not loaded", reason, str(path))
+                for path in files
+            ]
+        return []
+
     def load_builtin(self, module: ModuleType) -> None:
         """Register a module of labseq itself; its failure is a bug in labseq and raises."""
         info = PluginInfo(module.__name__, "built in", _version("labseq"))
@@ -173,16 +221,16 @@ class PluginHost:
             self._load(info, partial(module_location, point.value.partition(":")[0]), point.load)
 
     def load_folders(self, folders: Sequence[Path]) -> None:
-        """Load single files and packages from folders, and from LABSEQ_PLUGIN_PATH.
+        """Load single files and packages from folders, and from those of --plugins and LABSEQ_PLUGIN_PATH.
 
         Raises:
             ConfigError: A folder does not exist, or cannot be read.
         """
-        from_environment = [Path(p) for p in os.environ.get(PATH_VARIABLE, "").split(os.pathsep) if p]
+        from_environment = [Path(p) for p in os.environ.get(PLUGIN_PATH, "").split(os.pathsep) if p]
         for folder in [*folders, *from_environment]:
-            origin = "" if folder in folders else f" (from {PATH_VARIABLE})"
+            origin = "" if folder in folders else f" (from {PLUGIN_PATH})"
             try:
-                paths = sorted(folder.iterdir())
+                paths = plugin_files(folder)
             except OSError as error:
                 what = f"plugin folder {folder}{origin} cannot be read: {error.strerror}"
                 if isinstance(error, FileNotFoundError):
@@ -192,15 +240,9 @@ class PluginHost:
                 self._load_path(path)
 
     def _load_path(self, path: Path) -> None:
-        name = path.stem
-        if name.startswith((".", "_")):
+        name = plugin_name(path)
+        if not self._is_new(path):
             return
-        if path.is_dir():
-            path = path / "__init__.py"
-        if path.suffix != ".py" or not path.is_file() or self._is_loaded(path):
-            return
-        if module_location(name) == plugin_location(path) and not _states_api(path):
-            return  # an installed library, such as a simulator
         info = PluginInfo(name, str(path), source=str(path))
         if not name.isidentifier():
             reason = "its name is no Python name: letters, digits and '_' only; rename it"
@@ -230,9 +272,13 @@ class PluginHost:
         self._infos[info.name] = info
         return info.state == "loaded"
 
-    def _is_loaded(self, path: Path) -> bool:
-        files = (getattr(plugin, "__file__", None) for plugin in self._pluggy.get_plugins())
-        return any(file is not None and Path(file).resolve() == path.resolve() for file in files)
+    def _is_new(self, path: Path) -> bool:
+        """Whether a file is neither a plugin that was found already nor an installed library."""
+        files = {getattr(plugin, "__file__", None) for plugin in self._pluggy.get_plugins()}
+        files |= {info.source for info in self._infos.values()}
+        if any(file and Path(file).resolve() == path.resolve() for file in files):
+            return False
+        return module_location(plugin_name(path)) != plugin_location(path) or _states_api(path)
 
     def _register(
         self, info: PluginInfo, home: Callable[[], Path | None] | None, importing: Callable[[], ModuleType]
@@ -248,8 +294,13 @@ class PluginHost:
                 self._pluggy.unregister(module)
                 raise
 
-    def get(self, kind: str, name: str) -> Entry:
+    def get(self, kind: str, name: str, file: Path | None = None) -> Entry:
         """Find the registry entry of a name in a sequence or profile.
+
+        Args:
+            kind: Kind of plugin.
+            name: Its name.
+            file: The file that names it, for messages.
 
         Raises:
             PluginLoadError: The plugin of that name was found but did not load, or two plugins
@@ -258,24 +309,19 @@ class PluginHost:
         """
         if (kind, name) in self.registry.contested:
             raise self.registry.contested[kind, name]
-        if self.registry.find(kind, name) is None:
+        try:
+            entry = self.registry.get(kind, name)
+        except UnknownPluginError as error:
             broken = [info for info in self._infos.values() if info.state == "failed"]
             for info in broken:
                 if info.name.removeprefix("labseq_").split(" ")[0] == name.removeprefix("labseq_"):
-                    raise PluginLoadError(info.name, info.reason, info.source)
-            if broken and kind not in ("step", "pattern"):
-                self._raise_with_broken(kind, name, broken)
-        entry = self.registry.get(kind, name)
+                    raise PluginLoadError(info.name, info.reason, info.source) from None
+            hints = [error.hint, advice(kind, name, file)]
+            if kind not in ("step", "pattern"):
+                hints += [f"plugin '{info.name}' did not load ({info.reason})" for info in broken]
+            raise UnknownPluginError(kind, name, error.known, "; ".join(filter(None, hints))) from None
         self._used.add(entry.origin)
         return entry
-
-    def _raise_with_broken(self, kind: str, name: str, broken: Sequence[PluginInfo]) -> None:
-        try:
-            self.registry.get(kind, name)
-        except UnknownPluginError as error:
-            reasons = "; ".join(f"plugin '{info.name}' did not load ({info.reason})" for info in broken)
-            hint = f"{error.hint}; {reasons}" if error.hint else reasons
-            raise UnknownPluginError(kind, name, error.known, hint) from None
 
     def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
         """Name of each plugin that implements an observer hook, and the call of the hook."""

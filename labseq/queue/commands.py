@@ -9,6 +9,7 @@ from labseq.console.options import (
     Json,
     Output,
     Overrides,
+    Plugins,
     Profile,
     Realtime,
     Seed,
@@ -50,6 +51,7 @@ def add(
     overrides: Overrides = None,
     output: Output = None,
     realtime: Realtime = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Check a sequence and add it at the end of the queue.
 

@@ -23,7 +23,7 @@ from typing import Final
 from labseq import __version__
 from labseq.config.find import find_profile
 from labseq.errors import ConfigError, Problem
-from labseq.files import packaged_profiles_dir
+from labseq.files import PLUGINS, packaged_profiles_dir
 from labseq.messages import clean, visible
 from labseq.plugins import PluginHost
 from labseq.registry import Registry
@@ -32,8 +32,6 @@ from labseq.session.chosen import load_plugins
 
 MAX_LENGTH: Final = 40
 """Maximum length of a name."""
-PLUGINS: Final = "plugins"
-"""Folder of the plugins, next to the sequences and profiles that name them."""
 FIRST: Final = "first"
 """Name of the sequence that the examples run."""
 PACKAGE_PREFIX: Final = "labseq_"

@@ -11,10 +11,11 @@ from typing import Any, Final
 
 from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
+from labseq.files import PLUGINS
 from labseq.messages import clean, did_you_mean, listing
 from labseq.plugins import PluginHost
 from labseq.registry import KINDS
-from labseq.scaffold.new import PLUGINS, CreatedFiles, make_file, make_plugin
+from labseq.scaffold.new import CreatedFiles, make_file, make_plugin
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, SCHEMA_FOLDER, schema_text
 from labseq.session.chosen import load_plugins
 

@@ -97,8 +97,27 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
             and column.
     """
     entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
-    settings = validate(document, entry, choice.loc, choice.core_keys)
+    try:
+        settings = validate(document, entry, choice.loc, choice.core_keys)
+    except ConfigError as error:
+        raise _with_advice(error, document, choice) from None
     return ChosenPlugin(entry, settings, document, choice.loc)
+
+
+def _with_advice(error: ConfigError, document: Document, choice: Choice) -> ConfigError:
+    """The error about settings of another plugin that are left in the file, if an option chose this one."""
+    option = document.root.mark_at((*choice.loc, choice.key)).origin
+    address, dot, key = option.removeprefix("--set ").partition("=")[0].rpartition(".")
+    if not (option.startswith("--set ") and dot and key == choice.key):
+        return error
+    hint = f'to drop the settings of another plugin, use --set "{address}={{{key}: {choice.use}}}"'
+    problems = [
+        replace(one, hint="; ".join(filter(None, [one.hint, hint])))
+        if one.line and "setting" in one.what
+        else one
+        for one in error.problems
+    ]
+    return ConfigError(problems)
 
 
 def named(
@@ -118,7 +137,7 @@ def named(
         ConfigError: No plugin offers it, or the one that does failed to load.
     """
     try:
-        return host.get(kind, name)
+        return host.get(kind, name, document.path)
     except UnknownPluginError as error:
         what = f"unknown {kind.replace('_', ' ')} '{clean(name)}'"
         raise document.error(loc, what, one_of(error.known), error.hint, key) from None
@@ -222,10 +241,10 @@ def _defaults(entry: Entry) -> Settings | None:
 def load_plugins(
     folders: Sequence[Path] = (), found: ProblemCollector | None = None, max_wait_s: float = LOAD_S
 ) -> PluginHost:
-    """Load labseq's own, the installed and the folders' plugins.
+    """Load labseq's own, the installed and the folders' plugins; every command finds them by this function.
 
     Args:
-        folders: Folders with plugins, in addition to those of LABSEQ_PLUGIN_PATH.
+        folders: The folders that profile and sequence name; --plugins and LABSEQ_PLUGIN_PATH are added.
         found: Receives the problem of an unreadable folder; without it, it is raised.
         max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
 

@@ -136,7 +136,7 @@ def resolve_profile(
         overrides: Values that replace those in the file.
         dry_run: "off", "full" or "fast".
         named_in: The sequence that names the profile, for messages.
-        plugin_folders: Further folders with plugins.
+        plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
         scan: The sequence's scan; the profile receives the values of its first point.
         found: Receives the problems of a readable profile; without it they are raised.
         again: The profile's text and calibrations, if a run is resumed.
@@ -154,7 +154,7 @@ def resolve_profile(
         found=found,
         kept=None if again is None else again.profile,
     )
-    folders = [*plugin_paths(document, spec.plugin_folders), *plugin_folders]
+    folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
     host = load_plugins(folders, max_wait_s=spec.timeouts.load)
     problems = ProblemCollector() if found is None else found
     pins = None if again is None else again.calibrations
