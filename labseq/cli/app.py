@@ -56,6 +56,12 @@ Examples:
   labseq resume data/2026-01-02/0001_compact-225
   labseq resume data/2026-01-02/0001_compact-225 --accept-changes
 """
+RUNS_EXAMPLES: Final = """\b
+Examples:
+  labseq runs
+  labseq runs --name kagome --limit 5
+  labseq show kagome
+"""
 EXPORT_EXAMPLES: Final = """\b
 Examples:
   labseq export --to csv
@@ -152,7 +158,7 @@ def run(
 
 @app.command(epilog=RESUME_EXAMPLES, short_help="Resume a run that ended early.")
 def resume(
-    run: Annotated[Path, run_argument("The run's folder, or any file in it.")],
+    run: Annotated[Path, run_argument("The run's folder, name or number.")],
     accept_changes: Annotated[
         bool,
         typer.Option(
@@ -172,7 +178,9 @@ def resume(
 
 @app.command(short_help="End a run in progress after its current shot.")
 def stop(
-    run: Annotated[Path | None, run_argument("The run's folder; default: the run in progress.")] = None,
+    run: Annotated[
+        Path | None, run_argument("The run's folder, name or number; default: the run in progress.")
+    ] = None,
     profile: Annotated[str | None, profile_option("Stop the run that uses this profile.")] = None,
     queue: Annotated[
         bool, typer.Option("--queue", help="Also let `labseq queue run` start no further entry.")
@@ -215,6 +223,31 @@ def check(
     from labseq.cli.check import check_sequence
 
     check_sequence(sequence, profile, overrides or (), dry_run_mode(dry_run), as_json=as_json)
+
+
+@app.command(epilog=RUNS_EXAMPLES, short_help="List the runs in a data folder.")
+def runs(
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="DATA", help="A data folder; default: LABSEQ_DATA or ./data.", show_default=False
+        ),
+    ] = None,
+    name: Annotated[
+        str,
+        typer.Option(metavar="TEXT", help="Only runs with this in their name or date.", show_default=False),
+    ] = "",
+    limit: Annotated[int, typer.Option(metavar="N", min=1, help="Only the newest N runs.")] = 20,
+    as_json: Json = False,
+) -> None:
+    """List the runs in a data folder, the newest last.
+
+    The first column is the name by which all commands accept a run. Its number or the name of its sequence
+    will do; it is then the newest of them.
+    """
+    from labseq.cli.runs import list_runs
+
+    list_runs(data, name, limit, as_json=as_json)
 
 
 app.command(epilog=PLAN_EXAMPLES, short_help="Plan the moves for one occupancy; print or draw them.")(plan)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.console.output import as_line, say
-from labseq.console.runs import chosen_run
+from labseq.console.runs import chosen_run, existing_run
 from labseq.console.text import columns, plural
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import visible
@@ -27,8 +27,10 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
     """
     root = data_root() if data is None else data.expanduser()
     if not root.is_dir():
-        hint = "give a data folder or a run's folder, or set LABSEQ_DATA"
-        raise ConfigError(Problem("there is no such folder", visible(str(root)), hint=hint))
+        if data is None:
+            hint = "give a data folder or a run, or set LABSEQ_DATA"
+            raise ConfigError(Problem("there is no such folder", visible(str(root)), hint=hint))
+        root = existing_run(data)
     report = find_damage(root, dry_run=dry_run)
     if as_json:
         say(as_line(_as_values(report)))

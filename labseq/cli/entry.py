@@ -74,6 +74,7 @@ def _report_usage(error: Any, arguments: Sequence[str]) -> int:
     Returns:
         The exit code.
     """
+    error = _in_own_words(error)
     with suppress(OSError, RecordingError):  # the exit code reports it, too
         error.show()
         options = arguments[: arguments.index("--")] if "--" in arguments else arguments
@@ -81,6 +82,21 @@ def _report_usage(error: Any, arguments: Sequence[str]) -> int:
         if line:
             say(line)
     return int(error.exit_code)
+
+
+def _in_own_words(error: Any) -> Any:
+    """The error of a value of the wrong type or beyond a limit, worded as that of a setting in a file."""
+    parameter, found = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
+    if parameter is None or found is None:
+        return error
+    from labseq.config.validation import explain
+
+    first = found(include_url=False)[0]
+    value = first["input"]
+    is_whole = isinstance(value, str) and value.lstrip("+-").isdecimal()
+    name = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.metavar
+    problem = explain(first, name, int(value) if is_whole else value, "")
+    return type(error).__mro__[1](str(problem), ctx=error.ctx)
 
 
 def _usage_json(error: Any) -> str:

@@ -169,5 +169,6 @@ Output = Annotated[
 ]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
 RunFolder = Annotated[
-    Path | None, run_argument("The run's folder, or any file in it; default: the newest run.")
+    Path | None,
+    run_argument("The run's folder, or its name or number as in labseq runs; default: the newest run."),
 ]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.messages import clean
+from labseq.messages import clean, visible
 from labseq.recording import Run, data_root, open_run
-from labseq.recording.folders import find_run
+from labseq.recording.folders import RUN_FILE, find_run
 
 
 def chosen_run(path: Path | None) -> Run:
@@ -21,12 +21,14 @@ def chosen_run(path: Path | None) -> Run:
 
 
 def existing_run(path: Path) -> Path:
-    """The folder of the run that a command is given, or any file in it.
+    """The folder of the run that a command is given: its folder, any file in it, its name or its number.
 
     Raises:
         ConfigError: There is no such run: the command line is wrong, not the data.
     """
     try:
+        if not path.expanduser().exists():
+            return named_run(path.as_posix(), data_root())
         return find_run(path)
     except RecordingError as error:
         raise ConfigError(str(error)) from error
@@ -35,16 +37,42 @@ def existing_run(path: Path) -> Path:
         raise ConfigError(Problem(f"the folder cannot be read: {reason}", clean(str(path)))) from error
 
 
+def named_run(name: str, root: Path) -> Path:
+    """The newest run of a name or number as `labseq runs` prints it, all of it or a part.
+
+    Args:
+        name: "2026-11-20/0001_compact-225", "2026-11-20/1", "0001_compact-225", "compact-225" or "1".
+
+    Raises:
+        ConfigError: There is none.
+    """
+    day, _, last = name.rpartition("/")
+    for folder in reversed(runs_in(root)):
+        is_number = last.isdecimal() and int(last) == _counter(folder)
+        if day in ("", folder.parent.name) and (
+            is_number or last in (folder.name, folder.name.partition("_")[2])
+        ):
+            return folder
+    what = f"there is no such folder, and no run of this name or number in {visible(str(root))}"
+    raise ConfigError(Problem(what, clean(name), hint="`labseq runs` lists the runs"))
+
+
 def newest_run(root: Path) -> Path:
     """The folder of the run that was started last: newest day, highest counter.
 
     Raises:
         ConfigError: There is none.
     """
-    folders = [file.parent for file in root.glob("*-*-*/*_*/run.json")]
+    folders = [folder for folder in runs_in(root) if (folder / RUN_FILE).exists()]
     if not folders:
         raise ConfigError(f"{root} holds no runs; give a run's folder, or set LABSEQ_DATA")
-    return max(folders, key=lambda folder: (folder.parent.name, _counter(folder)))
+    return folders[-1]
+
+
+def runs_in(root: Path) -> list[Path]:
+    """The folders of runs in a data folder, damaged ones included, the newest last."""
+    found = [folder for folder in root.glob("*-*-*/*_*") if _counter(folder) >= 0 and folder.is_dir()]
+    return sorted(found, key=lambda folder: (folder.parent.name, _counter(folder)))
 
 
 def _counter(folder: Path) -> int:

@@ -40,10 +40,13 @@ def test_help_names_every_command_and_option(call: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["run", "a.yaml", "--shots", "x"], "--shots"),
-        (["run", "a.yaml", "--dry-run=quick"], "--dry-run"),
+        (["run", "a.yaml", "--shots", "x"], "Error: --shots is 'x'; expected a whole number\n"),
+        (["run", "a.yaml", "--shots", "2.5"], "Error: --shots is '2.5'; expected a whole number\n"),
+        (["bench", "planners", "--loadings", "0"], "Error: --loadings is 0; expected at least 1\n"),
+        (["queue", "remove", "x"], "Error: ID... is 'x'; expected a whole number\n"),
+        (["run", "a.yaml", "--dry-run=quick"], "--dry-run: 'quick' is not one of 'full', 'fast'"),
         (["run"], "SEQUENCE"),
-        (["plan", "random:3x3@1", "--seed", "-1"], "--seed"),
+        (["plan", "random:3x3@1", "--seed", "-1"], "Error: --seed is -1; expected at least 0\n"),
         (["fly"], "fly"),
     ],
 )
@@ -106,7 +109,11 @@ def test_safe_changes_no_sequence(call: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "said"), [("nope", "nope: no such file or folder"), ("x" * 5000, "xxx...: the folder cannot be")]
+    ("path", "said"),
+    [
+        ("nope", "nope: there is no such folder, and no run of this name"),
+        ("x" * 5000, "xxx...: the folder cannot be"),
+    ],
 )
 def test_a_run_that_does_not_exist_is_a_mistake_of_the_user(path: str, said: str, call: Any) -> None:
     code, _, err = call("show", path)

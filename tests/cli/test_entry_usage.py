@@ -13,7 +13,7 @@ NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction":
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["run", "a.yaml", "--json", "--shots", "x"], "--shots"),
+        (["run", "a.yaml", "--json", "--shots", "x"], "--shots is 'x'; expected a whole number"),
         (["run", "--json"], "SEQUENCE"),
         (["show", "--json", "a", "b"], "b"),
     ],
