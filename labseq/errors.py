@@ -212,14 +212,16 @@ class LimitError(LabseqError, ValueError):
         what: The quantity, for example "row tones in batch 3".
         value: The value.
         limit: The limit that it exceeds.
+        setting: Location of the setting of the profile that it follows from; () if unknown.
     """
 
     exit_code: ClassVar[int] = 2
 
-    def __init__(self, what: str, value: object, limit: object, hint: str = "") -> None:
+    def __init__(self, what: str, value: object, limit: object, hint: str = "", *, setting: Loc = ()) -> None:
         self.what = what
         self.value = value
         self.limit = limit
+        self.setting = setting
         text = f"{what} is {value}; the limit is {limit}"
         super().__init__(f"{text}; {hint}" if hint else text)
 

@@ -114,6 +114,7 @@ from labseq.roles import (
     Trigger,
     find_leader,
     offers,
+    unknown_name,
 )
 from labseq.roles.shot import NeverStopped
 from labseq.sequencer.lines import idle_program, off_program, trigger_line
@@ -279,6 +280,7 @@ __all__ = [
     "state_root",
     "tone_program",
     "trigger_line",
+    "unknown_name",
     "visible",
     "wait_for",
     "warm_rendering",

@@ -226,10 +226,7 @@ class CameraDriver(Camera):
         facts = self.facts
         if n_frames < 1:
             raise LimitError(f"{self._name}: number of frames", n_frames, "at least 1")
-        if not 0 < exposure_s <= facts.max_exposure_s:
-            longest = format_quantity(facts.max_exposure_s, "time")
-            came, limit = format_quantity(exposure_s, "time"), f"more than 0 and at most {longest}"
-            raise LimitError(f"{self._name}: exposure", came, limit, "choose another exposure")
+        facts.check_exposure(exposure_s, self._name)
         if trigger not in facts.triggers:
             text = f"it has no {trigger} trigger; expected {one_of(facts.triggers)}"
             raise DeviceError(self._name, text)

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.errors import LimitError
 from labseq.model.arrays import read_only
+from labseq.units import format_quantity
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,7 @@ class CameraFacts:
         frame_shape: (height, width) of its frames; None if not known.
         em_gain: Mean gain of the EM register in an exposure; 1 for a camera without one.
         triggers: What may start its exposures: "software", "internal", "external".
+        min_exposure_s: Shortest exposure, in seconds; 0 if not known.
     """
 
     readout_s: float = 0.0
@@ -51,6 +54,21 @@ class CameraFacts:
     frame_shape: tuple[int, int] | None = None
     em_gain: float = 1.0
     triggers: tuple[str, ...] = ("software",)
+    min_exposure_s: float = 0.0
+
+    def check_exposure(self, exposure_s: float, camera: str = "camera") -> None:
+        """Refuse an exposure that the camera cannot make.
+
+        Raises:
+            LimitError: It is too short or too long.
+        """
+        if exposure_s > 0 and self.min_exposure_s <= exposure_s <= self.max_exposure_s:
+            return
+        came, low, high = (
+            format_quantity(s, "time") for s in (exposure_s, self.min_exposure_s, self.max_exposure_s)
+        )
+        limit = f"{low} to {high}" if self.min_exposure_s else f"more than 0 and at most {high}"
+        raise LimitError(f"{camera}: exposure", came, limit, "choose another exposure")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -204,22 +204,27 @@ def _raise_limit_error(
     from labseq.motion.tone_kernels import AMPLITUDES, BAND, SPACING
 
     name = AXES[axis]
+    frequency, rf_settings = ("grid", f"{name}_frequency"), ("mobile_tweezers", "rf")
     in_batch = f"in batch {batch + 1}"
     all_tones = f"{name} tones 0 to {n_tones - 1} {in_batch}" if n_tones > 1 else f"{name} tone 0 {in_batch}"
     if fault == BAND:
         low, high = (f"{hz / 1e6:.6g}" for hz in (rf.row_band_hz, rf.column_band_hz)[axis])
         what, limit = f"the frequency of {name} tone {tone} {in_batch}", f"the band of {low} to {high} MHz"
-        raise LimitError(what, f"{value / 1e6:.6g} MHz", limit)
+        raise LimitError(what, f"{value / 1e6:.6g} MHz", limit, setting=frequency)
     if fault == SPACING:
         what = f"the distance of {name} tones {tone - 1} and {tone} {in_batch}"
         least = format_quantity(rf.min_spacing_hz, "frequency")
-        raise LimitError(what, f"{value / 1e6:.6g} MHz", f"{least} at least, in the order of the sites")
+        raise LimitError(
+            what, f"{value / 1e6:.6g} MHz", f"{least} at least, in the order of the sites", setting=frequency
+        )
     if fault == AMPLITUDES and rf.full_scale_v > rf.max_peak_v:
         what, came = f"the peak voltage of {all_tones}", format_quantity(value * rf.full_scale_v, "voltage")
-        raise LimitError(what, came, f"{format_quantity(rf.max_peak_v, 'voltage')}: more ruins the amplifier")
+        limit = f"{format_quantity(rf.max_peak_v, 'voltage')}: more ruins the amplifier"
+        raise LimitError(what, came, limit, setting=rf_settings)
     if fault == AMPLITUDES:
         what = f"the sum of the amplitudes of {all_tones}"
-        raise LimitError(what, f"{value:.6g} of full scale", "1: the output would clip")
+        raise LimitError(what, f"{value:.6g} of full scale", "1: the output would clip", setting=rf_settings)
     power_w = value * rf.full_scale_power_w
     limit = f"{format_quantity(rf.max_mean_power_w, 'power')} at the AOD"
-    raise LimitError(f"the mean RF power of {all_tones}", format_quantity(power_w, "power"), limit)
+    what = f"the mean RF power of {all_tones}"
+    raise LimitError(what, format_quantity(power_w, "power"), limit, setting=rf_settings)

@@ -34,6 +34,7 @@ from labseq.roles.hardware import (
     find_leader,
     leaders,
     offers,
+    unknown_name,
 )
 from labseq.roles.shot import EVENTS, Clock, Context, NeverStopped, RunObserver, Shot, Step, StepContext
 from labseq.roles.simulation import (
@@ -79,4 +80,5 @@ __all__ = [
     "find_leader",
     "leaders",
     "offers",
+    "unknown_name",
 ]

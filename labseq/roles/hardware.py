@@ -13,7 +13,8 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import ConfigError, Problem, one_of
+from labseq.errors import ConfigError, DeviceError, Problem, one_of
+from labseq.messages import clean, did_you_mean
 from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram
 
 Trigger = Literal["software", "internal", "external"]
@@ -127,6 +128,13 @@ class StaticTweezers(Hardware):
 class MobileTweezers(Hardware):
     """The mobile tweezers."""
 
+    def check_program(self, program: ToneProgram) -> None:
+        """Refuse before the device is opened what ``prepare`` would refuse; nothing is sent.
+
+        Raises:
+            LimitError: The program exceeds a limit that the settings imply.
+        """
+
     @abstractmethod
     def prepare(self, program: ToneProgram) -> float:
         """Render and upload a program without playing it.
@@ -189,6 +197,13 @@ class Lines(Hardware):
     def lines_facts(self) -> LinesFacts:
         """Channels, number of edges and resolution; also before ``open()``."""
         return LinesFacts(())
+
+    def check_program(self, program: LineProgram) -> None:
+        """Refuse before the box is opened what ``compile`` would refuse; nothing is sent.
+
+        Raises:
+            LimitError: The program has more edges, or edges closer together, than the box can make.
+        """
 
     @abstractmethod
     def compile(self, program: LineProgram) -> None:
@@ -299,6 +314,24 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
     if len(able) > 1:
         raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")
     return next(iter(able.items()))
+
+
+def unknown_name(device: str, what: str, name: str, known: Sequence[str]) -> DeviceError:
+    """The error of a device that has no such command or value.
+
+    Args:
+        device: Name of the device.
+        what: "command" or "value".
+        name: What it was asked for.
+        known: What it has.
+
+    Example:
+        >>> str(unknown_name("shutter", "command", "opne", ["open", "close"]))
+        "shutter: unknown command 'opne'; expected one of 'open', 'close'; did you mean 'open'?"
+    """
+    text = f"unknown {what} '{clean(name)}'; expected {one_of(known) if known else 'none: it has none'}"
+    hint = did_you_mean(name, known)
+    return DeviceError(device, f"{text}; {hint}" if hint else text)
 
 
 def offers(part: object, ability: str) -> bool:

@@ -71,8 +71,9 @@ def spans_on(
     found: dict[str, list[tuple[float, float]]] = {spec.name: [] for spec in specs}
     start_s = 0.0
     for bar in bars:
-        own_s = bar.exposure_s or max(0.0, bar.duration_s - margin_s(specs, bar.kind))
-        program = line_program(specs, bar.kind, own_s) if bar.kind else idle_program(specs)
+        program = (
+            line_program(specs, bar.kind, own_duration_s(specs, bar)) if bar.kind else idle_program(specs)
+        )
         for spec in specs:
             spans = [(start_s + a, start_s + b) for a, b in program.spans(spec.name)]
             if IDLE in spec.on and bar.duration_s > program.duration_s:
@@ -80,6 +81,11 @@ def spans_on(
             _join(found[spec.name], spans)
         start_s += bar.duration_s
     return found
+
+
+def own_duration_s(specs: Sequence[LineSpec], bar: TimelineEntry) -> float:
+    """The length of a bar without read-out and the margins of the lines, in seconds."""
+    return bar.exposure_s or max(0.0, bar.duration_s - margin_s(specs, bar.kind))
 
 
 def trigger_line(specs: Iterable[LineSpec], role: str) -> LineSpec | None:

@@ -84,13 +84,16 @@ class Assembly:
     def first_point(self) -> Point:
         """The settings of the first point of a scan; those of the files if no point is known yet."""
         alone = self.scanned is None or self.search is not None
-        return Point(self.planner, self.steps, self.hardware, {}) if alone else self.at(0)
+        return self._alone if alone else self.at(0)
 
     def at(self, point: int) -> Point:
         """The settings of a point of the scan."""
-        if self.scanned is None:
-            return Point(self.planner, self.steps, self.hardware, {})
-        return self.scanned.at(point)
+        return self._alone if self.scanned is None else self.scanned.at(point)
+
+    @property
+    def _alone(self) -> Point:
+        """The settings of the files."""
+        return Point(self.planner, self.steps, self.hardware, {}, self.document)
 
 
 def assemble(

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.config.document import Document
+from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem
 from labseq.guard import Guard
-from labseq.model import TimelineEntry
-from labseq.motion import check_plan
+from labseq.model import Occupancy, Plan, PlanReport, TimelineEntry
+from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.roles import Step, find_leader, offers
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.lines import spans_on
+from labseq.sequencer.lines import line_program, own_duration_s, spans_on
 from labseq.sequencer.run import plan_timelines
 from labseq.session.assembly import Assembly
+from labseq.session.lab import WARM_S
 from labseq.session.scan import Point
 from labseq.units import format_quantity
 
@@ -27,42 +29,128 @@ if TYPE_CHECKING:
     from labseq.session.session import Session
 
 
-def check_steps(assembly: Assembly, points: Iterable[Point], build: Callable[[Point], Lab]) -> None:
-    """Have every step check its settings against the devices; nothing is opened.
+N_LOADINGS: Final = 200
+"""Maximum number of random loadings for which the planner is run."""
+MAX_WAIT_S: Final = 2.0
+"""Time after which no further loading is tried, in seconds of real time."""
+PAPERS_LOADING: Final = 0.75
+"""Loading probability if the profile has no simulation that reports it."""
+SURVIVAL: Final = 0.98
+"""Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
+N_PROGRAMS: Final = 20
+"""Number of plans whose tones are computed."""
+SHOT_OVERHEAD_BYTES: Final = 60_000
+"""Approximate size of a shot file without frames, in bytes."""
 
-    Args:
-        assembly: The run.
-        points: The points of its scan.
-        build: Constructs the devices of a point.
-
-    Raises:
-        ConfigError: All settings that do not fit the devices, with their place.
-    """
-    if not any(offers(step, "check_devices") for _, step in assembly.steps):
-        return
-    labs: dict[int, Lab] = {}
-    problems: dict[str, Problem] = {}
-    guard = Guard()
-    for point in points:
-        lab = labs.get(id(point.hardware)) or labs.setdefault(id(point.hardware), build(point))
-        devices = dict(lab.hardware())
-        for spec, (name, step) in zip(assembly.sequence.shot, point.steps, strict=True):
-            for setting, what in _wrong_settings(guard, lab.timeouts.call_s, name, step, devices).items():
-                problem = assembly.document.problem((*spec.loc, setting) if setting else spec.loc, what)
-                problems[str(problem)] = problem
-    guard.end()
-    if problems:
-        raise ConfigError([*problems.values()])
+Timeline: TypeAlias = Sequence[tuple[str, Sequence[TimelineEntry]]]
+"""Name and bars of each step."""
 
 
-def _wrong_settings(
-    guard: Guard, timeout_s: float, name: str, step: Step, devices: Mapping[str, object]
-) -> dict[str, str]:
+@dataclass(slots=True)
+class _Points:
+    """What devices and steps say of the points of a run; each combination of settings is asked for once."""
+
+    session: Session
+    guard: Guard
+    problems: dict[str, Problem] = field(default_factory=dict[str, Problem])
+    _labs: dict[tuple[int, int], tuple[Point, Lab]] = field(default_factory=dict[Any, Any])
+    _timelines: dict[tuple[int, ...], tuple[Point, Timeline]] = field(default_factory=dict[Any, Any])
+
+    def lab(self, point: Point) -> Lab:
+        """The devices of a point; none is open."""
+        key = id(point.planner), id(point.hardware)
+        if key not in self._labs:
+            self._labs[key] = point, self.session.build_lab(point)
+        return self._labs[key][1]
+
+    def labs(self) -> list[tuple[Point, Lab]]:
+        """The devices of all points so far, each with the first of its points."""
+        return [*self._labs.values()]
+
+    def timeline(self, point: Point) -> Timeline:
+        """Name and bars of each step."""
+        lab = self.lab(point)
+        key = (id(lab), *(id(step) for _, step in point.steps))
+        if key not in self._timelines:
+            bars = plan_timelines(lab, self.guard, point.steps)
+            named = [(name, own) for (name, _), own in zip(point.steps, bars, strict=True)]
+            self._timelines[key] = point, named
+        return self._timelines[key][1]
+
+    def add(self, document: Document, loc: Loc, what: str, expected: str = "") -> None:
+        """Add a problem, unless it is known."""
+        problem = document.problem(loc, what, expected)
+        self.problems.setdefault(str(problem), problem)
+
+    def raise_problems(self) -> None:
+        """Raise what was found.
+
+        Raises:
+            ConfigError: There is a problem.
+        """
+        if self.problems:
+            error, scanned = ConfigError([*self.problems.values()]), self.session.assembly.scanned
+            raise error if scanned is None else scanned.scan.explained(error)
+
+    def ask_steps(self, point: Point) -> None:
+        """Have every step check its settings against the devices."""
+        lab, shot = self.lab(point), self.session.assembly.sequence.shot
+        for spec, (name, step) in zip(shot, point.steps, strict=True):
+            if offers(step, "check_devices"):
+                for setting, what in _wrong_settings(self.guard, lab, name, step).items():
+                    self.add(point.document, (*spec.loc, setting) if setting else spec.loc, what)
+
+    def ask_devices(self, point: Point) -> None:
+        """Have camera and lines check what each step of a shot would ask of them."""
+        lab, shot = self.lab(point), self.session.assembly.sequence.shot
+        for spec, (_, bars) in zip(shot, self.timeline(point), strict=True):
+            for bar in bars:
+                key = "exposure" if bar.exposure_s else "duration"
+                try:
+                    if bar.exposure_s:
+                        lab.step_context.camera.check_exposure(bar.exposure_s)
+                    if bar.kind and bar.kind != "rearrange":  # its length follows from the plan
+                        self._ask_lines(lab, bar.kind, own_duration_s(lab.line_specs, bar))
+                except LabseqError as error:
+                    self.add(point.document, (*spec.loc, key), str(error))
+        self._ask_timeouts(point, lab)
+
+    def _ask_lines(self, lab: Lab, kind: str, duration_s: float) -> None:
+        if lab.lines is not None and offers(lab.lines, "check_program"):
+            program = line_program(lab.line_specs, kind, duration_s)
+            self.guard.call("lines", lab.timeouts.call_s, lab.lines.check_program, program)
+
+    def _ask_timeouts(self, point: Point, lab: Lab) -> None:
+        """A timeout that is written in the profile must be longer than the exposures."""
+        document, loc = point.hardware.document, ("timeouts", "call")
+        longest_s = max((bar.exposure_s for _, bars in self.timeline(point) for bar in bars), default=0.0)
+        if document.get(loc) is not None and lab.timeouts.call_s < longest_s:
+            call, exposure = (format_quantity(s, "time") for s in (lab.timeouts.call_s, longest_s))
+            what = f"device calls time out after {call}, but an exposure takes {exposure}"
+            self.add(document, loc, what, f"more than {exposure}")
+
+    def ask_tweezers(self, point: Point, lab: Lab, plans: Iterable[Plan]) -> None:
+        """Turn plans into tones, and have the devices check them."""
+        document = point.hardware.document
+        for plan in plans:
+            try:
+                program = tone_program(plan, grid=lab.grid, motion=lab.motion)
+                if offers(lab.mobile_tweezers, "check_program"):
+                    check_program = lab.mobile_tweezers.check_program
+                    self.guard.call("mobile_tweezers", WARM_S, check_program, program)
+                self._ask_lines(lab, "rearrange", program.total_duration_s)
+            except LimitError as error:
+                self.add(document, error.setting or ("mobile_tweezers", "use"), f"moving atoms: {error}")
+                return
+            except LabseqError as error:
+                self.add(document, ("mobile_tweezers", "use"), str(error))
+                return
+
+
+def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, str]:
     """Setting -> what is wrong with it, as a step says; "" for a step that fails to say it."""
-    if not offers(step, "check_devices"):
-        return {}
     try:
-        found = guard.call(f"step '{name}'", timeout_s, step.check_devices, devices)
+        found = guard.call(f"step '{name}'", lab.timeouts.call_s, step.check_devices, dict(lab.hardware()))
         return {str(setting): str(what) for setting, what in dict(found).items()}
     except LabseqError as failure:
         return {"": str(failure)}
@@ -70,15 +158,8 @@ def _wrong_settings(
         return {"": f"check_devices() of step '{name}' returned no mapping"}
 
 
-def timeout_warnings(
-    assembly: Assembly, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
-) -> list[Problem]:
-    """Warnings about steps that may take longer than the timeout of their policy.
-
-    Args:
-        assembly: The run.
-        timeline: Name of each step and its bars.
-    """
+def _timeout_warnings(assembly: Assembly, timeline: Timeline) -> list[Problem]:
+    """Warnings about steps that may take longer than the timeout of their policy."""
     problems: list[Problem] = []
     for spec, policy, (_, bars) in zip(assembly.sequence.shot, assembly.policy.steps, timeline, strict=True):
         longest_s = sum(bar.duration_s for bar in bars)
@@ -89,16 +170,6 @@ def timeout_warnings(
             place = (*spec.policy_loc, "timeout")
             problems.append(assembly.document.problem(place, what, f"more than {longest}"))
     return problems
-
-
-N_LOADINGS: Final = 200
-"""Maximum number of random loadings for which the planner is run."""
-MAX_WAIT_S: Final = 5.0
-"""Time after which no further loading is tried, in seconds of real time."""
-PAPERS_LOADING: Final = 0.75
-"""Loading probability if the profile has no simulation that reports it."""
-SHOT_OVERHEAD_BYTES: Final = 60_000
-"""Approximate size of a shot file without frames, in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +204,7 @@ class CheckReport:
         lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
     """
 
-    timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
+    timeline: Timeline
     n_shots: int
     n_points: int | None
     run_s: tuple[float, float]
@@ -170,52 +241,48 @@ def check(session: Session) -> CheckReport:
         session: An opened session; its sequence and profile have no errors.
 
     Raises:
-        ConfigError: A step sends a command that its device does not know.
+        ConfigError: What a device or plugin would refuse in the first shot at some point of the run.
     """
-    assembly = session.assembly
-    check_steps(assembly, session.scan_run.each(), session.build_lab)
-    lab = session.build_lab()
-    timeline = session.timeline()
-    windows = _windows(assembly.steps)
-    if windows:
-        session.warm(lab, devices=False)
-    rehearsal, failure = _rehearse(lab) if windows else (None, "")
-    warnings = [Problem(text) for text in assembly.warnings]
-    document = assembly.document
-    if failure:
-        warnings.append(document.problem((*assembly.sequence.planner.loc, "use"), failure))
-    if rehearsal is not None:
-        warnings += _window_warnings(session, windows, rehearsal)
-    warnings += _exposure_warnings(session, lab, timeline)
-    warnings += _judgement_warnings(session, [number for number, _ in windows])
-    warnings += _parallelism_warnings(session)
+    assembly, guard = session.assembly, Guard(session.stop_flag)
+    points = _Points(session, guard)
+    try:
+        first = assembly.first_point
+        lab = points.lab(first)
+        each = [first, *session.scan_run.each()]
+        for ask in (points.ask_steps, points.ask_devices):
+            for point in each:
+                ask(point)
+            points.raise_problems()
+        rehearsals, warnings = _rehearsed(points)
+        points.raise_problems()
+        run_s = _run_s(session, points)
+        timeline = points.timeline(first)
+    finally:
+        guard.end()
+    warnings += _judgement_warnings(session, [*rehearsals])
+    warnings += _parallelism_warnings(session, each)
     warnings += _deadline_warnings(session, lab, timeline)
-    warnings += timeout_warnings(assembly, timeline)
-    for point in session.scan_run.representative_labs():
-        session.build_lab(point)  # whether the constructors accept the settings
-    warnings += [Problem(text) for text in assembly.hardware.host.notes]
+    warnings += _timeout_warnings(assembly, timeline)
+    notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         timeline,
         assembly.sequence.shots,
         None if assembly.scanned is None else session.scan_run.n_points,
-        _run_s(session, lab),
-        tuple(warnings),
-        rehearsal,
+        run_s,
+        (*notes, *warnings),
+        next(iter(rehearsals.values()), None),
         _shot_bytes(session, lab, timeline),
         spans_on(lab.line_specs, (bar for _, bars in timeline for bar in bars)),
     )
 
 
-def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
+def _run_s(session: Session, points: _Points) -> tuple[float, float]:
     """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
-    guard = Guard()
     min_duration_s, most_s = list[float](), list[float]()
     for point, n in session.scan_run.counted():
-        context = replace(lab.step_context, motion=point.hardware.profile.motion)
-        bars = [bar for bars in plan_timelines(lab, guard, point.steps, context) for bar in bars]
+        bars = [bar for _, bars in points.timeline(point) for bar in bars]
         min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
-    guard.end()
     return (
         (min(min_duration_s), max(most_s))
         if session.scan_run.is_adaptive
@@ -223,47 +290,100 @@ def _run_s(session: Session, lab: Lab) -> tuple[float, float]:
     )
 
 
-def _windows(steps: Sequence[tuple[str, Step]]) -> list[tuple[int, tuple[float, ...]]]:
-    """Step number and window per cycle of each rearrangement step."""
-    windows = ((number, getattr(step, "windows_s", ())) for number, (_, step) in enumerate(steps))
-    return [(number, windows_s) for number, windows_s in windows if windows_s]
+def _windows(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
+    """Step number -> window per cycle, of each rearrangement."""
+    windows = {number: getattr(step, "windows_s", ()) for number, (_, step) in enumerate(steps)}
+    return {number: windows_s for number, windows_s in windows.items() if windows_s}
 
 
-def _rehearse(lab: Lab) -> tuple[Rehearsal | None, str]:
-    """Plan for random loadings; returns the results, or the planner's failure as text."""
+def _rehearsed(points: _Points) -> tuple[dict[int, Rehearsal], list[Problem]]:
+    """Rehearse the moves at every point with devices of its own: the results at the first, and warnings."""
+    session, rehearsals, warnings = points.session, dict[int, Rehearsal](), list[Problem]()
+    for n, (point, lab) in enumerate(points.labs()):
+        windows = _windows(point.steps)
+        if not windows:
+            continue
+        session.warm(lab, devices=False)
+        found, plans, failure = _rehearse(points.guard, lab, [*windows.values()], 1 if n else N_LOADINGS)
+        points.ask_tweezers(point, lab, plans)
+        if failure:
+            loc = (*session.assembly.sequence.planner.loc, "use")
+            warnings.append(point.document.problem(loc, failure))
+        elif n == 0:
+            rehearsals = dict(zip(windows, found, strict=True))
+            warnings += _window_warnings(session, windows, rehearsals)
+    return rehearsals, list(dict.fromkeys(warnings))
+
+
+def _rehearse(
+    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int
+) -> tuple[list[Rehearsal], list[Plan], str]:
+    """Plan for random loadings.
+
+    Returns:
+        The results of each rearrangement, some of the plans, and the planner's failure as text.
+    """
     loading = None
     if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
         loading = lab.simulation.loading_probability
     if loading is None:
         loading = PAPERS_LOADING
-    rng, guard = np.random.default_rng(0), Guard()
-    durations, firsts, n_filled = list[float](), list[float](), 0
-    deadline = time.monotonic() + MAX_WAIT_S
-    try:
-        while len(durations) < N_LOADINGS and time.monotonic() < deadline:
-            occupancy = rng.random(lab.grid.shape) < loading
+    rng, deadline = np.random.default_rng(0), time.monotonic() + MAX_WAIT_S
+    shots: list[list[tuple[Plan, PlanReport]]] = []
+    failure = ""
+    while len(shots) < n_loadings and time.monotonic() < deadline and not failure:
+        occupancy = rng.random(lab.grid.shape) < loading
+        try:
+            shots.append(_rehearse_shot(guard, lab, windows, occupancy, rng))
+        except LabseqError as error:
+            failure = f"on a random loading of {loading:.0%} of the sites: {error}"
+    plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
+    found = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
+    return found, plans, failure
+
+
+def _rehearse_shot(
+    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], occupancy: Occupancy, rng: np.random.Generator
+) -> list[tuple[Plan, PlanReport]]:
+    """Plan and report of the first cycle of each rearrangement, which begins where the one before ends."""
+
+    def checked(plan: Plan) -> PlanReport:
+        dop, name = lab.degree_of_parallelism, lab.planner_name
+        return check_plan(plan, occupancy, lab.target, dop, lab.grid, lab.motion, name)
+
+    first_cycles: list[tuple[Plan, PlanReport]] = []
+    for number, windows_s in enumerate(windows):
+        for cycle, window_s in enumerate(windows_s):
             plan = guard.call("planner", lab.timeouts.plan_s, lab.planner.plan, occupancy.copy(), lab.target)
-            report = check_plan(
-                plan, occupancy, lab.target, lab.degree_of_parallelism, lab.grid, lab.motion, lab.planner_name
-            )
-            n_filled += report.meets_target
-            durations.append(report.duration_s)
-            firsts.append(float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0)
-    except LabseqError as error:
-        return None, f"on a random loading of {loading:.0%} of the sites: {error}"
-    finally:
-        guard.end()
-    return Rehearsal(len(durations), n_filled, np.array(durations), np.array(firsts)), ""
+            report = checked(plan)
+            if cycle == 0:
+                first_cycles.append((plan, report))
+            if number == len(windows) - 1:
+                break
+            n_played = fitting_batches(report, plan, window_s)
+            after = report if n_played == plan.n_batches else checked(plan.first(n_played))
+            occupancy = after.predicted & (rng.random(lab.grid.shape) < SURVIVAL)
+            if lab.target.is_met_by(occupancy):
+                break
+    return first_cycles
+
+
+def _summary(reports: Sequence[PlanReport]) -> Rehearsal:
+    durations = np.array([report.duration_s for report in reports])
+    firsts = np.array(
+        [float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0 for report in reports]
+    )
+    return Rehearsal(len(reports), sum(report.meets_target for report in reports), durations, firsts)
 
 
 def _window_warnings(
-    session: Session, windows: Sequence[tuple[int, Sequence[float]]], rehearsal: Rehearsal
+    session: Session, windows: Mapping[int, Sequence[float]], rehearsals: Mapping[int, Rehearsal]
 ) -> list[Problem]:
     document, sequence = session.assembly.document, session.assembly.sequence
     problems: list[Problem] = []
-    for number, window_s in windows:
+    for number, rehearsal in rehearsals.items():
         loc = (*sequence.shot[number].loc, "window")
-        first, shortest = window_s[0], min(window_s)
+        first, shortest = windows[number][0], min(windows[number])
         n_fit = int(np.count_nonzero(rehearsal.duration_s <= first + 1e-9))
         enough = format_quantity(float(np.quantile(rehearsal.duration_s, 0.95)), "time")
         if 2 * n_fit < rehearsal.n_loadings:
@@ -275,24 +395,10 @@ def _window_warnings(
         elif shortest < np.median(rehearsal.first_batch_s):
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
             problems.append(document.problem(loc, what, "more than the overheads of a cycle and a batch"))
-    if rehearsal.n_filled < 0.9 * rehearsal.n_loadings:
-        what = f"only {rehearsal.n_filled} of {rehearsal.n_loadings} loadings allow to fill the target"
+    loaded = next(iter(rehearsals.values()))
+    if loaded.n_filled < 0.9 * loaded.n_loadings:
+        what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings allow to fill the target"
         problems.append(document.problem(sequence.target.loc, what, "a smaller target, or better loading"))
-    return problems
-
-
-def _exposure_warnings(
-    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
-) -> list[Problem]:
-    limit_s = lab.step_context.camera.max_exposure_s
-    document, sequence = session.assembly.document, session.assembly.sequence
-    problems: list[Problem] = []
-    for spec, (_, bars) in zip(sequence.shot, timeline, strict=True):
-        longest_s = max((bar.exposure_s for bar in bars), default=0.0)
-        if longest_s > limit_s:
-            what = f"an exposure of {format_quantity(longest_s, 'time')} is more than the camera can do"
-            expected = f"at most {format_quantity(limit_s, 'time')}"
-            problems.append(document.problem((*spec.loc, "exposure"), what, expected))
     return problems
 
 
@@ -309,20 +415,19 @@ def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list
     return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
 
 
-def _parallelism_warnings(session: Session) -> list[Problem]:
-    assembly = session.assembly
-    asked = getattr(assembly.planner.settings, "degree_of_parallelism", None)
-    limit = assembly.hardware.profile.motion.max_tweezers
-    if not isinstance(asked, int) or asked <= limit:
-        return []
-    loc = (*assembly.sequence.planner.loc, "degree_of_parallelism")
-    what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
-    return [assembly.document.problem(loc, what, f"at most {limit}")]
+def _parallelism_warnings(session: Session, points: Iterable[Point]) -> list[Problem]:
+    problems: dict[str, Problem] = {}
+    for point in points:
+        asked = getattr(point.planner.settings, "degree_of_parallelism", None)
+        limit = point.hardware.profile.motion.max_tweezers
+        if isinstance(asked, int) and asked > limit:
+            loc = (*session.assembly.sequence.planner.loc, "degree_of_parallelism")
+            what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
+            problems.setdefault(what, point.document.problem(loc, what, f"at most {limit}"))
+    return [*problems.values()]
 
 
-def _deadline_warnings(
-    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
-) -> list[Problem]:
+def _deadline_warnings(session: Session, lab: Lab, timeline: Timeline) -> list[Problem]:
     """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
     problems: list[Problem] = []
     steps = [step for _, step in session.assembly.steps]
@@ -346,9 +451,7 @@ def _deadline_warnings(
     return problems
 
 
-def _shot_bytes(
-    session: Session, lab: Lab, timeline: Sequence[tuple[str, Sequence[TimelineEntry]]]
-) -> int | None:
+def _shot_bytes(session: Session, lab: Lab, timeline: Timeline) -> int | None:
     shape = lab.step_context.camera.frame_shape
     n_images = sum(bar.n_images for _, bars in timeline for bar in bars)
     kept = {"all": n_images, "last": min(1, n_images), "none": 0}[session.assembly.sequence.record_frames]

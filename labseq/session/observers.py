@@ -58,11 +58,6 @@ class Observers:
         if name == "shot_finished" and self._analyses is not None:
             self._analyses.look()
 
-    def report_prints(self) -> None:
-        """Show as warnings the text that plugins in use printed while they were loaded and constructed."""
-        for text in self._host.notes:
-            self.event("warning", {"text": text})
-
     def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
         """Start the analyses of the run's shots, each in its own process."""
         self._analyses = AnalysisProcesses(

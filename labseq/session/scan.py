@@ -71,12 +71,14 @@ class Point:
         steps: Name and step, in order.
         hardware: The profile.
         parameters: Scanned address -> value, SI, JSON-ready.
+        document: The sequence's file with the values of the point.
     """
 
     planner: ChosenPlugin
     steps: tuple[tuple[str, Step], ...]
     hardware: ResolvedProfile
     parameters: Mapping[str, Any]
+    document: Document
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +151,8 @@ class ScanPoints:
             for loc in self._dependents(axis):
                 part = _part_of(axis.of_profile, loc)
                 parameters[_address(axis.of_profile, loc)] = _value_in(parts[part], part, loc)
-        return Point(planner, tuple(steps), self._profile_at(parts), parameters)
+        hardware = self._profile_at(parts, self._document_at(True, point))
+        return Point(planner, tuple(steps), hardware, parameters, self._document_at(False, point))
 
     def of(self, scan: Scan) -> ScanPoints:
         """The points of another scan of the same run."""
@@ -245,7 +248,7 @@ class ScanPoints:
             dumped |= choice.model_dump(mode="json", exclude={"use"})
         return PartSettings(chosen, None, choice, dumped)
 
-    def _profile_at(self, parts: Mapping[Part, PartSettings]) -> ResolvedProfile:
+    def _profile_at(self, parts: Mapping[Part, PartSettings], document: Document) -> ResolvedProfile:
         """The profile at a point; points with equal parts share one object."""
         changed = {str(loc[-1]): made for (in_profile, loc), made in parts.items() if in_profile}
         key = tuple(map(id, changed.values()))
@@ -256,8 +259,8 @@ class ScanPoints:
                 chosen[name] = made.chosen
                 if isinstance(made.choice, MobileTweezersChoice):
                     profile = profile.model_copy(update={"mobile_tweezers": made.choice})
-            hardware = replace(self.hardware, profile=profile, chosen=chosen) if changed else self.hardware
-            self._profiles[key] = hardware
+            own = replace(self.hardware, document=document, profile=profile, chosen=chosen)
+            self._profiles[key] = own if changed else self.hardware
         return self._profiles[key]
 
 

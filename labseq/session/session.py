@@ -19,7 +19,7 @@ from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, plan_timelines
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.check import check_steps
+from labseq.session.check import check
 from labseq.session.chosen import DryRun
 from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.observers import Observers
@@ -168,7 +168,7 @@ class Session:
             The finished run, read back from disk.
 
         Raises:
-            ConfigError: A step sends a command that its device does not know; nothing was opened.
+            ConfigError: A device would refuse a step; nothing was opened.
             StopRequested: Ctrl-C or SIGTERM; devices are safe, the data is on disk.
             LabseqError: The error that ended the run; devices are safe, the data is on disk.
         """
@@ -176,9 +176,8 @@ class Session:
             raise ConfigError("a session runs once; open another for the next run")
         root = self.options.output or data_root()
         roots = marker_roots(root if self.earlier is None else self.earlier.root)
-        for text in (*self.assembly.warnings, *(() if self.earlier is None else self.earlier.warnings)):
+        for text in () if self.earlier is None else self.earlier.warnings:
             self._warn(text)
-        check_steps(self.assembly, self.scan_run.each(), self.build_lab)
         with ExitStack() as stack:
             stack.enter_context(stop_on_signals(self.stop_flag))
             if not self.assembly.virtual_time:
@@ -192,6 +191,7 @@ class Session:
                 _, writer = self._begin(roots[0])
                 writer.finish("complete")
                 return open_run(writer.run_dir)
+            warnings = [str(problem) for problem in check(self).warnings]
             labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
             lab = next(labs)
             for one in itertools.chain([lab], labs):
@@ -199,7 +199,7 @@ class Session:
             gc.unfreeze()  # left by an earlier run in this process
             gc.collect()
             gc.freeze()  # loaded modules stay: searching them for garbage would take 0.1 s of a shot
-            return self._run(lab, roots)
+            return self._run(lab, roots, warnings)
 
     def build_lab(self, point: Point | None = None) -> Lab:
         """Construct the object of every role with the run's clock; no device is opened.
@@ -214,9 +214,10 @@ class Session:
         """Compile the kernels of a lab; see :func:`labseq.session.lab.warm`."""
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
-    def _run(self, lab: Lab, roots: Sequence[Path]) -> Run:
+    def _run(self, lab: Lab, roots: Sequence[Path], warnings: Sequence[str]) -> Run:
         record, writer = self._begin(roots[0])
-        self._observers.report_prints()
+        for text in dict.fromkeys([*warnings, *self.assembly.hardware.host.notes]):
+            self._warn(text)
         error: BaseException | None = None
         try:
             self._take_shots(lab, roots, writer, record)

@@ -34,12 +34,15 @@ class GenicamCamera(CameraDriver):
 
     @property
     def facts(self) -> CameraFacts:
-        """Read-out time of the settings; longest exposure and frame shape as soon as they are known."""
+        """Read-out time of the settings; bounds of exposures and frame shape as soon as they are known."""
         shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
-        _, longest_s = self._reported.get("exposure_bounds_s", (0.0, self._settings.max_exposure))
+        known = self._connection.min_exposure_s, self._settings.max_exposure
+        shortest_s, longest_s = self._reported.get("exposure_bounds_s", known)
         longest_s = min(longest_s, self._settings.max_exposure)
         triggers = ("software", "internal", "external")
-        return CameraFacts(self._settings.readout, longest_s, shape, triggers=triggers)
+        return CameraFacts(
+            self._settings.readout, longest_s, shape, triggers=triggers, min_exposure_s=shortest_s
+        )
 
     def warm(self) -> None:
         """Do slow work that can be done before the camera is opened."""

@@ -38,6 +38,7 @@ class CameraConnection:
     Attributes:
         sensor_shape: (height, width) of the sensor if it is known before the camera is opened.
         packet_size: Bytes of a network packet; None as the camera is set.
+        min_exposure_s: Shortest exposure if it is known before the camera is opened, else 0, in seconds.
     """
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:
@@ -45,6 +46,7 @@ class CameraConnection:
         self._camera = settings.camera
         self.sensor_shape: tuple[int, int] | None = None
         self.packet_size = settings.packet_size
+        self.min_exposure_s = 0.0
 
     def warm(self) -> None:
         """Do slow work that can be done before the camera is opened."""

@@ -23,6 +23,7 @@ from labseq.plugin import (
     SimulatedSensor,
     trigger_line,
 )
+from labseq_genicam_sim.description import EXPOSURE_US
 from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure, Faults
 
@@ -40,6 +41,7 @@ class SimulatedConnection(CameraConnection):
         super().__init__(settings, context)
         self._world = settings.simulated_world(context)
         self.sensor_shape = self._world.sensor_shape
+        self.min_exposure_s = 1e-6 * EXPOSURE_US[0]
         self.packet_size = settings.packet_size or PACKET_SIZE
         self._clock = context.clock
         self._is_wired = trigger_line(context.lines, "camera") is not None

@@ -12,6 +12,9 @@ from labseq_aravis.stream import MONO
 
 from labseq_genicam_sim.messages import GAIN_STEP
 
+EXPOSURE_US: Final = 10, 10_000_000
+"""Shortest and longest exposure, in microseconds."""
+
 VENDOR, MODEL = "labseq", "Simulated"
 
 REGISTERS: Final = {
@@ -124,7 +127,7 @@ def _acquisition() -> Iterable[str]:
     yield _enumeration("TriggerSource", TRIGGERS)
     yield _enumeration("TriggerActivation", {"RisingEdge": 0})
     yield _command("TriggerSoftware", "TriggerSoftware", 1)
-    yield from _float("ExposureTime", "ExposureTime", "{0} * {1}", (10, 10_000_000))
+    yield from _float("ExposureTime", "ExposureTime", "{0} * {1}", EXPOSURE_US)
     yield from _float("Gain", "Gain", "{0} * {1}", (0, 1_000_000), 1 / GAIN_STEP)
 
 

@@ -17,10 +17,11 @@ from labseq.plugin import (
     TransientError,
     clean,
     format_quantity,
+    unknown_name,
 )
 from labseq_serial.line import Line, open_line
 from labseq_serial.patterns import compiled
-from labseq_serial.settings import Call, SerialSettings, call_of, known
+from labseq_serial.settings import Call, SerialSettings, call_of
 from labseq_serial.values import Scalar
 
 T = TypeVar("T")
@@ -232,9 +233,7 @@ class SerialDevice(Device):
             TransientError: The line broke.
         """
         if name not in self._settings.values:
-            raise DeviceError(
-                self._name, f"unknown value '{clean(name)}'; expected {known(self._settings.values)}"
-            )
+            raise unknown_name(self._name, "value", name, [*self._settings.values])
         with self._lock:
             reading = self._ready().read(name)
             self._readings[name] = self._clock.now(), reading
@@ -326,8 +325,7 @@ class SerialDevice(Device):
         """The arguments of a command, in SI."""
         command = self._settings.commands.get(name)
         if command is None:
-            text = f"unknown command '{clean(name)}'; expected {known(self._settings.commands)}"
-            raise DeviceError(self._name, text)
+            raise unknown_name(self._name, "command", name, [*self._settings.commands])
         if {*given} != {*command.arguments}:
             came = f"the arguments {', '.join(given)}" if given else "no arguments"
             expected = ", ".join(command.arguments) or "none"

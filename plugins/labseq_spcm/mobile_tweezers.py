@@ -27,7 +27,7 @@ from labseq.plugin import (
 )
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
-from labseq_spcm.dds import Dds, choose_cores
+from labseq_spcm.dds import Dds, choose_cores, compile_commands
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import check_type, set_amplitude, set_up, switch_output
@@ -163,6 +163,16 @@ class SpcmMobileTweezers(MobileTweezers):
         card, self._card, self._mode = self._card, None, None
         if card is not None:
             card.close()
+
+    def check_program(self, program: ToneProgram) -> None:
+        """Refuse a program that has no length, leaves an AOD's band, clips, or is too much for the DDS.
+
+        Raises:
+            LimitError: It does.
+        """
+        limits.check_program(self._name, program, self._rf)
+        if self._cores is not None:
+            compile_commands(self._name, program, self._cores)
 
     def prepare(self, program: ToneProgram) -> float:
         """Render a program and transfer it to the card.

@@ -134,6 +134,14 @@ class TtlLines(Lines):
             self._connect()  # which turns all lines off
         self.access.lines_set(off_program(self._specs))
 
+    def check_program(self, program: LineProgram) -> None:
+        """Refuse a program that the box cannot play.
+
+        Raises:
+            LimitError: More edges, or closer together, than the box can make.
+        """
+        edges_of(program, self._specs, self._name)
+
     def compile(self, program: LineProgram) -> None:
         """Take a program for the next firing; one that the box stores already is not sent again.
 

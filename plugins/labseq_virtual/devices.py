@@ -20,7 +20,7 @@ from labseq.plugin import (
     format_quantity,
     idle_program,
     off_program,
-    one_of,
+    unknown_name,
 )
 from labseq_virtual.settings import DeviceSettings, LinesSettings, SpotMeterSettings
 from labseq_virtual.tweezers import VirtualDriver
@@ -64,6 +64,16 @@ class VirtualLines(VirtualDriver, Lines):
             DeviceError: Not open, or lines that the profile does not declare.
         """
         self._check_open()
+        self.check_program(program)
+        self._compiled, self._is_armed = program, False
+
+    def check_program(self, program: LineProgram) -> None:
+        """Refuse a program that the settings do not allow.
+
+        Raises:
+            LimitError: More edges, or edges closer to one another, than the settings allow.
+            DeviceError: Lines that the profile does not declare.
+        """
         known = tuple(spec.name for spec in self._specs)
         if program.lines != known:
             raise DeviceError(self._name, f"a program has the lines {program.lines}; expected {known}")
@@ -75,7 +85,6 @@ class VirtualLines(VirtualDriver, Lines):
         if shortest_s < self._settings.shortest - ROUNDING_S:
             limit = f"at least {format_quantity(self._settings.shortest, 'time')}"
             raise LimitError(f"{what}: time between two edges", format_quantity(shortest_s, "time"), limit)
-        self._compiled, self._is_armed = program, False
 
     def arm(self) -> None:
         """Get ready to fire the program compiled last.
@@ -161,6 +170,15 @@ class VirtualDevice(Device):
         if self._is_open:
             self._values["state"] = "safe"
 
+    def check_command(self, name: str, **arguments: Any) -> None:  # noqa: ARG002 - any are kept
+        """Refuse a command that the settings do not list, if they list any.
+
+        Raises:
+            DeviceError: An unknown command.
+        """
+        if self._commands and name not in self._commands:
+            raise unknown_name(self._name, "command", name, self._commands)
+
     def command(self, name: str, **arguments: Any) -> None:
         """Carry out a command.
 
@@ -168,8 +186,7 @@ class VirtualDevice(Device):
             DeviceError: Not open, or an unknown command.
         """
         self._check_open()
-        if self._commands and name not in self._commands:
-            raise DeviceError(self._name, f"unknown command '{name}'; expected {one_of(self._commands)}")
+        self.check_command(name)
         self._values.update(arguments)
         self._values["state"] = name
 
@@ -181,7 +198,7 @@ class VirtualDevice(Device):
         """
         self._check_open()
         if name not in self._values:
-            raise DeviceError(self._name, f"unknown value '{name}'; expected {one_of(sorted(self._values))}")
+            raise unknown_name(self._name, "value", name, sorted(self._values))
         return self._values[name]
 
     def describe(self) -> Mapping[str, Any]:
@@ -209,7 +226,7 @@ class VirtualSpotMeter(VirtualDriver, Device):
     def safe_state(self) -> None:
         """Do nothing: the meter only measures."""
 
-    def command(self, name: str, **arguments: Any) -> None:
+    def check_command(self, name: str, **arguments: Any) -> None:
         """Refuse: the meter has no commands.
 
         Raises:
@@ -217,6 +234,8 @@ class VirtualSpotMeter(VirtualDriver, Device):
         """
         del arguments
         raise DeviceError(self._name, f"unknown command '{name}'; it only measures: read '{VALUE}'")
+
+    command = check_command
 
     def read(self, name: str) -> NDArray[np.float64]:
         """Measure once.

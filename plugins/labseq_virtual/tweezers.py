@@ -118,11 +118,19 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         self._check_open()
         self._check_idle("prepare()")
         self._prepared = None
+        self.check_program(program)
+        self._prepared = program
+        return program.total_duration_s
+
+    def check_program(self, program: ToneProgram) -> None:
+        """Refuse a program that has no length, leaves the AOD's band, or clips.
+
+        Raises:
+            LimitError: It does.
+        """
         self._check_durations(program)
         self._check_axis("row", program.row, program)
         self._check_axis("column", program.column, program)
-        self._prepared = program
-        return program.total_duration_s
 
     def play(self) -> None:
         """Start playing the prepared program; returns at once.

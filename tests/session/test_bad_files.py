@@ -87,6 +87,48 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         {"- image: {exposure: 45 ms}": "- device: {name: shuter, do: open}\n  - image: {exposure: 45 ms}"},
         ["s.yaml:12:20: the profile 'virtual' has no device 'shuter'; expected 'shutter'"],
     ),
+    (
+        "tones outside the AOD's band",
+        {
+            "column_frequency: {centre: 100 MHz, step: 1.6 MHz}": "column_frequency: {centre: 100 MHz, step: 3 MHz}"
+        },
+        [
+            "p.yaml:23:21: moving atoms: the frequency of column tone 0 in batch 1 is 71.5 MHz; the limit is the band of 82 to 118 MHz"
+        ],
+    ),
+    (
+        "a command that the device does not have",
+        {"- image: {exposure: 45 ms}": "- device: {name: shutter, do: opne}\n  - image: {exposure: 45 ms}"},
+        ["s.yaml:12:33: shutter: unknown command 'opne'; expected ...; did you mean 'open'?"],
+    ),
+    (
+        "an exposure that the camera cannot make, and one that times out",
+        {"- image: {exposure: 45 ms}": "- image: {exposure: 11 s}"},
+        [
+            "s.yaml:12:23: camera: exposure is 11 s; the limit is more than 0 and at most 10 s; choose another exposure",
+            "p.yaml:116:9: device calls time out after 10 s, but an exposure takes 11 s; expected more than 11 s",
+        ],
+    ),
+    (
+        "edges too close for the lines",
+        {
+            "- load: {duration: 500 ms}": "- wait: {duration: 1 us}\n  - load: {duration: 2 us}",
+            "plugin_folders: []": "lines: {use: ttl, channels: {light: {channel: 2, on: [wait, load]}, mot: {channel: 3, on: [load]}}}",
+        },
+        [
+            "s.yaml:11:22: lines: `wait`: time between the edges of 'light' at 0 s and of 'light' at 1 us is 1 us; the limit is at least 5 us; change a lead, a lag or a pulse",
+            "s.yaml:12:22: lines: `load`: time between the edges of 'light', 'mot' at 0 s and of 'light', 'mot' at 2 us is 2 us; the limit is at least 5 us; change a lead, a lag or a pulse",
+        ],
+    ),
+    (
+        "values of a scan's other points",
+        {
+            "shots: 20": "scan: {shot.1.image.exposure: [45 ms, 9 s], profile.camera.max_exposure: [10 s, 5 s]}",
+        },
+        [
+            "s.yaml:5:39: camera: exposure is 9 s; the limit is more than 0 and at most 5 s; choose another exposure",
+        ],
+    ),
 ]
 
 
@@ -121,6 +163,24 @@ def test_all_messages(changes: dict[str, str], expected: list[str]) -> None:
     assert [
         re.sub(r"^(.* unknown .*; expected )(one of )?'.*'(;|$)", r"\1...\3", m) for m in messages()
     ] == expected
+
+
+def test_a_run_refuses_what_the_check_refuses(tmp_path: Path) -> None:
+    write(CASES[-2][1])
+    with (
+        pytest.raises(ConfigError) as caught,
+        labseq.Session.open("s.yaml", output=tmp_path / "data") as session,
+    ):
+        session.run()
+    assert [str(problem) for problem in caught.value.problems] == CASES[-2][2]
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("address", ["shot.1.image.exposure", "shot.2.rearrange.exposure"])
+def test_a_driver_states_the_limits_of_its_device_before_it_is_open(address: str) -> None:
+    write({})
+    problem = f"--set {address}=1 us: camera: exposure is 1 us; the limit is 10 us to 10 s"
+    assert messages(profile="bench", overrides=[f"{address}=1 us"]) == [f"{problem}; choose another exposure"]
 
 
 def test_wrong_options_are_reported_with_the_files() -> None:

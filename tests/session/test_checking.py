@@ -1,11 +1,13 @@
 """What is known of a run before anything is opened."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import labseq
+from labseq.errors import Problem
 from labseq.session.check import N_LOADINGS, CheckReport, check
 
 ROOT = Path(__file__).parents[2]
@@ -53,10 +55,6 @@ def test_a_run_takes_as_long_as_the_check_predicts(tmp_path: Path):
             "shot.2.rearrange={cycles: 2, window: [60 ms, 10 ms]}",
             "a window of 10 ms is over before the first",
         ),
-        (
-            "shot.1.image.exposure=11 s",
-            "an exposure of 11 s is more than the camera can do; expected at most 1",
-        ),
         ("profile.simulation.loading=0.5", "loadings allow to fill the target"),
         (
             "shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 3}}]",
@@ -69,6 +67,33 @@ def test_what_runs_but_makes_little_sense_is_a_warning(override: str, message: s
     (warning,) = checked(override).warnings
     assert message in str(warning)
     assert warning.source.startswith("--set") or not override.startswith("shot.2")
+
+
+def test_a_run_gives_the_warnings_of_the_check_once(tmp_path: Path):
+    class Seen:
+        def event(self, name: str, values: Mapping[str, Any]) -> None:
+            events.append(values["text"] if name == "warning" else name)
+
+    events: list[str] = []
+    wrong = "planner.degree_of_parallelism=100"
+    with labseq.Session.open(
+        COMPACT, shots=1, overrides=[wrong], output=tmp_path, observer=Seen()
+    ) as session:
+        session.run()
+    (warning,) = map(str, checked(wrong).warnings)
+    assert events.count(warning) == 1
+    assert events.index(warning) < events.index("shot_started")
+
+
+def test_a_rearrangement_is_rehearsed_where_the_one_before_it_ends():
+    def repair(window: str) -> tuple[Problem, ...]:
+        sort, image = "{rearrange: {cycles: 2}}", "{image: {}}"
+        steps = f"{{load: {{}}}}, {image}, {sort}, {sort}, {{rearrange: {{window: {window}}}}}, {image}"
+        return checked(f"shot=[{steps}]").warnings
+
+    assert repair("25 ms") == ()  # on a random loading the median is 36 ms
+    (warning,) = repair("10 ms")
+    assert "too short for most plans" in warning.what
 
 
 def test_sequences_without_a_warning(tmp_path: Path):

@@ -11,10 +11,10 @@ from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, one_of
+from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
 from labseq.guard import StopFlag
 from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram
-from labseq.roles import Clock, Context, Trigger
+from labseq.roles import Clock, Context, Trigger, unknown_name
 from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lines import idle_program, off_program
 
@@ -477,19 +477,22 @@ class RecordingDevice(RecordingHardware):
         self.commands = commands
         self.values: dict[str, Any] = {"state": "off"}
 
+    def check_command(self, name: str, **arguments: Any) -> None:  # noqa: ARG002 - takes any
+        """Refuse a command that it does not have."""
+        if name not in self.commands:
+            raise unknown_name(self.name, "command", name, self.commands)
+
     def command(self, name: str, **arguments: Any) -> None:
         """Carry out a command."""
         self.use("command", name, **arguments)
-        if name not in self.commands:
-            raise DeviceError(self.name, f"unknown command '{name}'; expected {one_of(self.commands)}")
+        self.check_command(name)
         self.values["state"] = name
 
     def read(self, name: str) -> Any:
         """Give a value."""
         self.use("read", name)
         if name not in self.values:
-            known = one_of(tuple(self.values))
-            raise DeviceError(self.name, f"unknown value '{name}'; expected {known}")
+            raise unknown_name(self.name, "value", name, tuple(self.values))
         return self.values[name]
 
 
