@@ -239,12 +239,11 @@ def packaged_sequences_dir() -> Path:
 def profile_dir(profile: Path) -> Path:
     """The folder for data of a profile, such as its calibrations: the folder of the profile's file.
 
-    For a profile that is installed with labseq it is ./hardware_profiles, where a copy of the profile would
-    be. The installed folder is shared by all users, may be read-only, and is replaced by the next version.
+    For a profile that comes with labseq it is ./hardware_profiles, where a copy of the profile would be: others
+    use the same file from other working folders, in a wheel or a copy of the repository.
     """
-    folder = profile.resolve().parent
-    is_installed = folder == Path(__file__).resolve().parent / "config" / PROFILES
-    return Path(PROFILES).absolute() if is_installed else profile.parent
+    is_packaged = profile.resolve().parent == packaged_profiles_dir().resolve()
+    return Path(PROFILES).absolute() if is_packaged else profile.parent
 
 
 def data_root() -> Path:

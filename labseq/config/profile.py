@@ -121,7 +121,7 @@ class CalibrationSettings(Settings):
     folder: FilePath | None = Field(
         default=None,
         description="folder of the calibrations, relative to this file; without it `calibrations/NAME` "
-        "beside a file `NAME.yaml`",
+        "beside a file `NAME.yaml`, and in `./hardware_profiles` for a profile that comes with labseq",
     )
     use: Annotated[CalibrationChoices, empty_is({})] = Field(
         default=CalibrationChoices(),

@@ -76,15 +76,16 @@ def test_odd_names(name: str) -> None:
     assert refusal(name).isprintable()
 
 
-def test_what_belongs_to_a_profile_is_not_kept_inside_of_a_wheel(
+def test_what_belongs_to_a_profile_of_labseq_is_kept_in_the_working_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert profile_dir(packaged_profiles_dir() / "virtual.yaml") == packaged_profiles_dir()  # of a checkout
+    own = tmp_path / "hardware_profiles"
     assert profile_dir(Path("mine/lab.yaml")) == Path("mine")
+    assert profile_dir(packaged_profiles_dir() / "virtual.yaml") == own  # of a checkout
     inside = tmp_path / "labseq" / "config" / "hardware_profiles"
     inside.mkdir(parents=True)
     monkeypatch.setattr(places, "__file__", str(inside.parents[1] / "places.py"))
-    assert profile_dir(inside / "practice.yaml") == tmp_path / "hardware_profiles"
+    assert profile_dir(inside / "practice.yaml") == own  # of a wheel
 
 
 def refused_sequence(name: str) -> str:
