@@ -75,7 +75,7 @@ class Tally:
     target: Any = None
 
     def write_shot(self, shot: ShotRecord) -> None:
-        images = [image for image in shot.images if image.cycle]
+        images = [image for image in shot.images if image.cycle >= 0]
         self.defects.append([int(self.target.n_defects(image.occupancy)) for image in images])
         played = [cycle.plan.batch_offsets[cycle.n_batches_played] for cycle in shot.cycles]
         self.n_atom_moves.append([int(n) for n in played])
@@ -177,7 +177,7 @@ def simulate_5(n_shots: int, n_processes: int) -> None:
             append(
                 path,
                 {
-                    "cycle": cycle + 1,
+                    "cycles": cycle + 1,
                     "shots": len(defects),
                     **{f"defects_{n}": int(counts[n]) for n in range(10)},
                     "filling": f"{1 - defects[:, cycle].mean() / 225:.6f}",
@@ -372,7 +372,7 @@ def draw_figure_5(
         left.plot(ceiling.x, 100 * ceiling.y, "--", color=GREY, linewidth=1, label=ceiling.label)
     left.set_ylim(0.0, 1.35 * left.get_ylim()[1])
     left.set_xlim(0.5, max(points.x[-1] for points in (*series, *([quoted] if quoted else []))) + 0.5)
-    style(left, "rearrangement cycles n", "defect-free on the image that ends cycle n (%)")
+    style(left, "rearrangement cycles n", "defect-free after n cycles (%)")
     handles, labels = left.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i].startswith("ceiling"))
     key: dict[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left"}
@@ -384,7 +384,7 @@ def draw_figure_5(
         right.stairs(share, edges, color=rim, linewidth=0.9)
     right.set_xlim(-0.8, max(4, *(len(counts) - 1 for counts in defects)) + 0.8)
     right.set_ylim(bottom=0.0)
-    style(right, f"defects after cycle {int(series[0].x[-1])}", "shots (%)")
+    style(right, f"defects after {int(series[0].x[-1])} cycles", "shots (%)")
     figure.suptitle(f"figure 5: defect-free probability after n cycles\n{note}", fontsize=9)
     figure.savefig(path, dpi=150)
     plt.close(figure)
@@ -429,7 +429,7 @@ def figure_5_of(path: Path, runs: Sequence[Run]) -> None:
     series = [
         Points.of(
             f"{label}, {statistics.n_shots} shots",
-            [(c.cycle, c.defect_free.value, *c.defect_free.interval) for c in statistics.cycles],
+            [(c.cycle + 1, c.defect_free.value, *c.defect_free.interval) for c in statistics.cycles],
         )
         for label, statistics in zip(labels_of(runs), found, strict=True)
     ]
@@ -445,7 +445,7 @@ def ceiling_of(run: Run, statistics: Statistics) -> Points | None:
     if losses is None:
         return None
     images = run.shots[0].summary.images
-    exposures = [s for s, cycle in zip(images.exposure_s, images.cycle, strict=True) if cycle]
+    exposures = [s for s, cycle in zip(images.exposure_s, images.cycle, strict=True) if cycle >= 0]
     label = "ceiling: losses in the light and with time"
     label += "" if losses.false_negative is None else ", missed atoms"
     highest = [

@@ -245,8 +245,8 @@ class InvalidPlanError(PlanError):
 
     Attributes:
         rule: The rule that was broken, one of :data:`labseq.motion.RULES`.
-        batch: Index of the batch, from 0; -1 if the plan as a whole is wrong. The message counts from 1.
-        move: Index of the atom move within the batch, from 0, or -1. The message counts from 1.
+        batch: Index of the batch, from 0; -1 if the plan as a whole is wrong.
+        move: Index of the atom move within the batch, from 0, or -1.
         detail: The error, with the sites.
         site: Row and column of the site that the rule is broken at; None if there is no particular one.
     """
@@ -266,9 +266,9 @@ class InvalidPlanError(PlanError):
         self.move = move
         self.detail = detail
         self.site = site
-        where = f"batch {batch + 1}" if batch >= 0 else "plan"
+        where = f"batch {batch}" if batch >= 0 else "plan"
         if move >= 0:
-            where += f", atom move {move + 1}"
+            where += f", atom move {move}"
         super().__init__(f"{where} breaks the rule '{rule}': {detail}", planner)
 
 

@@ -42,7 +42,7 @@ def test_all_problems_are_reported():
 def test_errors_carry_their_values():
     error = errors.InvalidPlanError("path", "(1, 2) is occupied", batch=3, move=1, planner="mine")
     assert (error.rule, error.batch, error.move, error.planner) == ("path", 3, 1, "mine")
-    assert str(error) == "planner 'mine': batch 4, atom move 2 breaks the rule 'path': (1, 2) is occupied"
+    assert str(error) == "planner 'mine': batch 3, atom move 1 breaks the rule 'path': (1, 2) is occupied"
     limit = errors.LimitError("row tones in batch 3", 21, 20, "use fewer")
     assert str(limit) == "row tones in batch 3 is 21; the limit is 20; use fewer"
     assert str(errors.UnknownPluginError("planner", "x", ["a", "b"])) == (

@@ -92,7 +92,7 @@ def draw_trend(
     """Draw a fraction for each shot, and its running mean with the error.
 
     Args:
-        shots: float64 (n,), numbers of the shots, from 1.
+        shots: float64 (n,), indices of the shots.
         values: float64 (n,), a fraction for each.
         running: The running mean, see :func:`points_of`.
         is_rate: Whether each value is 0 or 1; the scale is then 0 to 100 %.

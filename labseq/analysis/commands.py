@@ -55,7 +55,7 @@ def replay(
     ] = None,
     shots: Annotated[
         str | None,
-        typer.Option(metavar="LIST", help="Only these shots, counted from 1 as in `labseq show`: 3,5-9."),
+        typer.Option(metavar="LIST", help="Only these shots, counted from 0 as in `labseq show`: 3,5-9."),
     ] = None,
     as_json: Json = False,
     output: Annotated[
@@ -119,13 +119,13 @@ def plot(
         int | None,
         typer.Option(
             metavar="N",
-            help="Draw one shot, counted from 1: its images, occupancies and the moves after them.",
+            help="Draw one shot, counted from 0: its images, occupancies and the moves after them.",
         ),
     ] = None,
     cycle: Annotated[
         int | None,
         typer.Option(
-            metavar="K", help="Only one cycle of that shot, counted from 1: the images before and after it."
+            metavar="K", help="Only one cycle of that shot, counted from 0: the images before and after it."
         ),
     ] = None,
     output: Annotated[

@@ -179,7 +179,7 @@ class Measure:
             images = shot.summary.images
         except RecordingError:  # for an old index with a damaged shot file
             return math.nan
-        if not len(images) or not images.cycle[-1] or not target.n_atoms:
+        if not len(images) or images.cycle[-1] < 0 or not target.n_atoms:
             return math.nan
         n_defects, n_surplus = images.n_defects[-1], images.n_surplus[-1]
         return float(not n_defects and not n_surplus) if self.is_rate else 1.0 - n_defects / target.n_atoms
@@ -203,7 +203,7 @@ def trend_panel(run: Run, measure: Measure) -> Panel | None:
     known = np.isfinite(values)
     if not known.any():
         return None
-    x, y = np.array([shot.index + 1.0 for shot in run.shots])[known], values[known]
+    x, y = np.array([float(shot.index) for shot in run.shots])[known], values[known]
     window = min(len(y), max(MIN_WINDOW, len(y) // N_WINDOWS))
     starts = np.unique(np.linspace(0, len(y) - window, MAX_POINTS).astype(np.int64))
     means = [measure.over(y[start : start + window].tolist()) for start in starts]
@@ -258,7 +258,7 @@ def survival_panels(run: Run, survival: Survival) -> Row:
 
 def lost_by_cycle(run: Run, survival: Survival) -> Panel | None:
     """The fraction of the atoms that the next image does not show, for each cycle; None without cycles."""
-    cycles = range(1, len(survival.by_cycle) + 1)
+    cycles = range(len(survival.by_cycle))
     curves = {
         name: points_of(cycles, [_lost(pair[kind].rate) for pair in survival.by_cycle])
         for kind, name in enumerate(("moved", "stayed"))
@@ -289,6 +289,7 @@ def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
     """Histogram of the defects at the end of the shots, compared with independent sites."""
     cycles, n_sites = statistics.cycles, run.target.n_atoms
     counts = statistics.defects or (cycles[-1].defects if cycles else ())
+    end = "on the last image" if statistics.defects else f"after {len(cycles)} cycle{'s' * (len(cycles) != 1)}"
     n_shots = sum(counts)
     if not n_shots or not n_sites:
         return None
@@ -297,7 +298,7 @@ def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
     return partial(
         draw_defects,
         title=f"{mean(np.repeat(number, counts))} defects in a shot, {n_shots} of {len(run.shots)} shots",
-        x_label=f"defects {'on the last image' if statistics.defects else f'after cycle {len(cycles)}'}",
+        x_label=f"defects {end}",
         shares=points_of(number.tolist(), [Rate(count, n_shots) for count in counts]),
         expected=binomial(n_sites, empty, len(counts)),
     )
@@ -349,7 +350,7 @@ def scan_panels(found: Scanned, measure: Measure) -> Row:
             title=f"{measure.title} by point of {len(found.axes)} values",
             x_label="point of the scan",
             y_label=measure.label,
-            curves={"": points_of(range(1, len(means) + 1), means)},
+            curves={"": points_of(range(len(means)), means)},
             whole=True,
             from_zero=measure.is_rate,
         ),

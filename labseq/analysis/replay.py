@@ -177,7 +177,7 @@ class ReplayedPlan:
     Attributes:
         shot: Index of the shot, from 0.
         step: Index of the step in the shot.
-        cycle: Counted from 1.
+        cycle: Index of the cycle in its step.
         recorded: The plan of the run.
         replayed: The plan of the replay; None if the planner failed, or its plan breaks a rule.
         same: Whether both are the same, move by move.
@@ -277,7 +277,7 @@ class ReplayRequest:
         degree_of_parallelism: The planner's setting of that name.
         detector: Another detector, with its default settings; None for the run's own.
         overrides: ``"planner.key=value"`` and ``"profile.detector.key=value"`` strings.
-        shots: The shots to replay, counted from 1: "3,5-9"; None for all.
+        shots: The shots to replay, counted from 0: "3,5-9"; None for all.
     """
 
     planner: str | None = None
@@ -474,18 +474,18 @@ def assembly_of(run: Run) -> Assembly:
 
 
 def shots_of(run: Run, text: str | None) -> list[Shot]:
-    """The shots of a selection such as "3,5-9", counted from 1.
+    """The shots of a selection such as "3,5-9", counted from 0.
 
     Raises:
         ConfigError: The text is no such selection, or a shot does not exist.
     """
     if text is None:
         return list(run.shots)
-    by_number = {shot.index + 1: shot for shot in run.shots}
-    return [by_number[number] for number in sorted({*_numbers(text, by_number)})]
+    by_index = {shot.index: shot for shot in run.shots}
+    return [by_index[index] for index in sorted({*_indices(text, by_index)})]
 
 
-def _numbers(text: str, known: Collection[int]) -> Iterator[int]:
+def _indices(text: str, known: Collection[int]) -> Iterator[int]:
     source = clean(f"--shots {text}")
     for part in text.split(","):
         match = _RANGE.fullmatch(part)
@@ -496,8 +496,8 @@ def _numbers(text: str, known: Collection[int]) -> Iterator[int]:
         first, last = int(match[1]), int(match[2] or match[1])
         if last < first:
             raise ConfigError(Problem(f"{first}-{last} goes backwards", source, expected=f"{last}-{first}"))
-        for number in range(first, last + 1):
-            if number not in known:
-                there_are = f"1 to {max(known)}" if known else "none: the run has no shots"
-                raise ConfigError(Problem(f"there is no shot {number}", source, expected=there_are))
-            yield number
+        for index in range(first, last + 1):
+            if index not in known:
+                there_are = f"{min(known)} to {max(known)}" if known else "none: the run has no shots"
+                raise ConfigError(Problem(f"there is no shot {index}", source, expected=there_are))
+            yield index

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -242,29 +243,28 @@ MAX_SITES = 128
 """Maximum number of rows and of columns of an array that is drawn."""
 
 
-def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing:
+def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     """The images of a shot with the detected atoms and the moves that followed.
 
     Args:
-        number: The shot, counted from 1 as ``labseq show`` does. Of one that did not complete, the last
-            attempt.
-        cycle: Only this cycle, counted from 1 over all rearrangements of the shot: the image that it was
+        index: Index of the shot, from 0. Of one that did not complete, the last attempt.
+        cycle: Only this cycle, counted from 0 over all rearrangements of the shot: the image that it was
             planned on, and the one that ended it.
 
     Raises:
         ConfigError: There is no such shot or cycle, it has no images, or the array is too large.
         RecordingError: The shot's file is damaged.
     """
-    shot = _shot(run, number)
+    shot = _shot(run, index)
     record, target = shot.record(), run.target
     if max(target.shape) > MAX_SITES:
         what = f"{target.shape[0]} x {target.shape[1]} sites are too many to be made out"
         raise cannot_draw(run, what, f"at most {MAX_SITES} rows and columns")
     if not record.images:
-        raise cannot_draw(run, f"shot {number} has no images", "a shot with an 'image' step")
+        raise cannot_draw(run, f"shot {index} has no images", "a shot with an 'image' step")
     panels = _panels(record, target)
     if cycle is not None:
-        panels = _of_cycle(run, number, record, panels, cycle)
+        panels = _of_cycle(run, index, record, panels, cycle)
     sites = sites_of(run)
     frames = [panel.image for panel in panels if panel.image is not None]
     fits = sites is not None and all(image.shape == sites.frame for image in frames)
@@ -273,7 +273,7 @@ def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing
     )
     ended = "" if shot.status == "complete" else f", {shot.status}: {clean(record.error)}"
     return ShotDrawing(
-        title=f"shot {number}{ended}",
+        title=f"shot {index}{ended}",
         note=note_of(run) + kept,
         grid=grid_of(run),
         target=target,
@@ -282,22 +282,22 @@ def shot_picture(run: Run, number: int, cycle: int | None = None) -> ShotDrawing
     )
 
 
-def _shot(run: Run, number: int) -> Shot:
-    of_number = [shot for shot in (*run.attempts, *run.shots) if shot.index == number - 1]
-    if not of_number:
-        known = sorted({shot.index + 1 for shot in (*run.shots, *run.attempts)})
+def _shot(run: Run, index: int) -> Shot:
+    attempts = [shot for shot in (*run.attempts, *run.shots) if shot.index == index]
+    if not attempts:
+        known = sorted({shot.index for shot in (*run.shots, *run.attempts)})
         expected = f"one from {known[0]} to {known[-1]}" if known else "a run that has shots"
-        raise ConfigError(Problem(f"the run has no shot {number}", "--shot", expected=expected))
-    return of_number[-1]
+        raise ConfigError(Problem(f"the run has no shot {index}", "--shot", expected=expected))
+    return attempts[-1]
 
 
 def _panels(record: ShotRecord, target: TargetPattern) -> list[ShotPanel]:
     """A panel for each image, with the moves of the cycle that was planned on it."""
     made = iter(record.cycles)
-    ended_by = [next(made, None) if image.cycle else None for image in record.images]
+    ended_by = [next(made, None) if image.cycle >= 0 else None for image in record.images]
     after = [*ended_by[1:], next(made, None)]  # a shot that was interrupted may lack the last image
-    numbers = iter(range(1, len(record.cycles) + 1))
-    titles = [f"after cycle {next(numbers, 0)}" if cycle else "image" for cycle in ended_by]
+    cycles = count()
+    titles = [f"end of cycle {next(cycles)}" if cycle else "image" for cycle in ended_by]
     return [
         _panel(image, f"{title}: {_seen(image, target)}", cycle)
         for image, title, cycle in zip(record.images, titles, after, strict=True)
@@ -326,12 +326,12 @@ def _panel(image: ImageRecord, title: str, cycle: CycleRecord | None) -> ShotPan
 
 
 def _of_cycle(
-    run: Run, number: int, record: ShotRecord, panels: list[ShotPanel], cycle: int
+    run: Run, index: int, record: ShotRecord, panels: list[ShotPanel], cycle: int
 ) -> list[ShotPanel]:
-    ends = [i for i, image in enumerate(record.images) if image.cycle]
-    if not 1 <= cycle <= len(ends):
-        made = f"one from 1 to {len(ends)}" if ends else "a shot that rearranges"
-        text = f"shot {number} of {clean(run.path.name)} has no cycle {cycle}"
+    ends = [i for i, image in enumerate(record.images) if image.cycle >= 0]
+    if not 0 <= cycle < len(ends):
+        made = f"one from 0 to {len(ends) - 1}" if ends else "a shot that rearranges"
+        text = f"shot {index} of {clean(run.path.name)} has no cycle {cycle}"
         raise ConfigError(Problem(text, "--cycle", expected=made))
-    after = ends[cycle - 1]
+    after = ends[cycle]
     return panels[max(0, after - 1) : after + 1]

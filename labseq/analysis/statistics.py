@@ -28,7 +28,7 @@ class CycleStatistics:
     Standard errors are over shots, not sites: the losses within a shot are correlated.
 
     Attributes:
-        cycle: Its number, counted from 1 over all rearrangements of the shot.
+        cycle: Its index, from 0, over all rearrangements of the shot.
         n_shots: Number of shots that made it.
         defect_free: Shots in which the image that ends it is defect-free.
         seen: Shots in which that image, or one at the end of an earlier cycle, is defect-free.
@@ -123,7 +123,7 @@ def _has_filling(shot: Shot) -> bool:
 
 
 def _is_seen(shot: Shot) -> bool:
-    return shot.success or shot.seen_defect_free_cycle > 0
+    return shot.success or shot.seen_defect_free_cycle >= 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +141,7 @@ class _ShotCycle:
 def _made(summary: ShotSummary) -> list[_ShotCycle]:
     """The cycles of a shot that end with an image."""
     images, cycles = summary.images, summary.cycles
-    ends = [i for i, cycle in enumerate(images.cycle) if cycle > 0]
+    ends = [i for i, cycle in enumerate(images.cycle) if cycle >= 0]
     return [
         _ShotCycle(
             is_met=not images.n_defects[i] and not images.n_surplus[i],
@@ -162,11 +162,11 @@ def _cycles(summaries: Sequence[ShotSummary], target: TargetPattern) -> tuple[Cy
     return tuple(
         _cycle(
             cycle,
-            [made[cycle - 1] for made in per_shot if len(made) >= cycle],
-            Rate(sum(any(of[:cycle][-1:]) for of in seen), len(seen)),
+            [made[cycle] for made in per_shot if len(made) > cycle],
+            Rate(sum(any(of[: cycle + 1][-1:]) for of in seen), len(seen)),
             target.n_atoms,
         )
-        for cycle in range(1, n_most + 1)
+        for cycle in range(n_most)
     )
 
 

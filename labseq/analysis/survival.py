@@ -57,7 +57,7 @@ class Survival:
     Attributes:
         moved: Atoms that were moved, by the site that they were moved to.
         kept: Atoms that stayed on their site.
-        by_cycle: Moved and kept for each cycle, counted from 1 over all rearrangements of the shot.
+        by_cycle: Moved and kept for each cycle, counted from 0 over all rearrangements of the shot.
         n_read: Number of shots.
     """
 
@@ -86,25 +86,25 @@ class Survival:
         loaded_s = [timing.t_start_s for timing in shot.timing if timing.step in loads]
         if len(images) != len(occupancies):
             raise RecordingError(shot.file, "has other images than the index says; restore it from a backup")
-        number = 0
-        for i, is_cycle in enumerate(images.cycle):
-            made = next(cycles, None) if is_cycle else None
-            number += made is not None
+        last = -1
+        for i, ended in enumerate(images.cycle):
+            made = next(cycles, None) if ended >= 0 else None
+            last += made is not None
             start_s, end_s = images.t_start_s[i - 1] if i else -1.0, images.t_start_s[i]
             if not i or any(start_s <= t_s < end_s for t_s in loaded_s):
                 continue
             moved, kept = expected(occupancies[i - 1], made)
-            self._count(moved, kept, occupancies[i], number if made is not None else 0)
+            self._count(moved, kept, occupancies[i], last if made is not None else -1)
         self.n_read += 1
 
     def _count(self, moved: Occupancy, kept: Occupancy, seen: Occupancy, cycle: int) -> None:
         self.moved.add(moved, seen)
         self.kept.add(kept, seen)
-        if cycle:
-            while len(self.by_cycle) < cycle:
+        if cycle >= 0:
+            while len(self.by_cycle) <= cycle:
                 self.by_cycle.append((_nothing(seen.shape), _nothing(seen.shape)))
-            self.by_cycle[cycle - 1][0].add(moved, seen)
-            self.by_cycle[cycle - 1][1].add(kept, seen)
+            self.by_cycle[cycle][0].add(moved, seen)
+            self.by_cycle[cycle][1].add(kept, seen)
 
 
 def steps_that_load(run: Run) -> frozenset[int]:

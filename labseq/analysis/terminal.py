@@ -103,12 +103,12 @@ def _plan_lines(found: Replay) -> list[str]:
 
 
 def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedPlan]]]:
-    """The plans of each cycle, then of all; cycles are counted from 1 over all rearrangements of a shot."""
+    """The plans of each cycle, then of all; cycles are counted from 0 over all rearrangements of a shot."""
     by_cycle: dict[int, list[ReplayedPlan]] = {}
-    numbers: dict[int, int] = {}
+    last: dict[int, int] = {}
     for plan in plans:
-        numbers[plan.shot] = numbers.get(plan.shot, 0) + 1
-        by_cycle.setdefault(numbers[plan.shot], []).append(plan)
+        last[plan.shot] = last.get(plan.shot, -1) + 1
+        by_cycle.setdefault(last[plan.shot], []).append(plan)
     for cycle in sorted(by_cycle):
         yield f"cycle {cycle}", by_cycle[cycle]
     if len(by_cycle) > 1:
@@ -182,10 +182,10 @@ def _map(images: ReplayedImages) -> list[str]:
 
 def _failure_lines(found: Replay) -> list[str]:
     lines = [
-        f"shot {plan.shot + 1}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure
+        f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure
     ]
-    lines += [f"shot {s + 1}, image {i + 1}: {text}" for (s, i), text in found.images.failures.items()]
-    lines += [f"shot {shot + 1} is left out: {text}" for shot, text in found.unreadable.items()]
+    lines += [f"shot {s}, image {i}: {text}" for (s, i), text in found.images.failures.items()]
+    lines += [f"shot {shot} is left out: {text}" for shot, text in found.unreadable.items()]
     more = len(lines) - MAX_REPORTED
     return [
         *lines[:MAX_REPORTED],
@@ -275,7 +275,7 @@ def _changes(overrides: Sequence[str]) -> dict[str, Any]:
 def _report(done: AnalysisOutcome) -> None:
     before = f", {done.n_before} had a result already" if done.n_before else ""
     say(f"{done.name}: {plural(done.n_done, 'shot')} analysed{before}; see {done.path}")
-    failed = [f"{done.name}: shot {shot + 1} failed: {text}" for shot, text in done.failures.items()]
+    failed = [f"{done.name}: shot {shot} failed: {text}" for shot, text in done.failures.items()]
     more = len(failed) - MAX_REPORTED
     say(*failed[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
 
@@ -286,8 +286,8 @@ class PlotRequest:
 
     Attributes:
         what: A part of the overview; None for all of it.
-        shot: A shot, counted from 1.
-        cycle: A cycle of it, counted from 1.
+        shot: A shot, counted from 0.
+        cycle: A cycle of it, counted from 0.
     """
 
     what: str | None = None

@@ -120,36 +120,36 @@ def read_batches(text: str | None, plan: Plan) -> range:
     """Read a selection of batches; a chain of linked batches must not be cut.
 
     Args:
-        text: "2" or "1-3", counted from 1; None for all.
+        text: "2" or "1-3", counted from 0; None for all.
         plan: The plan.
 
     Returns:
         Their indices, from 0.
 
     Example:
-        >>> read_batches("1-2", Plan.from_batches([([(0, 0)], [(0, 3)])] * 3))
+        >>> read_batches("0-1", Plan.from_batches([([(0, 0)], [(0, 3)])] * 3))
         range(0, 2)
     """
     n = plan.n_batches
     if text is None:
         return range(n)
     option = clean(f"--batches {text}")
-    there_are = f"a number from 1 to {n}, or two of them as in 1-{n}" if n > 1 else "1, the only one"
+    there_are = f"a number from 0 to {n - 1}, or two of them as in 0-{n - 1}" if n > 1 else "0, the only one"
     match = _BATCHES.fullmatch(text)
     if match is None:
         raise ConfigError(Problem("these are no batches", option, expected=there_are))
     first, last = int(match[1]), int(match[2] or match[1])
-    if not 1 <= first <= last <= n:
+    if not first <= last < n:
         raise ConfigError(Problem("there are no such batches", option, expected=there_are))
     begins, ends = first, last
-    while plan.linked[begins - 1]:
+    while plan.linked[begins]:
         begins -= 1
-    while ends < n and plan.linked[ends]:
+    while ends + 1 < n and plan.linked[ends + 1]:
         ends += 1
     if (begins, ends) != (first, last):
         what = "linked batches are cut, between which the tweezers stay on"
         raise ConfigError(Problem(what, option, expected=f"--batches {begins}-{ends}"))
-    return range(first - 1, last)
+    return range(first, last + 1)
 
 
 MAX_DURATION_S: Final = 60.0
@@ -162,7 +162,7 @@ class WaveformRequest:
 
     Attributes:
         plan: The request for a plan, whose occupancy may be a plan, too: see :func:`read_moves`.
-        batches: "2" or "1-3", from 1; None for all.
+        batches: "2" or "1-3", from 0; None for all.
         sample_rate: A frequency; None for the profile's.
     """
 

@@ -326,4 +326,4 @@ def _handle_exceeded(shot: Shot, exceeded: Exceeded, device: str, text: str) -> 
 
 
 def _warn(shot: Shot, text: str) -> None:
-    shot.log("warning", text=f"shot {shot.index + 1}: {text}")
+    shot.log("warning", text=f"shot {shot.index}: {text}")

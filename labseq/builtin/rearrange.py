@@ -62,9 +62,9 @@ class RearrangeSettings(Settings):
         """The window of a cycle, in seconds.
 
         Args:
-            cycle: Counted from 1.
+            cycle: Index of the cycle, from 0.
         """
-        return self.window[cycle - 1] if isinstance(self.window, tuple) else self.window
+        return self.window[cycle] if isinstance(self.window, tuple) else self.window
 
 
 class RearrangeStep(Step):
@@ -80,7 +80,7 @@ class RearrangeStep(Step):
 
     def __init__(self, settings: RearrangeSettings) -> None:
         self.settings = settings
-        self.windows_s = tuple(settings.window_of(cycle) for cycle in range(1, settings.cycles + 1))
+        self.windows_s = tuple(settings.window_of(cycle) for cycle in range(settings.cycles))
         self.judges_shot = settings.stop_when == "never"
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
@@ -90,7 +90,7 @@ class RearrangeStep(Step):
         all_made = self.settings.stop_when == "never"
         waited_out = all_made and self.settings.window_mode == "fixed"
         entries: list[TimelineEntry] = []
-        for cycle in range(1, self.settings.cycles + 1):
+        for cycle in range(self.settings.cycles):
             window_s = self.settings.window_of(cycle)
             min_duration_s, min_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
             moves = TimelineEntry(f"cycle {cycle}: move", window_s, min_duration_s, kind="rearrange")
@@ -100,7 +100,7 @@ class RearrangeStep(Step):
 
     def run(self, shot: Shot) -> None:
         """Run cycles until the target is met (``stop_when: defect_free``) or all are done."""
-        for cycle in range(1, self.settings.cycles + 1):
+        for cycle in range(self.settings.cycles):
             if shot.occupancy is None:
                 raise PlanError("rearrange needs an image before it in the shot")
             if self.settings.stop_when == "defect_free" and shot.target.is_met_by(shot.occupancy):
@@ -175,7 +175,7 @@ def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:
     return plan, report
 
 
-def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = 0) -> None:
+def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = -1) -> None:
     """Build a tone program, play it and wait for its end.
 
     On a virtual clock it takes at least the modelled overhead of a cycle, as on real hardware.
@@ -184,7 +184,7 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
         shot: The running shot.
         build: Makes the program.
         start_s: Start of the cycle on the session's clock; its overhead counts from there.
-        cycle: Rearrangement cycle, counted from 1; 0 outside of one.
+        cycle: Index of the rearrangement cycle; -1 outside of one.
 
     Raises:
         LimitError: The program breaks a limit.

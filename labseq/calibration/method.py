@@ -78,7 +78,7 @@ class CalibrationData:
         for shot in self.run.shots:
             frame = read_frames(shot.file).get(0)
             if frame is None:
-                what = f"the first image of shot {shot.index + 1} was not kept"
+                what = f"the first image of shot {shot.index} was not kept"
                 hint = "take a run with 'record_frames: all'"
                 raise ConfigError(Problem(what, path, expected="a frame of each shot", hint=hint))
             shape = shape or frame.image.shape
@@ -87,7 +87,7 @@ class CalibrationData:
                 raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
             n_saturated = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
             if n_saturated > max(MIN_SATURATED, self.hardware.grid.n_rows * self.hardware.grid.n_cols // 20):
-                what = f"{n_saturated} pixels of the first frame of shot {shot.index + 1} are saturated"
+                what = f"{n_saturated} pixels of the first frame of shot {shot.index} are saturated"
                 raise DeviceError(frame.camera, f"{what}; use less light, gain or exposure")
             yield frame
 

@@ -269,7 +269,7 @@ def show(
 ) -> None:
     """Show what a run has recorded, finished or not: its summary, or the tables that you choose.
 
-    Shots and cycles are counted from 1, steps from 0 as in addresses; with --json shots are counted from 0.
+    Shots, attempts, cycles and scan points are counted from 0.
     """
     from labseq.cli.show import Tables, show_run
 

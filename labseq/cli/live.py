@@ -259,14 +259,14 @@ def _caption(tally: Tally) -> list[Text]:
     if tally.image is None or tally.record is None:
         return []
     image, target = tally.image, tally.record.target
-    which = f"cycle {image.cycle}" if image.cycle else f"step {image.step}"
+    which = f"cycle {image.cycle}" if image.cycle >= 0 else f"step {image.step}"
     n_defects, n_surplus = target.n_defects(image.occupancy), target.n_surplus(image.occupancy)
     found = plural(n_defects, "defect") if n_defects or n_surplus else "defect-free"
     style = "green" if found == "defect-free" else ""
     if n_surplus:
         found += f", {n_surplus} surplus"
     atoms = f"{int(image.occupancy.sum())} atoms, {found}"
-    return [Text(), _line(f"shot {tally.image_shot + 1}, image of {which}:"), _line(atoms, style)]
+    return [Text(), _line(f"shot {tally.image_shot}, image of {which}:"), _line(atoms, style)]
 
 
 MIN_WIDTH: Final = 16
@@ -455,8 +455,8 @@ class Tally:
         n_seen: Number of them that met it in at least one image.
         n_repeated: Number of attempts that had to be repeated.
         image: The last image.
-        image_shot: The shot of the last image, counted from 0.
-        shot: The current shot, counted from 0.
+        image_shot: Index of the shot of the last image.
+        shot: Index of the current shot.
         stages: Stage -> its durations.
         scan: The points of the scan; None without one.
         best: The best point of an adaptive scan so far, as text, or "".
@@ -527,7 +527,7 @@ class Tally:
             return
         self.n_done += 1
         self.n_defect_free += shot.success
-        self.n_seen += shot.success or shot.seen_defect_free_cycle > 0
+        self.n_seen += shot.success or shot.seen_defect_free_cycle >= 0
         if self.scan is not None:
             self.scan.add(shot)
         if not math.isnan(shot.filling_fraction):

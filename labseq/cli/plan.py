@@ -115,7 +115,7 @@ def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[
             parts.append("with the tweezers still on from the previous batch")
         marked = batch.from_sites, batch.to_sites[stays]
         yield [
-            Text.assemble((f"batch {i + 1} of {plan.n_batches}", "bold"), "  ", ", ".join(parts)),
+            Text.assemble((f"batch {i}", "bold"), "  ", ", ".join(parts)),
             *(Text(f"  {line}") for line in moves_text(batch, shape, arrow)),
             *canvas.lines(("before", "after"), arrays[i : i + 2], marked),
         ]

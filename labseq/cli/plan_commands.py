@@ -11,7 +11,7 @@ PLAN_EXAMPLES: Final = """\b
 Examples:
   labseq plan random:20x20@0.75 --seed 1 --target kagome:15x15 --dop 7
   labseq plan random:20x20@0.75 --seed 1 --target sierpinski:16x16 --step
-  labseq plan data/2026-11-20/0001_compact-225/shots/shot_000003.h5#2 --png second_cycle.png
+  labseq plan data/2026-11-20/0001_compact-225/shots/shot_000003.h5#1 --png second_cycle.png
   labseq plan occupancy.npy --target ring:radius=4 --origin 2,3 --json - | jq .n_batches
 """
 WAVEFORM_EXAMPLES: Final = """\b
@@ -69,7 +69,7 @@ def plan(
         typer.Argument(
             metavar="OCCUPANCY",
             help="A .npy file; a text file of 0 and 1, or '-' for such a text on standard input; the shot "
-            "file run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on; default: cycle 1); or "
+            "file run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on, counted from 0; default: 0); or "
             "random:20x20@0.75 (each site filled with that probability).",
             show_default=False,
         ),
@@ -92,7 +92,7 @@ def plan(
 ) -> None:
     """Plan the moves for one occupancy, check the plan as a run does, and print or draw it.
 
-    Batches and cycles are counted from 1, rows and columns from 0.
+    Batches, cycles, rows and columns are counted from 0.
     """
     from labseq.cli.plan import PlanOutput, plan_once
     from labseq.session.planning import PlanRequest
@@ -119,7 +119,7 @@ def waveform(
     profile: Profile = None,
     overrides: Overrides = None,
     batches: Annotated[
-        str | None, typer.Option(metavar="N|M-N", help="Only these batches, counted from 1. Default: all.")
+        str | None, typer.Option(metavar="N|M-N", help="Only these batches, counted from 0. Default: all.")
     ] = None,
     sample_rate: Annotated[
         str | None,

@@ -113,11 +113,11 @@ def _shot_row(shot: Shot, run: Run, *, details: bool) -> tuple[str, ...]:
     row = shot.row
     result = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, run.target.n_atoms)
     if shot.status != "complete":
-        result = f"attempt {shot.attempt + 1} {shot.status}: {clean(str(row.get('error', '')))}"
+        result = f"attempt {shot.attempt} {shot.status}: {clean(str(row.get('error', '')))}"
     counts = ("n_cycles", "n_batches", "n_atom_moves") if details else ("n_cycles", "n_atom_moves")
     time_s = shot_time_s(shot)
     return (
-        str(shot.index + 1),
+        str(shot.index),
         *(_scanned_values(shot, run.scan) if details else ()),
         result,
         percent(shot.filling_fraction),

@@ -25,7 +25,7 @@ NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
 
 
 def summary_lines(run: Run) -> list[str]:
-    """A table of the run's points or cycles, and its statistics. Shots and cycles are counted from 1."""
+    """A table of the run's points or cycles, and its statistics. Shots and cycles are counted from 0."""
     statistics = statistics_of(run.shots, run.target)
     table = shortened(point_table(run)) or cycle_table(statistics)
     skipped = f", {len(run.skipped)} skipped" if run.skipped else ""
@@ -44,7 +44,7 @@ def summary_lines(run: Run) -> list[str]:
 
 
 def json_summary(run: Run | None) -> dict[str, Any]:
-    """The summary as ``--json`` prints it, with shots counted from 0; None for a run that never started."""
+    """The summary as ``--json`` prints it; None for a run that never started."""
     if run is None:
         nothing = {"defect_free": None, "filling_fraction": None}
         return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
@@ -135,7 +135,7 @@ def statistics_rows(statistics: Statistics) -> list[tuple[str, str]]:
     if one.defects:
         rows.append(("defects", histogram_text(one.defects)))
     elif one.cycles and not is_judged:
-        rows.append(("defects", f"{histogram_text(one.cycles[-1].defects)}, after cycle {len(one.cycles)}"))
+        rows.append(("defects", f"{histogram_text(one.cycles[-1].defects)}, after {plural(len(one.cycles), 'cycle')}"))
     if one.too_short.n:
         rows.append(("window", f"too short in {count_of(one.too_short.n, one.too_short.n_trials)}"))
     if one.losses:
@@ -215,7 +215,7 @@ def _skipped_rows(run: Run) -> list[tuple[str, str]]:
 
 
 def _by_reason(run: Run) -> list[tuple[str, list[int]]]:
-    """The reasons why shots were skipped, each with its shots counted from 0."""
+    """The reasons why shots were skipped, each with the indices of its shots."""
     found: dict[str, list[int]] = {}
     for shot, why in sorted(run.skipped.items()):
         found.setdefault(why, []).append(shot)
@@ -223,8 +223,8 @@ def _by_reason(run: Run) -> list[tuple[str, list[int]]]:
 
 
 def _numbers(shots: Sequence[int]) -> str:
-    """The numbers of the first shots, counted from 1."""
-    return ", ".join(str(shot + 1) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
+    """The indices of the first shots."""
+    return ", ".join(str(shot) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
 
 
 def _duration(run: Run) -> str:

@@ -205,7 +205,7 @@ def _shot_record(logged: Mapping[str, Any], shot: Shot | None) -> ShotRecord:
     row: Mapping[str, Any] = {} if shot is None else shot.row
     filling: float | None = logged["filling_fraction"]
     time_s = math.nan if shot is None else shot_time_s(shot)
-    timing = [] if math.isnan(time_s) else [StageTiming("shot", 0, 0, 0.0, time_s, math.nan)]
+    timing = [] if math.isnan(time_s) else [StageTiming("shot", 0, -1, 0.0, time_s, math.nan)]
     return ShotRecord(
         shot_index=logged["shot_index"],
         attempt=logged["attempt"],
@@ -214,7 +214,7 @@ def _shot_record(logged: Mapping[str, Any], shot: Shot | None) -> ShotRecord:
         status=logged["status"],
         error=logged["error"],
         timing=timing,
-        seen_defect_free_cycle=int(row.get("seen_defect_free_cycle") or 0),
+        seen_defect_free_cycle=int(row.get("seen_defect_free_cycle", -1)),
         success=bool(logged["success"]),
         filling_fraction=math.nan if filling is None else float(filling),
         n_missing_atoms=int(row.get("n_missing_atoms") or 0),

@@ -132,7 +132,7 @@ def _axis_rows(axis: AxisStatistics, rf: RfSpec) -> list[tuple[str, str]]:
         ("sum of amplitudes", f"at most {axis.amplitude_sum:.3g} of full scale"),
         (
             f"peak voltage (limit {volts})",
-            f"{format_quantity(axis.peak_v, 'voltage')}, in batch {axis.peak_batch + 1}",
+            f"{format_quantity(axis.peak_v, 'voltage')}, in batch {axis.peak_batch}",
         ),
         ("  after the amplifier", format_quantity(axis.aod_peak_v, "voltage")),
         ("crest factor", _crest(axis)),
@@ -154,14 +154,15 @@ def _span(low_hz: float, high_hz: float) -> str:
 def _crest(axis: AxisStatistics) -> str:
     if axis.crest_factor is None:
         return "-"
-    return f"{axis.crest_factor:.2f}, in batch {axis.crest_batch + 1}"
+    return f"{axis.crest_factor:.2f}, in batch {axis.crest_batch}"
 
 
 def _batches(waveform: PlannedWaveform) -> str:
-    first, last, n = waveform.batches.start + 1, waveform.batches.stop, waveform.moves.plan.n_batches
-    if last - first + 1 == n:
+    shown, n = waveform.batches, waveform.moves.plan.n_batches
+    if len(shown) == n:
         return str(n)
-    return f"{first} of {n}" if first == last else f"{first} to {last} of {n}"
+    which = f"{shown[0]}" if len(shown) == 1 else f"{shown[0]} to {shown[-1]}"
+    return f"{which} ({len(shown)} of {n})"
 
 
 def _rate(waveform: PlannedWaveform) -> str:

@@ -150,7 +150,7 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
 def _batches(batches: list[object], name: str) -> list[Batch]:
     made: list[Batch] = []
     for i, batch in enumerate(batches):
-        where = f"{name}, batch {i + 1}"
+        where = f"{name}, batch {i}"
         if not isinstance(batch, dict):
             raise ConfigError(Problem("this is no batch", where, expected='{"from": [...], "to": [...]}'))
         made.append(validate_values(BatchFile, cast("Mapping[str, Any]", batch), where).model())

@@ -48,7 +48,7 @@ class LogLines:
 
 
 def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
-    """Describe an event on one line. Shots, attempts and points are counted from 1.
+    """Describe an event on one line.
 
     Returns:
         "" for an event that is not printed.
@@ -61,7 +61,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "shot_repeated":
             shot: ShotRecord = values["shot"]
             return (
-                f"shot {shot.shot_index + 1}: attempt {shot.attempt + 1} failed, trying again: {shot.error}"
+                f"shot {shot.shot_index}: attempt {shot.attempt} failed, trying again: {shot.error}"
             )
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
@@ -76,18 +76,18 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "warning":
             return f"warning: {values['text']}"
         case "window_too_short":
-            where = f"shot {values['shot'] + 1}, cycle {values['cycle']}"
+            where = f"shot {values['shot']}, cycle {values['cycle']}"
             return f"{where}: {values['n_batches_played']} of {values['n_batches']} batches fit the window"
         case "leader_awaited":
             longest = format_quantity(values["timeout_s"], "time")
             who, signal = values["device"], values["signal"]
-            return f"shot {values['shot'] + 1}: waiting for '{signal}' from {who}, at most {longest}"
+            return f"shot {values['shot']}: waiting for '{signal}' from {who}, at most {longest}"
         case "scan_point":
             return point_text(values)
         case "scan_ended":
             return f"{values['scanner']} needs no more points"
         case "device_command":
-            return f"shot {values['shot'] + 1}: {values['device']}: {values['command']}"
+            return f"shot {values['shot']}: {values['device']}: {values['command']}"
         case _:
             return ""
 
@@ -102,11 +102,11 @@ def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
 
 def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
     """A line about a shot that is over."""
-    of = f"{shot.shot_index + 1}/{run.n_shots}" if run is not None else f"{shot.shot_index + 1}"
     if shot.status != "complete":
-        return f"shot {of}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
+        return f"shot {shot.shot_index}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
     n_atoms = run.target.n_atoms if run is not None else 0
-    parts = [f"shot {of}", outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)]
+    ended = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)
+    parts = [f"shot {shot.shot_index}", ended]
     if not math.isnan(shot.filling_fraction):
         parts.append(f"filling {percent(shot.filling_fraction)}")
     if shot.n_missing_atoms:
@@ -116,15 +116,15 @@ def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
 
 
 def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: int) -> str:
-    """How a shot ended. Cycles are counted from 1; ``seen_cycle`` is 0 if no image met the target.
+    """How a shot ended; ``seen_cycle`` is the index of the first cycle that met the target, or -1.
 
     Example:
-        >>> outcome(True, 2, 1.0, 225)
-        'defect-free in cycle 2'
-        >>> outcome(False, 3, 0.9955555, 225)
-        '1 defect (defect-free in cycle 3)'
+        >>> outcome(True, 1, 1.0, 225)
+        'defect-free after 2 cycles'
+        >>> outcome(False, 0, 0.9955555, 225)
+        '1 defect (defect-free after 1 cycle)'
     """
-    seen = f"defect-free in cycle {seen_cycle}" if seen_cycle else ""
+    seen = f"defect-free after {plural(seen_cycle + 1, 'cycle')}" if seen_cycle >= 0 else ""
     if success:
         return seen or "defect-free"
     if math.isnan(filling_fraction):
@@ -138,7 +138,7 @@ def point_text(values: Mapping[str, Any]) -> str:
     """A line about a point of an adaptive scan, and the best one so far."""
     best = values["best"]
     at = ", ".join(f"{address} {text}" for address, text in values["written"].items())
-    this = f"point {values['point'] + 1} ({at}): {values['figure']} {_figure(values['value'])}"
+    this = f"point {values['point']} ({at}): {values['figure']} {_figure(values['value'])}"
     if best is None:
         return this
     return f"{this}; best so far " + ("this" if best["point"] == values["point"] else best_text(values))
@@ -149,7 +149,7 @@ def best_text(values: Mapping[str, Any]) -> str:
     best = values["best"]
     if best is None:
         return ""
-    return f"{_figure(best['value'])}, point {best['point'] + 1} ({', '.join(best['written'].values())})"
+    return f"{_figure(best['value'])}, point {best['point']} ({', '.join(best['written'].values())})"
 
 
 def _figure(value: float | None) -> str:

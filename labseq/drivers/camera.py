@@ -195,10 +195,10 @@ class CameraDriver(Camera):
             raise self._no_frame(timeout_s)
         if taken.number > self._n_read:
             self._held = taken
-            raise self._lost(taken.number, "the camera's frame numbers have a gap")
+            raise self._lost(taken.number - 1, "the camera's frame numbers have a gap")
         self._n_read = taken.number + 1
         if taken.image is None:
-            raise self._lost(taken.number + 1, taken.fault)
+            raise self._lost(taken.number, taken.fault)
         exposure_s = series.exposure_s if math.isnan(taken.exposure_s) else taken.exposure_s
         t_start_s = self._t_start_s(taken, exposure_s)
         return Frame(taken.image, exposure_s, t_start_s, self._name, taken.number, taken.device_time_s)
@@ -264,15 +264,15 @@ class CameraDriver(Camera):
         elif series.trigger == "software" and n_read >= len(self._fired_s):
             reason = "the next one was not triggered"
         elif series.trigger == "external":
-            reason = f"frame {n_read + 1} of {series.n_frames} waits for its external trigger; check the line"
+            reason = f"frame {n_read} waits for its external trigger; check the line"
         else:
-            reason = f"frame {n_read + 1} of {series.n_frames} is not ready"
+            reason = f"frame {n_read} is not ready"
         text = f"no frame within {format_quantity(timeout_s, 'time')}: {reason}"
         return DeviceTimeoutError(self._name, text, timeout_s)
 
-    def _lost(self, n_read: int, why: str) -> TransientError:
-        first, self._n_read = min(self._n_read, n_read - 1) + 1, n_read
-        which = f"frame {first} was" if first == n_read else f"frames {first} to {n_read} were"
+    def _lost(self, last: int, why: str) -> TransientError:
+        first, self._n_read = min(self._n_read, last), last + 1
+        which = f"frame {first} was" if first == last else f"frames {first} to {last} were"
         n_frames = self._series.n_frames if self._series is not None else 0
         return TransientError(f"{which} lost, of a series of {n_frames}: {why}", self._name)
 

@@ -46,7 +46,7 @@ class StageTiming:
     Attributes:
         stage: "load", "expose", "detect", "plan", "check", "prepare", "play", ...
         step: Index of the step in the shot.
-        cycle: Rearrangement cycle, counted from 1; 0 outside of one.
+        cycle: Index of the rearrangement cycle; -1 outside of one.
         t_start_s: Start on the session's clock, from the start of the shot.
         duration_s: Duration on the session's clock. In a dry run this is the
             modelled time.
@@ -81,8 +81,8 @@ class ImageRecord:
         occupancy: bool (n_rows, n_cols), as the detector saw it.
         confidence: float32 (n_rows, n_cols), the detector's confidence per site.
         step: Index of the step in the shot.
-        cycle: Rearrangement cycle that it ended, counted from 1; 0 for the image
-            of an ``image`` step.
+        cycle: Index of the rearrangement cycle that it ended; -1 for the image of
+            an ``image`` step.
         t_start_s: Start of the exposure, from the start of the shot.
         exposure_s: Exposure time, in seconds.
         name: Name of the image, unique in the shot and the same in every shot.
@@ -107,7 +107,7 @@ class CycleRecord:
 
     Attributes:
         step: Index of the step in the shot.
-        cycle: Counted from 1.
+        cycle: Index of the cycle within its step.
         plan: The whole plan.
         report: What the check said of it.
         n_batches_played: How many batches fitted into the window and were played.
@@ -139,7 +139,7 @@ class ShotRecord:
 
     Attributes:
         shot_index: Index of the shot in the run, from 0.
-        attempt: 0 for the first try.
+        attempt: Index of the attempt, from 0.
         seed: The run's seed.
         t_start_utc: Wall time of its start, ISO 8601, UTC.
         t_end_utc: Wall time of its end.
@@ -148,7 +148,7 @@ class ShotRecord:
         images: In the order they were taken.
         cycles: In the order they were made.
         timing: In the order the stages ended.
-        seen_defect_free_cycle: First cycle whose image met the target; 0 if none.
+        seen_defect_free_cycle: Index of the first cycle whose image met the target; -1 if none.
         success: Whether the last ``image`` step met the target.
         filling_fraction: Filling of the target on the last ``image`` step; nan
             without one, or if a rearrangement follows it.
@@ -173,7 +173,7 @@ class ShotRecord:
     images: list[ImageRecord] = field(default_factory=list[ImageRecord])
     cycles: list[CycleRecord] = field(default_factory=list[CycleRecord])
     timing: list[StageTiming] = field(default_factory=list[StageTiming])
-    seen_defect_free_cycle: int = 0
+    seen_defect_free_cycle: int = -1
     success: bool = False
     filling_fraction: float = float("nan")
     n_missing_atoms: int = 0

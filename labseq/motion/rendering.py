@@ -374,7 +374,7 @@ def _prepare(
 def _check_durations(program: ToneProgram, sample_rate_hz: float) -> None:
     wrong = np.flatnonzero(~((program.duration_s >= 0) & (program.duration_s < np.inf)))
     if len(wrong):
-        which = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]] + 1}"
+        which = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]]}"
         raise LimitError(which, f"{program.duration_s[wrong[0]]} s", "0 or more and finite")
     with np.errstate(over="ignore"):
         n_samples = float(program.duration_s.sum()) * sample_rate_hz
@@ -390,7 +390,7 @@ def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_r
     if fault == SUM:
         tones = slice(axis.offsets[where], axis.offsets[where + 1])
         largest = max(axis.start_amplitude[tones].sum(), axis.end_amplitude[tones].sum())
-        which = f"the sum of the amplitudes of the {name} tones in batch {program.batch[where] + 1}"
+        which = f"the sum of the amplitudes of the {name} tones in batch {program.batch[where]}"
         raise LimitError(which, f"{largest:.9g}", "1, full scale")
     field, limit = (
         ("start_hz", f"0 to {sample_rate_hz / 2:.9g}"),
@@ -400,5 +400,5 @@ def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_r
         ("phase_rad", "finite"),
     )[fault]
     segment = int(np.searchsorted(axis.offsets, where, "right")) - 1
-    which = f"{field} of a {name} tone in batch {program.batch[segment] + 1}"
+    which = f"{field} of a {name} tone in batch {program.batch[segment]}"
     raise LimitError(which, getattr(axis, field)[where], limit)

@@ -188,7 +188,7 @@ def check_limits(
     n_tones = np.diff(offsets)
     if len(n_tones) and n_tones.max() > drive.max_tones:
         worst = int(n_tones.argmax())
-        what = f"the number of {AXES[axis]} tones in batch {batch[worst] + 1}"
+        what = f"the number of {AXES[axis]} tones in batch {batch[worst]}"
         raise LimitError(what, n_tones[worst], drive.max_tones)
     fault, tone, value = first_excess(offsets, values, drive.limits)
     if fault != WITHIN:
@@ -205,7 +205,7 @@ def _raise_limit_error(
 
     name = AXES[axis]
     frequency, rf_settings = ("grid", f"{name}_frequency"), ("mobile_tweezers", "rf")
-    in_batch = f"in batch {batch + 1}"
+    in_batch = f"in batch {batch}"
     all_tones = f"{name} tones 0 to {n_tones - 1} {in_batch}" if n_tones > 1 else f"{name} tone 0 {in_batch}"
     if fault == BAND:
         low, high = (f"{hz / 1e6:.6g}" for hz in (rf.row_band_hz, rf.column_band_hz)[axis])

@@ -305,14 +305,14 @@ class Panel:
 
     @property
     def title(self) -> str:
-        """Numbers of the batches, from 1, and the lines that they move along.
+        """Indices of the batches, and the lines that they move along.
 
         Example:
             >>> Panel(2, 4, (("row", (7, 9)),)).title
-            'batches 3-5: rows 7, 9'
+            'batches 2-4: rows 7, 9'
         """
-        first, last = self.first + 1, self.last + 1
-        numbers = f"batch {first}" if first == last else f"batches {first}-{last}"
+        one = self.n_batches == 1
+        numbers = f"batch {self.first}" if one else f"batches {self.first}-{self.last}"
         return f"{numbers}: " + "; ".join(_words(axis, lines) for axis, lines in self.moves_along)
 
 

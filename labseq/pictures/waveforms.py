@@ -280,7 +280,7 @@ def _draw_batches(axes: Axes, program: ToneProgram, timeline: _Timeline) -> None
     batch = program.batch[on]
     starts = np.flatnonzero(np.diff(batch, prepend=-1))
     edges = np.append(at_ms[starts], at_ms[-1])
-    middles, numbers = (edges[1:] + edges[:-1]) / 2, batch[starts] + 1
+    middles, numbers = (edges[1:] + edges[:-1]) / 2, batch[starts]
     for x in edges[1:-1]:
         axes.axvline(x, color="white", linewidth=0.8)
     needed = (LABEL_PART[0] + LABEL_PART[1] * len(str(numbers[-1]))) * at_ms[-1]

@@ -163,7 +163,7 @@ class Images:
     """The images of a shot, in the order they were taken.
 
     Attributes:
-        cycle: The cycle that each ended, counted from 1 within its step; 0 for that of an ``image`` step.
+        cycle: Index of the cycle that each ended, within its step; -1 for that of an ``image`` step.
         t_start_s: Start of each exposure, from the start of the shot.
         exposure_s: Exposure times.
         n_defects: Empty target sites on each.
@@ -215,7 +215,7 @@ class ShotSummary:
     @property
     def is_judged(self) -> bool:
         """Whether the last image is not that of a cycle, whose result may have ended the rearrangement."""
-        return not any(self.images.cycle[-1:])
+        return all(cycle < 0 for cycle in self.images.cycle[-1:])
 
 
 def summarise(shot: ShotRecord, target: TargetPattern) -> ShotSummary:

@@ -167,14 +167,14 @@ def _plain_values(column: NDArray[Any]) -> list[Any]:
 
 SHOT: Final = (
     Field("shot", "int64", "index of the shot in the run, from 0", "shot_index"),
-    Field("attempt", "int64", "0 for the first attempt at the shot"),
+    Field("attempt", "int64", "index of the attempt at the shot, from 0"),
     Field("status", "text", "complete, interrupted or failed"),
     Field("error", "text", "why it did not complete, or empty"),
     Field("t_start_utc", "text", "wall time of its start, ISO 8601, UTC"),
     Field("t_end_utc", "text", "wall time of its end, ISO 8601, UTC"),
     Field("success", "bool", "whether the last image step met the target"),
     Field("filling_fraction", "float64", "filling of the target on the last image step; nan without one"),
-    Field("seen_defect_free_cycle", "int64", "first cycle whose image met the target; 0 if none"),
+    Field("seen_defect_free_cycle", "int64", "index of the first cycle whose image met the target; -1 if none"),
     Field("n_images", "int64", "number of images"),
     Field("n_cycles", "int64", "number of rearrangement cycles"),
     Field("n_batches", "int64", "batches that were played"),
@@ -216,7 +216,7 @@ RUN_TEXTS: Final = (
 """Texts in ``/entry/run``, of a :class:`RunRecord`."""
 
 _STEP: Final = Field("step", "i4", "index of the step in the shot, from 0")
-_CYCLE: Final = Field("cycle", "i4", "rearrangement cycle, from 1")
+_CYCLE: Final = Field("cycle", "i4", "index of the rearrangement cycle in its step, from 0")
 
 IMAGES: Final = Table(
     "detection/images",
@@ -224,7 +224,7 @@ IMAGES: Final = Table(
     "all images, whether their frames were kept or not",
     (
         _STEP,
-        Field("cycle", "i4", "rearrangement cycle that it ended, from 1; 0 for that of an image step"),
+        Field("cycle", "i4", "index of the rearrangement cycle that it ended, from 0; -1 for that of an image step"),
         Field("t_start_s", "f8", "start of the exposure, from the start of the shot"),
         Field("exposure_s", "f8", "exposure time"),
         Field(
@@ -365,7 +365,7 @@ TIMING: Final = Table(
     (
         Field("stage", "text", "name of the stage: load, expose, detect, plan, check, prepare, play, ..."),
         _STEP,
-        Field("cycle", "i4", "rearrangement cycle, from 1; 0 outside of one"),
+        Field("cycle", "i4", "index of the rearrangement cycle, from 0; -1 outside of one"),
         Field("t_start_s", "f8", "start on the session's clock, from the start of the shot"),
         Field("duration_s", "f8", "duration on the session's clock; in a dry run the modelled time"),
         Field("host_s", "f8", "duration on the computer's clock"),

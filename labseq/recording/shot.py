@@ -75,7 +75,7 @@ class Shot:
 
     @property
     def seen_defect_free_cycle(self) -> int:
-        """First cycle whose image met the target; 0 if none."""
+        """Index of the first cycle whose image met the target; -1 if none."""
         return int(self.row["seen_defect_free_cycle"])
 
     @property

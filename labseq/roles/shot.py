@@ -265,12 +265,12 @@ class Shot(Protocol):
         """
         ...
 
-    def stage(self, name: str, budget_s: float = ..., cycle: int = 0) -> AbstractContextManager[None]:
+    def stage(self, name: str, budget_s: float = ..., cycle: int = -1) -> AbstractContextManager[None]:
         """Context manager that times a stage against its budget."""
         ...
 
     def stage_done(
-        self, name: str, duration_s: float, host_s: float, budget_s: float = ..., cycle: int = 0
+        self, name: str, duration_s: float, host_s: float, budget_s: float = ..., cycle: int = -1
     ) -> None:
         """Record a stage that has just ended, where :meth:`stage` cannot be used.
 
@@ -279,11 +279,11 @@ class Shot(Protocol):
             duration_s: Its duration on the session's clock, in seconds.
             host_s: The same on this computer's clock.
             budget_s: Its budget; by default that of the profile's ``budgets``.
-            cycle: Rearrangement cycle, counted from 1; 0 outside of one.
+            cycle: Index of the rearrangement cycle; -1 outside of one.
         """
         ...
 
-    def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
+    def take_image(self, exposure_s: float, cycle: int = -1) -> Occupancy:
         """Expose, read, detect and record an image."""
         ...
 

@@ -115,7 +115,7 @@ class Stages:
         self._is_warned = (
             True  # the stages around it, and the step, are over their budgets for the same reason
         )
-        self._emit("warning", {"text": f"shot {self._record.shot_index + 1}: {text}"})
+        self._emit("warning", {"text": f"shot {self._record.shot_index}: {text}"})
 
 
 P = ParamSpec("P")
@@ -262,17 +262,17 @@ class RunningShot:
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
         self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
 
-    def stage(self, name: str, budget_s: float = math.nan, cycle: int = 0) -> AbstractContextManager[None]:
+    def stage(self, name: str, budget_s: float = math.nan, cycle: int = -1) -> AbstractContextManager[None]:
         """Time a stage against its budget; see ``labseq.sequencer.shot``."""
         return self.stages.around(name, budget_s, cycle)
 
     def stage_done(
-        self, name: str, duration_s: float, host_s: float, budget_s: float = math.nan, cycle: int = 0
+        self, name: str, duration_s: float, host_s: float, budget_s: float = math.nan, cycle: int = -1
     ) -> None:
         """Record a stage that has just ended; see ``labseq.plugin.Shot``."""
         self.stages.done(name, duration_s, host_s, budget_s, cycle)
 
-    def take_image(self, exposure_s: float, cycle: int = 0) -> Occupancy:
+    def take_image(self, exposure_s: float, cycle: int = -1) -> Occupancy:
         """Expose, read, detect and record an image.
 
         Raises:
@@ -291,14 +291,14 @@ class RunningShot:
         name = self._name_of_image(cycle)
         image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s, name, signal)
         self.record.images.append(image)
-        if cycle and not self.record.seen_defect_free_cycle and self.target.is_met_by(occupancy):
+        if 0 <= cycle and self.record.seen_defect_free_cycle < 0 and self.target.is_met_by(occupancy):
             self.record.seen_defect_free_cycle = cycle
         self._emit("image", {"image": image, "filling_fraction": self.target.filling_fraction(occupancy)})
         return occupancy
 
     def _name_of_image(self, cycle: int) -> str:
         """A name that no other image of the shot has: that of the step, with the cycle or a number."""
-        name = f"{self._image_name}_cycle_{cycle}" if cycle else self._image_name
+        name = f"{self._image_name}_cycle_{cycle}" if cycle >= 0 else self._image_name
         taken = {image.name for image in self.record.images}
         return next(one for n in itertools.count() if (one := f"{name}_{n}" if n else name) not in taken)
 

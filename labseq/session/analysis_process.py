@@ -91,7 +91,7 @@ def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Shot]
 
 def _report(shot: int, error: BaseException) -> None:
     traceback.print_exception(error)
-    print(f"{FAILED}shot {shot + 1}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)  # noqa: T201 - its log
+    print(f"{FAILED}shot {shot}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)  # noqa: T201 - its log
 
 
 if __name__ == "__main__":

@@ -194,14 +194,14 @@ def _shot(path: Path, cycle: str | None) -> Source:
     cycles, images = content.record.cycles, content.record.images
     if not cycles:
         raise ConfigError(Problem("this shot has no cycles", name, expected="a shot that was rearranged"))
-    number = 1 if cycle is None else int(cycle) if re.fullmatch(r"[0-9]{1,6}", cycle) else 0
-    if not 1 <= number <= len(cycles):
-        there_are = "1, the only one there is" if len(cycles) == 1 else f"a cycle from 1 to {len(cycles)}"
+    index = 0 if cycle is None else int(cycle) if re.fullmatch(r"[0-9]{1,6}", cycle) else -1
+    if not 0 <= index < len(cycles):
+        there_are = "0, the only one" if len(cycles) == 1 else f"a cycle from 0 to {len(cycles) - 1}"
         raise ConfigError(Problem(f"there is no cycle '{clean(cycle or '')}'", name, expected=there_are))
-    seen = image_before(cycles[number - 1], images)
+    seen = image_before(cycles[index], images)
     if seen is None:
-        raise ConfigError(Problem(f"there is no image before cycle {number}", name, expected="one"))
-    label = f"{name}, before cycle {number} of {len(cycles)}"
+        raise ConfigError(Problem(f"there is no image before cycle {index}", name, expected="one"))
+    label = f"{name}, before cycle {index}"
     machine = cast("dict[str, Any]", content.run["resolved"] or {}).get("profile")
     return Source(seen.occupancy, label, target=content.target, machine=machine)
 

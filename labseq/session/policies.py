@@ -65,7 +65,7 @@ def missing_figure(shot: int, figure: str, purpose: str, figures: Iterable[str])
     """
     known = list(figures)
     hint = did_you_mean(figure, known) or f"it has {listing(known)}"
-    return f"shot {shot + 1} has no '{clean(figure)}' {purpose} ({hint})"
+    return f"shot {shot} has no '{clean(figure)}' {purpose} ({hint})"
 
 
 _CHECKED: Final = "to check"
@@ -188,7 +188,7 @@ class Checks:
             if check.then == "skip_point":
                 skipped = skipped or message
             else:
-                self._warn(f"shot {row['shot'] + 1}: {message}")
+                self._warn(f"shot {row['shot']}: {message}")
         return skipped
 
     def _warn_unchecked(self, row: Mapping[str, Any]) -> None:
@@ -278,7 +278,7 @@ class ShotHooks:
         """
         if shots:
             self._writer.skip(shots, why)
-            which = f"shot {shots[0] + 1} is" if len(shots) == 1 else f"{len(shots)} shots are"
+            which = f"shot {shots[0]} is" if len(shots) == 1 else f"{len(shots)} shots are"
             self._emit("warning", {"text": f"{which} skipped: {why}"})
             self._emit("shots_skipped", {"shots": list(shots), "why": why})
 

@@ -124,7 +124,7 @@ def compile_commands(name: str, program: ToneProgram, cores: Cores) -> Commands:
         raise _too_many_tones(name, program, cores, int(ends[0]))
     if n_blocks == kernels.TOO_SHORT:
         segment = int(ends[0])
-        what = f"{name}: duration of a segment in batch {program.batch[segment] + 1}"
+        what = f"{name}: duration of a segment in batch {program.batch[segment]}"
         limit = "83.2 ns, the DDS's shortest time"
         raise LimitError(what, f"{program.duration_s[segment]:.4g} s", limit)
     ends = ends[:n_blocks]
@@ -162,7 +162,7 @@ def _too_many_tones(name: str, program: ToneProgram, cores: Cores, segment: int)
     n_row, n_column = (
         int(axis.offsets[segment + 1] - axis.offsets[segment]) for axis in (program.row, program.column)
     )
-    what = f"{name}: row and column tones in batch {program.batch[segment] + 1}"
+    what = f"{name}: row and column tones in batch {program.batch[segment]}"
     limit = f"{len(cores.row)} and {len(cores.column)}, the DDS's cores on these outputs"
     return LimitError(what, f"{n_row} and {n_column}", limit, "lower max_row_tones and max_column_tones")
 

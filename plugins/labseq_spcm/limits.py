@@ -129,11 +129,11 @@ def _check_axis(what: str, axis: AxisTones, batch: NDArray[np.int32], band_hz: t
         if not within.all():
             tone = int(within.argmin())
             segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
-            where = f"{what.format(quantity)} in batch {batch[segment] + 1}"
+            where = f"{what.format(quantity)} in batch {batch[segment]}"
             raise LimitError(where, f"{values[tone]:.9g}", limit)
     for values in (axis.start_amplitude, axis.end_amplitude):
         sums = np.diff(np.concatenate([[0.0], np.cumsum(values)])[axis.offsets])
         if len(sums) and sums.max() > 1.0 + ROUNDING:
             worst = int(sums.argmax())
-            where = f"{what.format('sum of the amplitudes')}s in batch {batch[worst] + 1}"
+            where = f"{what.format('sum of the amplitudes')}s in batch {batch[worst]}"
             raise LimitError(where, f"{sums[worst]:.9g} of full scale", "1: the output would clip")

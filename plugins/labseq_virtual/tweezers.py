@@ -230,7 +230,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
             )
         sums = _sums(amplitudes, tones.offsets)
         for segment, value in _first_outside(sums, -ROUNDING, most + ROUNDING):
-            where = f"segment {segment} (batch {program.batch[segment] + 1})"
+            where = f"segment {segment} (batch {program.batch[segment]})"
             raise LimitError(
                 f"{self._name}: sum of the {axis} amplitudes in {where}",
                 f"{value:g} of full scale",
@@ -254,7 +254,7 @@ def _where(axis: str, tones: AxisTones, program: ToneProgram, tone: int) -> str:
     """Name a tone: its axis, number, segment and batch."""
     segment = int(np.searchsorted(tones.offsets, tone, side="right")) - 1
     number = tone - int(tones.offsets[segment])
-    return f"{axis} tone {number} in segment {segment} (batch {program.batch[segment] + 1})"
+    return f"{axis} tone {number} in segment {segment} (batch {program.batch[segment]})"
 
 
 Amplitudes = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -81,20 +81,20 @@ def make_shot(
     before[1, 1], before[0, 1] = False, True
     after = target().fill.copy()
     after[tuple(np.argwhere(after)[-n_defects:].T)] = n_defects == 0
-    timing = [StageTiming("step_0_load", 0, 0, 0.0, 0.5, 0.001, 0.5)]
-    images = [image(before, 1, 0, 0.5, kept=kept)]
+    timing = [StageTiming("step_0_load", 0, -1, 0.0, 0.5, 0.001, 0.5)]
+    images = [image(before, 1, -1, 0.5, kept=kept)]
     cycles: list[CycleRecord] = []
-    for cycle in range(1, n_cycles + 1):
-        plan = Plan.from_batches([([(0, 1)], [(1, 1)])]) if cycle == 1 else Plan.from_batches([])
+    for cycle in range(n_cycles):
+        plan = Plan.from_batches([([(0, 1)], [(1, 1)])]) if cycle == 0 else Plan.from_batches([])
         n = plan.n_batches
         report = PlanReport(target().fill, np.full(n, 0.001), np.ones(n, np.int32), 0, 0)
         cycles.append(CycleRecord(2, cycle, plan, report, n, 0.06, 0.55, 0.001))
         timing.append(StageTiming("plan", 2, cycle, 0.55, 0.0, 0.002))
-        timing.append(StageTiming("move", 2, cycle, 0.55, 0.02 * cycle, 0.003, 0.03))
-        images.append(image(after, 2, cycle, 0.6 + 0.1 * cycle))
-    timing.append(StageTiming("step_2_rearrange", 2, 0, 0.55, 0.5, 0.01, 0.6))
+        timing.append(StageTiming("move", 2, cycle, 0.55, 0.02 * (cycle + 1), 0.003, 0.03))
+        images.append(image(after, 2, cycle, 0.7 + 0.1 * cycle))
+    timing.append(StageTiming("step_2_rearrange", 2, -1, 0.55, 0.5, 0.01, 0.6))
     if judged:
-        images.append(image(after, 3, 0, 1.8))
+        images.append(image(after, 3, -1, 1.8))
     shot = ShotRecord(index, 0, 7, START, "2026-11-20T10:00:01+00:00", "complete")
     shot.images, shot.cycles, shot.timing = images, cycles, timing
     shot.success = judged and not n_defects

@@ -65,7 +65,7 @@ def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cy
 def test_a_running_rate_has_jeffreys_intervals(write: Write) -> None:
     trend = drawn(picture_of(write([make_shot(i, n_defects=i % 2) for i in range(30)]), "success"))
     x, _, low, high = trend.running[:, 0]
-    assert x == 5.5  # ten shots
+    assert x == 4.5  # ten shots
     assert (low, high) == jeffreys(5, 10)
     assert trend.is_rate
 

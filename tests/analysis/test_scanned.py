@@ -103,4 +103,4 @@ def test_points_of_an_optimiser_are_drawn_in_their_order(write: Write) -> None:
     a, b = ["0.1", "0.4", "0.2", "0.35", "0.3", "0.15"], ["1", "5", "2", "3", "4", "6"]
     ((chart, _),) = charts(taken(write, scan(("a", a), ("b", b))))
     assert chart.x_label == "point of the scan"
-    assert chart.curves[""][0].tolist() == [1, 2, 3, 4, 5, 6]
+    assert chart.curves[""][0].tolist() == [0, 1, 2, 3, 4, 5]

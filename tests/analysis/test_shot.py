@@ -17,7 +17,7 @@ Write = Callable[..., Run]
 
 
 def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> None:
-    drawing = shot_picture(compact, 1)
+    drawing = shot_picture(compact, 0)
     shot = compact.shots[0]
     assert len(drawing.panels) == len(shot.occupancies)
     assert [len(panel.moves) for panel in drawing.panels] == [
@@ -26,23 +26,23 @@ def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> N
         0,
     ]
     assert drawing.panels[0].title.endswith("batches")
-    assert drawing.panels[1].title.startswith("after cycle 1: ")
+    assert drawing.panels[1].title.startswith("end of cycle 0: ")
     assert drawing.sites_px is not None
     assert drawing.sites_px.shape == (20, 20, 2)
 
 
 def test_frames_lie_under_the_sites(compact: Run, tmp_path: Path) -> None:
-    save_shot(tmp_path / "shot.png", shot_picture(compact, 2, cycle=1))
+    save_shot(tmp_path / "shot.png", shot_picture(compact, 1, cycle=0))
     assert (tmp_path / "shot.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:
-    panels = shot_picture(write([make_shot(0, n_cycles=2)]), 1, cycle=2).panels
-    assert [panel.title.partition(":")[0] for panel in panels] == ["after cycle 1", "after cycle 2"]
+    panels = shot_picture(write([make_shot(0, n_cycles=2)]), 0, cycle=1).panels
+    assert [panel.title.partition(":")[0] for panel in panels] == ["end of cycle 0", "end of cycle 1"]
 
 
 def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> None:
-    drawing = shot_picture(write([make_shot(0, kept=True)]), 1)
+    drawing = shot_picture(write([make_shot(0, kept=True)]), 0)
     assert drawing.sites_px is None
     assert drawing.note.endswith("no frames: not of the sites' size")
 
@@ -50,21 +50,21 @@ def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> Non
 def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write) -> None:
     whole = make_shot(0)
     broken = make_shot(0, images=whole.images[:1], status="interrupted", error="StopRequested: enough")
-    drawing = shot_picture(write([broken], status="stopped"), 1)
-    assert drawing.title == "shot 1, interrupted: StopRequested: enough"
+    drawing = shot_picture(write([broken], status="stopped"), 0)
+    assert drawing.title == "shot 0, interrupted: StopRequested: enough"
     (panel,) = drawing.panels
     assert panel.title.endswith("then 1 move in 1 batch")
 
 
 @pytest.mark.parametrize(
-    ("number", "cycle", "reported"),
+    ("index", "cycle", "reported"),
     [
-        (3, None, "--shot: the run has no shot 3; expected one from 1 to 2"),
-        (1, 2, "has no cycle 2; expected one from 1 to 1"),
-        (2, 1, "has no cycle 1; expected a shot that rearranges"),
+        (2, None, "--shot: the run has no shot 2; expected one from 0 to 1"),
+        (0, 1, "has no cycle 1; expected one from 0 to 0"),
+        (1, 0, "has no cycle 0; expected a shot that rearranges"),
     ],
 )
-def test_what_is_not_there_is_told(write: Write, number: int, cycle: int | None, reported: str) -> None:
+def test_what_is_not_there_is_told(write: Write, index: int, cycle: int | None, reported: str) -> None:
     run = write([make_shot(0), make_shot(1, n_cycles=0)])
     with pytest.raises(ConfigError, match=reported):
-        shot_picture(run, number, cycle)
+        shot_picture(run, index, cycle)

@@ -21,7 +21,7 @@ Write = Callable[..., Run]
 def cycle(plan: Plan, n_played: int) -> CycleRecord:
     n = plan.n_batches
     report = PlanReport(np.zeros((2, 4), np.bool_), np.zeros(n), np.ones(n, np.int32), 0, 0)
-    return CycleRecord(2, 1, plan, report, n_played, 0.06, 0.5, 0.0)
+    return CycleRecord(2, 0, plan, report, n_played, 0.06, 0.5, 0.0)
 
 
 def counted(run: Run) -> Survival:

@@ -68,8 +68,8 @@ def test_a_run_that_comes_out_the_same_says_so(run, capsys):
     assert re.search(r"^sites that differ +0 of 3200, on 0 images$", out, re.MULTILINE)
     rows = [line.split()[:5] for line in out.splitlines() if "recorded   " in line or "replayed   " in line]
     assert [row[:4] for row in rows[:2]] == [
-        ["cycle", "1,", "recorded", "2"],
-        ["cycle", "1,", "replayed", "2"],
+        ["cycle", "0,", "recorded", "2"],
+        ["cycle", "0,", "replayed", "2"],
     ]
 
 
@@ -82,14 +82,14 @@ def test_a_run_that_does_not_come_out_the_same_exits_with_1(run, capsys, monkeyp
 
 
 def test_plans_that_break_a_rule_are_reported(run, capsys):
-    assert replayed(run, planner="wrong", shots="2") == 0
+    assert replayed(run, planner="wrong", shots="1") == 0
     printed = capsys.readouterr()
     assert "INVALID: 2 of 2 (100.0 %)" in printed.out
-    assert re.match(r"shot 2, cycle 1: planner 'wrong': batch 1.* breaks the rule", printed.err)
+    assert re.match(r"shot 1, cycle 0: planner 'wrong': batch 0.* breaks the rule", printed.err)
 
 
 def test_sites_that_differ_are_drawn(run, capsys):
-    assert replayed(run, overrides=["profile.detector.threshold=1e6"], shots="1") == 0
+    assert replayed(run, overrides=["profile.detector.threshold=1e6"], shots="0") == 0
     out = capsys.readouterr().out
     assert "detector threshold: threshold 1000000.0" in out
     assert re.search(r"^on a last image +recorded \d+, now 0, truth \d+$", out, re.MULTILINE)
@@ -120,7 +120,7 @@ def test_an_analysis_is_made_up_and_reported(run, capsys):
 def test_an_analysis_that_fails_exits_with_1(run, capsys):
     assert analyse_run(run.path, "wrong", [], again=False) == 1
     assert capsys.readouterr().err.splitlines() == [
-        f"wrong: shot {i} failed: ValueError: too dark" for i in (1, 2)
+        f"wrong: shot {i} failed: ValueError: too dark" for i in (0, 1)
     ]
 
 

@@ -29,8 +29,8 @@ def test_each_picture_has_a_name_of_its_own(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     plot_run(compact.path, PlotRequest(what="defects"), None)
-    plot_run(compact.path, PlotRequest(shot=2, cycle=1), None)
-    assert {path.name for path in tmp_path.iterdir()} == {"defects.png", "shot-2-cycle-1.png"}
+    plot_run(compact.path, PlotRequest(shot=1, cycle=0), None)
+    assert {path.name for path in tmp_path.iterdir()} == {"defects.png", "shot-1-cycle-0.png"}
 
 
 @pytest.mark.parametrize(

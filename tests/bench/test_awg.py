@@ -49,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunProfile:
 
 def filled_once(shot: Shot, done: Run) -> float:
     """Filling after the first cycle."""
-    first = next(i for i, image in enumerate(shot.record().images) if image.cycle == 1)
+    first = next(i for i, image in enumerate(shot.record().images) if image.cycle == 0)
     return done.target.filling_fraction(shot.occupancies[first])
 
 

@@ -97,7 +97,7 @@ def test_an_overlay_that_has_drifted_is_a_warning_with_the_shift() -> None:
     shots, observer = run(overlay_lab(Drifting((0.25e-6, 0.0))), check_overlay())
     assert shots[0].status == "complete"
     (warning,) = observer.of("warning")
-    assert warning["text"].startswith("shot 1: the mobile tweezers are 2")
+    assert warning["text"].startswith("shot 0: the mobile tweezers are 2")
     assert "from row to row" in warning["text"]
     assert warning["text"].endswith("from the sites; the limit is 100 nm: run `labseq calibrate overlay`")
 
@@ -113,7 +113,7 @@ def test_too_few_atoms_are_a_warning(n_atoms: int) -> None:
     shots, observer = run(fake_lab([few], grid=GRID), check_overlay(exceeded="stop"))
     (warning,) = observer.of("warning")
     what = f"check_overlay cannot measure the overlay to 100 nm with {n_atoms} atoms in this shot"
-    assert warning["text"] == f"shot 1: {what}"
+    assert warning["text"] == f"shot 0: {what}"
     assert ("overlay.along_row_m" in shots[0].readings) == bool(n_atoms)
 
 
@@ -199,7 +199,7 @@ def test_the_shift_of_the_sites_is_recorded() -> None:
 def test_sites_that_have_moved_are_a_warning_with_the_shift() -> None:
     _, observer = sites_run((-0.6, 0.4), loaded(0.75))
     (warning,) = observer.of("warning")
-    assert warning["text"].startswith("shot 1: the sites have moved by -0.6")
+    assert warning["text"].startswith("shot 0: the sites have moved by -0.6")
     assert warning["text"].endswith("; the limit is 0.5 px: run `labseq calibrate sites`")
     with pytest.raises(DeviceError, match=r"camera: the sites have moved by \+1\.\d+ px down and"):
         sites_run((1.2, 0.0), loaded(0.6), exceeded="stop")
@@ -212,7 +212,7 @@ def test_too_few_atoms_are_no_drift(n_atoms: int) -> None:
     shots, observer = sites_run((0.9, 0.0), occupied, exceeded="stop")
     (warning,) = observer.of("warning")
     assert warning["text"] == (
-        f"shot 1: check_sites cannot locate the sites with {n_atoms} atoms seen on them: "
+        f"shot 0: check_sites cannot locate the sites with {n_atoms} atoms seen on them: "
         "few were loaded, or the sites are far from where the detector looks"
     )
     assert "sites.shift_y_px" not in shots[0].readings

@@ -35,17 +35,17 @@ def test_it_stops_when_the_target_is_met():
     rig = rearranging([HALF, HALF, DONE, DONE])
     rig.run()
     record = rig.record()
-    assert [cycle.cycle for cycle in record.cycles] == [1, 2]
-    assert record.seen_defect_free_cycle == 2
+    assert [cycle.cycle for cycle in record.cycles] == [0, 1]
+    assert record.seen_defect_free_cycle == 1
     assert record.success
-    assert [image.cycle for image in record.images] == [0, 1, 2, 0]
+    assert [image.cycle for image in record.images] == [-1, 0, 1, -1]
     assert rig.lab.calls.names("mobile_tweezers").count("mobile_tweezers.play") == 2
 
 
 def test_seen_defect_free_is_no_success():
     rig = rearranging([HALF, DONE, HALF])
     rig.run()
-    assert rig.record().seen_defect_free_cycle == 1
+    assert rig.record().seen_defect_free_cycle == 0
     assert not rig.record().success
 
 
@@ -53,7 +53,7 @@ def test_an_image_before_the_last_rearrangement_judges_nothing():
     rig = rearranging([DONE, HALF, DONE], after=(), stop_when="never", cycles=2)
     rig.run()
     record = rig.record()
-    assert (record.status, record.success, record.seen_defect_free_cycle) == ("complete", False, 2)
+    assert (record.status, record.success, record.seen_defect_free_cycle) == ("complete", False, 1)
     assert np.isnan(record.filling_fraction)
 
 
@@ -68,7 +68,7 @@ def test_never_makes_every_cycle_and_plays_nothing_for_an_empty_plan():
     rig = rearranging([DONE], stop_when="never")
     rig.run()
     assert [c.n_batches_played for c in rig.record().cycles] == [0, 0, 0]
-    assert [i.cycle for i in rig.record().images] == [0, 1, 2, 3, 0]
+    assert [i.cycle for i in rig.record().images] == [-1, 0, 1, 2, -1]
     assert not rig.lab.calls.of("mobile_tweezers.play")
 
 

@@ -135,7 +135,7 @@ def test_settings_of_the_detector_count_in_the_analysis(measured: Any, copied: A
     [
         ("sites", 3, "loading=0 %", "no lattice found"),
         ("thresholds", 30, "loading=0 %", "show one peak"),
-        ("sites", 2, "image.photoelectrons=200000", "first frame of shot 1 are saturated; use less light"),
+        ("sites", 2, "image.photoelectrons=200000", "first frame of shot 0 are saturated; use less light"),
     ],
 )
 def test_an_analysis_that_fails_says_why_and_keeps_what_is_in_use(
@@ -222,7 +222,7 @@ def test_a_simulated_run_serves_dry_runs_only(measured: Any, lab: Any) -> None:
 
 
 def test_a_run_without_frames_is_refused(lab: Any) -> None:
-    with pytest.raises(ConfigError, match="the first image of shot 1 was not kept"):
+    with pytest.raises(ConfigError, match="the first image of shot 0 was not kept"):
         lab.calibrate("sites", shots=1, overrides=["record_frames=none"])
 
 

@@ -78,7 +78,7 @@ def make_run(
     )
 
 
-def make_image(occupancy: np.ndarray[Any, np.dtype[np.bool_]], cycle: int = 0) -> ImageRecord:
+def make_image(occupancy: np.ndarray[Any, np.dtype[np.bool_]], cycle: int = -1) -> ImageRecord:
     confidence = np.ones(occupancy.shape, np.float32)
     return ImageRecord(None, occupancy, confidence, 2, cycle, 0.6, 0.045)
 
@@ -87,7 +87,7 @@ def make_shot(
     index: int = 0,
     *,
     success: bool = True,
-    seen: int = 2,
+    seen: int = 1,
     filling: float = 1.0,
     status: Literal["complete", "interrupted", "failed"] = "complete",
     error: str = "",
@@ -97,7 +97,7 @@ def make_shot(
     shot.success, shot.seen_defect_free_cycle, shot.filling_fraction = success, seen, filling
     shot.status, shot.error = status, error
     shot.t_end_utc = "2026-01-02T03:04:07+00:00"
-    shot.timing.append(StageTiming("step_0_load", 0, 0, 0.0, 1.9, 0.01))
+    shot.timing.append(StageTiming("step_0_load", 0, -1, 0.0, 1.9, 0.01))
     return shot
 
 
@@ -126,12 +126,12 @@ class Script:
         yield "shot_started", {"shot": index, "attempt": 0}
         occupancy = rng.random(target.shape) < 0.75
         yield "image", {"image": make_image(occupancy), "filling_fraction": 0.75}
-        for cycle in range(1, self.n_cycles + 1):
+        for cycle in range(self.n_cycles):
             for stage, budget_s in (("plan", math.nan), ("check", math.nan), ("play", 8e-3), ("move", 60e-3)):
                 timing = StageTiming(stage, 2, cycle, 0.6, 7.5e-3, 0.8e-3, budget_s)
                 yield "stage", {"timing": timing}
             occupancy = target.fill | (occupancy & (rng.random(target.shape) < 0.3))
-            occupancy[target.shape[0] // 2, target.shape[1] // 2] = cycle == self.n_cycles
+            occupancy[target.shape[0] // 2, target.shape[1] // 2] = cycle == self.n_cycles - 1
             for stage in ("expose", "detect"):
                 yield "stage", {"timing": StageTiming(stage, 2, cycle, 0.6, 45e-3, 1.2e-3)}
             yield "image", {"image": make_image(occupancy, cycle), "filling_fraction": 1.0}

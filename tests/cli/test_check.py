@@ -13,7 +13,7 @@ TIMELINE = [
     ("image", [TimelineEntry("image", 0.045, 0.045, 1)]),
     (
         "sort",
-        [TimelineEntry("cycle 1: move", 0.06, 0.06), TimelineEntry("cycle 1: image", 0.045, 0.045, 1)],
+        [TimelineEntry("cycle 0: move", 0.06, 0.06), TimelineEntry("cycle 0: image", 0.045, 0.045, 1)],
     ),
     ("device", [TimelineEntry("shutter: open", 0.0, 0.0)]),
 ]
@@ -34,8 +34,8 @@ def test_timeline_table() -> None:
         "step                       start  at most",
         "0 load                       0 s   500 ms  " + "#" * 23,
         "1 image                   500 ms    45 ms  " + " " * 23 + "##",
-        "2 sort    cycle 1: move   545 ms    60 ms  " + " " * 25 + "###",
-        "          cycle 1: image  605 ms    45 ms  " + " " * 28 + "##",
+        "2 sort    cycle 0: move   545 ms    60 ms  " + " " * 25 + "###",
+        "          cycle 0: image  605 ms    45 ms  " + " " * 28 + "##",
         "3 device  shutter: open   650 ms      0 s  " + " " * 29 + "#",
     ]
 

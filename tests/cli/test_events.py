@@ -23,8 +23,8 @@ def test_a_run_in_lines(fake: Any) -> None:
         "compiling labseq_psca.kernels; later runs find it in the cache",
         "compiled in 6 s",
         "data/2026-01-02/0001_compact-225: 20 shots, seed 1, profile virtual, simulated",
-        "shot 1/20  defect-free in cycle 2  filling 100.0 %  1.9 s",
-        "shot 2/20  defect-free in cycle 2  filling 100.0 %  1.9 s",
+        "shot 0  defect-free after 2 cycles  filling 100.0 %  1.9 s",
+        "shot 1  defect-free after 2 cycles  filling 100.0 %  1.9 s",
     ]
 
 
@@ -41,8 +41,8 @@ def test_what_goes_wrong_is_reported(fake: Any) -> None:
     ]
     assert lines_of(events) == [
         "warning: the laser is warm",
-        "shot 1: attempt 2 failed, trying again: TransientError: no light",
-        "shot 1  failed: TransientError: no light",
+        "shot 0: attempt 1 failed, trying again: TransientError: no light",
+        "shot 0  failed: TransientError: no light",
         "warning: camera could not be brought to its safe state: camera: mute",
         "warning: shutter could not be closed: shutter: jammed",
     ]
@@ -51,21 +51,21 @@ def test_what_goes_wrong_is_reported(fake: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"success": True, "seen": 0}, "defect-free  filling 100.0 %"),
+        ({"success": True, "seen": -1}, "defect-free  filling 100.0 %"),
         (
-            {"success": False, "seen": 4, "filling": 223 / 225},
-            "2 defects (defect-free in cycle 4)  filling 99.1 %",
+            {"success": False, "seen": 3, "filling": 223 / 225},
+            "2 defects (defect-free after 4 cycles)  filling 99.1 %",
         ),
-        ({"success": False, "seen": 0, "filling": 224 / 225}, "1 defect  filling 99.6 %"),
-        ({"success": False, "seen": 0, "filling": 1.0}, "surplus atoms  filling 100.0 %"),
-        ({"success": False, "seen": 0, "filling": math.nan}, "not judged: no image"),
+        ({"success": False, "seen": -1, "filling": 224 / 225}, "1 defect  filling 99.6 %"),
+        ({"success": False, "seen": -1, "filling": 1.0}, "surplus atoms  filling 100.0 %"),
+        ({"success": False, "seen": -1, "filling": math.nan}, "not judged: no image"),
     ],
 )
 def test_a_shot_as_text(fake: Any, changes: Any, words: str) -> None:
     text = event_text("shot_finished", {"shot": fake.shot(2, **changes)}, fake.run())
-    assert text == f"shot 3/20  {words}  1.9 s"
+    assert text == f"shot 2  {words}  1.9 s"
 
 
 def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     shot = fake.shot(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
-    assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 1/20  interrupted"
+    assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 0  interrupted"

@@ -173,7 +173,7 @@ def test_a_wide_terminal_shows_everything(fake: Any) -> None:
     assert "defect-free       2 of 2 (100.0 %), 65-100 %" in text
     assert "filling           100 %" in text
     assert text.count("● " * 14 + "●") == 15
-    assert "shot 2, image of cycle 2:" in text
+    assert "shot 1, image of cycle 1:" in text
     assert lines[-3:] == RECENT
 
 

@@ -64,7 +64,7 @@ def perform(fake: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: A
     """Run a made-up session; returns it, stdout, stderr and the error."""
 
     def run(error: BaseException | None = None, *, as_json: bool = True, options: Any = None) -> Any:
-        shots = [fake.shot(0), fake.shot(1, success=False, seen=1, filling=224 / 225)]
+        shots = [fake.shot(0), fake.shot(1, success=False, seen=0, filling=224 / 225)]
         session = FakeSession(tmp_path, fake.run(n_shots=2), shots, error)
         monkeypatch.setattr("labseq.cli.run.Session", session)
         monkeypatch.setattr(sys, "stdout", sys.stdout)  # given back at the end
@@ -94,7 +94,7 @@ def test_json_is_alone_on_stdout(perform: Any) -> None:
     assert out.count("\n") == 1
     assert "a plugin prints\n" in err
     assert "a C library prints\n" in err
-    assert "shot 2/2" in err
+    assert "shot 1  " in err
     assert session.closed
 
 
@@ -158,7 +158,7 @@ def test_for_people(perform: Any) -> None:
         "filling           99.8(2) %",
         "duration          2 s",
     ]
-    assert "shot 1/2  defect-free in cycle 2  filling 100.0 %  1.9 s" in lines
+    assert "shot 0  defect-free after 2 cycles  filling 100.0 %  1.9 s" in lines
 
 
 def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:

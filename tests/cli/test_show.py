@@ -30,16 +30,16 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     shots = [
         fake.shot(0),
         fake.shot(1, status="failed", error="TransientError: no light"),
-        fake.shot(1, success=False, seen=0, filling=223 / 225, attempt=1),
-        fake.shot(2, success=False, seen=0, filling=math.nan),
+        fake.shot(1, success=False, seen=-1, filling=223 / 225, attempt=1),
+        fake.shot(2, success=False, seen=-1, filling=math.nan),
     ]
     folder = write_run(tmp_path, fake, shots)
     show_run(folder, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split() for line in lines[1:4]] == [
-        ["1", "defect-free", "in", "cycle", "2", "100.0", "%", "0", "0", "1.9", "s"],
-        ["2", "2", "defects", "99.1", "%", "0", "0", "1.9", "s"],
-        ["3", "not", "judged:", "no", "image", "-", "0", "0", "1.9", "s"],
+        ["0", "defect-free", "after", "2", "cycles", "100.0", "%", "0", "0", "1.9", "s"],
+        ["1", "2", "defects", "99.1", "%", "0", "0", "1.9", "s"],
+        ["2", "not", "judged:", "no", "image", "-", "0", "0", "1.9", "s"],
     ]
     assert "shots             3 of 3, 1 attempt kept that did not complete" in lines
     assert "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %" in lines  # one was not judged
@@ -143,8 +143,8 @@ def test_what_was_skipped_is_reported_with_the_reasons(
     show_run(skipped, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert "shots             0 of 8, 8 skipped" in lines
-    assert "skipped           shots 1, 2, 3, 4, 5, ...: DeviceError: laser: went out of lock" in lines
-    assert r"skipped           shots 7, 8: filling\nfraction" in lines
+    assert "skipped           shots 0, 1, 2, 3, 4, ...: DeviceError: laser: went out of lock" in lines
+    assert r"skipped           shots 6, 7: filling\nfraction" in lines
     show_run(skipped, as_json=True)
     assert json.loads(capsys.readouterr().out)["skipped_shots"] == [
         {"shots": [0, 1, 2, 3, 4, 5], "why": "DeviceError: laser: went out of lock"},
@@ -177,7 +177,7 @@ def folder(tmp_path: Path, fake: Any) -> Path:
     for shot in (
         fake.shot(0),
         fake.shot(1, status="failed", error="TransientError: no light"),
-        fake.shot(1, success=False, seen=0, filling=223 / 225, attempt=1),
+        fake.shot(1, success=False, seen=-1, filling=223 / 225, attempt=1),
     ):
         shot.timing.insert(0, StageTiming("play", 0, 1, 0.0, 0.02, 0.001, 0.01))
         writer.write_shot(shot)
@@ -199,9 +199,9 @@ def test_every_shot_and_every_attempt_has_a_row(folder: Path, capsys: pytest.Cap
     lines = shown(folder, capsys, shots=True)
     assert lines[0].split()[:2] == ["shot", "shot.2.rearrange.window"]
     assert [" ".join(line.split()) for line in lines[1:]] == [
-        "1 60 ms defect-free in cycle 2 100.0 % 0 0 0 1.9 s",
-        "2 100 ms attempt 1 failed: TransientError: no light 100.0 % 0 0 0 1.9 s",
-        "2 100 ms 2 defects 99.1 % 0 0 0 1.9 s",
+        "0 60 ms defect-free after 2 cycles 100.0 % 0 0 0 1.9 s",
+        "1 100 ms attempt 0 failed: TransientError: no light 100.0 % 0 0 0 1.9 s",
+        "1 100 ms 2 defects 99.1 % 0 0 0 1.9 s",
     ]
 
 

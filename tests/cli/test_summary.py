@@ -15,7 +15,7 @@ from labseq.model.estimate import Estimate, Rate
 
 UNKNOWN = Estimate(math.nan, math.nan)
 CYCLE = CycleStatistics(
-    cycle=1,
+    cycle=0,
     n_shots=20,
     defect_free=Rate(1, 20),
     seen=Rate(1, 20),
@@ -57,7 +57,7 @@ def test_success_and_what_was_only_seen_stand_apart() -> None:
 def test_shots_that_are_not_judged_are_said_not_to_be() -> None:
     printed = lines(defect_free=Rate(0, 0), filling=UNKNOWN, defects=())
     assert (printed["defect-free"], printed["filling"]) == (NOT_JUDGED, "-")
-    assert printed["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after cycle 1"
+    assert printed["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after 1 cycle"
 
 
 def test_no_shots_are_no_reason_to_complain() -> None:
@@ -81,10 +81,10 @@ def test_the_truth_of_a_simulation_is_reported() -> None:
 @pytest.mark.parametrize(
     ("unreadable", "printed"),
     [
-        ((3,), "1 shot cannot be read and is left out of cycles and defects: 4"),
+        ((3,), "1 shot cannot be read and is left out of cycles and defects: 3"),
         (
             tuple(range(7)),
-            "7 shots cannot be read and are left out of cycles and defects: 1, 2, 3, 4, 5, ...",
+            "7 shots cannot be read and are left out of cycles and defects: 0, 1, 2, 3, 4, ...",
         ),
     ],
 )
@@ -96,7 +96,7 @@ def test_each_cycle_has_a_row() -> None:
     header, row, note = cycle_table(STATISTICS)
     assert header.split()[:3] == ["cycle", "shots", "defect-free"]
     assert row.split() == [
-        "1",
+        "0",
         "20",
         "5.0",
         "%",
@@ -114,5 +114,5 @@ def test_each_cycle_has_a_row() -> None:
 
 
 def test_cycles_that_not_all_shots_made_are_said_to_be() -> None:
-    *_, note = cycle_table(replace(STATISTICS, cycles=(CYCLE, replace(CYCLE, cycle=2, n_shots=12))))
+    *_, note = cycle_table(replace(STATISTICS, cycles=(CYCLE, replace(CYCLE, cycle=1, n_shots=12))))
     assert "only shots that reached it count" in note

@@ -21,7 +21,7 @@ def test_a_run_is_summed_up(fake: Any) -> None:
     assert (tally.n_done, tally.n_defect_free, tally.n_seen) == (3, 3, 3)
     assert tally.n_shots == 20
     assert tally.filling == Estimate(1.0, 0.0)
-    assert (tally.image_shot, tally.image.cycle if tally.image else None) == (2, 2)
+    assert (tally.image_shot, tally.image.cycle if tally.image else None) == (2, 1)
     assert len(tally.stages["plan"].host_s) == 6
     assert tally.stages["plan"].medians_s() == (0.8e-3, 7.5e-3)
     assert tally.status == "complete"
@@ -30,10 +30,10 @@ def test_a_run_is_summed_up(fake: Any) -> None:
 def test_only_complete_shots_count(fake: Any) -> None:
     tally = Tally(lambda: 0.0)
     shots = [
-        fake.shot(0, success=False, seen=3, filling=0.99),
+        fake.shot(0, success=False, seen=0, filling=0.99),
         fake.shot(1, status="interrupted"),
         fake.shot(2, status="failed"),
-        fake.shot(3, success=False, seen=0, filling=math.nan),
+        fake.shot(3, success=False, seen=-1, filling=math.nan),
     ]
     for shot in shots:
         tally.add("shot_finished", {"shot": shot})

@@ -61,9 +61,9 @@ def test_a_run_is_watched_to_its_end(watched: WatchedRun) -> None:
     )
     assert lines[0].endswith("3 shots, seed 1, profile virtual, simulated")
     assert lines[1:4] == [
-        "shot 1/3  defect-free in cycle 2  filling 100.0 %  1.9 s",
-        "shot 2: attempt 1 failed, trying again: TransientError: no light",
-        "shot 2/3  defect-free in cycle 2  filling 100.0 %  1.9 s",
+        "shot 0  defect-free after 2 cycles  filling 100.0 %  1.9 s",
+        "shot 1: attempt 0 failed, trying again: TransientError: no light",
+        "shot 1  defect-free after 2 cycles  filling 100.0 %  1.9 s",
     ]
     assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
 
@@ -107,7 +107,7 @@ def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: Watc
     path.write_text(
         "x\n" + "".join(f"{json.dumps(line)}\n" for line in odd) + path.read_text("utf-8"), "utf-8"
     )
-    assert any(line.startswith("shot 1/3") for line in watched.watch())
+    assert any(line.startswith("shot 0  ") for line in watched.watch())
 
 
 def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> tuple[labseq.Run, list[
 def test_each_point_is_reported_with_the_best_so_far(printed: tuple[labseq.Run, list[str]]) -> None:
     lines = [line for line in printed[1] if line.startswith("point ")]
     assert len(lines) == 5
-    assert lines[0].startswith(f"point 1 ({DOP} 2, shot.2.rearrange.window 60 ms): filling_fraction ")
+    assert lines[0].startswith(f"point 0 ({DOP} 2, shot.2.rearrange.window 60 ms): filling_fraction ")
     assert lines[0].endswith("best so far this")
     assert all("; best so far " in line for line in lines)
 

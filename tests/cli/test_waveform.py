@@ -47,17 +47,17 @@ def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
 
 
 def test_some_batches_are_named_in_report_and_title() -> None:
-    made = plan_waveform(WaveformRequest(REQUEST.plan, "2-3", REQUEST.sample_rate))
+    made = plan_waveform(WaveformRequest(REQUEST.plan, "1-2", REQUEST.sample_rate))
     n = made.moves.plan.n_batches
-    assert title(made).startswith(f"psca, degree of parallelism 7: batches 2 to 3 of {n}, ")
-    assert f"batches    2 to 3 of {n}" in report(made, made.statistics())
+    assert title(made).startswith(f"psca, degree of parallelism 7: batches 1 to 2 (2 of {n}), ")
+    assert f"batches    1 to 2 (2 of {n})" in report(made, made.statistics())
 
 
 def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     faint = [f"profile.mobile_tweezers.rf.row_amplitudes={[1e-9] * 20}"]
     plan = PlanRequest("random:20x20@0.75", "compact:3x3", seed=1, profile="virtual", overrides=faint)
-    request = WaveformRequest(plan, "1", "250 MHz")
+    request = WaveformRequest(plan, "0", "250 MHz")
     made = plan_waveform(request)
     row, column = made.statistics()
     assert (row.crest_factor, row.peak_v, row.mean_power_w) == (None, 0.0, 0.0)
@@ -100,7 +100,7 @@ BAD = [
     (["one.json"], "one.json: this is no plan; expected what 'labseq plan --json' writes"),
     (["half.json"], "half.json:1:13: this is no JSON: expecting value"),
     (["random:6x6@0.7"], "--target is missing"),
-    ([*WORDS, "--batches", "9-99"], "there are no such batches; expected a number from 1 to "),
+    ([*WORDS, "--batches", "9-99"], "there are no such batches; expected a number from 0 to "),
     ([*WORDS, "--batches", "first"], "--batches first: these are no batches"),
     ([*WORDS, "--sample-rate", "1"], "cannot be sampled at 1 Hz; expected more than 211.2 MHz"),
     ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),

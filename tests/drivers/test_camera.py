@@ -144,11 +144,11 @@ def test_a_software_trigger_belongs_to_a_series_with_one() -> None:
 @pytest.mark.parametrize(
     ("trigger", "n_triggered", "n_read", "reason"),
     [
-        ("software", 1, 0, "frame 1 of 3 is not ready"),
+        ("software", 1, 0, "frame 0 is not ready"),
         ("software", 1, 1, "the next one was not triggered"),
         ("software", 3, 3, "all 3 frames of the series were read"),
-        ("internal", 0, 1, "frame 2 of 3 is not ready"),
-        ("external", 0, 0, "frame 1 of 3 waits for its external trigger; check the line"),
+        ("internal", 0, 1, "frame 1 is not ready"),
+        ("external", 0, 0, "frame 0 waits for its external trigger; check the line"),
     ],
 )
 def test_a_timeout_says_why_and_takes_its_time(

@@ -25,7 +25,7 @@ def outcomes(bench: Bench, n_reads: int) -> list[int | str]:
 def test_a_gap_in_the_numbers_is_reported_once_and_the_next_frame_follows() -> None:
     bench = Bench(lose={1: ""})
     bench.fire(3)
-    said = "cam: frame 2 was lost, of a series of 3: the camera's frame numbers have a gap"
+    said = "cam: frame 1 was lost, of a series of 3: the camera's frame numbers have a gap"
     assert outcomes(bench, 3) == [0, said, 2]
     with pytest.raises(DeviceTimeoutError, match="all 3 frames of the series were read"):
         bench.read(0.0)
@@ -34,7 +34,7 @@ def test_a_gap_in_the_numbers_is_reported_once_and_the_next_frame_follows() -> N
 def test_several_frames_in_a_gap_are_reported_together() -> None:
     bench = Bench(lose={0: "", 1: "", 2: ""})
     bench.fire(5)
-    said = "cam: frames 1 to 3 were lost, of a series of 5: the camera's frame numbers have a gap"
+    said = "cam: frames 0 to 2 were lost, of a series of 5: the camera's frame numbers have a gap"
     assert outcomes(bench, 3) == [said, 3, 4]
 
 
@@ -42,16 +42,16 @@ def test_a_frame_that_the_camera_reports_as_lost_is_reported_with_its_reason() -
     bench = Bench(lose={0: "17 packets are missing", 2: "bad checksum"})
     bench.fire(3)
     assert outcomes(bench, 3) == [
-        "cam: frame 1 was lost, of a series of 3: 17 packets are missing",
+        "cam: frame 0 was lost, of a series of 3: 17 packets are missing",
         1,
-        "cam: frame 3 was lost, of a series of 3: bad checksum",
+        "cam: frame 2 was lost, of a series of 3: bad checksum",
     ]
 
 
 def test_a_frame_held_back_behind_a_gap_is_dropped_by_the_next_series() -> None:
     bench = Bench(lose={0: ""})
     bench.fire(2)
-    assert "frame 1 was lost" in str(outcomes(bench, 1)[0])
+    assert "frame 0 was lost" in str(outcomes(bench, 1)[0])
     bench.camera.arm(1, 0.01, "software")
     with pytest.raises(DeviceTimeoutError, match="was not triggered"):
         bench.read(0.0)

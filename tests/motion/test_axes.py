@@ -185,43 +185,43 @@ def program_of(*batches: Any, grid: SiteGrid = GRID, **rf: Any) -> ToneProgram:
         (
             FOUR,
             {"column_band_hz": (90e6, 101e6)},
-            "the frequency of column tone 3 in batch 2 is 102.4 MHz",
+            "the frequency of column tone 3 in batch 1 is 102.4 MHz",
             "the band of 90 to 101 MHz",
         ),
         (
             ([(3, 0)], [(2, 0)]),
             {"row_band_hz": (90e6, 102e6)},
-            "the frequency of row tone 0 in batch 2 is 102.4 MHz",
+            "the frequency of row tone 0 in batch 1 is 102.4 MHz",
             "the band of 90 to 102 MHz",
         ),
         (
             FOUR,
             {"min_spacing_hz": 1.7e6},
-            "the distance of column tones 0 and 1 in batch 2 is 1.6 MHz",
+            "the distance of column tones 0 and 1 in batch 1 is 1.6 MHz",
             "1.7 MHz at least, in the order of the sites",
         ),
         (
             ([(0, 0), (0, 2)], [(0, 4), (0, 1)]),
             {},
-            "the distance of column tones 0 and 1 in batch 2 is 0 MHz",
+            "the distance of column tones 0 and 1 in batch 1 is 0 MHz",
             "500 kHz at least, in the order of the sites",
         ),
         (
             FOUR,
             {"column_amplitudes": (0.3, *QUARTERS[1:])},
-            "the sum of the amplitudes of column tones 0 to 3 in batch 2 is 1.05 of full scale",
+            "the sum of the amplitudes of column tones 0 to 3 in batch 1 is 1.05 of full scale",
             "1: the output would clip",
         ),
         (
             FOUR,
             {"column_amplitudes": QUARTERS, "full_scale_v": 2.5},
-            "the peak voltage of column tones 0 to 3 in batch 2 is 2.5 V",
+            "the peak voltage of column tones 0 to 3 in batch 1 is 2.5 V",
             "2 V: more ruins the amplifier",
         ),
         (
             FOUR,
             {"column_amplitudes": QUARTERS, "amplifier_gain_db": 27.0},
-            "the mean RF power of column tones 0 to 3 in batch 2 is 3.21 W",
+            "the mean RF power of column tones 0 to 3 in batch 1 is 3.21 W",
             "3 W at the AOD",
         ),
         (
@@ -241,14 +241,14 @@ def test_what_would_be_too_much(batch: Any, rf: dict[str, Any], what: str, limit
 def test_amplitudes_that_change_on_the_way_may_be_too_loud_in_between() -> None:
     moves = ([(0, 1), (0, 4)], [(0, 0), (0, 5)])
     amplitudes = (0.1, 0.9, 0.1, 0.1, 0.1, 0.9)
-    with pytest.raises(LimitError, match=r"sum of the amplitudes of column tones 0 to 1 in batch 1 is 1\.28"):
+    with pytest.raises(LimitError, match=r"sum of the amplitudes of column tones 0 to 1 in batch 0 is 1\.28"):
         program_of(moves, column_amplitudes=amplitudes, max_mean_power_w=100.0)
 
 
 def test_frequencies_that_fall_along_the_grid() -> None:
     falling = SiteGrid(4, 6, column_frequency_hz=centred_comb(6, step_hz=-1.6e6))
     assert program_of(FOUR, grid=falling).n_segments == 4
-    with pytest.raises(LimitError, match=r"column tones 0 and 1 in batch 1 is 1\.6 MHz; the limit is 2 MHz"):
+    with pytest.raises(LimitError, match=r"column tones 0 and 1 in batch 0 is 1\.6 MHz; the limit is 2 MHz"):
         program_of(FOUR, grid=falling, min_spacing_hz=2e6)
 
 

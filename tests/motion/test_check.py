@@ -201,7 +201,7 @@ def test_the_error_names_the_batch_and_the_atom_move() -> None:
     error = refusal("##..", batch((0, 1, 0, 2)), batch((0, 2, 0, 3), (0, 1, 0, 2)))
     assert (error.batch, error.move, error.rule) == (1, 1, "source")
     assert str(error) == (
-        "planner 'test': batch 2, atom move 2 breaks the rule 'source': there is no atom on (0, 1)"
+        "planner 'test': batch 1, atom move 1 breaks the rule 'source': there is no atom on (0, 1)"
     )
 
 

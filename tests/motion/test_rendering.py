@@ -202,12 +202,12 @@ def test_chunks_come_in_the_callers_buffers_in_turn() -> None:
     [
         (
             (320e6, 1e8, 0.1, 0.1, 0.0),
-            r"start_hz of a row tone in batch 1 is 320000000.0; the limit is 0 to 312500000",
+            r"start_hz of a row tone in batch 0 is 320000000.0; the limit is 0 to 312500000",
         ),
-        ((1e8, 1e8, float("nan"), 0.1, 0.0), "start_amplitude of a row tone in batch 1 is nan"),
+        ((1e8, 1e8, float("nan"), 0.1, 0.0), "start_amplitude of a row tone in batch 0 is nan"),
         (
             (1e8, 1e8, 0.1, 0.96, 0.0),
-            "sum of the amplitudes of the row tones in batch 1 is 1.01; the limit is 1",
+            "sum of the amplitudes of the row tones in batch 0 is 1.01; the limit is 1",
         ),
     ],
 )
@@ -219,7 +219,7 @@ def test_what_cannot_be_played_is_refused(tone: Any, message: str) -> None:
 
 @pytest.mark.parametrize("duration_s", [-1e-6, float("nan")])
 def test_wrong_durations_are_refused(duration_s: float) -> None:
-    with pytest.raises(LimitError, match="duration of segment 0 in batch 1"):
+    with pytest.raises(LimitError, match="duration of segment 0 in batch 0"):
         render(program_of((duration_s, [])))
 
 

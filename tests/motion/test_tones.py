@@ -290,7 +290,7 @@ def test_what_takes_no_time_is_left_out() -> None:
 
 
 def test_what_cannot_be_played() -> None:
-    with pytest.raises(LimitError, match="column tones in batch 2 is 2; the limit is 1"):
+    with pytest.raises(LimitError, match="column tones in batch 1 is 2; the limit is 1"):
         program_of(batch((0, 0, 0, 1)), batch((0, 1, 0, 2), (0, 3, 0, 4)), max_column_tones=1)
     with pytest.raises(LimitError, match="speed profile is 'jerky'; the limit is one of 'constant', "):
         program_of(batch((0, 0, 0, 1)), speed_profile="jerky")

@@ -114,10 +114,10 @@ def test_a_batch_is_alone_while_there_is_room(batches: list[Lines]) -> None:
 def test_axes_are_kept_apart_while_there_is_room() -> None:
     panels = make_panels([*(("row", (i,)) for i in range(9)), *(("column", (i,)) for i in range(3))], 4)
     assert [panel.title for panel in panels] == [
-        "batches 1-3: rows 0-2",
-        "batches 4-6: rows 3-5",
-        "batches 7-9: rows 6-8",
-        "batches 10-12: columns 0-2",
+        "batches 0-2: rows 0-2",
+        "batches 3-5: rows 3-5",
+        "batches 6-8: rows 6-8",
+        "batches 9-11: columns 0-2",
     ]
 
 

@@ -88,7 +88,7 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it(driver: str) -> None:
         lab.camera.arm(1, 0.045, "software")
         start_s = lab.clock.now()
         lab.camera.trigger()
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 1 is not ready"):
+        with pytest.raises(DeviceTimeoutError, match="frame 0 is not ready"):
             lab.camera.read(0.045)
         assert lab.clock.now() - start_s == pytest.approx(0.045)
         frame = lab.camera.read(0.1)
@@ -100,7 +100,7 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it(driver: str) -> None:
 def test_an_external_trigger_that_never_comes_is_a_timeout(driver: str) -> None:
     with opened_rig(driver) as lab:
         lab.camera.arm(2, 0.01, "external")
-        with pytest.raises(DeviceTimeoutError, match="frame 1 of 2 waits for its external trigger; check"):
+        with pytest.raises(DeviceTimeoutError, match="frame 0 waits for its external trigger; check"):
             lab.camera.read(0.05)
         assert len(lab.take(1)) == 1
         lab.camera.arm(1, 0.01, "external")

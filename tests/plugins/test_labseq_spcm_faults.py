@@ -159,12 +159,12 @@ class TestPrograms:
     @pytest.mark.parametrize(
         ("name", "value", "text"),
         [
-            ("start_hz", 81e6, r"frequency of a row tone in batch 1 is .* 82 to 118 MHz"),
-            ("end_hz", 119e6, r"frequency of a row tone in batch 1 is .* 82 to 118 MHz"),
-            ("start_hz", np.nan, "frequency of a row tone in batch 1 is nan"),
-            ("start_amplitude", 1.5, r"amplitude of a row tone in batch 1 is 1\.5; .* 0 to 1 of full scale"),
-            ("end_amplitude", -0.1, r"amplitude of a row tone in batch 1 is -0\.1"),
-            ("phase_rad", np.nan, "phase of a row tone in batch 1 is nan"),
+            ("start_hz", 81e6, r"frequency of a row tone in batch 0 is .* 82 to 118 MHz"),
+            ("end_hz", 119e6, r"frequency of a row tone in batch 0 is .* 82 to 118 MHz"),
+            ("start_hz", np.nan, "frequency of a row tone in batch 0 is nan"),
+            ("start_amplitude", 1.5, r"amplitude of a row tone in batch 0 is 1\.5; .* 0 to 1 of full scale"),
+            ("end_amplitude", -0.1, r"amplitude of a row tone in batch 0 is -0\.1"),
+            ("phase_rad", np.nan, "phase of a row tone in batch 0 is nan"),
         ],
     )
     def test_with_wrong_tones_are_refused_before_anything_is_uploaded(

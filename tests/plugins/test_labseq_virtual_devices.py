@@ -258,9 +258,9 @@ def test_the_safe_state_drops_atoms_in_flight(lab: Lab) -> None:
     [
         (
             {"col_hz": 80e6},
-            r"column tone 0 in segment 0 \(batch 1\) is 80 MHz; the limit is the band of 82 to 118 MHz",
+            r"column tone 0 in segment 0 \(batch 0\) is 80 MHz; the limit is the band of 82 to 118 MHz",
         ),
-        ({"end_hz": 118.1e6}, r"column tone 0 in segment 1 \(batch 1\) is 118\.1 MHz"),
+        ({"end_hz": 118.1e6}, r"column tone 0 in segment 1 \(batch 0\) is 118\.1 MHz"),
         ({"row_hz": float("nan")}, "row tone 0 in segment 0"),
         ({"amplitude": 1.1}, r"amplitude of row tone 0 .* is 1\.1 of full scale"),
         ({"duration_s": 0.0}, "length of the program is 0 s"),
@@ -281,7 +281,7 @@ def test_tones_that_would_clip_together_are_refused(lab: Lab) -> None:
     two = AxisTones(np.array([0, 2], np.int32), hz, hz, on, on, np.zeros(2))
     one = axis([100e6, 100e6], [1.0, 1.0])
     clipping = ToneProgram(two, one, np.array([1e-3]), np.zeros(1, np.int8), np.array([7], np.int32))
-    with pytest.raises(LimitError, match=r"sum of the row amplitudes in segment 0 \(batch 8\) is 1\.2"):
+    with pytest.raises(LimitError, match=r"sum of the row amplitudes in segment 0 \(batch 7\) is 1\.2"):
         lab.mobile.prepare(clipping)
 
 

@@ -77,7 +77,7 @@ def _cycle(number: int, n_moves_per_batch: tuple[int, ...], rng: np.random.Gener
         n_surplus=2,
     )
     plan = _plan(n_moves_per_batch, rng)
-    return CycleRecord(2, number, plan, report, max(0, n - 1), 0.06, 0.5 + number, 0.0123)
+    return CycleRecord(2, number, plan, report, max(0, n - 1), 0.06, 1.5 + number, 0.0123)
 
 
 def _image(number: int, cycle: int, rng: np.random.Generator, frame_shape: tuple[int, int]) -> ImageRecord:
@@ -111,15 +111,15 @@ def make_shot(
         t_start_utc=START,
         t_end_utc="2026-11-20T10:00:01.250000+00:00",
         status="complete",
-        images=[_image(i, i, rng, frame_shape) for i in range(n_images)],
-        cycles=[_cycle(i, sizes, rng) for i, sizes in enumerate(batches, start=1)],
+        images=[_image(i, i - 1, rng, frame_shape) for i in range(n_images)],
+        cycles=[_cycle(i, sizes, rng) for i, sizes in enumerate(batches)],
         timing=[
-            StageTiming("load", 0, 0, 0.0, 0.5, 0.001),
-            StageTiming("plan", 2, 1, 0.5, 0.003, 0.003, 0.001),
-            StageTiming("plan", 2, 2, 0.6, 0.001, 0.003, 0.001),
-            StageTiming("prüfen", 2, 1, 0.5, 1e-9, 0.0, 0.01),
+            StageTiming("load", 0, -1, 0.0, 0.5, 0.001),
+            StageTiming("plan", 2, 0, 0.5, 0.003, 0.003, 0.001),
+            StageTiming("plan", 2, 1, 0.6, 0.001, 0.003, 0.001),
+            StageTiming("prüfen", 2, 0, 0.5, 1e-9, 0.0, 0.01),
         ],
-        seen_defect_free_cycle=2,
+        seen_defect_free_cycle=1,
         success=True,
         filling_fraction=0.875,
         n_missing_atoms=3,

@@ -54,7 +54,7 @@ def test_a_run_tells_what_it_was(run_dir: Path) -> None:
     assert "3 of 20 shots, complete" in repr(run)
     shot = run.shots[1]
     assert (shot.index, shot.attempt, shot.status, shot.success) == (1, 0, "complete", False)
-    assert (shot.filling_fraction, shot.seen_defect_free_cycle) == (0.5, 2)
+    assert (shot.filling_fraction, shot.seen_defect_free_cycle) == (0.5, 1)
     assert math.isnan(run.shots[2].filling_fraction)
     assert "Shot 1" in repr(shot)
 

@@ -54,7 +54,7 @@ def test_the_tables_hold_every_move() -> None:
     with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
         moves = file["entry/rearrangement/moves"][()]
         cycles = file["entry/rearrangement/cycles"][()]
-    assert list(moves["cycle"]) == [1] * 6 + [3]
+    assert list(moves["cycle"]) == [0] * 6 + [2]
     assert list(moves["batch"]) == [0, 0, 1, 2, 2, 2, 0]
     assert list(moves["played"]) == [True] * 3 + [False] * 4
     sites = np.stack([moves[name] for name in ("from_row", "from_col", "to_row", "to_col")], axis=1)

@@ -28,7 +28,7 @@ Defects = Sequence[int | None]
 
 @pytest.fixture
 def of_defects() -> Callable[..., ShotRecord]:
-    """Build a shot whose cycles leave so many defects; cycle k moves k atoms in k batches of k + 1."""
+    """Build a shot whose cycles leave so many defects; the k-th cycle moves k atoms in k batches of k + 1."""
     target = make_run().target
 
     def image(n_defects: int | None, cycle: int, t_start_s: float) -> ImageRecord:
@@ -43,19 +43,19 @@ def of_defects() -> Callable[..., ShotRecord]:
         offsets = np.arange(k + 2, dtype=np.int32)
         plan = Plan(np.zeros((k + 1, 4), np.int16), offsets, np.zeros(k + 1, np.bool_))
         report = PlanReport(target.fill, np.arange(1.0, k + 2), np.ones(k + 1, np.int32), 0, 0)
-        return CycleRecord(2, k, plan, report, k, 0.06, 0.5, 0.01)
+        return CycleRecord(2, k - 1, plan, report, k, 0.06, 0.5, 0.01)
 
     def shot(index: int, cycles: Defects, last: int | None = None, **readings: float) -> ShotRecord:
-        images = [image(4, 0, 0.5), *(image(d, k, 0.5 + 0.1 * k) for k, d in enumerate(cycles, start=1))]
+        images = [image(4, -1, 0.5), *(image(d, k, 0.6 + 0.1 * k) for k, d in enumerate(cycles))]
         if last is not None:
-            images.append(image(last, 0, 2.0))
+            images.append(image(last, -1, 2.0))
         return make_shot(
             index,
             images=images,
             cycles=[cycle(k) for k in range(1, len(cycles) + 1)],
             success=last == 0,
             filling_fraction=math.nan if last is None else 1 - last / 6,
-            seen_defect_free_cycle=cycles.index(0) + 1 if 0 in cycles else 0,
+            seen_defect_free_cycle=cycles.index(0) if 0 in cycles else -1,
             readings={f"simulation.{name.replace('__', '.')}": value for name, value in readings.items()},
         )
 

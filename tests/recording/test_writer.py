@@ -98,7 +98,7 @@ def test_the_index_tells_each_shot_in_a_line(tmp_path: Path) -> None:
         "t_end_utc": "2026-11-20T10:00:01.250000+00:00",
         "success": True,
         "filling_fraction": 0.875,
-        "seen_defect_free_cycle": 2,
+        "seen_defect_free_cycle": 1,
         "n_cycles": 3,
         "n_images": 3,
         "n_batches": 2,

@@ -252,7 +252,7 @@ def test_a_stage_over_its_budget_follows_its_policy(then: Any, statuses: list[st
         made.run()
     assert [shot.status for shot in made.sink.shots] == statuses
     warnings = [event["text"] for event in made.observer.of("warning")]
-    assert warnings == (["shot 1: 'step_0_slow' took 300 ms; its budget is 100 ms"] if then == "warn" else [])
+    assert warnings == (["shot 0: 'step_0_slow' took 300 ms; its budget is 100 ms"] if then == "warn" else [])
     (first, *_) = [timing for timing in made.sink.shots[0].timing if timing.stage == "step_0_slow"]
     assert first.over_budget
 
@@ -261,7 +261,7 @@ def test_the_budget_of_a_stage_is_the_profiles() -> None:
     made = Rig(policy=policy(StepPolicy(over_budget="warn")), budgets={"detect": 1e-3})
     slow_detector(made, 0.01).run()
     texts = [event["text"] for event in made.observer.of("warning")]
-    assert texts == ["shot 1: 'detect' took 10 ms; its budget is 1 ms"]
+    assert texts == ["shot 0: 'detect' took 10 ms; its budget is 1 ms"]
     assert {timing.stage: timing.budget_s for timing in made.record().timing}["detect"] == 1e-3
     made = Rig(policy=policy(StepPolicy(over_budget="stop")), budgets={"detect": 5e-3})
     slow_detector(made, 0.005).run()  # the budget of the step includes that of the detection

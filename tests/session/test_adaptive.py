@@ -135,7 +135,7 @@ def test_a_missing_figure_is_one_warning_and_no_score(tmp_path: Path) -> None:
     over = OVER.replace("filling_fraction", "reading.laser.power_w")
     run(tmp_path, f"use: scripted, dops: [3, 5], {over}, points: 2", observer=seen)
     (warning,) = [values["text"] for name, values in seen.events if name == "warning"]
-    assert warning.startswith("shot 1 has no 'reading.laser.power_w' to climb on")
+    assert warning.startswith("shot 0 has no 'reading.laser.power_w' to climb on")
     points = [values for name, values in seen.events if name == "scan_point"]
     assert [(values["value"], values["best"]) for values in points] == [(None, None)] * 2
 

@@ -40,7 +40,7 @@ def test_a_plan_that_breaks_a_rule_is_refused_with_the_files_name() -> None:
     row, col = np.argwhere(np.array(document["occupancy"]) == 0)[0].tolist()
     document["batches"] = [{"from": [[row, col]], "to": [[row, col - 1 if col else 1]], "linked": False}]
     words = (
-        rf"^plan\.json: batch 1, atom move 1 breaks the rule 'source': there is no atom on \({row}, {col}\)"
+        rf"^plan\.json: batch 0, atom move 0 breaks the rule 'source': there is no atom on \({row}, {col}\)"
     )
     with pytest.raises(ConfigError, match=words):
         read(document)

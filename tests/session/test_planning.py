@@ -145,7 +145,7 @@ def test_the_seed_repeats_the_occupancy_and_what_the_planner_draws(tmp_path: Pat
         ("raises", PlanError, "planner 'raises': plan() raised ZeroDivisionError: oh"),
         ("refuses", PlanError, "planner 'refuses': no plan today"),
         ("lies", PlanError, "planner 'lies'"),
-        ("breaks", InvalidPlanError, "planner 'breaks': batch 1, atom move 1 breaks the rule"),
+        ("breaks", InvalidPlanError, "planner 'breaks': batch 0, atom move 0 breaks the rule"),
         ("fails", PluginLoadError, "the constructor of planner 'fails' raised OSError: no licence"),
     ],
 )

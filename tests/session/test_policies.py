@@ -82,7 +82,7 @@ def test_a_shot_that_fails_again_and_again_is_skipped_and_the_run_complete(tmp_p
     assert [(shot.index, shot.attempt) for shot in done.attempts] == [(2, 0), (2, 1)]
     assert done.skipped == {2: "DeviceError: laser: went out of lock"}
     assert [event["text"] for event in seen.of("warning")] == [
-        "shot 3 is skipped: DeviceError: laser: went out of lock"
+        "shot 2 is skipped: DeviceError: laser: went out of lock"
     ]
     assert done.summary()["skipped"] == 1
     with pytest.raises(ConfigError, match="it is complete"):
@@ -250,8 +250,8 @@ def test_a_value_that_no_shot_has_is_one_warning(tmp_path: Path) -> None:
         with pytest.raises(labseq.StopRequested):
             session.run()
     assert [event["text"] for event in observer.of("warning")] == [
-        "shot 1 has no 'reading.laser.pwer_w' to check (did you mean 'reading.laser.power_w'?)",
-        "shot 1 has no 'stage.plan' to check (did you mean 'stage.plan_s'?)",
+        "shot 0 has no 'reading.laser.pwer_w' to check (did you mean 'reading.laser.power_w'?)",
+        "shot 0 has no 'stage.plan' to check (did you mean 'stage.plan_s'?)",
     ]
     assert session.run_dir is not None
     resumed(session.run_dir, seen)

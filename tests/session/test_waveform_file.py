@@ -18,7 +18,7 @@ REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
 
 @pytest.fixture(scope="module")
 def made() -> PlannedWaveform:
-    return plan_waveform(WaveformRequest(REQUEST, "2-3", "250 MHz"))
+    return plan_waveform(WaveformRequest(REQUEST, "1-2", "250 MHz"))
 
 
 def test_numpy_reads_what_the_awg_would_play(made: PlannedWaveform, tmp_path: Path) -> None:

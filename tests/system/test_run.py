@@ -47,7 +47,7 @@ def test_without_a_terminal_there_are_plain_lines(tmp_path: Path, capsys: pytest
     assert "\x1b" not in out
     lines = out.splitlines()
     assert any("1 shot, seed 3, profile virtual, simulated" in line for line in lines)
-    assert any(line.startswith("shot 1/1  ") for line in lines)
+    assert any(line.startswith("shot 0  ") for line in lines)
     assert any(line.startswith("run  ") and "out" in line for line in lines)
 
 
@@ -58,7 +58,7 @@ def test_check_opens_and_writes_nothing(
     with pytest.raises(SystemExit, match=r"^0$"):
         main(["check", str(SEQUENCE), "--set", "planner.degree_of_parallelism=5"])
     out = capsys.readouterr().out
-    for words in ("compact-225", "225 atoms", "cycle 10: image", "12 images at most", "60 ms", "uses 5"):
+    for words in ("compact-225", "225 atoms", "cycle 9: image", "12 images at most", "60 ms", "uses 5"):
         assert words in out
     assert list(tmp_path.iterdir()) == []
 
@@ -85,7 +85,7 @@ def test_a_run_that_is_stopped(tmp_path: Path) -> None:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
     ) as child:
         assert child.stderr is not None
-        while not child.stderr.readline().startswith("shot 1/"):
+        while not child.stderr.readline().startswith("shot 0  "):
             assert child.poll() is None
         child.send_signal(signal.SIGTERM)
         out, err = child.communicate(timeout=60)

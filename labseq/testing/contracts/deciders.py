@@ -200,7 +200,7 @@ class ScannerContract:
             for n in {0, 1, len(visited) // 2, len(visited)}:
                 answers = [_plain(one.next_point(_copies(visited[:n]))) for one in (scanner, factory(space))]
                 known = [_plain(visited[n].values)] if n < len(visited) else answers[:1]
-                assert answers == known * 2, f"on {what}, point {n + 1} was {known[0]}, and is {answers}"
+                assert answers == known * 2, f"on {what}, point {n} was {known[0]}, and is {answers}"
 
     @promise("the input is left untouched")
     def test_leaves_its_input_untouched(self, factory: ScannerFactory) -> None:

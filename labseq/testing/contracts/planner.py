@@ -197,7 +197,7 @@ def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
     for index, batch in enumerate(plan.batches):
         for row, col in batch.from_sites.tolist():
             if (row, col) not in held:
-                detail = f"batch {index + 1} takes an atom from ({row}, {col}); there is none"
+                detail = f"batch {index} takes an atom from ({row}, {col}); there is none"
                 raise ContractViolation(NO_ATOM_CREATED, detail)
             held.remove((row, col))
         held.update((row, col) for row, col in batch.to_sites.tolist())

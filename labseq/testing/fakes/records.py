@@ -252,7 +252,7 @@ def fake_shot(
     Example:
         >>> shot = fake_shot((3, 4), n_images=3, n_cycles=1)
         >>> shot.occupancies.shape, [image.cycle for image in shot.images]
-        ((3, 3, 4), [0, 1, 0])
+        ((3, 3, 4), [-1, 0, -1])
     """
     rng = np.random.default_rng((index, 87))
     fill = np.zeros(shape, np.bool_)
@@ -262,9 +262,9 @@ def fake_shot(
     images: list[ImageRecord] = []
     cycles: list[CycleRecord] = []
     for number in range(n_images):
-        cycle = number if 0 < number <= n_cycles else 0
-        step = 2 if cycle else 1 if number == 0 else 3
-        if cycle:
+        cycle = number - 1 if 0 < number <= n_cycles else -1
+        step = 2 if cycle >= 0 else 1 if number == 0 else 3
+        if cycle >= 0:
             plan = OneByOnePlanner().plan(atoms, target)
             report = check_plan(plan, atoms, target, degree_of_parallelism=1)
             cycles.append(CycleRecord(step, cycle, plan, report, plan.n_batches, 0.06, 0.06 * number, 0.05))
