@@ -11,7 +11,7 @@ REPLAY_EXAMPLES = """\b
 Examples:
   labseq replay data/2026-01-02/0001_compact-225
   labseq replay data/2026-01-02/0001_compact-225 --planner tetris
-  labseq replay data/2026-01-02/0001_compact-225 --dop 3 --shots 1,5-9
+  labseq replay data/2026-01-02/0001_compact-225 --dop 3 --shots 0,4-8
   labseq replay data/2026-01-02/0001_compact-225 --set profile.detector.threshold=1500
 """
 ANALYSE_EXAMPLES = """\b

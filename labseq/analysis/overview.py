@@ -289,7 +289,9 @@ def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
     """Histogram of the defects at the end of the shots, compared with independent sites."""
     cycles, n_sites = statistics.cycles, run.target.n_atoms
     counts = statistics.defects or (cycles[-1].defects if cycles else ())
-    end = "on the last image" if statistics.defects else f"after {len(cycles)} cycle{'s' * (len(cycles) != 1)}"
+    end = (
+        "on the last image" if statistics.defects else f"after {len(cycles)} cycle{'s' * (len(cycles) != 1)}"
+    )
     n_shots = sum(counts)
     if not n_shots or not n_sites:
         return None

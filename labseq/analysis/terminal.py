@@ -181,9 +181,7 @@ def _map(images: ReplayedImages) -> list[str]:
 
 
 def _failure_lines(found: Replay) -> list[str]:
-    lines = [
-        f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure
-    ]
+    lines = [f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure]
     lines += [f"shot {s}, image {i}: {text}" for (s, i), text in found.images.failures.items()]
     lines += [f"shot {shot} is left out: {text}" for shot, text in found.unreadable.items()]
     more = len(lines) - MAX_REPORTED

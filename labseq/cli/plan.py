@@ -139,7 +139,7 @@ def refused_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> list[Te
     atoms = moves.report.predicted
     ways = zip(map(tuple, batch.from_sites.tolist()), map(tuple, batch.to_sites.tolist()), strict=True)
     return [
-        Text.assemble((f"batch {error.batch} of {plan.n_batches}", "bold"), "  ", ("refused", "bold red")),
+        Text.assemble((f"batch {error.batch}", "bold"), "  ", ("refused", "bold red")),
         Text("  " + ", ".join(f"{start}{arrow}{goal}" for start, goal in ways)),
         *canvas.lines(titles, (atoms, atoms), marked),
         Text(f"rule '{error.rule}': {error.detail}", "red"),

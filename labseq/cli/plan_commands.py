@@ -69,7 +69,8 @@ def plan(
         typer.Argument(
             metavar="OCCUPANCY",
             help="A .npy file; a text file of 0 and 1, or '-' for such a text on standard input; the shot "
-            "file run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on, counted from 0; default: 0); or "
+            "file run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on, counted from 0; "
+            "default: 0); or "
             "random:20x20@0.75 (each site filled with that probability).",
             show_default=False,
         ),

@@ -135,7 +135,9 @@ def statistics_rows(statistics: Statistics) -> list[tuple[str, str]]:
     if one.defects:
         rows.append(("defects", histogram_text(one.defects)))
     elif one.cycles and not is_judged:
-        rows.append(("defects", f"{histogram_text(one.cycles[-1].defects)}, after {plural(len(one.cycles), 'cycle')}"))
+        rows.append(
+            ("defects", f"{histogram_text(one.cycles[-1].defects)}, after {plural(len(one.cycles), 'cycle')}")
+        )
     if one.too_short.n:
         rows.append(("window", f"too short in {count_of(one.too_short.n, one.too_short.n_trials)}"))
     if one.losses:

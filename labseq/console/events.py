@@ -60,9 +60,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
             return shot_text(values["shot"], run)
         case "shot_repeated":
             shot: ShotRecord = values["shot"]
-            return (
-                f"shot {shot.shot_index}: attempt {shot.attempt} failed, trying again: {shot.error}"
-            )
+            return f"shot {shot.shot_index}: attempt {shot.attempt} failed, trying again: {shot.error}"
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
             return f"warning: {values['device']} could not be {task}: {values['error']}"
@@ -103,7 +101,9 @@ def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
 def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
     """A line about a shot that is over."""
     if shot.status != "complete":
-        return f"shot {shot.shot_index}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
+        return f"shot {shot.shot_index}  {shot.status}" + (
+            f": {shot.error}" if shot.status == "failed" else ""
+        )
     n_atoms = run.target.n_atoms if run is not None else 0
     ended = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)
     parts = [f"shot {shot.shot_index}", ended]

@@ -174,7 +174,9 @@ SHOT: Final = (
     Field("t_end_utc", "text", "wall time of its end, ISO 8601, UTC"),
     Field("success", "bool", "whether the last image step met the target"),
     Field("filling_fraction", "float64", "filling of the target on the last image step; nan without one"),
-    Field("seen_defect_free_cycle", "int64", "index of the first cycle whose image met the target; -1 if none"),
+    Field(
+        "seen_defect_free_cycle", "int64", "index of the first cycle whose image met the target; -1 if none"
+    ),
     Field("n_images", "int64", "number of images"),
     Field("n_cycles", "int64", "number of rearrangement cycles"),
     Field("n_batches", "int64", "batches that were played"),
@@ -224,7 +226,11 @@ IMAGES: Final = Table(
     "all images, whether their frames were kept or not",
     (
         _STEP,
-        Field("cycle", "i4", "index of the rearrangement cycle that it ended, from 0; -1 for that of an image step"),
+        Field(
+            "cycle",
+            "i4",
+            "index of the rearrangement cycle that it ended, from 0; -1 for that of an image step",
+        ),
         Field("t_start_s", "f8", "start of the exposure, from the start of the shot"),
         Field("exposure_s", "f8", "exposure time"),
         Field(

@@ -291,7 +291,7 @@ class RunningShot:
         name = self._name_of_image(cycle)
         image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s, name, signal)
         self.record.images.append(image)
-        if 0 <= cycle and self.record.seen_defect_free_cycle < 0 and self.target.is_met_by(occupancy):
+        if cycle >= 0 and self.record.seen_defect_free_cycle < 0 and self.target.is_met_by(occupancy):
             self.record.seen_defect_free_cycle = cycle
         self._emit("image", {"image": image, "filling_fraction": self.target.filling_fraction(occupancy)})
         return occupancy
