@@ -217,6 +217,35 @@ def _a(dimension: str) -> str:
     return f"an {dimension}" if dimension[0] in "aeiou" else f"a {dimension}"
 
 
+_LADDERS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "time": ("s", "ms", "us", "ns"),
+        "length": ("m", "mm", "um", "nm"),
+        "frequency": ("GHz", "MHz", "kHz", "Hz"),
+        "speed": ("um/ms",),
+        "voltage": ("V", "mV", "uV"),
+        "power": ("W", "mW", "uW"),
+        "temperature": ("K", "mK", "uK"),
+        "angle": ("deg",),
+        "fraction": ("%",),
+    }
+)
+"""Dimension -> the units that values are shown in, the largest first."""
+
+
+def readable_unit(value: float, dimension: str) -> str:
+    """The unit that a physicist would choose for an SI value.
+
+    Example:
+        >>> readable_unit(0.045, "time"), readable_unit(15e-6, "temperature")
+        ('ms', 'uK')
+    """
+    units, ladder = UNITS[dimension], _LADDERS[dimension]
+    if value == 0:
+        return next((u for u in ladder if units[u] == 1.0), ladder[-1])
+    return next((u for u in ladder if abs(value) >= units[u] * (1 - 1e-9)), ladder[-1])
+
+
 def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     """Format an SI value with the unit that a physicist would choose.
 
@@ -230,22 +259,7 @@ def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
         >>> format_quantity(1e300, "time")
         '1e+300 s'
     """
-    ladders = {
-        "time": ("s", "ms", "us", "ns"),
-        "length": ("m", "mm", "um", "nm"),
-        "frequency": ("GHz", "MHz", "kHz", "Hz"),
-        "speed": ("um/ms",),
-        "voltage": ("V", "mV", "uV"),
-        "power": ("W", "mW", "uW"),
-        "temperature": ("K", "mK", "uK"),
-        "angle": ("deg",),
-        "fraction": ("%",),
-    }
-    units = UNITS[dimension]
-    ladder = ladders[dimension]
-    unit = next((u for u in ladder if abs(value) >= units[u] * (1 - 1e-9)), ladder[-1])
-    if value == 0:
-        unit = next((u for u in ladder if units[u] == 1.0), ladder[-1])
+    units, unit = UNITS[dimension], readable_unit(value, dimension)
     amount = value / units[unit]
     number = f"{amount:.{digits}g}"
     if "e" in number and abs(amount) < _READABLE:

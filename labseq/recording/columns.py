@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from labseq.model.records import STEP
 from labseq.plain import dumps
 from labseq.recording import schema
-from labseq.recording.reader import Run
+from labseq.recording.results import result_columns
 from labseq.recording.run_file import SIMULATION
 from labseq.recording.schema import unit_of
 from labseq.recording.shot import Shot
 from labseq.units import si_unit_of
+
+if TYPE_CHECKING:
+    from labseq.recording.reader import Run
 
 _Row: TypeAlias = Mapping[str, Any]
 
@@ -47,6 +50,8 @@ _TEXTS: Final = frozenset({"file", *(field.name for field in _FIELDS if field.dt
 
 FIGURES: Final = tuple(name for name in DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
 """Columns of every run that are numerical results of a shot."""
+FRACTIONS: Final = frozenset({"success", "filling_fraction"})
+"""Those of them that are shown in per cent."""
 
 
 def _readings(row: _Row) -> dict[str, Any]:
@@ -93,6 +98,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
         shots: The shots of the rows; by default those that count.
     """
     rows = [shot.row for shot in (run.shots if shots is None else shots)]
+    analysed = result_columns(run.path)
     fixed = [_fixed(row) for row in rows]
     columns = [
         Column(name, _array([values[name] for values in fixed], text=name in _TEXTS), unit_of(name), about)
@@ -110,6 +116,9 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
             units = (written.get(name, "") if not prefix else "") or unit_of(name)
             about = _description(prefix, name, scanned=name in written)
             columns.append(Column(full_name, _array([group.get(name) for group in groups]), units, about))
+    for name, values in analysed.items():
+        of_rows = [values.get(row["shot"]) if row["counts"] else None for row in rows]
+        columns.append(Column(name, _array(of_rows), unit_of(name), "result of an analysis"))
     return columns
 
 

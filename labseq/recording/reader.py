@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from labseq.recording.quantities import Quantity
+
 
 def open_run(path: str | Path) -> Run:
     """Open a recorded run, which may be finished, still running or killed.
@@ -165,6 +167,23 @@ class Run:
             RecordingError: There are no results of that name, or they cannot be read.
         """
         return rows_of(self.path, name)
+
+    def quantity(self, name: str) -> Quantity:
+        """A quantity of the run's shots, by name.
+
+        Args:
+            name: "survival:before,after", "filling:before", the name of a numerical column of
+                :meth:`to_dataframe`, or "analysis.NAME.KEY".
+
+        Raises:
+            ConfigError: The run has no such quantity; lists those that it has.
+
+        Example:
+            ``run.quantity("survival:before,after").over(run.shots)`` is the mean over all shots, with its error.
+        """
+        from labseq.recording.quantities import find_quantity
+
+        return find_quantity(self, name)
 
     def summary(self) -> dict[str, Any]:
         """The main results of the run, JSON-ready; None for a missing number."""

@@ -107,3 +107,21 @@ def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
         hint = f"'labseq analyse {run_dir} --use {name}' makes them"
         raise RecordingError(path, f"there are no results of the analysis '{name}', {there}; {hint}")
     return read_results(path)[0]
+
+
+def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
+    """The results of all analyses that are single values: "analysis.NAME.KEY" -> shot -> value.
+
+    Raises:
+        RecordingError: They cannot be read.
+    """
+    found: dict[str, dict[int, Any]] = {}
+    for path in sorted((run_dir / folders.RESULTS_FOLDER).glob(f"*{_SUFFIX}")):
+        rows, about = read_results(path)
+        for row in rows:
+            for key, value in row.items():
+                if key not in (SHOT, ERROR) and isinstance(value, bool | int | float | str):
+                    found.setdefault(f"analysis.{about.get('analysis', path.stem)}.{key}", {})[row[SHOT]] = (
+                        value
+                    )
+    return found

@@ -1,0 +1,391 @@
+"""Fits of a quantity against a scanned value, with lmfit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import ConfigError, Problem, one_of
+from labseq.messages import clean, did_you_mean
+from labseq.model.estimate import Estimate, Estimated
+from labseq.units import UNITS, dimension_of, parse_any, readable_unit
+
+Floats = NDArray[np.float64]
+
+BOLTZMANN: Final = 1.380649e-23
+"""J/K (CODATA 2018)."""
+RB87_U, ATOMIC_MASS_KG = 86.909180531, 1.66053906660e-27
+"""Mass of 87Rb (AME2020), and the unit that it is in (CODATA 2018)."""
+N_ATOMS: Final = 20_000
+"""Number of atoms in the model of release and recapture."""
+RELATIVE_STEP: Final = 0.02
+"""Relative step of a parameter for the derivatives of that model, large enough to see through its noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitModel:
+    """A function that can be fitted.
+
+    Attributes:
+        formula: The function of x.
+        units: Parameter -> its unit: "x", "y" or "y/x" for those of the data, or an SI unit.
+        evaluate: The function: x and the parameters.
+        guess: Starting values from x, y and the known parameters.
+        fixed: Parameters that are fixed unless the user frees them; nan if the user must give the value.
+        at_least: Smallest values.
+        relative_step: For the derivatives; 0 for the smallest that is useful.
+    """
+
+    formula: str
+    units: Mapping[str, str]
+    evaluate: Callable[..., Floats]
+    guess: Callable[[Floats, Floats], dict[str, float]]
+    fixed: Mapping[str, float]
+    at_least: Mapping[str, float]
+    relative_step: float = 0.0
+
+
+def _exponential(x: Floats, amplitude: float, decay: float, offset: float) -> Floats:
+    return amplitude * np.exp(-x / decay) + offset
+
+
+def _guess_exponential(x: Floats, y: Floats) -> dict[str, float]:
+    positive = y > 0.02 * y.max()
+    slope = np.polyfit(x[positive], np.log(y[positive]), 1)[0] if positive.sum() > 1 else 0.0
+    return {"amplitude": float(y[0]), "decay": -1 / slope if slope < 0 else float(np.ptp(x)), "offset": 0.0}
+
+
+def _peak(x: Floats, y: Floats) -> tuple[float, float, float, float]:
+    """Offset, height, centre and full width at half maximum of a peak or a dip."""
+    offset = (
+        float(np.median(np.sort(y)[[0, 1, -2, -1]])) if len(y) < 6 else float(np.median(y[[0, 1, -2, -1]]))
+    )
+    at = int(np.argmax(np.abs(y - offset)))
+    within = x[np.abs(y - offset) >= abs(y[at] - offset) / 2]
+    spacing = float(np.ptp(x)) / (len(x) - 1)
+    return offset, float(y[at] - offset), float(x[at]), max(float(np.ptp(within)), spacing)
+
+
+def _gaussian(x: Floats, amplitude: float, centre: float, sigma: float, offset: float) -> Floats:
+    return amplitude * np.exp(-((x - centre) ** 2) / (2 * sigma**2)) + offset
+
+
+def _guess_gaussian(x: Floats, y: Floats) -> dict[str, float]:
+    offset, height, centre, width = _peak(x, y)
+    return {"amplitude": height, "centre": centre, "sigma": width / 2.355, "offset": offset}
+
+
+def _lorentzian(x: Floats, amplitude: float, centre: float, fwhm: float, offset: float) -> Floats:
+    return amplitude / (1 + (2 * (x - centre) / fwhm) ** 2) + offset
+
+
+def _guess_lorentzian(x: Floats, y: Floats) -> dict[str, float]:
+    offset, height, centre, width = _peak(x, y)
+    return {"amplitude": height, "centre": centre, "fwhm": width, "offset": offset}
+
+
+def _linear(x: Floats, slope: float, intercept: float) -> Floats:
+    return slope * x + intercept
+
+
+def _guess_linear(x: Floats, y: Floats) -> dict[str, float]:
+    slope, intercept = np.polyfit(x, y, 1)
+    return {"slope": float(slope), "intercept": float(intercept)}
+
+
+@cache
+def _draws() -> Floats:
+    """Standard normal positions and velocities of atoms, float64 (6, n): the same ones for every temperature."""
+    return np.random.default_rng(0).standard_normal((6, N_ATOMS))
+
+
+def _release_recapture(
+    x: Floats,
+    temperature: float,
+    amplitude: float,
+    depth: float,
+    waist: float,
+    wavelength: float,
+    mass: float,
+) -> Floats:
+    """Fraction of atoms that a Gaussian tweezer recaptures after they flew freely for a time.
+
+    Atoms start from the Boltzmann distribution in the harmonic part of the trap, restricted to bound ones,
+    and fly straight on. An atom is recaptured if its kinetic energy is less than the depth of the trap at
+    its new place (Tuchendler et al., Phys. Rev. A 78, 033425, 2008). Gravity is left out.
+
+    Args:
+        x: Times without the trap, in s.
+        temperature: Temperature in K.
+        amplitude: Recaptured fraction at x = 0.
+        depth: Depth of the trap in K.
+        waist: 1/e^2 radius of its intensity in m.
+        wavelength: Its wavelength in m.
+        mass: Mass of an atom in atomic mass units.
+    """
+    eta = depth / temperature
+    rayleigh = math.pi * waist**2 / wavelength
+    speed = math.sqrt(BOLTZMANN * temperature / (mass * ATOMIC_MASS_KG))
+    size = np.array([waist / 2, waist / 2, rayleigh / math.sqrt(2)])[:, None] / math.sqrt(eta)
+    places, velocities = size * _draws()[:3], speed * _draws()[3:]
+    kinetic = (_draws()[3:] ** 2).sum(axis=0) / 2  # in kT
+
+    def is_bound(at: Floats) -> NDArray[np.bool_]:
+        width = 1 + (at[2] / rayleigh) ** 2
+        trap: Floats = eta / width * np.exp(-2 * (at[0] ** 2 + at[1] ** 2) / (waist**2 * width))
+        return kinetic < trap
+
+    start = is_bound(places)
+    n_bound = max(1, int(start.sum()))
+    recaptured = [np.count_nonzero(is_bound(places + t * velocities) & start) for t in x]
+    return amplitude * np.array(recaptured, np.float64) / n_bound
+
+
+def _guess_release(x: Floats, y: Floats) -> dict[str, float]:
+    return {"temperature": 20e-6, "amplitude": float(np.clip(y[np.argmin(x)], 0.05, 1.0))}
+
+
+MODELS: Final[Mapping[str, FitModel]] = {
+    "exponential": FitModel(
+        "amplitude exp(-x / decay) + offset",
+        {"amplitude": "y", "decay": "x", "offset": "y"},
+        _exponential,
+        _guess_exponential,
+        {"offset": 0.0},
+        {},
+    ),
+    "gaussian": FitModel(
+        "amplitude exp(-(x - centre)^2 / (2 sigma^2)) + offset",
+        {"amplitude": "y", "centre": "x", "sigma": "x", "offset": "y"},
+        _gaussian,
+        _guess_gaussian,
+        {},
+        {"sigma": 0.0},
+    ),
+    "lorentzian": FitModel(
+        "amplitude / (1 + (2 (x - centre) / fwhm)^2) + offset",
+        {"amplitude": "y", "centre": "x", "fwhm": "x", "offset": "y"},
+        _lorentzian,
+        _guess_lorentzian,
+        {},
+        {"fwhm": 0.0},
+    ),
+    "linear": FitModel(
+        "slope x + intercept", {"slope": "y/x", "intercept": "y"}, _linear, _guess_linear, {}, {}
+    ),
+    "release_recapture": FitModel(
+        "recapture of atoms after a free flight of duration x",
+        {"temperature": "K", "amplitude": "y", "depth": "K", "waist": "m", "wavelength": "m", "mass": ""},
+        _release_recapture,
+        _guess_release,
+        {"depth": math.nan, "waist": math.nan, "wavelength": math.nan, "mass": RB87_U},
+        {"temperature": 1e-9, "amplitude": 0.0},
+        RELATIVE_STEP,
+    ),
+}
+"""The models that ``--fit`` offers. An offset of an exponential is fixed at 0 unless it is freed."""
+
+SETTINGS: Final = {"depth": "static_depth", "waist": "static_waist", "wavelength": "static_wavelength"}
+"""Parameter -> the setting of the profile's simulation that it is read from unless the user gives it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A fit.
+
+    Attributes:
+        model: Name of the model.
+        values: Parameter -> its value with its error, SI; the error is 0 if it was fixed.
+        units: Parameter -> SI unit; "%" for a fraction.
+        chi2: Reduced chi-square; nan if the points have no errors.
+        n_points: Number of points.
+    """
+
+    model: str
+    values: Mapping[str, Estimate]
+    units: Mapping[str, str]
+    chi2: float
+    n_points: int
+
+    def at(self, x: Floats) -> Floats:
+        """The fitted function at values of x in SI."""
+        return MODELS[self.model].evaluate(x, **{name: one.value for name, one in self.values.items()})
+
+    def lines(self) -> list[str]:
+        """The result, a line for each parameter."""
+        chi2 = "-, the points have no errors" if math.isnan(self.chi2) else f"{self.chi2:.2f}"
+        width = max(map(len, (*self.values, "chi-square")))
+        return [
+            f"fit {self.model}: {MODELS[self.model].formula}",
+            *(
+                f"  {name.ljust(width)}  {parameter_text(one, self.units[name])}"
+                for name, one in self.values.items()
+            ),
+            f"  {'chi-square'.ljust(width)}  {chi2} (reduced, {self.n_points} points)",
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The result, JSON-ready, SI."""
+        parameters = {
+            name: {
+                "value": one.value,
+                "error": one.error,
+                "unit": "" if self.units[name] == "%" else self.units[name],
+            }
+            for name, one in self.values.items()
+        }
+        return {
+            "model": self.model,
+            "parameters": parameters,
+            "reduced_chi_square": self.chi2,
+            "points": self.n_points,
+        }
+
+
+def parameter_text(value: Estimate, unit: str) -> str:
+    """A value with its error in a readable unit.
+
+    Example:
+        >>> parameter_text(Estimate(32.9, 0.8), "s"), parameter_text(Estimate(15e-6, 0), "K")
+        ('32.9(8) s', '15 uK (fixed)')
+        >>> parameter_text(Estimate(0.97, 0.01), "%"), parameter_text(Estimate(-0.02, 0.001), "%/s")
+        ('97(1) %', '-2.0(1) %/s')
+    """
+    dimension, factor = dimension_of(unit), 1.0
+    if unit.startswith("%"):
+        factor = 0.01
+    elif dimension:
+        unit = readable_unit(value.value, dimension)
+        factor = UNITS[dimension][unit]
+    shown = f"{value.scaled(1 / factor)} {unit}".rstrip()
+    return shown if value.error else f"{shown} (fixed)"
+
+
+def fit_points(
+    model: str,
+    x: Sequence[float],
+    values: Sequence[Estimated],
+    units: tuple[str, str],
+    given: Mapping[str, str] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Fit:
+    """Fit a model to points, weighted with their errors.
+
+    Args:
+        model: A name of :data:`MODELS`.
+        x: The scanned values, SI.
+        values: A mean at each; those that are nan are left out.
+        units: SI units of both; "%" for a fraction.
+        given: Parameter -> its value with a unit, at which it is fixed, or "free".
+        settings: Settings of the profile's simulation.
+
+    Raises:
+        ConfigError: There are too few points, a parameter is missing, or the fit fails; says which.
+    """
+    if model not in MODELS:
+        raise _problem(f"there is no fit '{clean(model)}'", one_of([*MODELS]), did_you_mean(model, MODELS))
+    chosen = MODELS[model]
+    rows = [
+        (at, one.value, _error(one)) for at, one in zip(x, values, strict=True) if not math.isnan(one.value)
+    ]
+    at, y, error = np.array(sorted(rows), np.float64).reshape(-1, 3).T
+    fixed = _fixed(chosen, given or {}, settings or {})
+    free = [name for name in chosen.units if name not in fixed]
+    if len(np.unique(at)) <= len(free):
+        what = (
+            f"{len(np.unique(at))} points are too few for a fit of {len(free)} parameters ({', '.join(free)})"
+        )
+        raise _problem(what, f"at least {len(free) + 1} different values with a result")
+    known = np.isfinite(error) & (error > 0)
+    sigma = np.where(known, error, error[known].max(initial=0.0)) if known.any() else np.ones_like(y)
+    start = {**chosen.guess(at, y), **fixed}
+    values_of, chi2 = _minimise(chosen, at, y, sigma, start, fixed, is_weighted=bool(known.any()))
+    x_unit, y_unit = units
+    named = {"x": x_unit, "y": y_unit, "y/x": f"{y_unit}/{x_unit}" if x_unit else y_unit}
+    in_units = {name: named.get(unit, unit) for name, unit in chosen.units.items()}
+    return Fit(model, values_of, in_units, chi2, len(at))
+
+
+def _minimise(
+    model: FitModel,
+    x: Floats,
+    y: Floats,
+    sigma: Floats,
+    start: Mapping[str, float],
+    fixed: Mapping[str, float],
+    *,
+    is_weighted: bool,
+) -> tuple[dict[str, Estimate], float]:
+    import lmfit  # takes a second
+
+    parameters: Any = lmfit.Parameters()
+    for name in model.units:
+        parameters.add(name, start[name], vary=name not in fixed, min=model.at_least.get(name, -math.inf))
+
+    def residual(now: Any) -> Floats:
+        return (model.evaluate(x, **now.valuesdict()) - y) / sigma
+
+    options = {"epsfcn": model.relative_step**2} if model.relative_step else {}
+    try:
+        result: Any = lmfit.minimize(residual, parameters, scale_covar=not is_weighted, **options)
+    except (ValueError, FloatingPointError, OverflowError) as error:
+        raise _problem(f"the fit failed: {error}", "points that follow the model") from error
+    found = {
+        name: Estimate(float(one.value), float(one.stderr or math.nan) if one.vary else 0.0)
+        for name, one in result.params.items()
+    }
+    unknown = [
+        name for name, one in found.items() if not math.isfinite(one.error) or not math.isfinite(one.value)
+    ]
+    if not result.success or unknown:
+        which = f": {', '.join(unknown)} cannot be determined" if unknown else ""
+        raise _problem(f"the fit did not converge{which}", "points that follow the model, over a wider range")
+    return found, float(result.redchi) if is_weighted else math.nan
+
+
+def _error(value: Estimated) -> float:
+    low, high = value.interval
+    return (high - low) / 2
+
+
+def _fixed(model: FitModel, given: Mapping[str, str], settings: Mapping[str, Any]) -> dict[str, float]:
+    """The parameters that are not fitted."""
+    fixed = dict(model.fixed)
+    for name, key in SETTINGS.items():
+        if name in fixed and isinstance(settings.get(key), int | float):
+            fixed[name] = float(settings[key])
+    for name, text in given.items():
+        if name not in model.units:
+            raise _problem(
+                f"the fit has no parameter '{clean(name)}'",
+                one_of([*model.units]),
+                did_you_mean(name, model.units),
+            )
+        fixed.pop(name, None)
+        if text != "free":
+            fixed[name] = _value(name, text)
+    missing = [name for name, value in fixed.items() if math.isnan(value)]
+    if missing:
+        what = f"the fit needs {' and '.join(missing)}, which the run's profile does not have"
+        raise _problem(what, " ".join(f"--fit-set {name}=VALUE" for name in missing))
+    return fixed
+
+
+def _value(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        try:
+            return parse_any(text)[0]
+        except ValueError as error:
+            raise _problem(f"{name}: {error}", "a number with its unit, or 'free'") from error
+
+
+def _problem(what: str, expected: str, hint: str = "") -> ConfigError:
+    return ConfigError(Problem(what, "--fit", expected=expected, hint=hint))

@@ -1,0 +1,341 @@
+"""The quantities of a run: every number that its shots have, by name, with its unit and its error.
+
+Tables, plots, fits, exports, adaptive scans and checks all take their values from here.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.messages import clean, closest
+from labseq.model import CycleRecord, ImageRecord, Occupancy
+from labseq.model.estimate import Estimated, Rate, mean
+from labseq.recording.columns import FRACTIONS, figures_in
+from labseq.recording.results import result_columns
+from labseq.recording.schema import unit_of
+from labseq.recording.shot import Shot
+from labseq.units import parse_any
+
+if TYPE_CHECKING:
+    from labseq.recording.reader import Run
+
+MAX_LOOKED_AT: Final = 20
+"""Maximum number of shots in which the names of images are looked up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quantity:
+    """A number that each shot has, or a count of events in a number of trials.
+
+    Attributes:
+        name: Its name: "survival:before,after", "stage.plan_s".
+        unit: Its SI unit; "" for none.
+        is_rate: Whether it counts events: shots are then added up, and the error is the Jeffreys interval;
+            otherwise it is the standard error of the mean over shots.
+        is_fraction: Whether it is shown in per cent.
+        events_of: A shot -> its value and 1, or its number of events and of trials; nan or 0 trials without.
+    """
+
+    name: str
+    unit: str
+    is_rate: bool
+    is_fraction: bool
+    events_of: Callable[[Shot], tuple[float, float]]
+
+    def of_shot(self, shot: Shot) -> float:
+        """The value of a shot; nan if it has none, or its file cannot be read."""
+        n, n_trials = self._events(shot)
+        return n / n_trials if n_trials else math.nan
+
+    def over(self, shots: Iterable[Shot]) -> Estimated:
+        """The mean over those shots that have a value, with its error."""
+        events = [one for one in map(self._events, shots) if one[1] and not math.isnan(one[0])]
+        if self.is_rate:
+            return Rate(round(sum(n for n, _ in events)), round(sum(n for _, n in events)))
+        return mean([n / n_trials for n, n_trials in events])
+
+    def _events(self, shot: Shot) -> tuple[float, float]:
+        try:
+            return self.events_of(shot)
+        except RecordingError:
+            return math.nan, 0
+
+
+def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occupancy, Occupancy]:
+    """Where atoms are after cycles without losses.
+
+    Args:
+        before: bool (n_rows, n_cols), the image that the first cycle was planned on.
+        cycles: The cycles, in order.
+
+    Returns:
+        The sites of moved atoms and of those that stayed, bool (n_rows, n_cols).
+    """
+    atoms, moved = before.copy(), np.zeros_like(before)
+    for cycle in cycles:
+        for batch in cycle.plan.batches[: cycle.n_batches_played]:
+            start, end = tuple(batch.from_sites.T), batch.to_sites
+            carried = atoms[start]
+            atoms[start] = moved[start] = False
+            inside = carried & ((end >= 0) & (end < before.shape)).all(axis=1)
+            atoms[tuple(end[inside].T)] = moved[tuple(end[inside].T)] = True
+    return moved, atoms & ~moved
+
+
+def named_images(shot: Shot) -> dict[str, ImageRecord]:
+    """The images of a shot by name: that of the step, with the cycle that the image ended."""
+    steps: Sequence[Mapping[str, Any]] = (shot.provenance["resolved"] or {}).get("shot", ())
+    names = [str(step.get("name") or next((key for key in step if key != "policy"), "")) for step in steps]
+    found: dict[str, ImageRecord] = {}
+    for image in shot.images:
+        name = names[image.step] if image.step < len(names) else "image"
+        if names.count(name) > 1:
+            name = f"{name}_{names[: image.step].count(name)}"
+        name += f"_cycle_{image.cycle}" if image.cycle > 0 else ""
+        found[name if name not in found else f"{name}_{len(found)}"] = image
+    return found
+
+
+def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
+    """The image of a name, or of an index counted from 0."""
+    images = shot.images
+    if not name:
+        return images[default] if images else None
+    if name.isdecimal():
+        return images[int(name)] if int(name) < len(images) else None
+    return named_images(shot).get(name)
+
+
+def _survival(shot: Shot, before: str = "", after: str = "") -> tuple[float, float]:
+    first, last = _image(shot, before, 0), _image(shot, after, -1)
+    if first is None or last is None or first.t_start_s >= last.t_start_s:
+        return math.nan, 0
+    place = (first.step, first.cycle), (last.step, last.cycle)
+    moved, held = follow_atoms(
+        first.occupancy, (cycle for cycle in shot.cycles if place[0] < (cycle.step, cycle.cycle) <= place[1])
+    )
+    return int(np.sum((moved | held) & last.occupancy)), int(np.sum(moved | held))
+
+
+def _loading(shot: Shot, name: str = "") -> tuple[float, float]:
+    image = _image(shot, name, 0)
+    return (math.nan, 0) if image is None else (float(image.occupancy.mean()), 1)
+
+
+def _filling(shot: Shot, name: str = "") -> tuple[float, float]:
+    if not name:
+        if not math.isnan(shot.filling_fraction):
+            return shot.filling_fraction, 1
+        if not len(shot.summary.images):
+            return math.nan, 0
+    image = _image(shot, name, -1)
+    return (math.nan, 0) if image is None else (shot.target.filling_fraction(image.occupancy), 1)
+
+
+def _defect_free(shot: Shot, name: str = "") -> tuple[float, float]:
+    if not name:
+        images = shot.summary.images
+        if not math.isnan(shot.filling_fraction):
+            return shot.success, 1
+        return (not images.n_defects[-1] and not images.n_surplus[-1], 1) if len(images) else (math.nan, 0)
+    image = _image(shot, name, -1)
+    return (math.nan, 0) if image is None else (shot.target.is_met_by(image.occupancy), 1)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageQuantity:
+    """A quantity of one or two images.
+
+    Attributes:
+        about: Its description.
+        n_images: Number of images that its name may give.
+        is_rate: See :class:`Quantity`.
+        events_of: Its value, see :class:`Quantity`; takes a shot and the names of the images.
+    """
+
+    about: str
+    n_images: int
+    is_rate: bool
+    events_of: Callable[..., tuple[float, float]]
+
+
+OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
+    "survival": ImageQuantity(
+        "atoms of an image that a later one still shows, at the sites to which they were moved; "
+        "by default from the first image to the last",
+        2,
+        True,
+        _survival,
+    ),
+    "filling": ImageQuantity("share of the target's sites with an atom; last image", 1, False, _filling),
+    "defect_free": ImageQuantity("whether the target is met; last image", 1, True, _defect_free),
+    "loading": ImageQuantity("share of all sites with an atom; first image", 1, False, _loading),
+}
+"""Quantities that follow from images; a name may give the images: "filling:before"."""
+
+
+def split_name(name: str) -> tuple[str, tuple[str, ...]]:
+    """Split the name of a quantity into its kind and its images.
+
+    Example:
+        >>> split_name("survival:before,after"), split_name("stage.plan_s")
+        (('survival', ('before', 'after')), ('stage.plan_s', ()))
+    """
+    kind, colon, images = name.partition(":")
+    return (kind, tuple(image.strip() for image in images.split(","))) if colon else (name, ())
+
+
+def make_quantity(name: str, results: Mapping[str, Mapping[int, Any]] | None = None) -> Quantity:
+    """A quantity of a name that has been checked.
+
+    Args:
+        name: Its name.
+        results: The results of analyses: name -> shot -> value.
+    """
+    kind, images = split_name(name)
+    if kind in OF_IMAGES:
+        one = OF_IMAGES[kind]
+        return Quantity(name, "", one.is_rate, True, lambda shot: one.events_of(shot, *images))
+    of_shots = (results or {}).get(name)
+    is_rate = name == "success" or (of_shots is not None and {*map(type, of_shots.values())} == {bool})
+
+    def events_of(shot: Shot) -> tuple[float, float]:
+        found = figures_in(shot.row).get(name) if of_shots is None else of_shots.get(shot.index)
+        return (math.nan, 0) if found is None else (float(found), 1)
+
+    return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
+
+
+def quantity_problem(
+    name: str, columns: Collection[str], images: Collection[str], open_prefixes: tuple[str, ...] = ()
+) -> tuple[str, str, str] | None:
+    """What is wrong with the name of a quantity: what, expected and hint; None if it is right.
+
+    Args:
+        name: The name.
+        columns: The known names of quantities without images.
+        images: The known names of images; none to accept any.
+        open_prefixes: Prefixes of names that are not known beforehand.
+    """
+    kind, given = split_name(name)
+    if kind not in OF_IMAGES:
+        if not given and (name in columns or name.startswith(open_prefixes or ("\0",))):
+            return None
+        near = closest(kind, [*OF_IMAGES, *columns])
+        hint = f"did you mean '{near}'?" if near else ""
+        forms = ("survival:IMAGE,IMAGE", *(f"{kind}[:IMAGE]" for kind in OF_IMAGES if kind != "survival"))
+        names = ", ".join([*forms, *columns, *(f"{prefix}<name>" for prefix in open_prefixes)])
+        return f"there is no quantity '{clean(name)}'", f"one of {names}", hint
+    if given and len(given) != OF_IMAGES[kind].n_images:
+        wanted = "two images: survival:IMAGE,IMAGE" if kind == "survival" else f"one image: {kind}:IMAGE"
+        return f"'{clean(name)}' names {len(given)}", wanted, ""
+    for image in given:
+        known = image in images or image.isdecimal() or any(image.startswith(f"{i}_") for i in images)
+        if images and not known:
+            near = closest(image, images)
+            what = f"there is no image '{clean(image)}' for '{clean(name)}'"
+            return what, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
+    return None
+
+
+def image_names(run: Run) -> list[str]:
+    """The names of the images of a run's first shots, in order."""
+    found = dict[str, None]()
+    for shot in run.shots[:MAX_LOOKED_AT]:
+        try:
+            found |= dict.fromkeys(named_images(shot))
+        except RecordingError:
+            continue
+    return [*found]
+
+
+def column_names(run: Run) -> list[str]:
+    """The names of the quantities of a run that need no image."""
+    names = dict.fromkeys(name for shot in run.shots[:MAX_LOOKED_AT] for name in figures_in(shot.row))
+    return [*names, *_numbers(run)]
+
+
+def _numbers(run: Run) -> dict[str, dict[int, Any]]:
+    """The results of analyses that are numbers."""
+    return {
+        name: values
+        for name, values in result_columns(run.path).items()
+        if all(isinstance(value, bool | int | float) for value in values.values())
+    }
+
+
+def find_quantity(run: Run, name: str) -> Quantity:
+    """A quantity of a run.
+
+    Raises:
+        ConfigError: The run has no such quantity; lists those that it has.
+    """
+    images = image_names(run) if split_name(name)[1] else []
+    problem = quantity_problem(name, column_names(run), images)
+    if problem is not None:
+        what, expected, hint = problem
+        raise ConfigError(Problem(what, clean(run.path.name), expected=expected, hint=hint))
+    _check_no_load(run, name)
+    return make_quantity(name, _numbers(run))
+
+
+def _check_no_load(run: Run, name: str) -> None:
+    """Refuse survival between images with a loading between them, as far as the run's record tells."""
+    kind, images = split_name(name)
+    steps: Sequence[Mapping[str, Any]] = (run.record.get("resolved") or {}).get("shot", ())
+    loads = [i for i, step in enumerate(steps) if "load" in step]
+    if kind != "survival" or not loads or not run.shots:
+        return
+    try:
+        first, last = (
+            _image(run.shots[0], image, at) for image, at in zip(images or ("", ""), (0, -1), strict=True)
+        )
+    except RecordingError:
+        return
+    if first is not None and last is not None and any(first.step < i < last.step for i in loads):
+        what = f"atoms are loaded between the images of '{clean(name)}'"
+        raise ConfigError(
+            Problem(what, clean(run.path.name), expected="two images without a 'load' between them")
+        )
+
+
+_CONDITION: Final = re.compile(r"\s*(\S+?)\s*(==|!=|>=|<=|>|<)\s*(\S.*?)\s*\Z")
+_COMPARE: Final[Mapping[str, Callable[[float, float], bool]]] = {
+    "==": lambda a, b: math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12),
+    "!=": lambda a, b: not math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12),
+    ">=": operator.ge,
+    "<=": operator.le,
+    ">": operator.gt,
+    "<": operator.lt,
+}
+
+
+def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
+    """The shots of a run that meet every condition, such as "filling:before == 1".
+
+    Raises:
+        ConfigError: A condition cannot be read, or names no quantity of the run.
+    """
+    shots = tuple(run.shots)
+    for condition in conditions:
+        match = _CONDITION.match(condition)
+        if match is None:
+            what = f"this is no condition: '{clean(condition)}'"
+            raise ConfigError(Problem(what, "--where", expected="for example 'filling:before == 1'"))
+        quantity, compare = find_quantity(run, match[1]), _COMPARE[match[2]]
+        try:
+            limit = float(match[3]) if re.fullmatch(r"[-+.\deE]+", match[3]) else parse_any(match[3])[0]
+        except ValueError as error:
+            raise ConfigError(
+                Problem(str(error), "--where", expected="a number, or one with a unit")
+            ) from error
+        shots = tuple(shot for shot in shots if compare(quantity.of_shot(shot), limit))
+    return shots
