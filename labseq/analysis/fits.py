@@ -24,6 +24,8 @@ RB87_U, ATOMIC_MASS_KG = 86.909180531, 1.66053906660e-27
 """Mass of 87Rb (AME2020), and the unit that it is in (CODATA 2018)."""
 N_ATOMS: Final = 20_000
 """Number of atoms in the model of release and recapture."""
+MAX_ERROR: Final = 10.0
+"""Largest error of a parameter, relative to its value or to the range of the points."""
 RELATIVE_STEP: Final = 0.02
 """Relative step of a parameter for the derivatives of that model, large enough to see through its noise."""
 
@@ -101,7 +103,7 @@ def _guess_linear(x: Floats, y: Floats) -> dict[str, float]:
 
 @cache
 def _draws() -> Floats:
-    """Standard normal positions and velocities of atoms, float64 (6, n): the same ones for every temperature."""
+    """Standard normal positions and velocities of atoms, float64 (6, n): the same ones every time."""
     return np.random.default_rng(0).standard_normal((6, N_ATOMS))
 
 
@@ -181,7 +183,7 @@ MODELS: Final[Mapping[str, FitModel]] = {
     ),
     "release_recapture": FitModel(
         "recapture of atoms after a free flight of duration x",
-        {"temperature": "K", "amplitude": "y", "depth": "K", "waist": "m", "wavelength": "m", "mass": ""},
+        {"temperature": "K", "amplitude": "y", "depth": "K", "waist": "m", "wavelength": "m", "mass": "u"},
         _release_recapture,
         _guess_release,
         {"depth": math.nan, "waist": math.nan, "wavelength": math.nan, "mass": RB87_U},
@@ -306,6 +308,7 @@ def fit_points(
     sigma = np.where(known, error, error[known].max(initial=0.0)) if known.any() else np.ones_like(y)
     start = {**chosen.guess(at, y), **fixed}
     values_of, chi2 = _minimise(chosen, at, y, sigma, start, fixed, is_weighted=bool(known.any()))
+    _check_determined(chosen, values_of, at, y)
     x_unit, y_unit = units
     named = {"x": x_unit, "y": y_unit, "y/x": f"{y_unit}/{x_unit}" if x_unit else y_unit}
     in_units = {name: named.get(unit, unit) for name, unit in chosen.units.items()}
@@ -331,7 +334,7 @@ def _minimise(
     def residual(now: Any) -> Floats:
         return (model.evaluate(x, **now.valuesdict()) - y) / sigma
 
-    options = {"epsfcn": model.relative_step**2} if model.relative_step else {}
+    options: dict[str, Any] = {"epsfcn": model.relative_step**2} if model.relative_step else {}
     try:
         result: Any = lmfit.minimize(residual, parameters, scale_covar=not is_weighted, **options)
     except (ValueError, FloatingPointError, OverflowError) as error:
@@ -340,13 +343,25 @@ def _minimise(
         name: Estimate(float(one.value), float(one.stderr or math.nan) if one.vary else 0.0)
         for name, one in result.params.items()
     }
-    unknown = [
-        name for name, one in found.items() if not math.isfinite(one.error) or not math.isfinite(one.value)
-    ]
-    if not result.success or unknown:
-        which = f": {', '.join(unknown)} cannot be determined" if unknown else ""
-        raise _problem(f"the fit did not converge{which}", "points that follow the model, over a wider range")
+    if not result.success:
+        raise _problem("the fit did not converge", "points that follow the model, over a wider range")
     return found, float(result.redchi) if is_weighted else math.nan
+
+
+def _check_determined(model: FitModel, values: Mapping[str, Estimate], x: Floats, y: Floats) -> None:
+    """Refuse a fit with an error that is far larger than the range of the points."""
+    ranges = {"x": float(np.ptp(x)), "y": float(np.ptp(y)), "y/x": float(np.ptp(y) / np.ptp(x))}
+    unknown = [
+        name
+        for name, one in values.items()
+        if not math.isfinite(one.error)
+        or one.error > MAX_ERROR * max(abs(one.value), ranges.get(model.units[name], 0.0))
+    ]
+    if unknown:
+        what = f"the points do not determine {' and '.join(unknown)}"
+        raise _problem(
+            what, "points that follow the model, over a wider range; or fewer parameters (--fit-set)"
+        )
 
 
 def _error(value: Estimated) -> float:

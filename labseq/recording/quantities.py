@@ -90,20 +90,6 @@ def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occu
     return moved, atoms & ~moved
 
 
-def named_images(shot: Shot) -> dict[str, ImageRecord]:
-    """The images of a shot by name: that of the step, with the cycle that the image ended."""
-    steps: Sequence[Mapping[str, Any]] = (shot.provenance["resolved"] or {}).get("shot", ())
-    names = [str(step.get("name") or next((key for key in step if key != "policy"), "")) for step in steps]
-    found: dict[str, ImageRecord] = {}
-    for image in shot.images:
-        name = names[image.step] if image.step < len(names) else "image"
-        if names.count(name) > 1:
-            name = f"{name}_{names[: image.step].count(name)}"
-        name += f"_cycle_{image.cycle}" if image.cycle > 0 else ""
-        found[name if name not in found else f"{name}_{len(found)}"] = image
-    return found
-
-
 def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
     """The image of a name, or of an index counted from 0."""
     images = shot.images
@@ -111,7 +97,7 @@ def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
         return images[default] if images else None
     if name.isdecimal():
         return images[int(name)] if int(name) < len(images) else None
-    return named_images(shot).get(name)
+    return next((image for image in images if image.name == name), None)
 
 
 def _survival(shot: Shot, before: str = "", after: str = "") -> tuple[float, float]:
@@ -251,7 +237,7 @@ def image_names(run: Run) -> list[str]:
     found = dict[str, None]()
     for shot in run.shots[:MAX_LOOKED_AT]:
         try:
-            found |= dict.fromkeys(named_images(shot))
+            found |= dict.fromkeys(image.name for image in shot.images)
         except RecordingError:
             continue
     return [*found]

@@ -179,7 +179,7 @@ class Run:
             ConfigError: The run has no such quantity; lists those that it has.
 
         Example:
-            ``run.quantity("survival:before,after").over(run.shots)`` is the mean over all shots, with its error.
+            ``run.quantity("survival:before,after").over(run.shots)`` is its mean, with the error.
         """
         from labseq.recording.quantities import find_quantity
 

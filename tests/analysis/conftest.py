@@ -48,3 +48,36 @@ def compact(tmp_path_factory: pytest.TempPathFactory) -> Run:
         sequence, profile=str(profile), shots=2, seed=1, output=root, overrides=("record_frames=all",)
     ) as session:
         return session.run()
+
+
+LIFETIME = """
+labseq: 1
+name: lifetime
+profile: virtual
+target: {pattern: compact, rows: 15, cols: 15}
+scan:
+  shot.hold.duration: [1 s, 5 s, 10 s, 20 s, 40 s, 80 s]
+repeats: 2
+order: shuffled
+record_frames: none
+analysis:
+  - {use: survival}
+shot:
+  - load: {duration: 500 ms}
+  - name: before
+    image: {exposure: 45 ms}
+  - name: hold
+    wait: {duration: 1 s}
+  - name: after
+    image: {exposure: 45 ms}
+"""
+
+
+@pytest.fixture(scope="session")
+def lifetime(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A lifetime scan of 12 shots in the virtual lab."""
+    root = tmp_path_factory.mktemp("lifetime")
+    (root / "lifetime.yaml").write_text(LIFETIME, "utf-8")
+    profile = ROOT / "hardware_profiles" / "virtual.yaml"
+    with labseq.Session.open(root / "lifetime.yaml", profile=str(profile), seed=2, output=root) as session:
+        return session.run()

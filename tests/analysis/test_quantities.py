@@ -1,0 +1,159 @@
+"""Quantities of a run by name, at the points of a scan, and fits of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+import labseq
+from labseq.analysis.fits import MODELS, Fit, fit_points
+from labseq.errors import ConfigError
+from labseq.model import CycleRecord, Plan, PlanReport
+from labseq.model.estimate import Estimate, Estimated, Rate
+from labseq.recording.points import scan_points
+from labseq.recording.quantities import follow_atoms, select_shots
+
+
+def at_points(run: labseq.Run, name: str) -> list[Estimated]:
+    quantity = run.quantity(name)
+    return [quantity.over(point.shots) for point in scan_points(run)]
+
+
+def test_survival_between_named_images_is_counted_atom_by_atom(lifetime: labseq.Run) -> None:
+    shot = lifetime.shots[0]
+    before, after = shot.occupancies
+    quantity = lifetime.quantity("survival:before,after")
+    assert quantity.over([shot]) == Rate(int((before & after).sum()), int(before.sum()))
+    assert lifetime.quantity("survival:0,1").over([shot]) == quantity.over([shot])
+    assert lifetime.quantity("survival").over([shot]) == quantity.over([shot])
+
+
+def test_atoms_are_followed_through_the_batches_that_were_played() -> None:
+    before = np.array([[True, True, False, True]])
+    batches = [([(0, 1)], [(0, 2)]), ([(0, 3)], [(0, 9)]), ([(0, 2)], [(0, 1)])]
+    report = PlanReport(before, np.zeros(3), np.ones(3, np.int32), 0, 0)
+    cycle = CycleRecord(0, 0, Plan.from_batches(batches), report, 2, 0.1, 0.0, 0.0)
+    moved, held = follow_atoms(before, [cycle])
+    assert (moved.tolist(), held.tolist()) == ([[False, False, True, False]], [[True, False, False, False]])
+
+
+def test_every_recorded_or_analysed_number_is_a_quantity(lifetime: labseq.Run) -> None:
+    survival = [one.value for one in at_points(lifetime, "survival:before,after")]
+    analysed = lifetime.quantity("analysis.survival.survival")
+    assert [analysed.of_shot(shot) for shot in lifetime.shots] == pytest.approx(
+        lifetime.to_dataframe()["analysis.survival.survival"].tolist()
+    )
+    assert [one.value for one in at_points(lifetime, "analysis.survival.survival")] == pytest.approx(
+        survival, abs=0.01
+    )
+    assert lifetime.to_xarray(occupancies=False)["analysis.survival.survival"].dims == (
+        "shot.hold.duration",
+        "repeat",
+    )
+    held = at_points(lifetime, "stage.step_2_hold_s")
+    assert [one.value for one in held] == pytest.approx([1, 5, 10, 20, 40, 80])
+    assert lifetime.quantity("stage.step_2_hold_s").unit == "s"
+    assert isinstance(at_points(lifetime, "filling:before")[0], Estimate)
+
+
+@pytest.mark.parametrize(
+    ("name", "printed"),
+    [
+        ("survivl:before,after", "no quantity 'survivl:before,after'; expected one of survival:IMAGE,IMAGE"),
+        ("survivl:before,after", "did you mean 'survival'?"),
+        (
+            "survival:befor,after",
+            "no image 'befor' for 'survival:befor,after'; expected one of before, after; did",
+        ),
+        ("survival:before", "names 1; expected two images"),
+        ("filing_fraction", "did you mean 'filling_fraction'?"),
+    ],
+)
+def test_a_wrong_name_is_answered_with_the_nearest(lifetime: labseq.Run, name: str, printed: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        lifetime.quantity(name)
+    assert printed in str(caught.value)
+
+
+def test_shots_are_selected_by_any_quantity(lifetime: labseq.Run) -> None:
+    chosen = select_shots(lifetime, ["loading:before > 0.74", "stage.step_2_hold_s <= 10 s"])
+    wanted = [
+        s
+        for s in lifetime.shots
+        if s.occupancies[0].mean() > 0.74 and s.parameters["shot.hold.duration"] <= 10
+    ]
+    assert 0 < len(chosen) < 6
+    assert list(chosen) == wanted
+    with pytest.raises(ConfigError, match="this is no condition: 'before full'"):
+        select_shots(lifetime, ["before full"])
+
+
+def test_a_lifetime_scan_gives_the_lifetime_of_the_profile(lifetime: labseq.Run) -> None:
+    x = [point.parameters["shot.hold.duration"] for point in scan_points(lifetime)]
+    fit = fit_points("exponential", x, at_points(lifetime, "survival:before,after"), ("s", "%"))
+    assert abs(fit.values["decay"].value - 33.0) < fit.values["decay"].error < 1.5
+    assert 0.2 < fit.chi2 < 2
+    assert "  decay       33(1) s" in fit.lines()
+
+
+TRAP = {"static_depth": 300e-6, "static_waist": 0.98e-6, "static_wavelength": 808e-9}
+TRUTH = {
+    "exponential": {"amplitude": 0.9, "decay": 0.03, "offset": 0.05},
+    "gaussian": {"amplitude": -0.6, "centre": 0.041, "sigma": 0.006, "offset": 0.9},
+    "lorentzian": {"amplitude": 0.5, "centre": 0.055, "fwhm": 0.02, "offset": 0.1},
+    "linear": {"slope": -3.0, "intercept": 0.7},
+    "release_recapture": {"temperature": 25e-6, "amplitude": 0.98},
+}
+
+
+def fitted(model: str, n: int = 15, given: dict[str, str] | None = None, settings: object = TRAP) -> Fit:
+    """A fit to points of the model with normal errors."""
+    x = np.linspace(2e-6, 60e-6, n) if model == "release_recapture" else np.linspace(0.0, 0.1, n)
+    rest = (
+        {"depth": 300e-6, "waist": 0.98e-6, "wavelength": 808e-9, "mass": 87.0}
+        if model == "release_recapture"
+        else {}
+    )
+    y = MODELS[model].evaluate(x, **TRUTH[model], **rest) + np.random.default_rng(3).normal(0, 0.01, n)
+    values: Sequence[Estimated] = [Estimate(float(one), 0.01) for one in y]
+    return fit_points(
+        model, x.tolist(), values, ("s", "%"), given, settings if isinstance(settings, dict) else {}
+    )
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_each_model_finds_its_parameters_from_its_own_starting_values(model: str) -> None:
+    found = fitted(model, given={"offset": "free"} if model == "exponential" else {})
+    for name, true in TRUTH[model].items():
+        one = found.values[name]
+        assert abs(one.value - true) < 3 * one.error < 0.5 * abs(true)
+    assert 0.3 < found.chi2 < 2.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "printed"),
+    [
+        (
+            {"model": "linear", "n": 2},
+            "2 points are too few for a fit of 2 parameters (slope, intercept); expected",
+        ),
+        ({"model": "release_recapture", "settings": None}, "the fit needs depth and waist and wavelength"),
+        ({"model": "linear", "given": {"slop": "1"}}, "the fit has no parameter 'slop'; expected one of"),
+        ({"model": "linear", "given": {"slope": "fast"}}, "slope: 'fast' is no number with a unit"),
+    ],
+)
+def test_a_fit_that_cannot_be_made_is_refused(arguments: dict[str, object], printed: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        fitted(**arguments)  # type: ignore[arg-type]
+    assert printed in str(caught.value)
+
+
+def test_points_that_do_not_determine_the_parameters_are_refused() -> None:
+    flat = [Estimate(0.5 + 0.001 * (-1) ** i, 0.01) for i in range(8)]
+    with pytest.raises(ConfigError, match=r"the points do not determine|did not converge"):
+        fit_points("gaussian", [float(i) for i in range(8)], flat, ("s", "%"))
+    with pytest.raises(ConfigError, match=r"there is no fit 'gausian'.*did you mean 'gaussian'"):
+        fit_points("gausian", [1.0], [Estimate(1.0, math.nan)], ("", ""))
