@@ -39,6 +39,7 @@ from labseq.hookspecs import LABSEQ_API, hookimpl
 from labseq.kernel import const, kernel
 from labseq.messages import clean, closest, visible
 from labseq.model import (
+    COMPUTER,
     AxisTones,
     Batch,
     CalibrationEntry,
@@ -67,9 +68,11 @@ from labseq.model import (
     ShotRecord,
     SiteGrid,
     TargetPattern,
+    TimedBy,
     TimelineEntry,
     ToneProgram,
     TweezerAmplitudes,
+    TweezersFacts,
     VisitedPoint,
     Waveform,
     as_occupancy,
@@ -139,6 +142,7 @@ from labseq.units import UNITS, ZERO_CELSIUS_K, expected, format_quantity, parse
 
 __all__ = [
     "BROKEN",
+    "COMPUTER",
     "LABSEQ_API",
     "UNITS",
     "WHOLE_SENSOR",
@@ -231,12 +235,14 @@ __all__ = [
     "TargetPattern",
     "Temperature",
     "Text",
+    "TimedBy",
     "TimelineEntry",
     "ToneProgram",
     "ToneSource",
     "TransientError",
     "Trigger",
     "TweezerAmplitudes",
+    "TweezersFacts",
     "UnknownPluginError",
     "VisitedPoint",
     "Voltage",

@@ -34,6 +34,8 @@ def labseq_register(registry: Registry) -> None:
         LoadStep,
         RampSettings,
         RampStep,
+        ReleaseSettings,
+        ReleaseStep,
         WaitSettings,
         wait_step,
     )
@@ -44,6 +46,7 @@ def labseq_register(registry: Registry) -> None:
     registry.step("image", ImageStep, ImageSettings)
     registry.step("rearrange", RearrangeStep, RearrangeSettings)
     registry.step("ramp", RampStep, RampSettings)
+    registry.step("release", ReleaseStep, ReleaseSettings)
     registry.step("probe", ProbeStep, ProbeSettings)
     registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
     registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)

@@ -34,6 +34,7 @@ from labseq.plugin import (
     SiteGrid,
     Step,
     StepContext,
+    TimedBy,
     TimelineEntry,
     format_quantity,
 )
@@ -82,7 +83,8 @@ class ProbeStep(Step):
         """
         settings = self.settings
         duration_s = longest_s(context, self._offsets_m(context.grid), settings)
-        return [TimelineEntry("probe", duration_s, duration_s if settings.sites == "all" else 0.0)]
+        min_duration_s = duration_s if settings.sites == "all" else 0.0
+        return [TimelineEntry("probe", duration_s, min_duration_s, timed_by=TimedBy("mobile_tweezers"))]
 
     def run(self, shot: Shot) -> None:
         """Hold the atoms that were seen on the last image, or those of all sites."""
@@ -258,11 +260,11 @@ class CheckOverlayStep(Step):
         offsets_m = self._offsets_m(context.grid.shape)
         probe_s = longest_s(context, offsets_m, settings)
         image_s = settings.exposure + context.camera.readout_s
+        min_s = image_s if settings.every == 1 else 0.0
+        awg, camera = TimedBy("mobile_tweezers"), TimedBy("camera")
         return [
-            TimelineEntry("check overlay: probe", probe_s, 0.0),
-            TimelineEntry(
-                "check overlay: image", image_s, image_s if settings.every == 1 else 0.0, 1, settings.exposure
-            ),
+            TimelineEntry("check overlay: probe", probe_s, 0.0, timed_by=awg),
+            TimelineEntry("check overlay: image", image_s, min_s, 1, settings.exposure, timed_by=camera),
         ]
 
     def run(self, shot: Shot) -> None:

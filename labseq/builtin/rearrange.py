@@ -21,6 +21,7 @@ from labseq.plugin import (
     Shot,
     Step,
     StepContext,
+    TimedBy,
     TimelineEntry,
     ToneProgram,
     check_plan,
@@ -93,9 +94,12 @@ class RearrangeStep(Step):
         for cycle in range(self.settings.cycles):
             window_s = self.settings.window_of(cycle)
             min_duration_s, min_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
-            moves = TimelineEntry(f"cycle {cycle}: move", window_s, min_duration_s, kind="rearrange")
-            image = TimelineEntry(f"cycle {cycle}: image", image_s, min_image_s, 1, exposure_s, "image")
-            entries += [moves, image]
+            moves, image = f"cycle {cycle}: move", f"cycle {cycle}: image"
+            awg, camera = TimedBy("mobile_tweezers"), TimedBy("camera")
+            entries += [
+                TimelineEntry(moves, window_s, min_duration_s, kind="rearrange", timed_by=awg),
+                TimelineEntry(image, image_s, min_image_s, 1, exposure_s, "image", camera),
+            ]
         return entries
 
     def run(self, shot: Shot) -> None:

@@ -1,4 +1,4 @@
-"""The basic steps: load, image, wait, device, ramp."""
+"""The basic steps: load, image, wait, device, ramp, release."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from labseq.plugin import (
+    COMPUTER,
     ConfigError,
     Duration,
     Fraction,
     LabseqError,
+    Problem,
     Settings,
     Shot,
     Step,
     StepContext,
     Text,
+    TimedBy,
     TimelineEntry,
     empty_is,
     find_leader,
@@ -43,8 +46,8 @@ class LoadStep(Step):
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One entry."""
-        duration_s = self.settings.duration + context.margin_s("load")
-        return [TimelineEntry("load", duration_s, duration_s, kind="load")]
+        duration_s, timed_by = self.settings.duration + context.margin_s("load"), context.timed_by("load")
+        return [TimelineEntry("load", duration_s, duration_s, kind="load", timed_by=timed_by)]
 
     def run(self, shot: Shot) -> None:
         """Wait while the atom source is on."""
@@ -75,7 +78,7 @@ class ImageStep(Step):
         """One entry, read-out included."""
         exposure_s = self.settings.exposure
         image_s = exposure_s + context.camera.readout_s + context.margin_s("image")
-        return [TimelineEntry("image", image_s, image_s, 1, exposure_s, "image")]
+        return [TimelineEntry("image", image_s, image_s, 1, exposure_s, "image", TimedBy("camera"))]
 
     def run(self, shot: Shot) -> None:
         """Take the image and judge the shot on it."""
@@ -104,8 +107,10 @@ class RampStep(Step):
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One entry."""
-        duration_s = self.settings.duration + context.margin_s("ramp")
-        return [TimelineEntry(f"ramp to {self.settings.depth:g}", duration_s, duration_s, kind="ramp")]
+        duration_s, facts = self.settings.duration + context.margin_s("ramp"), context.static_tweezers
+        label = f"ramp to {self.settings.depth:g}"
+        by = TimedBy("static_tweezers", facts.resolution_s)
+        return [TimelineEntry(label, duration_s, duration_s, 0, 0.0, "ramp", by, facts.latency_s)]
 
     def run(self, shot: Shot) -> None:
         """Ramp, and wait for the end."""
@@ -113,7 +118,60 @@ class RampStep(Step):
         limit_s = duration_s + shot.call_timeout_s
         with shot.lines_on("ramp", duration_s):
             shot.call("static_tweezers", limit_s, shot.static_tweezers.ramp, depth, duration_s)
+        shot.record_duration(duration_s, duration_s)
         shot.log("ramped", device="static_tweezers", depth=depth, duration_s=duration_s)
+
+
+class ReleaseSettings(Settings):
+    """``release``: turn the static tweezers off for a short time, and recapture the atoms."""
+
+    duration: PositiveDuration = Field(description="how long the atoms are free")
+
+
+class ReleaseStep(Step):
+    """Turns the static tweezers off for a time that hardware keeps, then on again at the same depth.
+
+    Either a line of the timing box turns them off, or their driver; where neither can, the step is refused.
+    """
+
+    def __init__(self, settings: ReleaseSettings) -> None:
+        self.settings = settings
+
+    def check_devices(
+        self, devices: Mapping[str, object], context: StepContext
+    ) -> Mapping[str, str | Problem]:
+        """Find what can release the atoms, and whether it is fast enough."""
+        del devices
+        by = context.release_by
+        if by is None:
+            what = "nothing on this profile can turn the static tweezers off for a time that hardware keeps"
+            hint = "wire their switch to the timing box: a line with `on: [release]` and"
+            hint += " `turns_off: static_tweezers`, see docs/how-to/release.md"
+            return {
+                "": Problem(what, expected="a timing box, or tweezers whose driver can release", hint=hint)
+            }
+        shortest = {
+            "lines": context.lines_facts.shortest_s,
+            "static_tweezers": context.static_tweezers.shortest_release_s,
+        }
+        if self.settings.duration < shortest[by.name]:
+            came, least = (format_quantity(t, "time") for t in (self.settings.duration, shortest[by.name]))
+            return {
+                "duration": Problem(f"'{by.name}' cannot release for {came}", expected=f"at least {least}")
+            }
+        return {}
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
+        """One entry."""
+        text = f"release for {format_quantity(self.settings.duration, 'time')}"
+        duration_s, by = self.settings.duration + context.margin_s("release"), context.release_by
+        return [TimelineEntry(text, duration_s, duration_s, kind="release", timed_by=by or COMPUTER)]
+
+    def run(self, shot: Shot) -> None:
+        """Release the atoms, and wait until they are recaptured."""
+        released_s = shot.release(self.settings.duration)
+        shot.record_duration(self.settings.duration, released_s)
+        shot.log("released", duration_s=released_s)
 
 
 class DeviceSettings(Settings):
@@ -137,7 +195,11 @@ class DeviceStep(Step):
     def __init__(self, settings: DeviceSettings) -> None:
         self.settings = settings
 
-    def check_devices(self, devices: Mapping[str, object]) -> Mapping[str, str]:
+    def check_devices(
+        self,
+        devices: Mapping[str, object],
+        context: StepContext,  # noqa: ARG002 - of the role
+    ) -> Mapping[str, str | Problem]:
         """Have the device check the command, if its driver can."""
         device: Any = devices.get(self.settings.name)
         if offers(device, "check_command"):
@@ -201,13 +263,15 @@ class WaitStep(Step):
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One entry."""
         text = f"wait {format_quantity(self.duration_s, 'time')}"
-        duration_s = self.duration_s + context.margin_s("wait")
-        return [TimelineEntry(text, duration_s, duration_s, kind="wait")]
+        duration_s, timed_by = self.duration_s + context.margin_s("wait"), context.timed_by("wait")
+        return [TimelineEntry(text, duration_s, duration_s, kind="wait", timed_by=timed_by)]
 
     def run(self, shot: Shot) -> None:
         """Wait on the session's clock."""
         with shot.lines_on("wait", self.duration_s):
             shot.clock.sleep(self.duration_s)
+        if shot.step_context.timed_by("wait").name == "lines":
+            shot.record_duration(self.duration_s, self.duration_s)
 
 
 class FollowStep(Step):
@@ -218,7 +282,11 @@ class FollowStep(Step):
         self.timeout_s = timeout_s
         self.device = device
 
-    def check_devices(self, devices: Mapping[str, object]) -> Mapping[str, str]:
+    def check_devices(
+        self,
+        devices: Mapping[str, object],
+        context: StepContext,  # noqa: ARG002 - of the role
+    ) -> Mapping[str, str | Problem]:
         """Find the device that receives the signal."""
         try:
             find_leader(devices, self.device)

@@ -36,7 +36,7 @@ Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
 def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> list[str]:
     """A row per bar of the timeline: step, start, length, and the bar itself; no bars if the width is 0."""
     total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
-    rows = [("step", "", "start", "at most", "")]
+    rows = [("step", "", "start", "at most", "timed by", "")]
     start_s = 0.0
     for number, (name, bars) in enumerate(timeline):
         for i, bar in enumerate(bars):
@@ -44,7 +44,10 @@ def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> li
             length = format_quantity(bar.duration_s, "time")
             drawn = _bar(start_s, bar.duration_s, total_s, block, width)
             step = f"{number} {name}" if i == 0 else ""
-            rows.append((step, label, format_quantity(start_s, "time"), length, drawn))
+            by = bar.timed_by
+            accuracy = f" to {format_quantity(by.accuracy_s, 'time')}" if by.accuracy_s else ""
+            by = by.name + accuracy if bar.duration_s else ""
+            rows.append((step, label, format_quantity(start_s, "time"), length, by, drawn))
             start_s += bar.duration_s
     return columns(rows, right=(2, 3))
 
@@ -114,9 +117,6 @@ def _check(check: CheckSettings) -> str:
     return f"{check.value} of {of} {' and '.join(limits)}; otherwise {then[check.then]}"
 
 
-_TEXT_WIDTH: Final = 48  # width of the timeline without its bars
-
-
 def check_sequence(
     sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
 ) -> None:
@@ -140,7 +140,8 @@ def check_sequence(
 
 def _print(assembly: Assembly, checked: CheckReport) -> None:
     block = "█" if encodes(sys.stdout.encoding, "█") else "#"
-    room = shutil.get_terminal_size((_TEXT_WIDTH + BAR_WIDTH, 24)).columns - _TEXT_WIDTH
+    text_width = 2 + max(map(len, timeline_table(checked.timeline, block, 0)))
+    room = shutil.get_terminal_size((text_width + BAR_WIDTH, 24)).columns - text_width
     width = max(0, min(BAR_WIDTH, room))
     parts = (
         columns(_subject(assembly)),

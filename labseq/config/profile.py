@@ -139,14 +139,17 @@ class CalibrationSettings(Settings):
 MAX_PULSE_S: Final = 1.0
 
 
+_SHAPES: Final = ("lead", "lag", "pulse")
+
+
 class ChannelSettings(Settings):
     """One line: its output on the timing box, and when it is on."""
 
     channel: NonNegativeInt = Field(description="output of the timing box")
     on: tuple[Text, ...] = Field(
         default=(),
-        description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, `wait`; "
-        "`idle`: between steps, and before and after a shot",
+        description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, `release`, "
+        "`wait`; `idle`: between steps, and before and after a shot",
     )
     lead: Duration = Field(default=0.0, description="how long before such a step it is turned on")
     lag: Duration = Field(default=0.0, description="how long after such a step it is turned off")
@@ -162,9 +165,23 @@ class ChannelSettings(Settings):
         default=False, description="its light would harm a camera with EM gain: never on during an exposure"
     )
     active_low: bool = Field(default=False, description="the output is low while the line is on")
+    turns_off: Literal["", "static_tweezers"] = Field(
+        default="",
+        description="the role whose light is off while the line is on; with `static_tweezers` the step "
+        "`release` is timed by the box, and the line is on in no other",
+    )
 
     @model_validator(mode="after")
     def _makes_sense(self) -> Self:
+        if self.turns_off and set(self.on) != {"release"}:
+            raise setting_error(
+                "a line that turns the static tweezers off is on at other times",
+                "`on: [release]`",
+                at=("on",),
+            )
+        if self.turns_off and (extra := next((key for key in _SHAPES if getattr(self, key)), None)):
+            what = f"{extra} is set for a line that turns the static tweezers off"
+            raise setting_error(what, "none: it is on as long as the release", at=(extra,), key=True)
         if self.pulse and self.lag:
             raise setting_error(
                 "lag is set beside pulse", "one of the two: a pulse ends by itself", at=("lag",), key=True
@@ -195,6 +212,7 @@ class ChannelSettings(Settings):
             self.triggers,
             self.blinding,
             self.active_low,
+            self.turns_off,
         )
 
 

@@ -14,11 +14,14 @@ from labseq.model.lines import LineProgram, LinesFacts, LineSpec
 from labseq.model.motion import MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport
 from labseq.model.records import (
+    COMPUTER,
     CycleRecord,
     ImageRecord,
     RunRecord,
     ShotRecord,
     StageTiming,
+    StepTiming,
+    TimedBy,
     TimelineEntry,
 )
 from labseq.model.scanning import RandomStream, ScanRange, ScanSpace, VisitedPoint
@@ -31,11 +34,13 @@ from labseq.model.signals import (
     TonesAt,
     TonesNow,
     TweezerAmplitudes,
+    TweezersFacts,
     Waveform,
 )
 
 __all__ = [
     "CALIBRATION_KINDS",
+    "COMPUTER",
     "AxisTones",
     "Batch",
     "CalibrationEntry",
@@ -66,12 +71,15 @@ __all__ = [
     "ShotRecord",
     "SiteGrid",
     "StageTiming",
+    "StepTiming",
     "TargetPattern",
+    "TimedBy",
     "TimelineEntry",
     "ToneProgram",
     "TonesAt",
     "TonesNow",
     "TweezerAmplitudes",
+    "TweezersFacts",
     "VisitedPoint",
     "Waveform",
     "as_occupancy",

@@ -30,6 +30,7 @@ class LineSpec:
         triggers: The role whose trigger input it is wired to, "camera"; "" for none.
         blinding: Whether its light would harm a camera with EM gain.
         active_low: Whether the output is low while the line is on.
+        turns_off: The role whose light is off while the line is on, "static_tweezers"; "" for none.
     """
 
     name: str
@@ -41,6 +42,7 @@ class LineSpec:
     triggers: str = ""
     blinding: bool = False
     active_low: bool = False
+    turns_off: str = ""
 
 
 def lines_of(specs: Iterable[LineSpec], kind: str) -> list[LineSpec]:

@@ -40,6 +40,23 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
+class TimedBy:
+    """What times a step, and how well.
+
+    Attributes:
+        name: "computer", or the role of the hardware: "lines", "camera".
+        accuracy_s: Resolution of the hardware, or how late the computer may be, in seconds; 0: unknown.
+    """
+
+    name: str
+    accuracy_s: float = 0.0
+
+
+COMPUTER: Final = TimedBy("computer", OVERSHOOT_S)
+"""The computer's own clock: steps on it follow one another typically 0.4 ms late (measured)."""
+
+
+@dataclass(frozen=True, slots=True)
 class StageTiming:
     """How long one stage took, against its budget.
 
@@ -70,6 +87,29 @@ class StageTiming:
         load or a fixed window that was kept would count as exceeded.
         """
         return self.duration_s > self.budget_s + OVERSHOOT_S
+
+
+@dataclass(frozen=True, slots=True)
+class StepTiming:
+    """How long a step should have taken, and how long it took.
+
+    Attributes:
+        step: Index of the step in the shot.
+        name: Its name.
+        timed_by: What timed it: "computer", or the role of the hardware.
+        t_start_s: Start on the session's clock, from the start of the shot.
+        planned_s: Its planned duration; at most, where it may end earlier.
+        achieved_s: Its duration: as the hardware reports it, otherwise on the session's clock.
+        host_s: Duration on this computer's clock, with all calls.
+    """
+
+    step: int
+    name: str
+    timed_by: str
+    t_start_s: float
+    planned_s: float
+    achieved_s: float
+    host_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +188,7 @@ class ShotRecord:
         images: In the order they were taken.
         cycles: In the order they were made.
         timing: In the order the stages ended.
+        steps: Planned and achieved durations of the steps that have ended.
         seen_defect_free_cycle: Index of the first cycle whose image met the target; -1 if none.
         success: Whether the last ``image`` step met the target.
         filling_fraction: Filling of the target on the last ``image`` step; nan
@@ -173,6 +214,7 @@ class ShotRecord:
     images: list[ImageRecord] = field(default_factory=list[ImageRecord])
     cycles: list[CycleRecord] = field(default_factory=list[CycleRecord])
     timing: list[StageTiming] = field(default_factory=list[StageTiming])
+    steps: list[StepTiming] = field(default_factory=list[StepTiming])
     seen_defect_free_cycle: int = -1
     success: bool = False
     filling_fraction: float = float("nan")
@@ -271,6 +313,8 @@ class TimelineEntry:
         n_images: Images that it takes at most.
         exposure_s: Exposure of each image, in seconds.
         kind: Kind of step that the profile's lines know it by, "image"; "" for one that they do not go with.
+        timed_by: What times it.
+        latency_s: How long after the end of the part before it it begins at the outputs, in seconds.
     """
 
     label: str
@@ -279,3 +323,5 @@ class TimelineEntry:
     n_images: int = 0
     exposure_s: float = 0.0
     kind: str = ""
+    timed_by: TimedBy = COMPUTER
+    latency_s: float = 0.0

@@ -262,6 +262,21 @@ class DepthRamp:
     duration_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class TweezersFacts:
+    """Facts about static tweezers that are known before they are opened.
+
+    Attributes:
+        resolution_s: Step of the clock that times their ramps and releases.
+        shortest_release_s: Shortest time for which they can turn their light off; inf: they cannot.
+        latency_s: Typical time from the call of ``ramp`` to its start at the outputs.
+    """
+
+    resolution_s: float = 0.0
+    shortest_release_s: float = math.inf
+    latency_s: float = 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TweezerAmplitudes:
     """Amplitudes of the static tweezers' tones, as fractions of full scale.
@@ -269,10 +284,12 @@ class TweezerAmplitudes:
     Attributes:
         row: float64 (n_rows,).
         column: float64 (n_cols,).
+        dark_s: How long the light was off just before, in seconds.
     """
 
     row: NDArray[np.float64]
     column: NDArray[np.float64]
+    dark_s: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "row", read_only(self.row, np.float64, (-1,), "row"))

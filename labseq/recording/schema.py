@@ -10,6 +10,7 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       detection                 occupancy (n, row, col), confidence, signal, t_s and the table of images;
                                 threshold (row, col), sites_px (row, col, yx)
       rearrangement             tables of moves, batches and cycles; predicted (cycle, row, col)
+      steps                     table of the steps: planned and achieved durations
       timing                    table of the stages
       atom_events               tables of the events of the atoms in a simulation
 
@@ -381,7 +382,29 @@ TIMING: Final = Table(
 )
 """Of :class:`StageTiming`."""
 
-TABLES: Final = (IMAGES, FRAMES, MOVES, BATCHES, CYCLES, TIMING)
+STEPS: Final = Table(
+    "steps",
+    "step",
+    "how long each step should have taken, and how long it took",
+    (
+        _STEP,
+        Field("name", "text", "name of the step"),
+        Field(
+            "timed_by", "text", "what timed it: computer, or hardware: camera, lines, static_tweezers, ..."
+        ),
+        Field("t_start_s", "f8", "start on the session's clock, from the start of the shot"),
+        Field("planned_s", "f8", "planned duration; at most, where the step may end earlier"),
+        Field(
+            "achieved_s",
+            "f8",
+            "duration as the hardware reports it, otherwise of the step on the session's clock",
+        ),
+        Field("host_s", "f8", "duration on the computer's clock with all calls; in a dry run the computing"),
+    ),
+)
+"""Of :class:`StepTiming`."""
+
+TABLES: Final = (IMAGES, FRAMES, MOVES, BATCHES, CYCLES, STEPS, TIMING)
 
 
 def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> list[CycleRecord]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
 from labseq.files import read_file
-from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, TargetPattern
+from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.model.records import ShotStatus
 from labseq.recording.run_file import ShotSummary, summary_of
 
@@ -112,6 +112,11 @@ class Shot:
     def cycles(self) -> tuple[CycleRecord, ...]:
         """The rearrangement cycles."""
         return tuple(self._content.record.cycles)
+
+    @property
+    def steps(self) -> tuple[StepTiming, ...]:
+        """Planned and achieved durations of the steps."""
+        return tuple(self._content.record.steps)
 
     @property
     def timing(self) -> tuple[StageTiming, ...]:

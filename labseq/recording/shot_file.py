@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import RecordingError
-from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, StageTiming, TargetPattern
+from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.recording import schema
 from labseq.recording.hdf5 import (
     describe,
@@ -72,6 +72,7 @@ class ShotEncoder:
             self._write_frames(entry, shot.images, kept)
         _write_detection(entry.create_group("detection"), shot, self._run.target.shape)
         _write_cycles(entry.create_group("rearrangement"), shot, self._run.target.shape)
+        write_table(entry, schema.STEPS, schema.STEPS.rows(shot.steps))
         write_table(entry, schema.TIMING, schema.TIMING.rows(shot.timing))
         if shot.atom_events:
             events, names = entry.create_group("atom_events"), list[str]()
@@ -255,6 +256,7 @@ def _record(entry: Any) -> ShotRecord:
     cycles = entry["rearrangement"]
     events = entry.get("atom_events", {})
     timing = schema.TIMING.arguments(StageTiming, entry["timing"][()])
+    steps = schema.STEPS.arguments(StepTiming, entry["steps"][()]) if "steps" in entry else []
     return ShotRecord(
         **{name: value for name, value in values.items() if name in taken},
         images=_images(entry["detection"]),
@@ -263,6 +265,7 @@ def _record(entry: Any) -> ShotRecord:
             {name: cycles[name][()] for name in ("cycles", "batches", "moves")}, cycles["predicted"][()]
         ),
         timing=[StageTiming(**known) for known in timing],
+        steps=[StepTiming(**known) for known in steps],
         atom_events={name: table[()] for name, table in events.items()},
     )
 

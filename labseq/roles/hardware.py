@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import ConfigError, DeviceError, Problem, one_of
 from labseq.messages import clean, did_you_mean
-from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram
+from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram, TweezersFacts
 
 Trigger = Literal["software", "internal", "external"]
 """The trigger that starts an exposure."""
@@ -106,6 +106,11 @@ class Camera(Hardware):
 class StaticTweezers(Hardware):
     """The static tweezer array."""
 
+    @property
+    def facts(self) -> TweezersFacts:
+        """How well it times ramps, and whether it can release the atoms; also before ``open()``."""
+        return TweezersFacts()
+
     @abstractmethod
     def load(self, amplitudes: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> None:
         """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,).
@@ -123,6 +128,17 @@ class StaticTweezers(Hardware):
     @abstractmethod
     def ramp(self, depth: float, duration_s: float) -> None:
         """Change the depth linearly, to a fraction of the nominal depth."""
+
+    def release(self, duration_s: float) -> float:
+        """Turn the light off for a time that the device itself keeps, then on again at the same depth.
+
+        One command to the device must do both: the light returns even if labseq is killed meanwhile, or the
+        device makes itself safe. Called only if ``facts.shortest_release_s`` is finite.
+
+        Returns:
+            The time without light, in seconds; when it is over.
+        """
+        raise NotImplementedError("these static tweezers cannot release atoms")
 
 
 class MobileTweezers(Hardware):

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Final, ParamSpec, Protocol, TypeVar
 
+from labseq.errors import Problem
 from labseq.model import (
+    COMPUTER,
     CalibrationEntry,
     CameraFacts,
     CycleRecord,
     Frame,
+    LinesFacts,
     LineSpec,
     MotionSpec,
     Occupancy,
     RandomStream,
     SiteGrid,
     TargetPattern,
+    TimedBy,
     TimelineEntry,
+    TweezersFacts,
 )
-from labseq.model.lines import margin_s
+from labseq.model.lines import IDLE, lines_of, margin_s
 from labseq.roles.deciding import Detector, Planner
 from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
 from labseq.roles.simulation import Simulation
@@ -256,6 +262,11 @@ class Shot(Protocol):
         """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         ...
 
+    @property
+    def step_context(self) -> StepContext:
+        """The context from which the step laid out its timeline."""
+        ...
+
     def lines_on(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
         """Context manager for the work of a step: its lines switch on before it and off after it.
 
@@ -263,6 +274,18 @@ class Shot(Protocol):
             kind: Kind of the step, as the profile's lines name it: "image".
             duration_s: Duration of the step, in seconds.
         """
+        ...
+
+    def release(self, duration_s: float) -> float:
+        """Turn the static tweezers off for a time that the timing box or the tweezers' own driver keeps.
+
+        Returns:
+            The time without light, in seconds; when it is over.
+        """
+        ...
+
+    def record_duration(self, planned_s: float, achieved_s: float) -> None:
+        """Record the duration that hardware kept, in the place of that of the whole step."""
         ...
 
     def stage(self, name: str, budget_s: float = ..., cycle: int = -1) -> AbstractContextManager[None]:
@@ -310,6 +333,8 @@ class StepContext:
         target: The target pattern.
         camera: The camera's facts, which are known before it is opened.
         lines: The lines of the timing box.
+        lines_facts: The facts of the timing box.
+        static_tweezers: The facts of the static tweezers.
     """
 
     grid: SiteGrid
@@ -317,10 +342,27 @@ class StepContext:
     target: TargetPattern
     camera: CameraFacts = field(default_factory=CameraFacts)
     lines: tuple[LineSpec, ...] = ()
+    lines_facts: LinesFacts = field(default_factory=lambda: LinesFacts(()))
+    static_tweezers: TweezersFacts = field(default_factory=TweezersFacts)
 
     def margin_s(self, kind: str) -> float:
         """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         return margin_s(self.lines, kind)
+
+    def timed_by(self, kind: str) -> TimedBy:
+        """What times such a step: the timing box if a line is on in it but not when idle, or the computer."""
+        if any(IDLE not in spec.on and not spec.pulse_s for spec in lines_of(self.lines, kind)):
+            return TimedBy("lines", self.lines_facts.resolution_s)
+        return COMPUTER
+
+    @property
+    def release_by(self) -> TimedBy | None:
+        """What times a release: a line that turns the static tweezers off, or their driver; None: nothing."""
+        if any(spec.turns_off == "static_tweezers" for spec in self.lines):
+            return TimedBy("lines", self.lines_facts.resolution_s)
+        if self.static_tweezers.shortest_release_s < math.inf:
+            return TimedBy("static_tweezers", self.static_tweezers.resolution_s)
+        return None
 
 
 class Step(ABC):
@@ -358,14 +400,20 @@ class Step(ABC):
     def run(self, shot: Shot) -> None:
         """Carry out the step."""
 
-    def check_devices(self, devices: Mapping[str, object]) -> Mapping[str, str]:  # noqa: ARG002 - overridden
+    def check_devices(
+        self,
+        devices: Mapping[str, object],  # noqa: ARG002 - overridden
+        context: StepContext,  # noqa: ARG002
+    ) -> Mapping[str, str | Problem]:
         """Check the settings against the devices, before any of them is opened.
 
         Args:
             devices: All hardware of the profile by its name, constructed.
+            context: What is known of them.
 
         Returns:
-            Setting -> what is wrong with it; empty if nothing is.
+            Setting -> what is wrong with it, as text or, with what was expected and a hint, as a ``Problem``
+            without a place; empty if nothing is.
         """
         return {}
 

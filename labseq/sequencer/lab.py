@@ -11,11 +11,13 @@ from labseq.guard import Guard
 from labseq.model import (
     CalibrationEntry,
     CameraFacts,
+    LinesFacts,
     LineSpec,
     MotionSpec,
     RandomStream,
     SiteGrid,
     TargetPattern,
+    TweezersFacts,
 )
 from labseq.roles import (
     Camera,
@@ -124,8 +126,12 @@ class Lab:
     @property
     def step_context(self) -> StepContext:
         """The context from which steps lay out their timelines."""
-        facts = self.camera.facts if offers(self.camera, "facts") else CameraFacts()
-        return StepContext(self.grid, self.motion, self.target, facts, self.line_specs)
+        camera = self.camera.facts if offers(self.camera, "facts") else CameraFacts()
+        tweezers = self.static_tweezers.facts if offers(self.static_tweezers, "facts") else TweezersFacts()
+        lines = LinesFacts(())
+        if self.lines is not None and offers(self.lines, "lines_facts"):
+            lines = self.lines.lines_facts
+        return StepContext(self.grid, self.motion, self.target, camera, self.line_specs, lines, tweezers)
 
     def hardware(self) -> Iterator[tuple[str, Hardware]]:
         """Name and device, in the order of opening: static tweezers first."""

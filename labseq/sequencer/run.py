@@ -255,7 +255,8 @@ class Sequencer:
         """Budget of each step in seconds: the length of its timeline; nan for one without a length."""
         detect_s = self.lab.budgets.get("detect", 0.0)  # a timeline leaves out the detection
         budgets: list[float] = []
-        for entries in plan_timelines(self.lab, self.guard, self._steps):
+        self._timelines = plan_timelines(self.lab, self.guard, self._steps)
+        for entries in self._timelines:
             planned_s = sum(entry.duration_s for entry in entries)
             detection_s = detect_s * sum(entry.n_images for entry in entries)
             budgets.append(planned_s + detection_s if planned_s else math.nan)
@@ -363,8 +364,12 @@ class Sequencer:
         images = unique_names([name for name, _ in self._steps])
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
-            policy, budget_s = self._policy.of_step(number), self._budgets[number]
-            with shot.of_step(number, name, policy, budget_s, images[number]):
+            policy, budget_s, entries = (
+                self._policy.of_step(number),
+                self._budgets[number],
+                self._timelines[number],
+            )
+            with shot.of_step(number, name, policy, budget_s, images[number], entries):
                 self._run_step(shot, number, name, step)
         shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
         shot.record_truth()

@@ -13,9 +13,18 @@ import numpy as np
 
 from labseq.errors import ConfigError, DeviceError, InterlockError, OverBudgetError, StepTimeoutError
 from labseq.guard import DRIVER_MARGIN_S, Guard
-from labseq.model import CycleRecord, Frame, ImageRecord, Occupancy, ShotRecord, StageTiming
+from labseq.model import (
+    CycleRecord,
+    Frame,
+    ImageRecord,
+    Occupancy,
+    ShotRecord,
+    StageTiming,
+    StepTiming,
+    TimelineEntry,
+)
 from labseq.model.records import OVERSHOOT_S, STEP
-from labseq.roles import Device, ReportsSignals, offers
+from labseq.roles import Device, ReportsSignals, StepContext, offers
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
@@ -154,6 +163,7 @@ class RunningShot:
         self.plan_timeout_s = lab.timeouts.plan_s
         self.in_step = False
         self._image_name = "image"
+        self._kept: tuple[float, float] | None = None
         self.stages = Stages(lab, record, emit)
         self.start_s = self.stages.start_s
         self.leaders = LeaderAnswers(lab, guard, record, emit)
@@ -172,7 +182,13 @@ class RunningShot:
 
     @contextmanager
     def of_step(
-        self, number: int, name: str, policy: StepPolicy, budget_s: float, images: str = ""
+        self,
+        number: int,
+        name: str,
+        policy: StepPolicy,
+        budget_s: float,
+        images: str = "",
+        entries: Sequence[TimelineEntry] = (),
     ) -> Generator[None]:
         """Context manager around a step: the stages, images and failures within belong to it.
 
@@ -186,11 +202,21 @@ class RunningShot:
         Raises:
             OverBudgetError: It took longer than its budget, and its policy does not allow that.
         """
-        self.in_step, self._image_name = True, images or name
+        self.in_step, self._image_name, self._kept = True, images or name, None
         self.stages.begin_step(number, name, policy)
+        start_s, host_start_s = self.elapsed_s, time.perf_counter()
         with self.stage(f"{STEP}{number}_{name}", budget_s):
             yield
+            planned_s = sum(entry.duration_s for entry in entries)
+            durations = self._kept or (planned_s, self.elapsed_s - start_s)
+            timed_by = ", ".join(dict.fromkeys(entry.timed_by.name for entry in entries))
+            host_s = time.perf_counter() - host_start_s
+            self.record.steps.append(StepTiming(number, name, timed_by, start_s, *durations, host_s))
         self.stages.policy, self.in_step = StepPolicy(), False
+
+    def record_duration(self, planned_s: float, achieved_s: float) -> None:
+        """Record the duration that hardware kept; see ``labseq.plugin.Shot``."""
+        self._kept = planned_s, achieved_s
 
     def device(self, name: str) -> Device:
         """A named device of the profile."""
@@ -241,6 +267,11 @@ class RunningShot:
         """Wait for the start signal of another control system; see ``labseq.plugin.Shot``."""
         self.leaders.follow(signal, timeout_s, device)
 
+    @property
+    def step_context(self) -> StepContext:
+        """The context from which the steps laid out their timelines."""
+        return self.lab.step_context
+
     def margin_s(self, kind: str) -> float:
         """Extra time that a kind of step takes for its lines, in seconds."""
         return margin_s(self.lab.line_specs, kind)
@@ -261,6 +292,25 @@ class RunningShot:
         yield
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
         self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
+
+    def release(self, duration_s: float) -> float:
+        """Turn the static tweezers off for a time that hardware keeps; see ``labseq.plugin.Shot``.
+
+        One command to the device turns them off and on again.
+
+        Raises:
+            ConfigError: Neither a line nor the driver of the static tweezers can do it.
+        """
+        by, achieved_s = self.step_context.release_by, duration_s
+        if by is None:
+            raise ConfigError("no line of this profile turns the static tweezers off, nor does their driver")
+        with self.lines_on("release", duration_s):
+            if by.name == "static_tweezers":
+                limit_s = duration_s + self.call_timeout_s
+                achieved_s = self.call(by.name, limit_s, self.static_tweezers.release, duration_s)
+            elif by.accuracy_s:
+                achieved_s = round(duration_s / by.accuracy_s) * by.accuracy_s
+        return achieved_s
 
     def stage(self, name: str, budget_s: float = math.nan, cycle: int = -1) -> AbstractContextManager[None]:
         """Time a stage against its budget; see ``labseq.sequencer.shot``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from labseq.config.document import Document
 from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem
 from labseq.guard import Guard
-from labseq.model import Occupancy, Plan, PlanReport, TimelineEntry
+from labseq.model import COMPUTER, Occupancy, Plan, PlanReport, TimelineEntry
 from labseq.motion import check_plan, fitting_batches, tone_program
-from labseq.roles import Step, find_leader, offers
+from labseq.roles import Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on
 from labseq.sequencer.run import plan_timelines
@@ -53,6 +53,7 @@ class _Points:
     session: Session
     guard: Guard
     problems: dict[str, Problem] = field(default_factory=dict[str, Problem])
+    warnings: dict[str, Problem] = field(default_factory=dict[str, Problem])
     _labs: dict[tuple[int, int], tuple[Point, Lab]] = field(default_factory=dict[Any, Any])
     _timelines: dict[tuple[int, ...], tuple[Point, Timeline]] = field(default_factory=dict[Any, Any])
 
@@ -77,9 +78,9 @@ class _Points:
             self._timelines[key] = point, named
         return self._timelines[key][1]
 
-    def add(self, document: Document, loc: Loc, what: str, expected: str = "") -> None:
+    def add(self, document: Document, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
         """Add a problem, unless it is known."""
-        problem = document.problem(loc, what, expected)
+        problem = document.problem(loc, what, expected, hint)
         self.problems.setdefault(str(problem), problem)
 
     def raise_problems(self) -> None:
@@ -97,8 +98,20 @@ class _Points:
         lab, shot = self.lab(point), self.session.assembly.sequence.shot
         for spec, (name, step) in zip(shot, point.steps, strict=True):
             if offers(step, "check_devices"):
-                for setting, what in _wrong_settings(self.guard, lab, name, step).items():
-                    self.add(point.document, (*spec.loc, setting) if setting else spec.loc, what)
+                for setting, one in _wrong_settings(self.guard, lab, name, step).items():
+                    loc = (*spec.loc, setting) if setting else spec.loc
+                    self.add(point.document, loc, one.what, one.expected, one.hint)
+
+    def ask_timing(self, point: Point) -> None:
+        """Refuse durations that the computer cannot keep; one that it keeps roughly is a warning."""
+        context, shot = self.lab(point).step_context, self.session.assembly.sequence.shot
+        for number, one, is_refused in _badly_timed([bars for _, bars in self.timeline(point)], context):
+            loc = (*shot[number].loc, "duration")
+            if is_refused:
+                self.add(point.document, loc, one.what, one.expected, one.hint)
+            else:
+                warning = point.document.problem(loc, one.what)
+                self.warnings.setdefault(f"{warning.source}:{warning.line}:{warning.column}", warning)
 
     def ask_devices(self, point: Point) -> None:
         """Have camera and lines check what each step of a shot would ask of them."""
@@ -147,15 +160,48 @@ class _Points:
                 return
 
 
-def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, str]:
+ROUGH: Final = 0.1
+"""Part of a duration by which the computer may be late without a warning."""
+
+
+def _badly_timed(
+    bars: Sequence[Sequence[TimelineEntry]], context: StepContext
+) -> Iterator[tuple[int, Problem, bool]]:
+    """Steps of fixed length that the computer cannot keep, or only roughly: index, what, if refused."""
+    least = format_quantity(COMPUTER.accuracy_s, "time")
+    for number, own in enumerate(bars):
+        own_s = sum(bar.duration_s for bar in own)
+        last = own[-1] if own else None
+        if last is None or not 0 < last.duration_s == last.min_duration_s or last.timed_by != COMPUTER:
+            continue
+        after = next((bar for later in bars[number + 1 :] for bar in later[:1]), last)
+        late_s = COMPUTER.accuracy_s + after.latency_s
+        wanted, late = (format_quantity(t, "time") for t in (own_s, late_s))
+        if own_s < COMPUTER.accuracy_s:
+            what = f"the computer cannot keep {wanted}: it is typically 0.4 ms late, now and then several ms"
+            by = context.release_by
+            hint = "to free the atoms, use the step `release`"
+            hint += f", which '{by.name}' times" if by else ""
+            hint += "; to pulse a light, use a line that is on in `wait` alone"
+            yield number, Problem(what, expected=f"at least {least}", hint=hint), True
+        elif late_s > ROUGH * own_s:
+            what = f"the computer keeps {wanted} only roughly: up to about {late} longer"
+            if after.latency_s:
+                what += f", because '{after.label}' begins late at the outputs of '{after.timed_by.name}'"
+            yield number, Problem(what), False
+
+
+def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, Problem]:
     """Setting -> what is wrong with it, as a step says; "" for a step that fails to say it."""
+    devices, timeout_s = dict(lab.hardware()), lab.timeouts.call_s
     try:
-        found = guard.call(f"step '{name}'", lab.timeouts.call_s, step.check_devices, dict(lab.hardware()))
-        return {str(setting): str(what) for setting, what in dict(found).items()}
+        found = guard.call(f"step '{name}'", timeout_s, step.check_devices, devices, lab.step_context)
+        problems = {str(setting): what for setting, what in dict(found).items()}
+        return {key: one if isinstance(one, Problem) else Problem(str(one)) for key, one in problems.items()}
     except LabseqError as failure:
-        return {"": str(failure)}
+        return {"": Problem(str(failure))}
     except (TypeError, ValueError):
-        return {"": f"check_devices() of step '{name}' returned no mapping"}
+        return {"": Problem(f"check_devices() of step '{name}' returned no mapping")}
 
 
 def _timeout_warnings(assembly: Assembly, timeline: Timeline) -> list[Problem]:
@@ -249,7 +295,7 @@ def check(session: Session) -> CheckReport:
         first = assembly.first_point
         lab = points.lab(first)
         each = [first, *session.scan_run.each()]
-        for ask in (points.ask_steps, points.ask_devices):
+        for ask in (points.ask_steps, points.ask_timing, points.ask_devices):
             for point in each:
                 ask(point)
             points.raise_problems()
@@ -262,7 +308,7 @@ def check(session: Session) -> CheckReport:
     warnings += _judgement_warnings(session, [*rehearsals])
     warnings += _parallelism_warnings(session, each)
     warnings += _deadline_warnings(session, lab, timeline)
-    warnings += _timeout_warnings(assembly, timeline)
+    warnings += [*_timeout_warnings(assembly, timeline), *points.warnings.values()]
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         timeline,

@@ -51,6 +51,9 @@ class RealRadio:
     def changed(self) -> None:
         """The amplitudes of the tones have changed."""
 
+    def released(self) -> None:
+        """The array was off, and is on again."""
+
     def disconnect(self) -> None:
         """The radio was closed; no effect if it is not connected."""
 

@@ -108,6 +108,10 @@ class Link:
         """Change the depth, and wait until the end of the ramp is at the connectors."""
         self._do("ramp", depth=depth, duration_s=duration_s)
 
+    def release(self, n_samples: int) -> None:
+        """Play silence for some samples, then the loop again; wait until that is at the connectors."""
+        self._do("release", n_samples=n_samples)
+
     def check(self) -> None:
         """Check that the stream is alive.
 

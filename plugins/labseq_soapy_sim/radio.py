@@ -123,6 +123,11 @@ class SimulatedRadio:
         if self._outputs is not None:
             self._outputs.measure()
 
+    def released(self) -> None:
+        """The driver has released the atoms: find the silence in the samples."""
+        if self._outputs is not None:
+            self._outputs.find_silence()
+
     def disconnect(self) -> None:
         """Remove its files, unless the profile names their folder; no effect if it is not connected."""
         self._outputs = None

@@ -66,6 +66,11 @@ class Ring:
         late_s = time.monotonic() - header["t0_s"] - header["sent"] / (header["rate_hz"] * header["speed"])
         return bool(late_s <= header["max_wait_s"])
 
+    @property
+    def n_kept(self) -> int:
+        """The most of the latest samples that can be read while the radio runs."""
+        return self._samples.shape[1] - (1 << 17)
+
     def latest(self, n: int) -> NDArray[np.complex64]:
         """The latest samples that it received, complex64 (2, n); fewer if there were fewer."""
         size = self._samples.shape[1]

@@ -31,7 +31,7 @@ class Output:
         self._next: Samples | None = None
         self._n_fade = self._n_faded = 0
         self._slope = self._goal = 0.0  # of the ramp: change of the depth per sample, and its end
-        self._n_ramp = 0
+        self._n_ramp = self._n_dark = 0
         self._at = 0
         self._steps = np.arange(1, BLOCK + 1, dtype=np.float32).repeat(2)
         self._factor = np.empty(2 * BLOCK, np.float32)
@@ -56,14 +56,23 @@ class Output:
             self._next, self._n_fade, self._n_faded = loop, max(1, n_fade), 0
 
     def ramp(self, depth: float, n_samples: int) -> None:
-        """Change the depth linearly from its present value; the last sample has the new depth."""
+        """Change the depth linearly from its present value; the last sample has the new depth.
+
+        During a release the ramp starts at once, from 0.
+        """
+        if self._n_dark:
+            self._n_dark, self.depth = 0, 0.0
         self._n_ramp = max(1, n_samples)
         self._slope, self._goal = (depth - self.depth) / self._n_ramp, depth
 
+    def release(self, n_samples: int) -> None:
+        """Silence for some samples; then the loop continues at its depth, as if it had played meanwhile."""
+        self._n_dark = n_samples
+
     @property
     def steady(self) -> bool:
-        """Whether no ramp or fade is under way."""
-        return self._n_ramp == 0 and self._next is None
+        """Whether no ramp, fade or release is under way."""
+        return self._n_ramp == 0 and self._n_dark == 0 and self._next is None
 
     def block(self) -> Samples:
         """The next samples, float32 (2, 2 n) with n from 1 to :data:`BLOCK`; valid until the next call."""
@@ -72,6 +81,8 @@ class Output:
             n = min(n, self._n_ramp)
         if self._next is not None:
             n = min(n, self._n_fade - self._n_faded)
+        if self._n_dark:
+            n = min(n, self._n_dark)
         samples = self._shaped(n)
         self._at = (self._at + n) % (self._loop.shape[1] // 2)
         if self._next is not None:
@@ -82,7 +93,8 @@ class Output:
 
     def _shaped(self, n: int) -> Samples:
         part = slice(2 * self._at, 2 * (self._at + n))
-        if self.depth == 0.0 and not self._n_ramp:
+        if self._n_dark or (self.depth == 0.0 and not self._n_ramp):
+            self._n_dark = max(0, self._n_dark - n)
             return self._silence[:, : 2 * n]
         samples = self._loop[:, part]
         made = self._made[:, : 2 * n]

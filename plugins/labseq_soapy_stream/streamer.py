@@ -136,6 +136,9 @@ class Streamer:
             case "ramp":
                 self._output.ramp(message["depth"], round(message["duration_s"] * self._rate_hz))
                 self._begin(message["id"])
+            case "release":
+                self._output.release(message["n_samples"])
+                self._begin(message["id"])
             case "end":
                 self._leave("")
             case "fail":

@@ -29,6 +29,7 @@ class Lights:
                 known = ", ".join(f"'{name}'" for name in names)
                 raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {known}")
         self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
+        self._switches = [spec.name for spec in specs if spec.turns_off == "static_tweezers"]
         self._wires: dict[str, Callable[[float], object]] = {}
         self._played: deque[tuple[float, LineProgram]] = deque(maxlen=N_REMEMBERED)
 
@@ -50,6 +51,10 @@ class Lights:
         for t_s, role in sorted(edges):
             if role in self._wires:
                 self._wires[role](t_s)
+
+    def tweezers_off(self, program: LineProgram) -> list[tuple[float, float]]:
+        """When a program turns the static tweezers off and on again, in seconds from its start."""
+        return [span for name in self._switches for span in program.spans(name)]
 
     def fraction_on(self, kind: str, start_s: float, end_s: float) -> float:
         """Fraction of an interval during which a kind of light is on, that is, all its lines are."""

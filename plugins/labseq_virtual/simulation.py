@@ -153,9 +153,13 @@ class VirtualSimulation(Simulation):
         elif role == "static_tweezers" and isinstance(signal, DepthRamp):
             self._play_ramp(signal, t_start_s)
         elif role == "static_tweezers" and isinstance(signal, TweezerAmplitudes):
+            if signal.dark_s:
+                self._release(t_start_s, signal.dark_s)
             self._static.drive(signal)
         elif role == "lines" and isinstance(signal, LineProgram):
             self._lights.switch(signal, t_start_s)
+            for start_s, end_s in self._lights.tweezers_off(signal):
+                self._release(t_start_s + start_s, end_s - start_s)
         else:
             text = f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram"
             text += ", 'static_tweezers' with a DepthRamp or TweezerAmplitudes, or 'lines' with a LineProgram"
@@ -208,8 +212,8 @@ class VirtualSimulation(Simulation):
         return self._occupied.copy()
 
     def losses(self) -> Mapping[str, int]:
-        """Atoms lost since the shot began, by cause: vacuum, imaging, too weak light, and transport."""
-        return {cause: self._lost[cause] for cause in ("vacuum", "imaging", "light", *CAUSES)}
+        """Atoms lost since the shot began, by cause: vacuum, imaging, weak light, release, transport."""
+        return {cause: self._lost[cause] for cause in ("vacuum", "imaging", "light", "release", *CAUSES)}
 
     def spot_powers(self) -> NDArray[np.float64]:
         """Power of each static tweezer now relative to the nominal one, float64 (n_rows, n_cols)."""
@@ -247,6 +251,11 @@ class VirtualSimulation(Simulation):
         self._lost["light"] += self._static.ramp(ramp, self._occupied)
         self._now_s += ramp.duration_s
 
+    def _release(self, t_start_s: float, dark_s: float) -> None:
+        self._begin_event(t_start_s, "a release")
+        self._lost["release"] += self._static.release(dark_s, self._occupied, self._random.shot)
+        self._now_s = t_start_s + dark_s
+
     def _finish_program(self, until_s: float = math.inf) -> None:
         """Carry out the running program up to a time."""
         if self._playing is None:
@@ -269,7 +278,7 @@ class VirtualSimulation(Simulation):
             depth, rng = self._static.depth, self._random.shot
             self._lost += self._flight.carry(self._occupied, pulse, depth, rng, factor)
             self._lose_to_vacuum(pulse.end_s)
-        self._lost["light"] += self._static.receive_until(until_s, self._occupied)
+        self._lost += self._static.receive_until(until_s, self._occupied, self._random.shot)
 
     def _heating(self, start_s: float, end_s: float) -> float:
         """Factor on the transport loss: above 1 if the cooling light is off part of the time."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import DepthRamp, SiteGrid, ToneSource, TweezerAmplitudes
+from labseq_virtual.flight import KELVIN, draw_atoms
 from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
@@ -58,25 +61,53 @@ class StaticArray:
     def connect_outputs(self, source: ToneSource) -> None:
         """From now on the depths follow what these outputs play."""
         rows, cols = self._grid.shape
-        self.drive(TweezerAmplitudes(np.zeros(rows), np.zeros(cols)))
+        self._power = np.zeros(rows), np.zeros(cols)
         self._source, self._level = source, 1.0
 
-    def receive_until(self, until_s: float, occupied: NDArray[np.bool_]) -> int:
-        """Apply the output played until a time; atoms in tweezers that become too shallow leave ``occupied``.
+    def receive_until(
+        self, until_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator
+    ) -> Counter[str]:
+        """Apply the output played until a time; atoms that are lost leave ``occupied``.
 
         Returns:
-            Number of atoms lost.
+            Number of atoms lost in tweezers that were too shallow ("light"), and in releases ("release").
         """
-        before = np.count_nonzero(occupied)
+        lost: Counter[str] = Counter()
         for amplitudes in () if self._source is None else self._source.played(until_s):
+            if amplitudes.dark_s:
+                lost["release"] += self.release(amplitudes.dark_s, occupied, rng)
             self.drive(amplitudes)
+            before = np.count_nonzero(occupied)
             occupied &= self.holds()
-        return int(before - np.count_nonzero(occupied))
+            lost["light"] += int(before - np.count_nonzero(occupied))
+        return lost
 
     def drive(self, amplitudes: TweezerAmplitudes) -> None:
         """Set the amplitudes of the tones."""
         rows, cols = amplitudes.row, amplitudes.column
         self._power = (rows * len(rows)) ** 2, (cols * len(cols)) ** 2
+
+    def release(self, dark_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator) -> int:
+        """Let the atoms fly while the light is off, and recapture those that the same tweezer then binds.
+
+        Atoms begin with the temperature of the settings and fly straight on: gravity and neighbouring
+        tweezers are left out.
+
+        Returns:
+            Number of atoms lost.
+        """
+        settings = self._settings
+        row, col = np.nonzero(occupied & self.holds())
+        depth = KELVIN * settings.static_depth * self.depth[row, col]
+        waist = settings.static_waist
+        rayleigh = np.pi * waist**2 / settings.static_wavelength
+        state = draw_atoms(depth, KELVIN * settings.temperature, waist, rayleigh, rng)
+        x, y, z = (state[:, :3] + dark_s * state[:, 3:]).T
+        width = 1 + (z / rayleigh) ** 2
+        light = depth / width * np.exp(-2 * (x**2 + y**2) / (waist**2 * width))
+        bound = 0.5 * (state[:, 3:] ** 2).sum(axis=1) < light
+        occupied[row, col] = bound
+        return int(np.count_nonzero(~bound))
 
     def ramp(self, ramp: DepthRamp, occupied: NDArray[np.bool_]) -> int:
         """Change the depth; atoms in tweezers that become too shallow leave ``occupied``.

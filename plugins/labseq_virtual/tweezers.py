@@ -24,6 +24,7 @@ from labseq.plugin import (
     StaticTweezers,
     ToneProgram,
     TweezerAmplitudes,
+    TweezersFacts,
     format_quantity,
 )
 from labseq_virtual.settings import MobileTweezersSettings, StaticTweezersSettings
@@ -274,6 +275,11 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
         self._calibrated = _calibrated(context)
         self._depth = 0.0
 
+    @property
+    def facts(self) -> TweezersFacts:
+        """They release the atoms for exactly the time that is asked for."""
+        return TweezersFacts(shortest_release_s=0.0)
+
     def load(self, amplitudes: Amplitudes | None) -> None:
         """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,); None: the calibrated ones.
 
@@ -311,6 +317,21 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
             raise LimitError(f"{self._name}: duration of the ramp", f"{duration_s:g} s", "0 or more")
         self._play(depth, duration_s)
         self._clock.sleep(duration_s)
+
+    def release(self, duration_s: float) -> float:
+        """Turn the light off for exactly this time, then on again; returns when it is on.
+
+        Raises:
+            LimitError: The duration is not positive, or not finite.
+        """
+        self._check_open()
+        if not 0 < duration_s < float("inf"):
+            raise LimitError(f"{self._name}: duration of the release", f"{duration_s:g} s", "more than 0")
+        rows, cols = self._calibrated if self._amplitudes is None else self._amplitudes
+        dark = TweezerAmplitudes(rows, cols, duration_s)
+        self._simulation.play("static_tweezers", dark, self._clock.now())
+        self._clock.sleep(duration_s)
+        return duration_s
 
     def safe_state(self) -> None:
         """Turn the array off at once."""

@@ -5,15 +5,18 @@ from pathlib import Path
 from hypothesis import given, strategies as st
 
 from labseq.cli.check import BAR_WIDTH, lines_table, timeline_table
-from labseq.model import TimelineEntry
+from labseq.model import TimedBy, TimelineEntry
 
 SEQUENCE = str(Path(__file__).parents[2] / "sequences" / "compact_225.yaml")
 TIMELINE = [
     ("load", [TimelineEntry("load", 0.5, 0.5)]),
-    ("image", [TimelineEntry("image", 0.045, 0.045, 1)]),
+    ("image", [TimelineEntry("image", 0.045, 0.045, 1, timed_by=TimedBy("camera"))]),
     (
         "sort",
-        [TimelineEntry("cycle 0: move", 0.06, 0.06), TimelineEntry("cycle 0: image", 0.045, 0.045, 1)],
+        [
+            TimelineEntry("cycle 0: move", 0.06, 0.06, timed_by=TimedBy("lines", 0.5e-6)),
+            TimelineEntry("cycle 0: image", 0.045, 0.045, 1),
+        ],
     ),
     ("device", [TimelineEntry("shutter: open", 0.0, 0.0)]),
 ]
@@ -31,12 +34,12 @@ def test_a_line_is_drawn_where_it_is_on() -> None:
 
 def test_timeline_table() -> None:
     assert timeline_table(TIMELINE, "#") == [
-        "step                       start  at most",
-        "0 load                       0 s   500 ms  " + "#" * 23,
-        "1 image                   500 ms    45 ms  " + " " * 23 + "##",
-        "2 sort    cycle 0: move   545 ms    60 ms  " + " " * 25 + "###",
-        "          cycle 0: image  605 ms    45 ms  " + " " * 28 + "##",
-        "3 device  shutter: open   650 ms      0 s  " + " " * 29 + "#",
+        "step                       start  at most  timed by",
+        "0 load                       0 s   500 ms  computer to 1 ms  " + "#" * 23,
+        "1 image                   500 ms    45 ms  camera            " + " " * 23 + "##",
+        "2 sort    cycle 0: move   545 ms    60 ms  lines to 500 ns   " + " " * 25 + "###",
+        "          cycle 0: image  605 ms    45 ms  computer to 1 ms  " + " " * 28 + "##",
+        "3 device  shutter: open   650 ms      0 s                    " + " " * 29 + "#",
     ]
 
 

@@ -299,12 +299,12 @@ def test_connected_outputs_alone_set_the_light() -> None:
     static, outputs = array(), PlayedAmplitudes()
     static.connect_outputs(outputs)
     occupied = np.zeros(ARRAY_GRID.shape, np.bool_)
-    assert static.receive_until(0.0, occupied) == 0
+    assert not static.receive_until(0.0, occupied, np.random.default_rng(1)).total()
     assert not static.holds().any()
     outputs.queued = [equal()]
-    static.receive_until(1.0, occupied)
+    static.receive_until(1.0, occupied, np.random.default_rng(1))
     np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
-    static.receive_until(2.0, occupied)
+    static.receive_until(2.0, occupied, np.random.default_rng(1))
     np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
 
 
@@ -313,9 +313,9 @@ def test_atoms_are_lost_in_a_dark_moment_between_two_reads_of_the_outputs() -> N
     static.connect_outputs(outputs)
     occupied = np.ones(ARRAY_GRID.shape, np.bool_)
     outputs.queued = [equal(), equal(0.9)]
-    assert static.receive_until(0.0, occupied) == 0
+    assert not static.receive_until(0.0, occupied, np.random.default_rng(1)).total()
     outputs.queued = [equal(0.0), equal()]
-    assert static.receive_until(1.0, occupied) == 12 * 15
+    assert static.receive_until(1.0, occupied, np.random.default_rng(1))["light"] == 12 * 15
     assert static.holds().all()
 
 
@@ -324,7 +324,7 @@ def test_outputs_are_ignored_after_the_light_was_switched_off() -> None:
     static.connect_outputs(outputs)
     static.switch_off()
     outputs.queued = [equal()]
-    static.receive_until(0.0, np.zeros(ARRAY_GRID.shape, np.bool_))
+    static.receive_until(0.0, np.zeros(ARRAY_GRID.shape, np.bool_), np.random.default_rng(1))
     assert not static.holds().any()
 
 

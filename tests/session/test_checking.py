@@ -148,7 +148,7 @@ class Choosy(Step):
     def __init__(self, settings): ...
     def plan_timeline(self, context): return []
     def run(self, shot): ...
-    def check_devices(self, devices): return None
+    def check_devices(self, devices, context): return None
 
 
 @hookimpl

@@ -27,6 +27,8 @@ def test_it_is_accepted_without_a_warning_and_runs(sequence: Path, tmp_path: Pat
         assert not check(session).warnings
         run = session.run()
     assert run.status == "complete"
+    if "rearrange" not in sequence.read_text("utf-8"):
+        return
     assert all(len(shot.plans) >= 1 for shot in run.shots)
     assert min(run.target.filling_fraction(shot.occupancies[-1]) for shot in run.shots) > 0.94
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
 from labseq.guard import StopFlag
-from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram
+from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram, TweezersFacts
 from labseq.roles import Clock, Context, Trigger, unknown_name
 from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lines import idle_program, off_program
@@ -325,6 +325,18 @@ class RecordingStaticTweezers(RecordingHardware):
         require_within("the depth", depth, 0.0, 1.0)
         require_within("the ramp's duration in seconds", duration_s, 0.0, 3600.0)
         self._go(depth, duration_s)
+
+    @property
+    def facts(self) -> TweezersFacts:
+        """They release for any time."""
+        return TweezersFacts(shortest_release_s=0.0)
+
+    def release(self, duration_s: float) -> float:
+        """Be dark for a time; an error that is planned for it comes after the light is back."""
+        require_within("the release in seconds", duration_s, 1e-9, 3600.0)
+        self.clock.sleep(duration_s)
+        self.use("release", duration_s)
+        return duration_s
 
     def _go(self, depth: float, duration_s: float) -> None:
         if self.simulation is not None:

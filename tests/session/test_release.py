@@ -1,0 +1,153 @@
+"""Durations that hardware keeps, and those that the computer cannot: in `check`, a run, and its files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_soapy_sim import build_module
+
+import labseq
+from labseq.session.check import check
+from labseq.testing.fakes import RecordingObserver
+from tests.plugins.needs import need_library
+
+ROOT = Path(__file__).parents[2]
+SHOT = """labseq: 1
+name: free flight
+shots: 1
+target: {pattern: compact, rows: 15, cols: 15}
+planner: {use: psca}
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+"""
+BY_HAND = """  - ramp: {depth: 0, duration: 10 us}
+  - wait: {duration: WAIT}
+  - ramp: {depth: 1, duration: 10 us}
+  - image: {exposure: 45 ms}
+"""
+BY_HARDWARE = "  - release: {duration: 20 us}\n  - image: {exposure: 45 ms}\n"
+BOX = "{use: ttl, channels: {traps_off: {channel: 7, on: [release], turns_off: static_tweezers}}}"
+RADIO = (
+    "{use: soapy, device: simulated, sample_rate: 40 MHz, row_frequency: {centre: 100 MHz, step: 1.6 MHz}, "
+    "column_frequency: {centre: 100 MHz, step: 1.6 MHz}}"
+)
+
+
+def written(folder: Path, steps: str) -> Path:
+    path = folder / "s.yaml"
+    path.write_text(SHOT + steps, "utf-8")
+    return path
+
+
+@pytest.mark.parametrize("profile", ["lab", "bench", "virtual"])
+def test_a_wait_that_the_computer_cannot_keep_is_refused(profile: str, tmp_path: Path) -> None:
+    path = written(tmp_path, BY_HAND.replace("WAIT", "10 us"))
+    options: dict[str, Any] = {"profile": profile, "dry_run": "fast" if profile == "lab" else "off"}
+    with labseq.Session.open(path, output=tmp_path / "data", shots=1, **options) as session:
+        for refused in (lambda: check(session), session.run):
+            with pytest.raises(labseq.ConfigError) as caught:
+                refused()
+            (problem,) = caught.value.problems
+            assert (problem.line, problem.column) == (10, 22)
+            assert "the computer cannot keep 10 us" in problem.what
+            assert problem.expected == "at least 1 ms"
+            assert "use the step `release`, which 'static_tweezers' times" in problem.hint
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_wait_that_is_kept_roughly_is_a_warning_of_check_and_run(tmp_path: Path) -> None:
+    path, observer = written(tmp_path, BY_HAND.replace("WAIT", "5 ms")), RecordingObserver()
+    with labseq.Session.open(path, profile="virtual", output=tmp_path, shots=1, observer=observer) as session:
+        (warning,) = check(session).warnings
+        session.run()
+    assert "s.yaml:10:22: the computer keeps 5 ms only roughly: up to about 1 ms longer" in str(warning)
+    assert [values["text"] for values in observer.of("warning")] == [str(warning)]
+    (late,) = check(labseq.Session.open(path, profile="lab")).warnings
+    assert "about 31 ms longer, because 'ramp to 1' begins late at the outputs of 'static" in late.what
+    on_a_line = ["profile.lines={use: ttl, channels: {push: {channel: 7, on: [wait]}}}"]
+    timed = labseq.Session.open(path, profile="virtual", overrides=on_a_line)
+    assert not check(timed).warnings
+
+
+@pytest.mark.parametrize(
+    ("override", "duration", "message"),
+    [
+        (f"profile.lines={BOX}", "4 us", "'lines' cannot release for 4 us; expected at least 5 us"),
+        (f"profile.static_tweezers={RADIO}", "0.4 us", "'static_tweezers' cannot release for 400 ns"),
+        (
+            "profile.static_tweezers={use: slow}",
+            "10 us",
+            "a line with `on: [release]` and `turns_off: static",
+        ),
+    ],
+)
+def test_a_release_that_the_profile_cannot_make_is_refused(
+    override: str, duration: str, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / "slow.py").write_text(
+        "from labseq.testing.fakes import RecordingStaticTweezers\nimport labseq\nLABSEQ_API = 1\n"
+        "class Slow(RecordingStaticTweezers):\n    facts = labseq.plugin.TweezersFacts()\n"
+        "@labseq.plugin.hookimpl\ndef labseq_register(registry):\n"
+        "    registry.static_tweezers('slow', lambda settings, context: Slow(context))\n",
+        "utf-8",
+    )
+    path = written(tmp_path, BY_HARDWARE.replace("20 us", duration) + "plugin_folders: [.]\n")
+    with pytest.raises(labseq.ConfigError, match=r"s\.yaml:9:") as caught:
+        check(labseq.Session.open(path, profile="virtual", overrides=[override]))
+    assert message in str(caught.value)
+
+
+def recaptured(path: Path, folder: Path, *overrides: str) -> tuple[float, labseq.Run]:
+    """The fraction of atoms that a release leaves, and the run."""
+    with labseq.Session.open(
+        path, profile="virtual", shots=4, seed=3, output=folder, overrides=["record_frames=none", *overrides]
+    ) as session:
+        run = session.run()
+    before = sum(np.count_nonzero(shot.occupancies[0]) for shot in run.shots)
+    lost = sum(shot.readings["simulation.lost.release"] for shot in run.shots)
+    return 1 - lost / before, run
+
+
+def harmonic(temperature_k: float, dark_s: float) -> float:
+    """Recaptured fraction of atoms that start in a harmonic well of the virtual lab."""
+    rng, n = np.random.default_rng(7), 40_000
+    waist, wavelength, mass, boltzmann = 0.98e-6, 808e-9, 1.443160e-25, 1.380649e-23
+    depth, kt = boltzmann * 300e-6, boltzmann * temperature_k
+    rayleigh = np.pi * waist**2 / wavelength
+    size = np.array([waist / 2, waist / 2, rayleigh / np.sqrt(2)]) * np.sqrt(kt / depth)
+    v = rng.standard_normal((n, 3)) * np.sqrt(kt / mass)
+    x, y, z = (rng.standard_normal((n, 3)) * size + v * dark_s).T
+    width = 1 + (z / rayleigh) ** 2
+    well = depth / width * np.exp(-2 * (x**2 + y**2) / waist**2 / width)
+    return float(np.mean(0.5 * mass * (v**2).sum(axis=1) < well))
+
+
+def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(tmp_path: Path) -> None:
+    path = written(tmp_path, BY_HARDWARE)
+    for kelvin, dark_s in ((15e-6, 10e-6), (15e-6, 20e-6), (15e-6, 40e-6), (30e-6, 20e-6)):
+        set_ = f"shot.2.release.duration={dark_s} s", f"profile.simulation.temperature={kelvin} K"
+        kept, _ = recaptured(path, tmp_path, *set_)
+        low, high = (harmonic(factor * kelvin, dark_s) for factor in (1.1, 0.9))
+        error = 3 * (kept * (1 - kept) / 1200) ** 0.5
+        assert low - error < kept < high + error, (kelvin, dark_s)
+
+
+def test_the_box_and_the_radio_release_as_the_virtual_tweezers_do(tmp_path: Path) -> None:
+    need_library(build_module)
+    path, ways = written(tmp_path, BY_HARDWARE), {"virtual": [], "box": [f"lines={BOX}"]}
+    ways["radio"] = [f"static_tweezers={RADIO}"]
+    kept = dict[str, float]()
+    for way, overrides in ways.items():
+        kept[way], run = recaptured(path, tmp_path, *(f"profile.{one}" for one in overrides))
+        for shot in run.shots:
+            (step,) = [step for step in shot.steps if step.name == "release"]
+            assert step.timed_by == ("lines" if way == "box" else "static_tweezers")
+            assert (step.planned_s, step.achieved_s) == pytest.approx((20e-6, 20e-6))
+            after = np.count_nonzero(shot.occupancies[1])  # the light is on again
+            assert after > 0.8 * kept[way] * np.count_nonzero(shot.occupancies[0])
+    assert max(kept.values()) - min(kept.values()) < 0.06
+    assert 0.6 < kept["virtual"] < 0.95
