@@ -433,6 +433,7 @@ EVENTS: Final = {
     "too_few_atoms": "there are fewer atoms than the target needs",
     "window_too_short": "not all batches of a plan fitted into the window",
     "ramped": "the static tweezers have another depth",
+    "released": "the static tweezers were off for a moment, and are on again",
     "device_command": "a device carried out a command",
     "step_repeated": "a step failed and is repeated, by its policy",
     "leader_awaited": "labseq waits for a signal of the external control system",

@@ -70,7 +70,8 @@ class CapturedOutputs:
         if same and not dark_s:
             return
         self._last = amplitudes
-        self._changes.append(TweezerAmplitudes(*amplitudes, dark_s))
+        rows, cols = amplitudes
+        self._changes.append(TweezerAmplitudes(rows, cols, dark_s))
 
     def _now(self) -> tuple[Floats, ...]:
         if not self._ring.is_playing:
