@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from labseq.errors import Loc
 from labseq.messages import clean, shown
 from labseq.model.grid import centred_comb
 from labseq.text_files import beside
-from labseq.units import expected, parse_any, parse_quantity
+from labseq.units import expected, parse_any, parse_quantity, unit_names
 
 FOLDER: Final = "folder"
 """Key of pydantic's validation context: the folder of the file that the settings are in."""
@@ -114,6 +114,39 @@ def empty_is(default: Any) -> BeforeValidator:
 
 def _quantity(dimension: str) -> BeforeValidator:
     return BeforeValidator(Quantity(dimension))
+
+
+def si_unit_at(model: type[BaseModel] | None, loc: Loc) -> str:
+    """SI unit of the setting at a location in a settings model; "" for one that has or is none.
+
+    Example:
+        >>> class Mine(Settings):
+        ...     windows: Duration | tuple[Duration, ...] = 60e-3
+        >>> si_unit_at(Mine, ("windows", 2))
+        's'
+    """
+    if model is None or not loc:
+        return ""
+    named = [one for name, one in model.model_fields.items() if loc[0] in (name, one.alias)]
+    if not named:
+        return ""
+    field = named[0]
+    parts = list(_parts(Annotated[field.annotation, "", *field.metadata]))
+    models = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+    keys = [i for i, key in enumerate(loc) if i and isinstance(key, str)]
+    if models and keys:
+        return next(filter(None, (si_unit_at(one, loc[keys[0] :]) for one in models)), "")
+    units = {unit_names(part.dimension)[0] for part in parts if isinstance(part, Quantity)}
+    return units.pop() if len(units) == 1 and "%" not in units else ""
+
+
+def _parts(kind: Any) -> Iterator[Any]:
+    """The types and the functions of the validators that an annotation is made of."""
+    if isinstance(kind, BeforeValidator):
+        yield kind.func
+    yield kind
+    for part in (*getattr(kind, "__metadata__", ()), *get_args(kind)):
+        yield from _parts(part)
 
 
 def _not_too_long(duration_s: float) -> float:

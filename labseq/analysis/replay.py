@@ -464,7 +464,7 @@ def assembly_of(run: Run) -> Assembly:
         RecordingError: Its recorded files are missing.
     """
     record = run.record
-    options = Options.of(record["overrides"])
+    options = Options.of(run.changes)
     return assemble(
         Path(record["sequence_path"]),
         replace(options, profile=Path(record["profile_path"]), dry_run="fast"),

@@ -195,7 +195,7 @@ class ShotRecord:
             without one, or if a rearrangement follows it.
         n_missing_atoms: Atoms that the loading fell short of the target.
         readings: Values read from devices during the shot.
-        parameters: What differs from the files in this shot: address -> value.
+        parameters: What differs from the files in this shot: address -> value, SI.
         calibrations: Those in use: kind -> id.
         atom_events: What a simulation reports about the atoms: name -> structured array.
         thresholds: float64 (n_rows, n_cols), there is an atom where the signal of an image exceeds them; None
@@ -264,7 +264,9 @@ class RunRecord:
         sequence_path: Where the sequence came from.
         profile_path: Where the profile came from.
         resolved: Every setting after defaults and overrides, SI, JSON-ready.
-        overrides: What ``--set`` and other options changed: address -> value.
+        overrides: What ``--set`` and other options changed: address -> "value", SI; "unit"; and "written", as
+            it was typed.
+        units: SI units of what was set and scanned: address -> unit; without those that have none.
         devices: ``describe()`` of each device: role -> values.
         plugins: Name, version and origin of each plugin that was used.
         provenance: Code and package versions, host, user.
@@ -299,6 +301,7 @@ class RunRecord:
     scan: Mapping[str, Any] = field(default_factory=dict[str, Any])
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     steps: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
     resumed: tuple[Mapping[str, Any], ...] = ()
 
 

@@ -17,7 +17,6 @@ from labseq.recording.results import result_columns
 from labseq.recording.run_file import SIMULATION
 from labseq.recording.schema import unit_of
 from labseq.recording.shot import Shot
-from labseq.units import si_unit_of
 
 if TYPE_CHECKING:
     from labseq.recording.reader import Run
@@ -105,16 +104,16 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
         for name, about in DESCRIPTIONS.items()
     ]
     taken = {*DESCRIPTIONS}
-    written = _units_of_scan(run.scan)
+    scanned = (run.record.get("scan") or {}).get("addresses") or ()
     for prefix, values_of in _GROUPS.items():
         groups = [values_of(row) for row in rows]
         for name in dict.fromkeys(name for group in groups for name in group):
-            full_name = f"{prefix}{name}"
+            full_name = _column_name(prefix, name)
             while full_name in taken:
                 full_name += "_"
             taken.add(full_name)
-            units = (written.get(name, "") if not prefix else "") or unit_of(name)
-            about = _description(prefix, name, scanned=name in written)
+            units = unit_of(name) if prefix else run.units.get(name, "")
+            about = _description(prefix, name, scanned=name in scanned)
             columns.append(Column(full_name, _array([group.get(name) for group in groups]), units, about))
     for name, values in analysed.items():
         of_rows = [values.get(row["shot"]) if row["counts"] else None for row in rows]
@@ -142,7 +141,7 @@ def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
     """
     found = {name: value for name, value in _fixed(row).items() if name in FIGURES}
     for prefix in ("stage.", "reading."):
-        found |= {f"{prefix}{name}": value for name, value in _GROUPS[prefix](row).items()}
+        found |= {_column_name(prefix, name): value for name, value in _GROUPS[prefix](row).items()}
     return {
         name: float(value)
         for name, value in found.items()
@@ -165,13 +164,9 @@ def _duration_s(stage_s: Mapping[str, float | None]) -> float | None:
     return math.fsum(steps) if steps else None
 
 
-def _units_of_scan(scan: Mapping[str, Any]) -> dict[str, str]:
-    """Units of the scanned addresses, from the values as the sequence has them."""
-    units: dict[str, str] = {}
-    for values in scan.get("written") or ():
-        for address, written in zip(scan.get("addresses") or (), values, strict=False):
-            units[address] = units.get(address) or si_unit_of(str(written))
-    return units
+def _column_name(prefix: str, name: str) -> str:
+    """The name of a column, without spaces."""
+    return "_".join(f"{prefix}{name}".split())
 
 
 def _array(values: Sequence[Any], *, text: bool = False) -> NDArray[Any]:

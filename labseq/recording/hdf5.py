@@ -14,7 +14,7 @@ from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - 
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.plain import dumps, plain_text
+from labseq.plain import dumps, plain_text, to_plain
 from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
 
 _STRING: Final = h5py.string_dtype()
@@ -80,6 +80,41 @@ def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
     return {
         field.attribute: json.loads(text) if field.dtype == "json" else text for field, text in texts.items()
     }
+
+
+def write_values(group: Any, values: Mapping[str, Any], units: Mapping[str, str], about: str) -> None:
+    """Add a dataset for each value: numbers and lists of numbers, texts, and JSON for all others."""
+    names: list[str] = []
+    for key, value in to_plain(values).items():
+        names.append(link_name(key, names))
+        facts = {"address": key, "units": units.get(key, ""), "description": about}
+        if _is_numeric(value):
+            dataset = group.create_dataset(names[-1], data=value)
+        else:
+            text = plain_text(value) if isinstance(value, str) else dumps(value)
+            dataset = group.create_dataset(names[-1], data=text, dtype=_STRING)
+            facts["content_type"] = "text/plain" if isinstance(value, str) else "application/json"
+        set_attributes(dataset, facts)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether an array holds a value as it is: a number, or a list of numbers of one type."""
+    several: list[Any] = value if isinstance(value, list) else [value]
+    is_one_type = {*map(type, several)} in ({bool}, {int}, {float})
+    return is_one_type and all(type(one) is not int or -(2**63) <= one < 2**63 for one in several)
+
+
+def read_values(group: Any) -> dict[str, Any]:
+    """Read what :func:`write_values` wrote."""
+    found: dict[str, Any] = {}
+    for dataset in group.values():
+        kind, value = dataset.attrs.get("content_type"), dataset[()]
+        if kind is None:
+            value = value.tolist()
+        else:
+            value = json.loads(value) if kind == "application/json" else value.decode()
+        found[str(dataset.attrs["address"])] = value
+    return found
 
 
 def write_array(group: Any, path: str, values: Any, units: str | None = None) -> Any:

@@ -50,7 +50,7 @@ class ChosenPoints:
         self.points: list[list[Any]] = []
         self.written: list[list[str]] = []
         self._addresses = [str(address) for address in scan["addresses"]]
-        self._units = [str(unit) for unit in scan["units"]]
+        self._units = [str(unit) for unit in scan["written_units"]]
         self._numbers: dict[str, int] = {}
 
     def number(self, parameters: Mapping[str, Any]) -> int:

@@ -125,6 +125,17 @@ class Run:
         return target_of(self.path / folders.RUN_FILE, self.record)
 
     @property
+    def units(self) -> Mapping[str, str]:
+        """SI units of what was set and scanned: address -> unit; without those that have none."""
+        return dict(self.record.get("units") or {})
+
+    @property
+    def changes(self) -> Mapping[str, str]:
+        """What ``--set`` and other options changed: address -> value, as it was typed."""
+        overrides = dict(self.record.get("overrides") or {})
+        return {address: str(change["written"]) for address, change in overrides.items()}
+
+    @property
     def scan(self) -> Mapping[str, Any]:
         """The scan: addresses, points and the point of each shot; empty without one.
 

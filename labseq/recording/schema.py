@@ -3,6 +3,7 @@
 The tree of a shot file, with n images, a grid of (row, col) sites and frames of (y, x) pixels::
 
     /entry                      the shot, as attributes (SHOT); JSON texts (SHOT_TEXTS)
+      parameters/<address>      what was set for the run or scanned
       run                       what all shots of the run share: attributes (RUN) and texts (RUN_TEXTS)
       target                    fill, clear (row, col)
       camera/<name>             images (n, y, x), t_s (n,) and the table of frames
@@ -188,7 +189,6 @@ SHOT: Final = (
 """Attributes of ``/entry``, of a :class:`ShotRecord`."""
 
 SHOT_TEXTS: Final = (
-    Field("parameters", "json", "what differs from the files in this shot: address -> value, SI"),
     Field("readings", "json", "values read from devices during the shot, SI: name -> value"),
     Field("calibrations", "json", "the calibrations in use: kind -> id"),
 )
@@ -211,7 +211,10 @@ RUN_TEXTS: Final = (
     Field("sequence", "text", "the sequence file", "sequence_text"),
     Field("profile", "text", "the hardware profile", "profile_text"),
     Field("resolved", "json", "every setting after defaults and overrides, SI"),
-    Field("overrides", "json", "what --set and other options changed: address -> value"),
+    Field(
+        "overrides", "json", "what --set and other options changed: address -> value, SI; unit; as written"
+    ),
+    Field("units", "json", "SI units of what was set and scanned: address -> unit"),
     Field("plugins", "json", "name, version and origin of each plugin that was used"),
     Field("devices", "json", "what each device reports about itself, SI: role -> values"),
     Field("provenance", "json", "where the run comes from: versions, commits, host, user"),
@@ -496,6 +499,15 @@ ARRAYS: Final[Mapping[str, Dataset]] = {
 }
 """Path below ``/entry`` -> the array."""
 
+PARAMETER: Final = Dataset(
+    "parameters/<address>",
+    "number, array, text or JSON text",
+    "",
+    "set for the run or scanned, SI",
+    "of the setting",
+)
+"""A dataset for each setting that differs from the files in the shot."""
+
 ATOM_EVENTS: Final = Table(
     "atom_events/<name>", "row", "what a simulation reports about the atoms; see its plugin", ()
 )
@@ -528,7 +540,7 @@ def datasets() -> list[Dataset]:
     texts = [Dataset(text.name, _kind(text), "", text.description) for text in SHOT_TEXTS]
     texts += [Dataset(f"run/{text.name}", _kind(text), "", text.description) for text in RUN_TEXTS]
     tables = [Dataset(table.path, "table", table.row, table.description) for table in (*TABLES, ATOM_EVENTS)]
-    return sorted((*ARRAYS.values(), *tables, *texts), key=lambda dataset: dataset.path)
+    return sorted((PARAMETER, *ARRAYS.values(), *tables, *texts), key=lambda dataset: dataset.path)
 
 
 def _kind(field: Field) -> str:
@@ -559,6 +571,7 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
     found |= {path: dict.fromkeys(names, _VIEWER) for path, names in nexus.items()}
     for path, own in (("/entry", SHOT), ("/entry/run", RUN)):
         found[path] = found.get(path, {}) | {field.name: (_kind(field), field.description) for field in own}
+    found[f"/entry/{PARAMETER.path}"] = {"address": ("text", "address of the setting")}
     found["/entry/camera/<name>"]["name"] = ("text", "name of the camera")
     return found
 

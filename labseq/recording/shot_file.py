@@ -25,11 +25,13 @@ from labseq.recording.hdf5 import (
     load_filter,
     read_fields,
     read_texts,
+    read_values,
     set_attributes,
     write_array,
     write_fields,
     write_table,
     write_texts,
+    write_values,
 )
 from labseq.recording.run_file import check_version, sha256_of_text
 
@@ -68,6 +70,9 @@ class ShotEncoder:
         set_attributes(entry, {"default": "images_view" if kept else "detection"})
         write_fields(entry, schema.SHOT, shot)
         write_texts(entry, schema.SHOT_TEXTS, shot)
+        write_values(
+            entry.create_group("parameters"), shot.parameters, self._run.units, schema.PARAMETER.description
+        )
         if kept:
             self._write_frames(entry, shot.images, kept)
         _write_detection(entry.create_group("detection"), shot, self._run.target.shape)
@@ -259,6 +264,7 @@ def _record(entry: Any) -> ShotRecord:
     steps = schema.STEPS.arguments(StepTiming, entry["steps"][()]) if "steps" in entry else []
     return ShotRecord(
         **{name: value for name, value in values.items() if name in taken},
+        parameters=read_values(entry["parameters"]),
         images=_images(entry["detection"]),
         **_detector(entry["detection"]),
         cycles=schema.cycles_of(

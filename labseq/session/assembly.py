@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
+
+from pydantic import BaseModel
 
 from labseq import builtin as builtins
-from labseq.config.addresses import ROLES, split_overrides
+from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
 from labseq.config.scan import Adaptive, Axis, Ends, Scan
 from labseq.config.sequence import SequenceSpec, load_sequence
-from labseq.errors import ConfigError, LabseqError, PluginLoadError, ProblemCollector
+from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, TargetPattern
 from labseq.plugins import PluginHost
@@ -35,7 +37,22 @@ from labseq.session.options import Options
 from labseq.session.policies import check_figure, make_policy, with_policies
 from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile, with_tones
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
-from labseq.units import written
+from labseq.settings import si_unit_at
+from labseq.units import si_unit_of, written
+
+
+class Setting(NamedTuple):
+    """A value as it is recorded.
+
+    Attributes:
+        value: SI, JSON-ready.
+        unit: SI unit; "" for none.
+        written: As it was typed.
+    """
+
+    value: Any
+    unit: str
+    written: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +90,45 @@ class Assembly:
     def virtual_time(self) -> bool:
         """Whether the run's clock is virtual, without real waiting times."""
         return self.dry_run != "off" or self.hardware.virtual_time
+
+    def setting(self, address: str, written: str = "") -> Setting:
+        """A setting of the run, after defaults and overrides; the scan is at its first point.
+
+        Args:
+            address: Its address; "profile." for one in the profile.
+            written: What was typed for it: taken if the record has no such setting.
+        """
+        of_profile = address.startswith(PROFILE)
+        document = self.hardware.document if of_profile else self.document
+        try:
+            loc = find(document.root, address.removeprefix(PROFILE) if of_profile else address, "", "")
+            value: Any = self.resolved["profile"] if of_profile else self.resolved
+            for key in loc:
+                value = value[key]
+        except (ConfigError, LookupError, TypeError):  # a setting that is written and not used
+            return Setting(written, "", written)
+        unit = next(filter(None, (si_unit_at(*place) for place in self._models(of_profile, loc))), "")
+        return Setting(value, unit or si_unit_of(written), written)
+
+    def _models(self, of_profile: bool, loc: Loc) -> list[tuple[type[BaseModel] | None, Loc]]:
+        """The settings models that may know a setting, with its location in each."""
+        top = str(loc[0]) if loc else ""
+        if of_profile:
+            name, n = (str(loc[1]), 2) if top == "devices" and len(loc) > 1 else (top, 1)
+            own = self.hardware.chosen.get(name)
+            entry, core = own.entry if own else None, type(self.hardware.profile)
+        else:
+            n, core = (3 if top == "shot" else 1), type(self.sequence)
+            kind = {"shot": "step", "target": "pattern"}.get(top, top)
+            names = {"step": str(loc[2]) if len(loc) > 2 else "", "pattern": self.sequence.target.use}
+            is_planner = kind == "planner"
+            found = None if is_planner else self.hardware.host.registry.find(kind, names.get(kind, ""))
+            entry = self.planner.entry if is_planner else found
+        return [(entry.settings_model if entry else None, loc[n:]), (core, loc)]
+
+    def units(self, addresses: Iterable[str]) -> dict[str, str]:
+        """The SI units of settings: address -> unit; without those that have none."""
+        return {address: unit for address in addresses if (unit := self.setting(address).unit)}
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -370,7 +426,7 @@ class Search:
         """The scan for the run's record, JSON-ready; the points are in the index."""
         return {
             "addresses": [one.address for one in self.ranges],
-            "units": self.units,
+            "written_units": self.units,
             "ranges": [asdict(one) for one in self.ranges],
             SCANNER: self.chosen.dump(),
             "figure": self.adaptive.figure,

@@ -12,7 +12,7 @@ from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.session.chosen import DryRun
 
-_NOT_SET: Final = ("profile", "dry_run")
+NOT_SET: Final = ("profile", "dry_run")
 """Options that do not replace a value of the sequence."""
 
 
@@ -58,13 +58,13 @@ class Options:
 
     @classmethod
     def of(cls, changes: Mapping[str, Any], *, realtime: bool = False) -> Self:
-        """Options from recorded changes; the inverse of :meth:`changes`."""
+        """Options from their changes; the inverse of :meth:`changes`."""
         own = {key: int(changes[key]) for key in ("shots", "seed") if str(changes.get(key)).isdecimal()}
         return cls(
             profile=changes.get("profile"),
             shots=own.get("shots"),
             seed=own.get("seed"),
-            overrides=tuple(f"{a}={v}" for a, v in changes.items() if a not in {*own, *_NOT_SET}),
+            overrides=tuple(f"{a}={v}" for a, v in changes.items() if a not in {*own, *NOT_SET}),
             dry_run=changes.get("dry_run", "off"),
             realtime=realtime,
         )
@@ -76,9 +76,9 @@ class Options:
             Override(key, str(value), f"--{key} {value}") for key, value in given.items() if value is not None
         ]
 
-    def changes(self) -> dict[str, Any]:
-        """Everything that differs from the files, for the record: address -> value."""
-        changed: dict[str, Any] = {override.address: override.value for override in self.own()}
+    def changes(self) -> dict[str, str]:
+        """Everything that differs from the files: address -> value, as it was typed."""
+        changed: dict[str, str] = {override.address: override.value for override in self.own()}
         changed |= dict(item.split("=", 1) for item in self.overrides)
         if self.profile is not None:
             changed["profile"] = str(self.profile)

@@ -20,7 +20,8 @@ from labseq.calibration.store import encode_entry
 from labseq.errors import StopRequested
 from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
-from labseq.session.assembly import Assembly
+from labseq.session.assembly import Assembly, Setting
+from labseq.session.options import NOT_SET
 
 _GIT_TIMEOUT_S: Final = 5.0
 
@@ -104,18 +105,23 @@ def _user() -> str:
 
 
 def run_record(
-    assembly: Assembly, seed: int, changes: Mapping[str, Any], scan: Mapping[str, Any], folder: Path
+    assembly: Assembly, seed: int, changes: Mapping[str, str], scan: Mapping[str, Any], folder: Path
 ) -> RunRecord:
     """The record of a run before anything is opened.
 
     Args:
         assembly: The run.
         seed: Its seed.
-        changes: Changes by options: address -> value.
+        changes: Changes by options, as they were typed: address -> value.
         scan: Its scan, see :meth:`labseq.session.scan_run.ScanRun.record`.
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """
     spec, hardware = assembly.sequence, assembly.hardware
+    changed = {
+        address: Setting(text, "", text) if address in NOT_SET else assembly.setting(address, text)
+        for address, text in changes.items()
+    }
+    scanned = () if assembly.scanned is None else assembly.scanned.at(0).parameters
     return RunRecord(
         name=spec.name,
         n_shots=spec.shots,
@@ -128,7 +134,8 @@ def run_record(
         sequence_path=str(folder / assembly.document.path),
         profile_path=str(folder / hardware.document.path),
         resolved=assembly.resolved,
-        overrides=changes,
+        overrides={address: setting._asdict() for address, setting in changed.items()},
+        units={address: one.unit for address, one in changed.items() if one.unit} | assembly.units(scanned),
         devices={},
         plugins=plugins_of(assembly),
         provenance=gather_provenance((folder / assembly.document.path).parent) | {"folder": str(folder)},

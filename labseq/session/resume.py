@@ -132,7 +132,7 @@ class ResumableRun:
             ConfigError: That is no longer possible, for example because a calibration or plugin is missing.
             RecordingError: The run's own files have been changed.
         """
-        record, options = self.run.record, Options.of(self.run.record["overrides"], realtime=realtime)
+        record, options = self.run.record, Options.of(self.run.changes, realtime=realtime)
         sequence, profile = Path(record["sequence_path"]), Path(record["profile_path"])
         kept = {
             "sequence": stored_text(self.run.path / SEQUENCE_FILE, record["sequence_sha256"]),

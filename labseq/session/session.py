@@ -238,7 +238,8 @@ class Session:
 
     def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
-        first, changes = self.scan_run.first, self.options.changes()
+        first = self.scan_run.first
+        changes = {address: change["value"] for address, change in record.overrides.items()}
         sequencer = self._sequencer = Sequencer(
             lab,
             first.steps,

@@ -43,7 +43,8 @@ def make_run(**changes: Any) -> RunRecord:
         sequence_path="sequences/compact_225.yaml",
         profile_path="hardware_profiles/virtual.yaml",
         resolved={"planner": {"use": "psca", "degree_of_parallelism": 7}},
-        overrides={"planner.degree_of_parallelism": 7},
+        overrides={"planner.degree_of_parallelism": {"value": 7, "unit": "", "written": "7"}},
+        units={"shot.2.rearrange.window": "s"},
         devices={"camera": {"model": "EMCCD"}, "laser/780 nm": {"power_w": np.float64(0.1)}},
         plugins=({"name": "labseq_psca", "version": "0.1.0", "origin": "entry point"},),
         provenance={

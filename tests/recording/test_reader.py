@@ -42,7 +42,7 @@ def test_a_run_tells_what_it_was(run_dir: Path) -> None:
     assert run.defect_free == 0.5  # of the two that were judged
     assert run.filling_fraction == 0.75
     assert run.status == "complete"
-    assert run.record["overrides"] == {"planner.degree_of_parallelism": 7}
+    assert run.changes == {"planner.degree_of_parallelism": "7"}
     assert run.summary() == {
         "run_dir": str(run_dir),
         "shots": 3,

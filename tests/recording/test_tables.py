@@ -37,7 +37,7 @@ def entries(run: Run) -> list[Any]:
             found.append(
                 {
                     **entry.attrs,
-                    "parameters": json.loads(entry["parameters"][()]),
+                    "parameters": {name: value[()] for name, value in entry["parameters"].items()},
                     "readings": json.loads(entry["readings"][()]),
                     "occupancy": entry["detection/occupancy"][()],
                     "cycles": entry["rearrangement/cycles"][()],

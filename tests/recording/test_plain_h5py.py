@@ -1,0 +1,95 @@
+"""What an analyst needs of a run is in its files, in SI and with names."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import labseq
+
+SEQUENCE = """\
+labseq: 1
+name: release
+profile: virtual
+seed: 3
+record_frames: none
+target: {pattern: compact, rows: 10, cols: 10}
+scan: {shot.hold.duration: [1 ms, 20 ms]}
+shot:
+  - load: {}
+  - image: {}
+    name: before
+  - wait: {duration: 1 ms}
+    name: hold
+  - rearrange: {cycles: 2, window: 60 ms, stop_when: never}
+  - image: {}
+"""
+CHANGES = (
+    "shot.before.exposure=80 ms",
+    "profile.mobile_tweezers.pick_up=0.0002",
+    "planner.degree_of_parallelism=5",
+)
+EXPOSURE, PICK_UP, HOLD = (
+    "shot.before.exposure",
+    "profile.mobile_tweezers.pick_up",
+    "shot.hold.duration",
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
+    folder = tmp_path_factory.mktemp("release")
+    (folder / "release.yaml").write_text(SEQUENCE, "utf-8")
+    with labseq.Session.open(folder / "release.yaml", output=folder, overrides=CHANGES) as session:
+        return session.run()
+
+
+def test_filling_per_cycle_and_survival_between_named_images(run: labseq.Run) -> None:
+    shot_file = run.shots[0].file
+    with h5py.File(shot_file) as file:
+        entry: Any = file["entry"]
+        images, sites = entry["detection/images"][()], entry["detection/occupancy"][()] == 1
+        target = entry["target/fill"][()] == 1
+    filling = {cycle: sites[images["cycle"] == cycle][:, target].mean() for cycle in {*images["cycle"]}}
+    before, after = (sites[images["name"] == name][0] for name in (b"before", b"image"))
+    survival = (before & after).sum() / before.sum()
+
+    names = ["before", *(f"rearrange_cycle_{cycle}" for cycle in images["cycle"][1:3]), "image"]
+    assert [name.decode() for name in images["name"]] == names == [one.name for one in run.shots[0].images]
+    assert filling[max(filling)] > 0.9
+    assert 0.5 < survival < 1
+
+
+def test_other_thresholds_need_no_frames(run: labseq.Run) -> None:
+    with h5py.File(run.shots[0].file) as file:
+        found: Any = file["entry/detection"]
+        signal, threshold, occupancy = found["signal"], found["threshold"], found["occupancy"]
+        np.testing.assert_array_equal(signal[()] > threshold[()], occupancy[()])
+        assert (signal.attrs["units"], threshold.attrs["units"]) == ("counts", "counts")
+        assert [axis.label for axis in signal.dims] == ["image", "row", "col"]
+        assert found["sites_px"].shape == (*threshold.shape, 2)
+        assert "camera" not in file["entry"]  # pyright: ignore[reportOperatorIssue] - a group
+        assert list(file["entry/run"].attrs["steps"]) == ["load", "before", "hold", "rearrange", "image"]
+
+
+def test_what_is_set_or_scanned_is_a_number_in_si_with_its_unit(run: labseq.Run) -> None:
+    expected = {EXPOSURE: (0.08, "s"), PICK_UP: (2e-4, "s"), "planner.degree_of_parallelism": (5, "")}
+    record = json.loads((run.path / "run.json").read_bytes())
+    assert record["overrides"][EXPOSURE] == {"value": 0.08, "unit": "s", "written": "80 ms"}
+    index = [json.loads(line) for line in (run.path / "index.jsonl").read_text("utf-8").splitlines()]
+    for shot, hold_s in zip(index, (0.001, 0.02), strict=True):
+        with h5py.File(run.path / shot["file"]) as file:
+            parameters: Any = file["entry/parameters"]
+            for address, (value, unit) in {**expected, HOLD: (hold_s, "s")}.items():
+                assert shot["parameters"][address] == parameters[address][()] == value
+                assert parameters[address].attrs["units"] == record["units"].get(address, "") == unit
+    pytest.importorskip("xarray")
+    table, data = run.to_dataframe(), run.to_xarray()
+    assert table[EXPOSURE].tolist() == [0.08, 0.08]
+    assert table.attrs["units"][PICK_UP] == data[PICK_UP].attrs["units"] == data[HOLD].attrs["units"] == "s"
+    assert data[HOLD].values.tolist() == [0.001, 0.02]
+    assert not [name for name in table.columns if " " in name]
