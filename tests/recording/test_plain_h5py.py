@@ -54,13 +54,13 @@ def test_filling_per_cycle_and_survival_between_named_images(run: labseq.Run) ->
         entry: Any = file["entry"]
         images, sites = entry["detection/images"][()], entry["detection/occupancy"][()] == 1
         target = entry["target/fill"][()] == 1
-    filling = {cycle: sites[images["cycle"] == cycle][:, target].mean() for cycle in {*images["cycle"]}}
+    filling = {cycle: sites[images["cycle"] == cycle][:, target].mean() for cycle in (0, 1)}
     before, after = (sites[images["name"] == name][0] for name in (b"before", b"image"))
     survival = (before & after).sum() / before.sum()
 
-    names = ["before", *(f"rearrange_cycle_{cycle}" for cycle in images["cycle"][1:3]), "image"]
+    names = ["before", "rearrange_cycle_0", "rearrange_cycle_1", "image"]
     assert [name.decode() for name in images["name"]] == names == [one.name for one in run.shots[0].images]
-    assert filling[max(filling)] > 0.9
+    assert filling[1] > 0.9
     assert 0.5 < survival < 1
 
 
@@ -73,7 +73,8 @@ def test_other_thresholds_need_no_frames(run: labseq.Run) -> None:
         assert [axis.label for axis in signal.dims] == ["image", "row", "col"]
         assert found["sites_px"].shape == (*threshold.shape, 2)
         assert "camera" not in file["entry"]  # pyright: ignore[reportOperatorIssue] - a group
-        assert list(file["entry/run"].attrs["steps"]) == ["load", "before", "hold", "rearrange", "image"]
+        steps: Any = file["entry/run"].attrs["steps"]
+        assert list(steps) == ["load", "before", "hold", "rearrange", "image"]
 
 
 def test_what_is_set_or_scanned_is_a_number_in_si_with_its_unit(run: labseq.Run) -> None:
