@@ -1,8 +1,10 @@
 """Compiled functions: a numba decorator that takes explicit signatures, and a cache keyed by the source.
 
-numba compiles when a decorated function is defined, because every kernel has
-explicit signatures: no new dtype or layout can cost a compile in the middle of
-a shot. Later processes load the machine code from the user's cache.
+Because every kernel has explicit signatures, no new dtype or layout can cost a compile
+in the middle of a shot. A kernel is compiled, or its machine code loaded from the user's
+cache, at the end of the :func:`warming` block in which its module is imported, otherwise
+at its first call. Several processes share what is missing from the cache. A helper, which
+only kernels call, is compiled with them and is part of their machine code: it is not loaded.
 
 numba's own cache notices an edit of a kernel's file, but not of a kernel or constant
 imported from another file: it would continue to use the old machine code. So each
@@ -14,7 +16,9 @@ anywhere therefore leads to a new folder.
 
 from __future__ import annotations
 
+import gc
 import hashlib
+import importlib
 import os
 import pickle
 import re
@@ -24,25 +28,63 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 
+from labseq.errors import LabseqError, PluginLoadError
 from labseq.files import cache_root
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 UNUSED_DAYS: Final = 30
 """Compiled kernels that no process has loaded for this many days are deleted."""
+MAX_WORKERS: Final = 4
+"""Maximum number of processes that compile; each needs about 200 MB."""
+WORTH_A_PROCESS_S: Final = 3.0
+"""What would take less than this is compiled without starting processes."""
+COMPILE_S: Final = 0.003
+"""Scale of the estimates of the time for compiling, in seconds; measured on a laptop's core."""
 
 _FOLDER_NAME = re.compile(r"[0-9a-f]{24}")
-_LOCK = threading.RLock()
 _INTERPRETED = threading.Event()
-_MODULES: set[str] = set()
-_KERNELS: dict[int, tuple[Any, str]] = {}  # id of a compiled kernel -> itself, its digest
+_KERNELS: dict[int, tuple[Any, str]] = {}  # id of a kernel -> itself, its digest
+_PENDING: dict[int, _Kernel] = {}  # id of a kernel that is neither compiled nor loaded yet
+_ANNOUNCE: list[Callable[[float], None]] = []
+
+
+@dataclass(eq=False)
+class _Kernel:
+    """A kernel, and what is needed to compile or load it; its folder is None if it cannot be kept."""
+
+    dispatcher: Any
+    signatures: list[str]
+    folder: Path | None
+    is_helper: bool
+    builds_on: frozenset[str]  # modules
+    is_loaded: bool = False
+
+    @property
+    def module(self) -> str:
+        return self.dispatcher.py_func.__module__
+
+    @property
+    def compile_s(self) -> float:
+        """Roughly how long compiling takes, in seconds."""
+        return COMPILE_S * len(self.signatures) * (30 + len(self.dispatcher.py_func.__code__.co_code) / 10)
+
+    def is_in_use(self) -> bool:
+        """Whether its module is the imported one, and not one that was edited and imported again since."""
+        return getattr(sys.modules.get(self.module), "__dict__", None) is self.dispatcher.py_func.__globals__
+
+    def is_cached(self) -> bool:
+        code = self.dispatcher.py_func.__code__
+        pattern = f"*{code.co_name}-{code.co_firstlineno}.*.nbi"
+        return self.folder is not None and any(self.folder.rglob(pattern))
 
 
 def const(dtype: str, ndim: int) -> str:
@@ -69,12 +111,15 @@ def kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[
         fused: Let ``a * b + c`` be rounded once instead of twice, where the processor
             can. That is faster, but the last digit may differ between processors.
     """
-    signatures = [signature] if isinstance(signature, str) else list(signature)
+    return _decorator(signature, fused, is_helper=False)
 
-    def decorate(function: F) -> F:
-        return cast("F", _compile(cast("FunctionType", function), signatures, fused))
 
-    return decorate
+def helper_kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[F], F]:
+    """Like :func:`kernel`, for a function that only kernels call: nothing to load if they are in the cache.
+
+    Python may call it, too; the first call then takes a few milliseconds longer.
+    """
+    return _decorator(signature, fused, is_helper=True)
 
 
 def interpret() -> None:
@@ -88,32 +133,42 @@ def interpret() -> None:
 
 
 @contextmanager
-def announcing(announce: Callable[[str], None]) -> Generator[None]:
-    """Call ``announce(module_name)`` before a module's first kernel is compiled.
+def announcing(announce: Callable[[float], None]) -> Generator[None]:
+    """Call ``announce(seconds)`` before the first kernel is compiled, with roughly how long compiling takes.
 
-    Modules whose kernels all come from the cache are not announced. Import the
-    kernels (for a planner: ``warm()``) inside the ``with`` block.
+    It is not called if all kernels come from the cache.
     """
-    if _INTERPRETED.is_set():
+    _ANNOUNCE.append(announce)
+    try:
         yield
-        return
+    finally:
+        with suppress(ValueError):  # it was called
+            _ANNOUNCE.remove(announce)
 
-    from numba.core import event
 
-    announced: set[str] = set()
+def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
+    """Compile the kernels of all modules imported so far, or load them from the cache.
 
-    class Announcer(event.Listener):
-        def on_start(self, event: Any) -> None:
-            module = event.data["dispatcher"].py_func.__module__
-            if module in _MODULES and module not in announced:
-                announced.add(module)
-                announce(module)
+    Args:
+        poll: Called while it waits for processes, and before each kernel.
 
-        def on_end(self, event: Any) -> None:
-            pass
-
-    with event.install_listener("numba:compile", Announcer()):
-        yield
+    Raises:
+        PluginLoadError: A kernel cannot be compiled.
+    """
+    wanted = [one for one in _PENDING.values() if one.is_in_use() and not one.is_helper]
+    if not all(one.is_cached() for one in wanted):
+        _compile_in_processes(
+            [one for one in _PENDING.values() if one.is_in_use() and not one.is_cached()], poll
+        )
+    for one in wanted:
+        poll()
+        try:
+            _load(one)
+        except Exception as error:
+            _PENDING.pop(id(one.dispatcher), None)  # the next session may do without it
+            name = one.dispatcher.py_func.__name__
+            reason = f"kernel '{name}' cannot be compiled: {type(error).__name__}: {error}"
+            raise error if isinstance(error, LabseqError) else PluginLoadError(one.module, reason) from error
 
 
 def _numba() -> Any:
@@ -122,62 +177,215 @@ def _numba() -> Any:
     return numba  # as Any: it ships no types
 
 
-def _compile(function: FunctionType, signatures: list[str], fused: bool) -> Any:
-    if _INTERPRETED.is_set():
-        return function
-    numba = _numba()
-    if numba.config.DISABLE_JIT:
-        return function
-    with _LOCK:
-        digest = _digest(function)
-        in_file = Path(function.__code__.co_filename).is_file()
-        folder = _folder(digest) if in_file else None
-        _MODULES.add(function.__module__)
+def _decorator(signature: str | Sequence[str], fused: bool, *, is_helper: bool) -> Callable[[F], F]:
+    signatures = [signature] if isinstance(signature, str) else list(signature)
+
+    def decorate(function: F) -> F:
+        if _INTERPRETED.is_set() or _numba().config.DISABLE_JIT:
+            return function
+        return cast("F", _define(cast("FunctionType", function), signatures, fused, is_helper))
+
+    return decorate
+
+
+def _define(function: FunctionType, signatures: list[str], fused: bool, is_helper: bool) -> Any:
+    from numba.core.compiler_lock import global_compiler_lock
+
+    config = _numba().config
+    with global_compiler_lock:
+        callees = _callees(function)
+        digest = _digest(function, callees)
+        folder = _folder(digest) if Path(function.__code__.co_filename).is_file() else None
+        before = config.CACHE_DIR  # kernels of other packages stay where they are
+        config.CACHE_DIR = str(folder or "")
         try:
-            compiled = _jit(function, signatures, folder, fused)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            # a full disk, or files truncated by a crash: compile without the cache
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-            compiled = _jit(function, signatures, None, fused)
-        _KERNELS[id(compiled)] = compiled, digest
-    return compiled
+            dispatcher = _numba().njit(
+                cache=folder is not None,
+                nogil=True,
+                error_model="numpy",
+                no_cfunc_wrapper=True,
+                fastmath={"contract"} if fused else False,
+            )(function)
+        finally:
+            config.CACHE_DIR = before
+        _KERNELS[id(dispatcher)] = dispatcher, digest
+        builds_on = frozenset(callee.py_func.__module__ for callee, _ in callees)
+        _defer(_Kernel(dispatcher, signatures, folder, is_helper, builds_on))
+    return dispatcher
 
 
-def _jit(function: FunctionType, signatures: list[str], folder: Path | None, fused: bool) -> Any:
-    """Compile, keeping the machine code in a folder (None: nowhere)."""
-    numba = _numba()
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = (
-        "" if folder is None else str(folder)
-    )  # kernels of other packages stay where they are
+def _defer(one: _Kernel) -> None:
+    """Load a kernel when Python calls it or numba compiles a call of it, if not before."""
+    dispatcher = one.dispatcher
+
+    def callable_for(*_: Any) -> Any:
+        _load(one)
+        return dispatcher
+
+    def get_call_template(args: Any, kws: Any) -> Any:
+        _load(one)
+        return type(dispatcher).get_call_template(dispatcher, args, kws)
+
+    # attributes of the object go before those of its class, and are deleted once it is loaded
+    dispatcher._compile_for_args = callable_for  # noqa: SLF001
+    dispatcher.get_call_template = get_call_template
+    _PENDING[id(dispatcher)] = one
+
+
+def _load(one: _Kernel) -> None:
+    """Load a kernel from the cache, or compile it with all that it calls."""
+    from numba.core.compiler_lock import global_compiler_lock
+
+    dispatcher = one.dispatcher
+    with global_compiler_lock:
+        if one.is_loaded:
+            return
+        _PENDING.pop(id(dispatcher), None)
+        del dispatcher._compile_for_args, dispatcher.get_call_template  # noqa: SLF001
+        try:
+            try:
+                _build(one)
+            except (OSError, EOFError, pickle.UnpicklingError):
+                # a full disk, or files truncated by a crash: compile without the cache
+                if one.folder is not None:
+                    shutil.rmtree(one.folder, ignore_errors=True)
+                dispatcher._cache.disable()  # noqa: SLF001
+                _build(one)
+            dispatcher.disable_compile()
+            one.is_loaded = True
+        except BaseException:
+            _defer(one)
+            raise
+
+
+def _build(one: _Kernel) -> None:
+    from numba.core import event
+    from numba.core.runtime.nrt import rtsys
+
+    context = one.dispatcher.targetctx
+
+    class Compiling(event.Listener):
+        def on_start(self, event: Any) -> None:  # noqa: ARG002 - numba names it
+            vars(context).pop("refresh", None)
+            while _ANNOUNCE:
+                missing = [one, *(other for other in _PENDING.values() if not other.is_cached())]
+                _ANNOUNCE.pop()(sum(other.compile_s for other in missing))
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    # before numba loads machine code, it would import all that it needs for compiling, which takes 0.4 s
+    rtsys.initialize(context)
+    context.refresh = lambda: None
     try:
-        return numba.njit(
-            signatures,
-            cache=folder is not None,
-            nogil=True,
-            error_model="numpy",
-            no_cfunc_wrapper=True,
-            fastmath={"contract"} if fused else False,
-        )(function)
+        with event.install_listener("numba:compile", Compiling()):
+            for signature in one.signatures:
+                one.dispatcher.compile(signature)
     finally:
-        numba.config.CACHE_DIR = before
+        vars(context).pop("refresh", None)
 
 
-def _digest(function: FunctionType) -> str:
-    """Digest of everything that a kernel is compiled from."""
-    parts: list[object] = [sys.version, _numba().__version__, np.__version__]
-    parts += sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    parts.append(_source(function))
-    module_globals = function.__globals__
-    taken = list(module_globals.values())
+def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> None:
+    """Let several processes compile kernels into the cache, a module at a time; failures are ignored."""
+    from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+    from graphlib import TopologicalSorter
+
+    seconds, graph = dict[str, float](), dict[str, set[str]]()
+    for one in kernels:
+        seconds[one.module] = seconds.get(one.module, 0.0) + one.compile_s
+        graph.setdefault(one.module, set()).update(one.builds_on)
+    n_workers = min(MAX_WORKERS, n_cores(), len(seconds))
+    if n_workers < 2 or sum(seconds.values()) < WORTH_A_PROCESS_S:
+        return
+    while _ANNOUNCE:
+        _ANNOUNCE.pop()(1.0 + max(sum(seconds.values()) / n_workers, *seconds.values()))
+    order = TopologicalSorter({module: on & seconds.keys() for module, on in graph.items()})
+    order.prepare()
+    with ThreadPoolExecutor(n_workers) as pool, ExitStack() as stack:
+        idle = [stack.enter_context(_Worker()) for _ in range(n_workers)]
+        busy: dict[Future[None], tuple[_Worker, str]] = {}
+        ready: list[str] = []
+        while order.is_active():
+            ready += order.get_ready()
+            ready.sort(key=lambda module: seconds[module])
+            while idle and ready:
+                worker, module = idle.pop(), ready.pop()
+                busy[pool.submit(worker.compile, module)] = worker, module
+            for done in wait(busy, 0.1, FIRST_COMPLETED).done:
+                worker, module = busy.pop(done)
+                idle.append(worker)
+                order.done(module)
+            poll()
+
+
+class _Worker:
+    """A process that compiles the kernels of modules into the cache."""
+
+    def __enter__(self) -> _Worker:
+        import subprocess
+
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", "from labseq.kernel import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            text=True,
+        )
+        return self
+
+    def compile(self, module: str) -> None:
+        """Ask for a module, and wait; returns at once if the process has ended."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with suppress(OSError, ValueError):
+            print(module, file=self._process.stdin, flush=True)
+            self._process.stdout.readline()
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        with self._process:
+            pass
+
+
+def serve() -> None:
+    """Compile the kernels of each module that standard input names, one per line."""
+    gc.disable()  # there are no cycles to speak of, and compiling takes a sixth less time
+    answer = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # a module may print
+    for line in sys.stdin:
+        with suppress(Exception):
+            importlib.import_module(line.strip())
+            for one in [one for one in _PENDING.values() if one.module == line.strip()]:
+                _load(one)
+        print("done", file=answer, flush=True)
+
+
+def n_cores() -> int:
+    """Number of processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # unavailable on Windows and macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _callees(function: FunctionType) -> list[tuple[Any, str]]:
+    """The kernels that a function's module imports from other files, with their digests."""
+    taken = list(function.__globals__.values())
     for module in [value for value in taken if isinstance(value, ModuleType)]:
         taken += vars(module).values()
     kernels = [_KERNELS[id(value)] for value in taken if id(value) in _KERNELS]
     file = function.__code__.co_filename
-    parts += sorted({digest for kernel, digest in kernels if kernel.py_func.__code__.co_filename != file})
+    return [(kernel, digest) for kernel, digest in kernels if kernel.py_func.__code__.co_filename != file]
+
+
+def _digest(function: FunctionType, callees: list[tuple[Any, str]]) -> str:
+    """Digest of everything that a kernel is compiled from."""
+    parts: list[object] = [sys.version, _numba().__version__, np.__version__]
+    parts += sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    parts.append(_source(function))
+    parts += sorted({digest for _, digest in callees})
     for name in function.__code__.co_names:
-        value = module_globals.get(name)
+        value = function.__globals__.get(name)
         if isinstance(value, np.ndarray):
             parts.append((name, value.dtype.str, value.shape, value.tobytes()))
         elif isinstance(value, bool | int | float | complex | str | tuple | np.generic):

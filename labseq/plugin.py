@@ -36,7 +36,7 @@ from labseq.errors import (
 from labseq.files import Process, cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
-from labseq.kernel import const, kernel
+from labseq.kernel import const, helper_kernel, kernel
 from labseq.messages import clean, closest, visible
 from labseq.model import (
     COMPUTER,
@@ -262,6 +262,7 @@ __all__ = [
     "fitting_batches",
     "format_quantity",
     "from_the_centre",
+    "helper_kernel",
     "hookimpl",
     "idle_program",
     "is_network_port",

@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba.core import event
 
+import labseq
 import labseq.kernel
-from labseq.kernel import announcing, const, kernel
+from labseq.kernel import announcing, const, kernel, load_kernels
 
 MAX_LACK = 3
 
@@ -64,11 +66,16 @@ class Package:
     def write(self, module: str, text: str) -> None:
         (self.folder / f"{module}.py").write_text(textwrap.dedent(text), encoding="utf-8")
 
-    def load(self) -> ModuleType:
+    def define(self) -> ModuleType:
         for module in [name for name in sys.modules if name.split(".")[0] == self.name]:
             del sys.modules[module]
         importlib.invalidate_caches()
         return importlib.import_module(f"{self.name}.top")
+
+    def load(self) -> ModuleType:
+        top = self.define()
+        load_kernels()
+        return top
 
     def result(self) -> int:
         return self.load().top(0)
@@ -89,10 +96,20 @@ def package(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, reques
 
 
 def compiled_modules(load: Callable[[], object]) -> list[str]:
-    announced: list[str] = []
-    with announcing(announced.append):
+    modules: list[str] = []
+
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            modules.append(event.data["dispatcher"].py_func.__module__)
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    announced: list[float] = []
+    with event.install_listener("numba:compile", Listener()), announcing(announced.append):
         load()
-    return [name.split(".")[-1] for name in announced]
+    assert len(announced) == bool(modules)
+    return [name.split(".")[-1] for name in modules if "kernels_of" in name]
 
 
 def test_an_edit_of_a_callee_in_another_file_is_seen(package: Package) -> None:
@@ -112,6 +129,50 @@ def test_only_what_an_edit_touches_is_compiled_again(package: Package) -> None:
     assert compiled_modules(package.load) == ["top"]
     package.write("middle", MIDDLE.format(package=package.name) + "\n")
     assert compiled_modules(package.load) == ["middle", "top"]
+
+
+def test_a_helper_is_loaded_only_to_compile_what_calls_it_or_when_python_does(package: Package) -> None:
+    package.write(
+        "middle",
+        MIDDLE.format(package=package.name)
+        .replace("@kernel", "@helper_kernel")
+        .replace("import kernel", "import helper_kernel"),
+    )
+    package.write(
+        "leaf",
+        LEAF.format(step=1)
+        .replace("@kernel", "@helper_kernel")
+        .replace("import kernel", "import helper_kernel"),
+    )
+    assert compiled_modules(package.load) == ["top", "middle", "leaf"]
+    top: Any = package.load()
+    assert (len(top.top.overloads), len(top.MIDDLE.overloads)) == (1, 0)
+    assert (top.top(0), top.MIDDLE(0), len(top.MIDDLE.overloads)) == (102, 2, 1)
+    with pytest.raises(TypeError, match="No matching definition"):
+        top.MIDDLE("text")
+
+
+def test_a_kernel_is_loaded_by_its_first_call(package: Package) -> None:
+    top = package.define()
+    assert compiled_modules(lambda: top.top(0)) == ["top", "middle", "leaf"]
+    again: Any = package.define()
+    assert compiled_modules(lambda: again.top(0)) == []
+    assert len(again.MIDDLE.overloads) == 0  # nothing has asked for it
+
+
+def test_processes_fill_the_cache(package: Package, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(labseq.kernel, "WORTH_A_PROCESS_S", 0.0)
+    monkeypatch.setattr(labseq.kernel, "n_cores", lambda: 2)
+    polled: list[None] = []
+    top = package.define()
+    announced: list[float] = []
+    with announcing(announced.append):
+        load_kernels(lambda: polled.append(None))
+    assert (top.top(0), len(announced)) == (102, 1)
+    assert sum(top.top.stats.cache_misses.values()) == 0
+    package.write("top", TOP.format(package=package.name).replace("MIDDLE(x)", "MIDDLE(y)"))
+    with pytest.raises(labseq.PluginLoadError, match=r"'top' cannot be compiled: TypingError(.|\n)*'y'"):
+        package.load()
 
 
 def test_a_cache_that_cannot_be_written_does_no_harm(

@@ -408,13 +408,13 @@ class _Replayer:
         return resolve(self.assembly.hardware.host, document, kind, choice)
 
 
-def replay(run: Run, request: ReplayRequest, *, announce: Callable[[str], None] = lambda _: None) -> Replay:
+def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None] = lambda _: None) -> Replay:
     """Pass a run's images to a planner or detector, and compare the results with the recorded ones.
 
     Settings, calibrations and motion are the run's own, from its folder.
 
     Args:
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
         ConfigError: The request has an error, or the run can no longer be assembled.

@@ -145,7 +145,7 @@ class LatencyRequest:
 def measure_latency(
     request: LatencyRequest,
     *,
-    announce: Callable[[str], None] = lambda _: None,
+    announce: Callable[[float], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda _done, _wanted: None,
 ) -> LatencyReport:
     """Take shots in a dry run up to the first image, and time the following stages.
@@ -155,7 +155,7 @@ def measure_latency(
 
     Args:
         request: Sequence, profile and loadings.
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
         progress: Called with the numbers of loadings that are done and wanted.
 
     Raises:
@@ -196,7 +196,7 @@ class _Watch:
     """Observer and sink of the shots that keeps only the times."""
 
     def __init__(
-        self, announce: Callable[[str], None], progress: Callable[[int, int], None], n_loadings: int
+        self, announce: Callable[[float], None], progress: Callable[[int, int], None], n_loadings: int
     ) -> None:
         self._announce = announce
         self._progress = progress
@@ -210,7 +210,7 @@ class _Watch:
         if isinstance(timing, StageTiming) and timing.stage == "expose":
             self.frame_s = time.perf_counter()
         elif name == "compiling":
-            self._announce(str(values["module"]))
+            self._announce(float(values["about_s"]))
 
     def write_shot(self, shot: ShotRecord) -> None:
         """Keep host time and modelled time of each stage."""

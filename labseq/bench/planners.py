@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import threading
 import time
@@ -20,6 +19,7 @@ from labseq.bench.comparison import (
 from labseq.bench.report import Report, Tally
 from labseq.bench.work import Done, Job, prepare, set_up, warm
 from labseq.errors import LabseqError, StopRequested
+from labseq.kernel import announcing, n_cores
 
 _LOOK_S: Final = 0.1
 """Interval at which waiting for results is interrupted, in seconds: on Windows, Ctrl-C does not end it."""
@@ -130,7 +130,7 @@ def compare(
     comparison: Comparison,
     n_workers: int | None = None,
     *,
-    announce: Callable[[str], None] = lambda _: None,
+    announce: Callable[[float], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda _done, _wanted: None,
 ) -> Report:
     """Run all planners on all loadings, check every plan, and summarise the results.
@@ -141,15 +141,13 @@ def compare(
     Args:
         comparison: Planners, conditions and loadings.
         n_workers: Number of processes; None for one per core, if there is enough work.
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
         progress: Called with the numbers of loadings that are done and wanted.
 
     Raises:
         ConfigError: The comparison has an error; says what was expected.
         PluginLoadError: A named plugin failed to load.
     """
-    from labseq.kernel import announcing
-
     start_s = time.perf_counter()
     prepared = set_up(comparison)
     tally = Tally(comparison, prepared)
@@ -180,7 +178,7 @@ def compare(
 
 def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
     """The results of all loadings, in any order."""
-    todo = _jobs(comparison, n_workers or _n_cores())
+    todo = _jobs(comparison, n_workers or n_cores())
     if n_workers is None:
         start_s, n_done = time.perf_counter(), 0
         for done in run_jobs(comparison, todo, 1):
@@ -190,7 +188,7 @@ def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:
                 break
         todo = todo[n_done:]
     if todo:
-        yield from run_jobs(comparison, todo, min(n_workers or _n_cores(), len(todo)))
+        yield from run_jobs(comparison, todo, min(n_workers or n_cores(), len(todo)))
 
 
 def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
@@ -206,9 +204,3 @@ def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
         for start in range(0, n_loadings, size)
         for condition in range(n_conditions)
     ]
-
-
-def _n_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # unavailable on Windows and macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

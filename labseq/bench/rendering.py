@@ -79,19 +79,20 @@ class WaveformReport:
         return asdict(self)
 
 
-def bench_waveform(repeats: int = 5, *, announce: Callable[[str], None] = lambda _: None) -> WaveformReport:
+def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lambda _: None) -> WaveformReport:
     """Measure rendering in two threads into reused buffers; the fastest of several repetitions counts.
 
     Args:
         repeats: Number of repetitions.
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
     """
-    from labseq.kernel import announcing
+    from labseq.kernel import announcing, load_kernels
 
     moves = plan_moves(PLAN, announce=announce)
     grid, rate_hz = moves.grid, comb_sample_rate(moves.grid)
     with announcing(announce):
         warm_rendering()
+        load_kernels()
         rows = [*_comb_rows(moves, rate_hz, repeats), *_other_ways(grid, rate_hz, repeats)]
     time_of = {row.name: 1.0 / row.gigasamples_per_s for row in rows}
     fast, stored, numpy = (time_of[name] for name in ("1 group, 20 tones", STORED_20, NUMPY_20))

@@ -50,7 +50,7 @@ class SampleRate:
 
 
 def read_moves(
-    request: PlanRequest, stdin: BinaryIO | None, announce: Callable[[str], None]
+    request: PlanRequest, stdin: BinaryIO | None, announce: Callable[[float], None]
 ) -> tuple[PlannedMoves, dict[str, Any]]:
     """Read a plan (a file that ends in .json, or JSON on "-"), or read an occupancy and plan for it.
 
@@ -242,14 +242,14 @@ def plan_waveform(
     request: WaveformRequest,
     stdin: BinaryIO | None = None,
     *,
-    announce: Callable[[str], None] = lambda _: None,
+    announce: Callable[[float], None] = lambda _: None,
 ) -> PlannedWaveform:
     """Read or make a plan, check it as a run does, and convert it to tones.
 
     Args:
         request: The plan, its batches and the sample rate.
         stdin: What "-" reads; standard input if None.
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
         ConfigError: The request has an error, or there is nothing to play.

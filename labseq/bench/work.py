@@ -17,6 +17,7 @@ from labseq.config.addresses import Override
 from labseq.config.document import Document
 from labseq.config.profile import MotionSettings
 from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
+from labseq.kernel import load_kernels
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
@@ -70,6 +71,7 @@ def warm(prepared: list[PreparedCondition]) -> None:
                 runner.planner.warm()
             except Exception as error:
                 raise PlanError(f"warm() raised {type(error).__name__}: {error}", runner.name) from error
+    load_kernels()
 
 
 def _prepare(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-from labseq.console.output import say
+from labseq.console.output import compiling_text, say
 from labseq.console.text import percent, plural
 from labseq.model import RunRecord, ShotRecord
 from labseq.units import format_quantity
@@ -68,7 +68,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
             longest = format_quantity(values["timeout_s"], "time")
             return f"waiting for {values['device']} to settle, at most {longest}"
         case "compiling":
-            return f"compiling {values['module']}; later runs find it in the cache"
+            return compiling_text(values["about_s"])
         case "compiled":
             return f"compiled in {format_quantity(values['duration_s'], 'time')}"
         case "warning":

@@ -79,9 +79,14 @@ def _to_null_device(stream: TextIO) -> None:
         os.close(null)
 
 
-def report_compiling(module: str) -> None:
+def report_compiling(about_s: float) -> None:
     """Say on stderr why the command takes longer this time."""
-    say(f"compiling {module}; later runs find it in the cache", stream=sys.stderr)
+    say(compiling_text(about_s), stream=sys.stderr)
+
+
+def compiling_text(about_s: float) -> str:
+    """What to say before kernels are compiled."""
+    return f"compiling kernels, about {about_s:.0f} s; later runs find them in the cache"
 
 
 def as_line(values: Any) -> str:

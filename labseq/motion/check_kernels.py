@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.kernel import const, helper_kernel, kernel
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -57,7 +57,7 @@ ATOMS: Final = const("bool_", 2)
 STAMPS: Final = "int32[:, ::1]"
 
 
-@kernel(f"{FAULT}({MOVES}, int64, int64, int64, boolean)")
+@helper_kernel(f"{FAULT}({MOVES}, int64, int64, int64, boolean)")
 def check_shapes(batch: Moves, n_rows: int, n_cols: int, slots: int, chained: bool) -> Fault:
     """Test that each move of a batch stays on the grid and all run along one axis.
 
@@ -83,7 +83,7 @@ def check_shapes(batch: Moves, n_rows: int, n_cols: int, slots: int, chained: bo
     return RIGHT, -1, 0, 0
 
 
-@kernel(f"{FAULT}({MOVES}, int64, {ATOMS}, {STAMPS}, {STAMPS}, int64, boolean)")
+@helper_kernel(f"{FAULT}({MOVES}, int64, {ATOMS}, {STAMPS}, {STAMPS}, int64, boolean)")
 def check_sites(
     batch: Moves, n_before: int, atoms: Bools, lifted: Stamps, goals: Stamps, stamp: int, linked: bool
 ) -> Fault:
@@ -114,7 +114,7 @@ def check_sites(
     return RIGHT, -1, 0, 0
 
 
-@kernel("UniTuple(int64, 3)(int64[::1])")
+@helper_kernel("UniTuple(int64, 3)(int64[::1])")
 def tones_in_order(tone_goal: Ints) -> tuple[int, int, int]:
     """Count the tones of an axis, and find the first two that come closer than one site (-1, -1: none)."""
     n = 0
@@ -129,7 +129,7 @@ def tones_in_order(tone_goal: Ints) -> tuple[int, int, int]:
     return n, meet, with_
 
 
-@kernel(f"{FAULT}({MOVES}, int64[::1], int64[::1], int64, int64, int64)")
+@helper_kernel(f"{FAULT}({MOVES}, int64[::1], int64[::1], int64, int64, int64)")
 def check_tones(
     batch: Moves,
     row_goal: Ints,
@@ -171,7 +171,7 @@ def check_tones(
     return RIGHT, -1, 0, n_tweezers
 
 
-@kernel(f"{FAULT}({ATOMS}, {STAMPS}, int64, int64[::1], int64[::1])")
+@helper_kernel(f"{FAULT}({ATOMS}, {STAMPS}, int64, int64[::1], int64[::1])")
 def check_paths(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column_goal: Ints) -> Fault:
     """Test that no crossing of two tones, named or not, meets an atom that stands.
 
@@ -204,7 +204,7 @@ def check_paths(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column
 GRID: Final = "bool_[:, ::1]"
 
 
-@kernel(f"boolean({MOVES}, {GRID})")
+@helper_kernel(f"boolean({MOVES}, {GRID})")
 def move_atoms(batch: Moves, atoms: Bools) -> bool:
     """Carry out a batch; return whether it ejects an atom."""
     n_rows, n_cols = atoms.shape
@@ -220,7 +220,7 @@ def move_atoms(batch: Moves, atoms: Bools) -> bool:
     return ejects
 
 
-@kernel(f"int64({MOVES})")
+@helper_kernel(f"int64({MOVES})")
 def longest_move(batch: Moves) -> int:
     """Length of the longest straight move of a batch, in sites."""
     longest = 0

@@ -28,7 +28,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.kernel import const, helper_kernel, kernel
 from labseq.motion.render_kernels import (
     AXIS,
     BLENDED,
@@ -78,7 +78,7 @@ STEP: Final = 4
 STEP_OF_STEP: Final = 6
 
 
-@kernel(f"void({F64}, float64[:, ::1], float64, float64)")
+@helper_kernel(f"void({F64}, float64[:, ::1], float64, float64)")
 def enter_block(state: Floats, lanes: Floats, x: float, length: float) -> None:
     """Prepare a group for a block that starts ``x`` samples after the start of the segment.
 
@@ -93,7 +93,7 @@ def enter_block(state: Floats, lanes: Floats, x: float, length: float) -> None:
     fill_powers(chirp * length, lanes[2], lanes[3])
 
 
-@kernel(f"void({F32}, int64, int64, {F32}, {F32}, {F64})", fused=True)
+@helper_kernel(f"void({F32}, int64, int64, {F32}, {F32}, {F64})", fused=True)
 def add_parked(acc: Singles, n: int, block: int, re: Singles, im: Singles, state: Floats) -> None:
     """Add a group at rest to the first ``n`` samples of ``acc``, and advance its state to the next block.
 
@@ -109,7 +109,9 @@ def add_parked(acc: Singles, n: int, block: int, re: Singles, im: Singles, state
     state[NOW], state[NOW + 1] = x, y
 
 
-@kernel(f"void({F32}, int64, {F32}, {F32}, float64, float64, float64, float64, {F32}, {F32})", fused=True)
+@helper_kernel(
+    f"void({F32}, int64, {F32}, {F32}, float64, float64, float64, float64, {F32}, {F32})", fused=True
+)
 def add_block(
     acc: Singles,
     n: int,
@@ -139,7 +141,7 @@ def add_block(
         acc[at + r] += re[at + r] * w_re - im[at + r] * w_im
 
 
-@kernel(
+@helper_kernel(
     f"void({F32}, int64, int64, {F32}, {F32}, {F64}, {F64}, {F64}, {F64}, {F64}, {F32}, {F32})", fused=True
 )
 def add_moving(
@@ -175,7 +177,7 @@ def add_moving(
         multiply(lane_re, lane_im, by_re, by_im, LANES + 1)
 
 
-@kernel(f"void(float32[:, ::1], int64, float64, {const('float32', 1)}, {F32}, {F32})", fused=True)
+@helper_kernel(f"void(float32[:, ::1], int64, float64, {const('float32', 1)}, {F32}, {F32})", fused=True)
 def blend(tables: Singles, n: int, u: float, within: Singles, re: Singles, im: Singles) -> None:
     """Blend four tables into one by a cubic in the time since the start of the segment.
 
@@ -194,7 +196,7 @@ def blend(tables: Singles, n: int, u: float, within: Singles, re: Singles, im: S
 Ints = NDArray[np.int32]
 
 
-@kernel(
+@helper_kernel(
     f"void({TONES}, {const('int32', 1)}, {TONES}, int64, int64, float64, float64, float64, boolean, int64,"
     " float64[:, ::1])"
 )
@@ -233,7 +235,7 @@ def add_to_sums(
         )
 
 
-@kernel(f"void({AXIS}, int64, int64, boolean, boolean, {WORKSPACE})")
+@helper_kernel(f"void({AXIS}, int64, int64, boolean, boolean, {WORKSPACE})")
 def fill_group(axis: Axis, i: int, g: int, shared: bool, blended: bool, workspace: Workspace) -> None:
     """Fill the tables of a group of segment ``i``."""
     tones, tooth, group, teeth, step, block = axis[0], axis[4], axis[5], axis[6], axis[10], axis[11]
@@ -253,7 +255,7 @@ def fill_group(axis: Axis, i: int, g: int, shared: bool, blended: bool, workspac
         fill_table(sums[row], sums[row + 1], period, re, im, block, tables[g, row], tables[g, row + 1])
 
 
-@kernel(f"void({WORKSPACE}, int64, int64, int64)", fused=True)
+@helper_kernel(f"void({WORKSPACE}, int64, int64, int64)", fused=True)
 def add_group(workspace: Workspace, g: int, n: int, block: int) -> None:
     """Add a group to the first ``n`` samples of a strip."""
     work, tables, lanes, state = workspace[1], workspace[2], workspace[3], workspace[4]
@@ -267,7 +269,7 @@ def add_group(workspace: Workspace, g: int, n: int, block: int) -> None:
         )  # fmt: skip
 
 
-@kernel(f"void({WORKSPACE}, int64, int64, int64, float64, float64)")
+@helper_kernel(f"void({WORKSPACE}, int64, int64, int64, float64, float64)")
 def add_blended_group(workspace: Workspace, g: int, n: int, block: int, u: float, per_block: float) -> None:
     """Add a blended group to the first ``n`` samples of a strip, which starts ``u`` into the segment."""
     work, tables, lanes, state = workspace[1], workspace[2], workspace[3], workspace[4]
@@ -285,7 +287,7 @@ def add_blended_group(workspace: Workspace, g: int, n: int, block: int, u: float
             )  # fmt: skip
 
 
-@kernel(f"boolean(int64, int64, float64, {WORKSPACE})")
+@helper_kernel(f"boolean(int64, int64, float64, {WORKSPACE})")
 def has_period(n_groups: int, block: int, length: float, workspace: Workspace) -> bool:
     """Whether all blocks of a segment are equal: its tones are parked, with whole cycles per block."""
     for g in range(n_groups):
@@ -295,7 +297,7 @@ def has_period(n_groups: int, block: int, length: float, workspace: Workspace) -
     return True
 
 
-@kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
+@helper_kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
 def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
     """Render a part of segment ``i``, on the comb or blended, from sample ``skip`` of the segment on.
 
@@ -373,7 +375,7 @@ def distinct_tones(start_hz: Floats, distinct_hz: Floats) -> int:
     return n
 
 
-@kernel(f"Tuple((int64, float64))({CONST}, float64)")
+@helper_kernel(f"Tuple((int64, float64))({CONST}, float64)")
 def count_multiples(gaps_hz: Floats, spacing_hz: float) -> tuple[int, float]:
     """Count the gaps that are a multiple of a spacing, and find the spacing that fits those best."""
     n, gap_hz, multiples = 0, 0.0, 0.0

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.kernel import const, helper_kernel, kernel
 from labseq.motion.render_comb_kernels import render_comb
 from labseq.motion.render_kernels import (
     AXIS,
@@ -68,7 +68,7 @@ C9: Final = np.float32(39.94631)
 F32: Final = "float32[::1]"
 
 
-@kernel("UniTuple(float64, 4)(float64)")
+@helper_kernel("UniTuple(float64, 4)(float64)")
 def minimum_jerk(u: float) -> tuple[float, float, float, float]:
     """See :func:`course`."""
     v = u * u
@@ -80,7 +80,7 @@ def minimum_jerk(u: float) -> tuple[float, float, float, float]:
     )
 
 
-@kernel("UniTuple(float64, 4)(float64)")
+@helper_kernel("UniTuple(float64, 4)(float64)")
 def constant_jerk(u: float) -> tuple[float, float, float, float]:
     """See :func:`course`; the third derivative is 32, changes by -64 at 1/4 and by 64 at 3/4."""
     v, w = max(0.0, u - 0.25), max(0.0, u - 0.75)
@@ -107,7 +107,7 @@ def course(kind: int, u: float) -> tuple[float, float, float, float]:
     return 0.5 * u * u, u, 1.0, 0.0
 
 
-@kernel("boolean(int64, float64, float64)")
+@helper_kernel("boolean(int64, float64, float64)")
 def is_steep(kind: int, sweep: float, length: float) -> bool:
     """Whether the frequency of a tone changes too fast for :func:`add_tone`: by ``sweep`` in the segment."""
     chirp = abs(sweep) / length
@@ -116,13 +116,15 @@ def is_steep(kind: int, sweep: float, length: float) -> bool:
     return 2.0 * chirp > MAX_CHIRP or 8.0 * chirp / length > MAX_JERK
 
 
-@kernel("int32(float64)")
+@helper_kernel("int32(float64)")
 def as_int32(cycles: float) -> int:
     """A phase in 2^-32 cycles, without whole cycles."""
     return np.int32(min(np.rint((cycles - np.rint(cycles)) * TURN), MOST))  # pyright: ignore[reportReturnType]
 
 
-@kernel("void(int64, float64, float64, float64, float64, float64, int64, int32[::1], int32[::1], int32[::1])")
+@helper_kernel(
+    "void(int64, float64, float64, float64, float64, float64, int64, int32[::1], int32[::1], int32[::1])"
+)
 def fill_course(
     kind: int,
     phase: float,
@@ -148,7 +150,7 @@ def fill_course(
         bends[q] = np.int32(np.rint(sweep * slope * per_length * (0.5 * TURN * (1 << BEND_BITS))))
 
 
-@kernel("void(float64, float64, float64, float64, int64, int32[::1], int32[::1], int32[::1])")
+@helper_kernel("void(float64, float64, float64, float64, int64, int32[::1], int32[::1], int32[::1])")
 def fill_linear(
     phase: float,
     frequency: float,
@@ -167,7 +169,7 @@ def fill_linear(
         bends[q] = np.int32(np.rint(chirp * (0.5 * TURN * (1 << BEND_BITS))))
 
 
-@kernel("void(int64, float64, float64, float64, float64, float64, int64, int32[:, ::1])")
+@helper_kernel("void(int64, float64, float64, float64, float64, float64, int64, int32[:, ::1])")
 def fill_nodes(
     kind: int,
     phase: float,
@@ -193,7 +195,7 @@ def fill_nodes(
         fill_linear(phase, frequency, sweep / length, x, n, a, b, c)
 
 
-@kernel("float32(int32, int32, int32, int64)", fused=True)
+@helper_kernel("float32(int32, int32, int32, int64)", fused=True)
 def wave(phase: int, frequency: int, bend: int, r: int) -> float:
     """Cosine of a phase, ``r`` samples from its node; cos(2 pi t) = sin(2 pi (1/4 - |t|))."""
     near = np.int32(r)
@@ -204,7 +206,7 @@ def wave(phase: int, frequency: int, bend: int, r: int) -> float:
     return z * (C1 + w * (C3 + w * (C5 + w * (C7 + w * C9))))  # pyright: ignore[reportReturnType]
 
 
-@kernel(f"void({F32}, int64, int32[:, ::1], float64)", fused=True)
+@helper_kernel(f"void({F32}, int64, int32[:, ::1], float64)", fused=True)
 def add_tone(acc: Singles, n: int, nodes: Nodes, amplitude: float) -> None:
     """Add a tone of constant amplitude to ``n`` times LANES samples."""
     a = np.float32(amplitude)
@@ -215,7 +217,7 @@ def add_tone(acc: Singles, n: int, nodes: Nodes, amplitude: float) -> None:
             acc[q * LANES + r] += a * z
 
 
-@kernel(f"void({F32}, int64, int32[:, ::1], float64, float64)", fused=True)
+@helper_kernel(f"void({F32}, int64, int32[:, ::1], float64, float64)", fused=True)
 def add_ramped_tone(acc: Singles, n: int, nodes: Nodes, start: float, slope: float) -> None:
     """Add a tone to ``n`` times LANES samples whose squared amplitude changes linearly."""
     by = np.float32(slope)
@@ -227,7 +229,7 @@ def add_ramped_tone(acc: Singles, n: int, nodes: Nodes, start: float, slope: flo
             acc[q * LANES + r] += np.sqrt(max(np.float32(0.0), first + by * np.float32(r))) * z
 
 
-@kernel(f"void({F32}, int64, int64, float64, float64, float64, float64, float64, float64, float64)")
+@helper_kernel(f"void({F32}, int64, int64, float64, float64, float64, float64, float64, float64, float64)")
 def add_steep(
     acc: Singles,
     n: int,
@@ -252,7 +254,7 @@ def add_steep(
         acc[j] += np.float32(amplitude * math.cos(2.0 * math.pi * (cycles - np.rint(cycles))))
 
 
-@kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {WORKSPACE})")
+@helper_kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {WORKSPACE})")
 def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, workspace: Workspace) -> None:
     """Add tone ``k`` of segment ``i`` to ``n`` samples, the first of them ``x`` samples after its start."""
     tones, _, course, _, _, _, _, _, _, length, _, _ = axis
@@ -274,7 +276,7 @@ def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, works
         add_ramped_tone(work[SAMPLES], n_nodes, nodes, start, slope)
 
 
-@kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
+@helper_kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
 def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
     """Render a part of segment ``i`` tone by tone; see :func:`render_comb`."""
     tones, offsets, _, _, _, _, _, _, delta, length, _, block = axis

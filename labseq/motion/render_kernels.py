@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.kernel import const, helper_kernel, kernel
 
 N_STATE: Final = 8
 """Numbers in the state of a group of tones in a block."""
@@ -36,20 +36,20 @@ F32: Final = "float32[::1]"
 F64: Final = "float64[::1]"
 
 
-@kernel("UniTuple(float64, 2)(float64)")
+@helper_kernel("UniTuple(float64, 2)(float64)")
 def turn(cycles: float) -> Complex:
     """Cosine and sine of a phase in cycles."""
     phase = 2.0 * math.pi * (cycles - np.rint(cycles))
     return math.cos(phase), math.sin(phase)
 
 
-@kernel("UniTuple(float64, 2)(float64, float64, float64, float64)", fused=True)
+@helper_kernel("UniTuple(float64, 2)(float64, float64, float64, float64)", fused=True)
 def times(a_re: float, a_im: float, b_re: float, b_im: float) -> Complex:
     """Product of two complex numbers."""
     return a_re * b_re - a_im * b_im, a_re * b_im + a_im * b_re
 
 
-@kernel(f"void(float64, {F64}, {F64})")
+@helper_kernel(f"void(float64, {F64}, {F64})")
 def fill_powers(cycles: float, re: Floats, im: Floats) -> None:
     """Fill in exp(2 pi i cycles r), r = 0, 1, ..."""
     step_re, step_im = turn(cycles)
@@ -67,7 +67,9 @@ def multiply(re: Floats, im: Floats, by_re: Floats, by_im: Floats, n: int) -> No
         im[r] = x * by_im[r] + y * by_re[r]
 
 
-@kernel(f"void({const('float64', 1)}, {const('float64', 1)}, float64, float64, {F64}, {F64})", fused=True)
+@helper_kernel(
+    f"void({const('float64', 1)}, {const('float64', 1)}, float64, float64, {F64}, {F64})", fused=True
+)
 def add_tooth(
     cosine: Floats, sine: Floats, weight_re: float, weight_im: float, re: Floats, im: Floats
 ) -> None:
@@ -77,7 +79,7 @@ def add_tooth(
         im[j] += weight_re * sine[j] + weight_im * cosine[j]
 
 
-@kernel(f"void(float64, float64, int64, {F32}, {F32}, float64[:, ::1])", fused=True)
+@helper_kernel(f"void(float64, float64, int64, {F32}, {F32}, float64[:, ::1])", fused=True)
 def fill_chirp(frequency: float, chirp: float, n: int, re: Singles, im: Singles, lanes: Floats) -> None:
     """Fill in exp 2 pi i (frequency j + chirp j^2 / 2), j = 0 ... n - 1.
 
@@ -102,7 +104,7 @@ def fill_chirp(frequency: float, chirp: float, n: int, re: Singles, im: Singles,
         multiply(now_re, now_im, by_re, by_im, LANES)
 
 
-@kernel(f"int64(float64, float64, int64, float32[:, :, ::1], {F64}, float64[:, ::1])")
+@helper_kernel(f"int64(float64, float64, int64, float32[:, :, ::1], {F64}, float64[:, ::1])")
 def find_chirp(frequency: float, chirp: float, n: int, chirps: Singles, keys: Floats, lanes: Floats) -> int:
     """Find or fill in exp 2 pi i (frequency j + chirp j^2 / 2), which many segments share.
 
@@ -131,7 +133,7 @@ def find_chirp(frequency: float, chirp: float, n: int, chirps: Singles, keys: Fl
     return at
 
 
-@kernel(f"void({F64}, {F64}, int64, {F32}, {F32}, int64, {F32}, {F32})", fused=True)
+@helper_kernel(f"void({F64}, {F64}, int64, {F32}, {F32}, int64, {F32}, {F32})", fused=True)
 def fill_table(
     sum_re: Floats,
     sum_im: Floats,
@@ -188,7 +190,7 @@ EXTREMES: Final = 0.5 - 0.5 * np.cos(np.pi * np.arange(N_COEFFICIENTS + 1) / N_C
 TONES: Final = const("float64", 2)
 
 
-@kernel(f"Tuple((boolean, float64, float64))({TONES}, int64, int64)")
+@helper_kernel(f"Tuple((boolean, float64, float64))({TONES}, int64, int64)")
 def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
     """Find the common course of the squared amplitudes of a segment's tones.
 
@@ -209,7 +211,7 @@ def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
     return True, (first / largest) ** 2, (last / largest) ** 2
 
 
-@kernel("UniTuple(float64, 2)(float64, float64, float64, float64, float64)")
+@helper_kernel("UniTuple(float64, 2)(float64, float64, float64, float64, float64)")
 def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[float, float]:
     """Amplitude and phase of a tone relative to its tooth at a fraction ``u`` of the segment.
 
@@ -221,7 +223,7 @@ def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[
     return amplitude * re, amplitude * im
 
 
-@kernel(f"float64(float64, float64, float64, float64, {F64}, {F64})")
+@helper_kernel(f"float64(float64, float64, float64, float64, {F64}, {F64})")
 def fit_cubic(a: float, b: float, drift: float, bend: float, re: Floats, im: Floats) -> float:
     """Fit a cubic in u to :func:`slow_part`, coefficients float64 (4,) by power; return its largest error."""
     re[:], im[:] = 0.0, 0.0
@@ -240,7 +242,7 @@ def fit_cubic(a: float, b: float, drift: float, bend: float, re: Floats, im: Flo
     return worst
 
 
-@kernel(f"UniTuple(float64, 2)({TONES}, int64, int64, int32, int32, float64, float64)")
+@helper_kernel(f"UniTuple(float64, 2)({TONES}, int64, int64, int32, int32, float64, float64)")
 def off_tooth(
     tones: Floats, k: int, anchor: int, tooth: int, anchor_tooth: int, step: float, length: float
 ) -> tuple[float, float]:
@@ -254,7 +256,7 @@ def off_tooth(
     return apart * length, 0.5 * sweep * length
 
 
-@kernel(f"boolean({TONES}, int64, int64, float64, float64, float64, int64, int32[::1], int8[::1])")
+@helper_kernel(f"boolean({TONES}, int64, int64, float64, float64, float64, int64, int32[::1], int8[::1])")
 def find_groups(
     tones: Floats,
     start: int,
@@ -294,7 +296,7 @@ def find_groups(
     return True
 
 
-@kernel(f"int64({TONES}, int64, int64, float64, float64, int32[::1], int8[::1])")
+@helper_kernel(f"int64({TONES}, int64, int64, float64, float64, int32[::1], int8[::1])")
 def choose(
     tones: Floats, start: int, stop: int, length: float, step: float, tooth: Ints, group: Bytes
 ) -> int:
@@ -440,7 +442,7 @@ def new_workspace(block: int) -> Workspace:
     )
 
 
-@kernel("void(int16[::1], int64, float32[::1], int64)")
+@helper_kernel("void(int16[::1], int64, float32[::1], int64)")
 def store(out: NDArray[np.int16], n: int, values: Singles, skip: int) -> None:
     """Round ``values[skip:skip + n]`` to integers, through int32, which is four times faster."""
     most = np.float32(FULL_SCALE)
@@ -449,7 +451,7 @@ def store(out: NDArray[np.int16], n: int, values: Singles, skip: int) -> None:
         out[j] = np.int16(np.int32(np.rint(min(max(kept[j], -most), most))))
 
 
-@kernel("void(int16[::1], int64, int16[::1], int64)")
+@helper_kernel("void(int16[::1], int64, int16[::1], int64)")
 def repeat(out: NDArray[np.int16], skip: int, block: NDArray[np.int16], n: int) -> None:
     """Fill ``out`` by repeating the ``n`` samples of a block, from sample ``skip`` on."""
     at = skip % n
@@ -463,7 +465,7 @@ def repeat(out: NDArray[np.int16], skip: int, block: NDArray[np.int16], n: int) 
         at = 0
 
 
-@kernel("void(float32[::1], int64, float64, float64)", fused=True)
+@helper_kernel("void(float32[::1], int64, float64, float64)", fused=True)
 def apply_envelope(values: Singles, n: int, start: float, slope: float) -> None:
     """Multiply ``n`` samples by an amplitude whose square changes linearly from sample to sample.
 

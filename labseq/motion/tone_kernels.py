@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.kernel import const, helper_kernel, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -24,7 +24,7 @@ SITES: Final = const("float64", 1)
 TONES: Final = "int64[:, ::1]"
 
 
-@kernel(f"int64({MOVES}, int64, int64, int64, int64, {TONES})")
+@helper_kernel(f"int64({MOVES}, int64, int64, int64, int64, {TONES})")
 def collect_tones(moves: Moves, start: int, stop: int, axis: int, n_sites: int, tones: Ints) -> int:
     """Collect the tones that the batch ``moves[start:stop]`` needs on an axis, by site."""
     on = np.zeros(n_sites, np.bool_)
@@ -41,7 +41,7 @@ def collect_tones(moves: Moves, start: int, stop: int, axis: int, n_sites: int, 
     return n
 
 
-@kernel(f"int64({TONES}, int64, int64)")
+@helper_kernel(f"int64({TONES}, int64, int64)")
 def next_arrival(tones: Ints, n_tones: int, travelled: int) -> int:
     """Distance, in sites, at which the next tones arrive; ``travelled`` if all have."""
     nearest = travelled
@@ -52,7 +52,7 @@ def next_arrival(tones: Ints, n_tones: int, travelled: int) -> int:
     return nearest
 
 
-@kernel(f"int64({TONES}, int64)")
+@helper_kernel(f"int64({TONES}, int64)")
 def last_arrival(tones: Ints, n_tones: int) -> int:
     """Longest displacement of all tones, in sites."""
     longest = 0
@@ -143,7 +143,7 @@ SITES_OF_AXIS: Final = f"Tuple(({SITES}, float64, {SITES}))"
 SEGMENTS: Final = "Tuple((int8[:, ::1], int32[::1], float64[::1], int32[::1]))"
 
 
-@kernel(
+@helper_kernel(
     f"int64(float64[:, ::1], int64, {SITES_OF_AXIS}, {TONES}, int64, int64, int64, float64, float64, float64,"
     " float64[::1])"
 )
@@ -191,7 +191,7 @@ def add_tones(
     return n + n_tones
 
 
-@kernel(f"int64({SEGMENTS}, int64, int64, int64, int64, float64, int64)")
+@helper_kernel(f"int64({SEGMENTS}, int64, int64, int64, int64, float64, int64)")
 def add_segment(
     segments: Segments, n: int, kind: int, course: int, batch: int, duration_s: float, n_tones: int
 ) -> int:
@@ -205,7 +205,7 @@ def add_segment(
     return n + 1
 
 
-@kernel(f"int64({TONES}, int64, {TONES}, int64, int64, int64)")
+@helper_kernel(f"int64({TONES}, int64, {TONES}, int64, int64, int64)")
 def next_joint(tones: Ints, n_tones: int, others: Ints, n_others: int, travelled: int, course: int) -> int:
     """Distance, in sites, at which a transport is cut next; ``travelled`` if it is over.
 
@@ -313,7 +313,7 @@ HALVINGS: Final = 40
 VALUES: Final = "float64[:, ::1]"
 
 
-@kernel(f"UniTuple(float64, 2)({VALUES}, int64, int64, float64)")
+@helper_kernel(f"UniTuple(float64, 2)({VALUES}, int64, int64, float64)")
 def amplitudes_at(values: Floats, first: int, last: int, u: float) -> tuple[float, float]:
     """Sum of the amplitudes of tones at a fraction of their segment, and the sign of its slope."""
     total = slope = 0.0

@@ -12,7 +12,7 @@ from labseq.config.document import Document
 from labseq.config.profile import MotionSettings, ProfileSpec
 from labseq.errors import ConfigError, LabseqError, PlanError, Problem, one_of
 from labseq.guard import Guard, StopFlag
-from labseq.kernel import announcing
+from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, offers
@@ -262,27 +262,28 @@ def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool 
 
     Args:
         lab: The lab whose objects need kernels.
-        stop_flag: Checked before each compile.
-        observer: Receives the names of the compiled modules and the time each took.
+        stop_flag: Checked all the time.
+        observer: Told before kernels are compiled, and how long that took.
         devices: Whether to compile the kernels of devices as well as those of planner and detector.
 
     Raises:
         StopRequested: The operator asked to stop.
         PlanError: The planner's kernels failed.
         DeviceError: The kernels of a device or the detector failed.
+        PluginLoadError: A kernel cannot be compiled.
     """
-    start_s, compiled = time.monotonic(), list[str]()
+    started_s = list[float]()
 
-    def announce(module: str) -> None:
-        stop_flag.check()
-        compiled.append(module)
-        observer.event("compiling", {"module": module})
+    def announce(about_s: float) -> None:
+        started_s.append(time.monotonic())
+        observer.event("compiling", {"about_s": about_s})
 
     with announcing(announce):
         motion.warm()
         _warm_plugins(lab, stop_flag, devices)
-    if compiled:
-        observer.event("compiled", {"duration_s": time.monotonic() - start_s})
+        load_kernels(stop_flag.check)
+    if started_s:
+        observer.event("compiled", {"duration_s": time.monotonic() - started_s[0]})
 
 
 def _warm_plugins(lab: Lab, stop_flag: StopFlag, devices: bool) -> None:

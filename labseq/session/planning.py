@@ -311,7 +311,7 @@ def plan_moves(
     request: PlanRequest,
     source: Source | None = None,
     *,
-    announce: Callable[[str], None] = lambda _: None,
+    announce: Callable[[float], None] = lambda _: None,
     keep_refused: bool = False,
 ) -> PlannedMoves:
     """Plan once, and check the plan as a run does.
@@ -319,7 +319,7 @@ def plan_moves(
     Args:
         request: The arguments.
         source: Its occupancy, if it has been read already.
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
         keep_refused: Whether a plan that breaks a rule in one of its batches is returned, too.
 
     Raises:
@@ -416,7 +416,7 @@ _OPTIONS = {"target": "--target", "planner": "--planner", "degree_of_parallelism
 
 
 def read_plan(
-    data: bytes, name: str, request: PlanRequest, *, announce: Callable[[str], None] = lambda _: None
+    data: bytes, name: str, request: PlanRequest, *, announce: Callable[[float], None] = lambda _: None
 ) -> PlannedMoves:
     """Read the JSON of a plan, and check the plan as a run does.
 
@@ -425,7 +425,7 @@ def read_plan(
         name: Its name in messages.
         request: Names the profile with grid and motion; without one the grid is that of
             the file, and the motion the paper's. Nothing is planned.
-        announce: Called with the name of a module before its kernels are compiled.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
         ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request

@@ -23,6 +23,7 @@ from labseq.errors import (
 )
 from labseq.files import Holder, Lock, knows_no_locks
 from labseq.guard import Guard, StopFlag, stop_on_signals
+from labseq.kernel import load_kernels
 from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer.clock import RealClock, VirtualClock
@@ -434,7 +435,8 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> Check
     found = CheckedDevice(name)
     try:
         if name != "simulation" and offers(device, "warm"):
-            guard.call(name, WARM_S, device.warm)  # else a self test might have to compile within its timeout
+            guard.call(name, WARM_S, device.warm)
+            load_kernels()  # else a self test might have to compile within its timeout
         guard.call_despite_stop(name, timeouts.call_s, device.open)
         described: Any = guard.call(name, timeouts.call_s, device.describe)
         if not isinstance(described, Mapping):

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import kernel
+from labseq.plugin import helper_kernel, kernel
 from labseq_psca.kernels_lines import (
     FINISHED,
     GRID,
@@ -41,7 +41,7 @@ Work = tuple[Ints, NDArray[np.int8], Ints, Ints]
 WORK: Final = "Tuple((int64[::1], int8[:, ::1], int64[:, ::1], int64[::1]))"
 
 
-@kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[::1])")
+@helper_kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[::1])")
 def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, rank: Ints) -> None:
     """Bound from above what sorting each row is worth per batch.
 
@@ -68,7 +68,7 @@ def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, r
             rank[row] = bound * PLACES + PLACES // 2 - place_in_order(n_atoms, n_cols, order)
 
 
-@kernel(f"int64({LINE}, int64[::1], int64[::1], {WORK}, int64[::1])")
+@helper_kernel(f"int64({LINE}, int64[::1], int64[::1], {WORK}, int64[::1])")
 def best_exchange(atoms: Bools, gain: Ints, cost: Ints, work: Work, change: Ints) -> int:
     """Find the atoms of a row that had best leave their columns, and the vacancies to fill.
 
@@ -133,7 +133,7 @@ def best_exchange(atoms: Bools, gain: Ints, cost: Ints, work: Work, change: Ints
     return int(worth[even])
 
 
-@kernel(f"int64({LINE}, int64[::1])")
+@helper_kernel(f"int64({LINE}, int64[::1])")
 def n_moved(atoms: Bools, change: Ints) -> int:
     """Count the atoms of a row that an exchange moves."""
     n = balance = 0
@@ -144,7 +144,7 @@ def n_moved(atoms: Bools, change: Ints) -> int:
     return n
 
 
-@kernel(f"int64({GRID}, {GRID}, int64[::1], int64[::1], int64, int64, {WORK}, int64[::1])")
+@helper_kernel(f"int64({GRID}, {GRID}, int64[::1], int64[::1], int64, int64, {WORK}, int64[::1])")
 def choose_row(
     atoms: Bools, fill: Bools, weight: Ints, leave: Ints, limit: int, order: int, work: Work, change: Ints
 ) -> int:
@@ -162,7 +162,10 @@ def choose_row(
     best = 0
     best_row = -1
     for _ in range(max(ROWS_TRIED, EFFORT // n_cols)):
-        row = int(np.argmax(rank))
+        row = 0
+        for other in range(1, len(rank)):
+            if rank[other] > rank[row]:
+                row = other
         if rank[row] // PLACES <= best:
             break
         for col in range(n_cols):
@@ -180,7 +183,7 @@ def choose_row(
     return best_row
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
 def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int) -> Growing:
     """Sort rows until every column holds at least as many atoms as it has fill sites; updates ``atoms``."""
     n_rows, n_cols = atoms.shape
@@ -207,7 +210,7 @@ def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int
     return plan
 
 
-@kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
+@helper_kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
 def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
     """Count the batches that the compression of all columns takes at least, after row sorting."""
     n_rows, n_cols = atoms.shape
@@ -223,7 +226,7 @@ def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
     return n
 
 
-@kernel(f"boolean[:, ::1]({GRID})")
+@helper_kernel(f"boolean[:, ::1]({GRID})")
 def transposed(sites: Bools) -> Bools:
     """Swap rows and columns, into a contiguous array."""
     n_rows, n_cols = sites.shape
@@ -234,7 +237,7 @@ def transposed(sites: Bools) -> Bools:
     return swapped
 
 
-@kernel(f"UniTuple(int64, 3)({GROWING})")
+@helper_kernel(f"UniTuple(int64, 3)({GROWING})")
 def costs(plan: Growing) -> tuple[int, int, int]:
     """Number of batches, number of atom moves, and total distance in sites."""
     moves, offsets, n_batches = plan

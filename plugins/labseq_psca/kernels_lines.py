@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -35,7 +35,7 @@ FINISHED: Final = "Tuple((int16[:, ::1], int32[::1]))"
 IMPOSSIBLE: Final = 1 << 60
 
 
-@kernel(f"{GROWING}(int64)")
+@helper_kernel(f"{GROWING}(int64)")
 def empty_plan(n_sites: int) -> Growing:
     """Make the arrays of a plan for a grid of ``n_sites``."""
     offsets = np.empty(2 * n_sites + 1, np.int32)
@@ -43,7 +43,7 @@ def empty_plan(n_sites: int) -> Growing:
     return np.empty((2 * n_sites, 4), np.int16), offsets, 0
 
 
-@kernel(f"{FINISHED}({GROWING}, int64)")
+@helper_kernel(f"{FINISHED}({GROWING}, int64)")
 def resized(plan: Growing, n_moves: int) -> Finished:
     """Copy a plan into arrays for ``n_moves`` atom moves, and no more batches."""
     moves, offsets, n_batches = plan
@@ -57,7 +57,7 @@ def resized(plan: Growing, n_moves: int) -> Finished:
     return new_moves, new_offsets
 
 
-@kernel(f"{FINISHED}({GROWING}, boolean)")
+@helper_kernel(f"{FINISHED}({GROWING}, boolean)")
 def finished(plan: Growing, swapped: bool) -> Finished:
     """Cut a grown plan to its length, and swap rows and columns back if they were swapped."""
     n_batches = plan[2]
@@ -71,7 +71,7 @@ def finished(plan: Growing, swapped: bool) -> Finished:
     return moves, offsets[: n_batches + 1]
 
 
-@kernel("int64(int64[::1], int64[::1], int64, int64, int64, int64[::1], int64)")
+@helper_kernel("int64(int64[::1], int64[::1], int64, int64, int64, int64[::1], int64)")
 def fill_batch(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int, turn: Ints, batch: int) -> int:
     """Choose the atoms of a line that move in its next batch; return how many.
 
@@ -119,7 +119,7 @@ def fill_batch(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int, t
     return n
 
 
-@kernel(f"{GROWING}({GROWING}, int64[::1], int64[::1], int64, int64, boolean, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, int64[::1], int64[::1], int64, int64, boolean, int64, int64)")
 def add_line(
     plan: Growing, source: Ints, goal: Ints, n_sites: int, line: int, is_row: bool, limit: int, slots: int
 ) -> Growing:
@@ -164,7 +164,7 @@ def add_line(
     return moves, offsets, n_batches
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64, int64, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64, int64, int64, int64)")
 def add_move(plan: Growing, atoms: Bools, row: int, col: int, to_row: int, to_col: int) -> Growing:
     """Move one atom along its row or column, in a batch of its own; updates ``atoms``."""
     atoms[row, col] = False
@@ -181,7 +181,7 @@ EJECTED: Final = 1 << 32
 ATOM_MOVED: Final = 1 << 12  # and 1 for each site of distance
 
 
-@kernel(f"int64(int64, int64, {LINE}, int64)")
+@helper_kernel(f"int64(int64, int64, {LINE}, int64)")
 def cost_of_move(source: int, goal: int, clear: Bools, batch: int) -> int:
     """Cost of an atom's move along a line.
 
@@ -197,7 +197,7 @@ def cost_of_move(source: int, goal: int, clear: Bools, batch: int) -> int:
     return cost if goal == source else cost + ATOM_MOVED + abs(goal - source)
 
 
-@kernel(f"void({LINE}, int64, int64, int64[:, ::1])")
+@helper_kernel(f"void({LINE}, int64, int64, int64[:, ::1])")
 def reach(fill: Bools, n_atoms: int, beyond: int, places: Ints) -> None:
     """Find the first and the last place of each atom with which all fill sites can be taken.
 
@@ -229,7 +229,7 @@ def reach(fill: Bools, n_atoms: int, beyond: int, places: Ints) -> None:
         places[i, 1] = min(site - i + beyond, last)
 
 
-@kernel(f"bool_(int64[::1], {LINE}, {LINE}, int64, int64, int64[:, ::1], int16[:, ::1], int64[::1])")
+@helper_kernel(f"bool_(int64[::1], {LINE}, {LINE}, int64, int64, int64[:, ::1], int16[:, ::1], int64[::1])")
 def compress(
     source: Ints,
     fill: Bools,
@@ -302,7 +302,7 @@ def compress(
     return True
 
 
-@kernel(f"{GROWING}({GROWING}, {GRID}, {GRID}, {GRID}, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, {GRID}, {GRID}, {GRID}, int64, int64)")
 def compress_columns(
     plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int, slots: int
 ) -> Growing:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labseq.plugin import kernel
+from labseq.plugin import helper_kernel, kernel
 from labseq_psca.kernels_lines import (
     FINISHED,
     GRID,
@@ -25,7 +25,7 @@ from labseq_psca.kernels_lines import (
 from labseq_psca.kernels_rows import count_columns, place_in_order, sort_row, unlock_row, weigh_columns
 
 
-@kernel("int64(bool_[::1], int64[::1], int64[::1], int64)")
+@helper_kernel("int64(bool_[::1], int64[::1], int64[::1], int64)")
 def partner(row: Bools, need: Ints, spare: Ints, col: int) -> int:
     """Find the column that exchanges an atom with another one in a row.
 
@@ -57,7 +57,7 @@ def partner(row: Bools, need: Ints, spare: Ints, col: int) -> int:
     return best
 
 
-@kernel("UniTuple(int64, 2)(bool_[:, ::1], int64[::1], int64[::1], int64, int64)")
+@helper_kernel("UniTuple(int64, 2)(bool_[:, ::1], int64[::1], int64[::1], int64, int64)")
 def first_row(atoms: Bools, need: Ints, spare: Ints, col: int, order: int) -> tuple[int, int]:
     """Find the first row, by an order, in which a column can exchange an atom.
 
@@ -84,7 +84,7 @@ def first_row(atoms: Bools, need: Ints, spare: Ints, col: int, order: int) -> tu
     return row, other
 
 
-@kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1])")
+@helper_kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1])")
 def column_in_need(need: Ints, room: Ints, count: Ints, spare: Ints) -> int:
     """Find the column that lacks most atoms; if none does, the target's column with most too many.
 
@@ -104,7 +104,7 @@ def column_in_need(need: Ints, room: Ints, count: Ints, spare: Ints) -> int:
     return lacking if lacking >= 0 else crowded
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
 def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int) -> Growing:
     """Sort rows until every column of the target holds as many atoms as it has fill sites, no more.
 

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.plugin import kernel
+from labseq.plugin import helper_kernel, kernel
 from labseq_psca.kernels_lines import (
     GRID,
     GROWING,
@@ -35,7 +35,7 @@ ATOM_MOVE: Final = 3
 BATCH: Final = 1
 
 
-@kernel("int64(bool_[:, ::1], bool_[:, ::1], int64, int64, int64, int64)")
+@helper_kernel("int64(bool_[:, ::1], bool_[:, ::1], int64, int64, int64, int64)")
 def nearest_beside(atoms: Bools, fill: Bools, row: int, col: int, down: int, right: int) -> int:
     """Find the nearest surplus atom on either side of an empty site, with nothing in its way.
 
@@ -58,7 +58,7 @@ def nearest_beside(atoms: Bools, fill: Bools, row: int, col: int, down: int, rig
     return 0
 
 
-@kernel("UniTuple(int64, 4)(bool_[:, ::1], bool_[:, ::1], int64, int64, int64, int64)")
+@helper_kernel("UniTuple(int64, 4)(bool_[:, ::1], bool_[:, ::1], int64, int64, int64, int64)")
 def shift_to(
     atoms: Bools, fill: Bools, row: int, col: int, down: int, right: int
 ) -> tuple[int, int, int, int]:
@@ -100,7 +100,7 @@ def shift_to(
     return best
 
 
-@kernel(f"{SHIFT}(bool_[:, ::1], bool_[:, ::1])")
+@helper_kernel(f"{SHIFT}(bool_[:, ::1], bool_[:, ::1])")
 def cheapest_shift(atoms: Bools, fill: Bools) -> Shift:
     """Find the shift that costs least for each defect that it fills, of equal ones the shortest.
 
@@ -124,7 +124,7 @@ def cheapest_shift(atoms: Bools, fill: Bools) -> Shift:
     return best
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], bool_[:, ::1], {SHIFT}, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], bool_[:, ::1], {SHIFT}, int64)")
 def add_shift(plan: Growing, atoms: Bools, fill: Bools, shift: Shift, limit: int) -> Growing:
     """Add the batches of a shift, without the atom from beside; updates ``atoms``."""
     row, col, down, right, n_sites, _ = shift

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.plugin import kernel
+from labseq.plugin import helper_kernel
 from labseq_psca.kernels_lines import GRID, GROWING, Bools, Growing, Ints, add_line, add_move
 
 NEED: Final = 80  # for an atom in a column that lacks one: this plus the number of columns, times its lack,
@@ -25,13 +25,13 @@ FULLEST: Final = -1
 EMPTIEST: Final = 1
 
 
-@kernel("int64(int64, int64, int64)")
+@helper_kernel("int64(int64, int64, int64)")
 def place_in_order(n_atoms: int, n_sites: int, order: int) -> int:
     """Place of a row in an order (HALF_FILLED, FULLEST or EMPTIEST); lower goes first."""
     return abs(2 * n_atoms - n_sites) if order == HALF_FILLED else order * n_atoms
 
 
-@kernel(f"UniTuple(int64[::1], 3)({GRID}, {GRID}, {GRID})")
+@helper_kernel(f"UniTuple(int64[::1], 3)({GRID}, {GRID}, {GRID})")
 def count_columns(atoms: Bools, fill: Bools, clear: Bools) -> tuple[Ints, Ints, Ints]:
     """Count the fill sites of each column, its sites that may hold an atom, and its atoms."""
     n_rows, n_cols = atoms.shape
@@ -46,7 +46,7 @@ def count_columns(atoms: Bools, fill: Bools, clear: Bools) -> tuple[Ints, Ints, 
     return need, room, count
 
 
-@kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1], int64[::1])")
+@helper_kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1], int64[::1])")
 def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints) -> int:
     """Work out what one atom more or less is worth to each column.
 
@@ -73,7 +73,7 @@ def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints
     return n_lacking
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64, int64[::1], int64[::1], int64[:, ::1], int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64, int64[::1], int64[::1], int64[:, ::1], int64)")
 def sort_row(
     plan: Growing, atoms: Bools, row: int, change: Ints, count: Ints, work: Ints, limit: int
 ) -> Growing:
@@ -94,7 +94,7 @@ def sort_row(
     return add_line(plan, source[:n_atoms], goal[:n_atoms], n_cols, row, True, limit, 0)
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64[::1])")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64[::1])")
 def unlock_row(plan: Growing, atoms: Bools, weight: Ints, leave: Ints) -> Growing:
     """Move an atom within its column, the shortest way after which some row can be sorted; updates ``atoms``.
 

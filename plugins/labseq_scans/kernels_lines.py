@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -38,13 +38,13 @@ EJECTED: Final = 1 << 32
 ATOM_MOVED: Final = 1 << 18  # and 1 for each site of distance: at most 250,000 in 1000 sites
 
 
-@kernel(f"{GROWING}(int64)")
+@helper_kernel(f"{GROWING}(int64)")
 def empty_plan(n_sites: int) -> Growing:
     """Make the log of a plan for a grid of ``n_sites``."""
     return np.empty((2 * n_sites, 5), np.int32), 0, 0
 
 
-@kernel(f"{GROWING}({GROWING}, int64, int64, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, int64, int64, int64, int64)")
 def add_move(plan: Growing, row: int, col: int, to_row: int, to_col: int) -> Growing:
     """Add an atom move to the batch that is being written."""
     log, n, batch = plan
@@ -60,14 +60,14 @@ def add_move(plan: Growing, row: int, col: int, to_row: int, to_col: int) -> Gro
     return log, n + 1, batch
 
 
-@kernel(f"{GROWING}({GROWING})")
+@helper_kernel(f"{GROWING}({GROWING})")
 def end_batch(plan: Growing) -> Growing:
     """Go on with the next batch, unless this one has no atom moves."""
     log, n, batch = plan
     return log, n, batch + (n > 0 and log[n - 1, 0] == batch)
 
 
-@kernel(f"int64[::1]({LINE})")
+@helper_kernel(f"int64[::1]({LINE})")
 def sites_of(atoms: Bools) -> Ints:
     """List the sites of a line's atoms, ascending."""
     sites = np.empty(len(atoms), np.int64)
@@ -79,7 +79,7 @@ def sites_of(atoms: Bools) -> Ints:
     return sites[:n]
 
 
-@kernel(f"void({LINE}, {LINE}, {LINE}, int64[:, ::1], bool_[:, ::1])")
+@helper_kernel(f"void({LINE}, {LINE}, {LINE}, int64[:, ::1], bool_[:, ::1])")
 def sum_costs(atoms: Bools, fill: Bools, clear: Bools, cost: Ints, taken: Bools) -> None:
     """Sum up what the cheapest arrangements of a line's first sites cost, for every balance.
 
@@ -116,7 +116,7 @@ def sum_costs(atoms: Bools, fill: Bools, clear: Bools, cost: Ints, taken: Bools)
                     taken[site, after] = taking == 1
 
 
-@kernel(f"UniTuple(int64[::1], 2)({LINE}, {LINE}, {LINE}, boolean, boolean)")
+@helper_kernel(f"UniTuple(int64[::1], 2)({LINE}, {LINE}, {LINE}, boolean, boolean)")
 def settle(atoms: Bools, fill: Bools, clear: Bools, low: bool, high: bool) -> tuple[Ints, Ints]:
     """Find the cheapest arrangement of a line: where its atoms are, and where they go.
 
@@ -163,7 +163,7 @@ def settle(atoms: Bools, fill: Bools, clear: Bools, low: bool, high: bool) -> tu
     return source, goal
 
 
-@kernel("int64(int64[::1], int64[::1], int64, int64, int64, int64[::1])")
+@helper_kernel("int64(int64[::1], int64[::1], int64, int64, int64, int64[::1])")
 def next_batch(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int, left: Ints) -> int:
     """Choose the atoms of a line that move in its next batch; return how many.
 
@@ -205,7 +205,7 @@ def next_batch(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int, l
     return n
 
 
-@kernel(f"{GROWING}({GROWING}, int64[::1], int64[::1], int64, int64, boolean, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, int64[::1], int64[::1], int64, int64, boolean, int64, int64)")
 def add_line(
     plan: Growing, source: Ints, goal: Ints, n_sites: int, line: int, is_row: bool, limit: int, slots: int
 ) -> Growing:
@@ -237,7 +237,7 @@ def add_line(
         plan = end_batch(plan)
 
 
-@kernel(f"int64[::1]({GRID})")
+@helper_kernel(f"int64[::1]({GRID})")
 def column_sums(sites: Bools) -> Ints:
     """Count the marked sites of each column."""
     total = np.zeros(sites.shape[1], np.int64)
@@ -247,7 +247,7 @@ def column_sums(sites: Bools) -> Ints:
     return total
 
 
-@kernel(f"UniTuple(int64, 2)({LINE}, int64[::1])")
+@helper_kernel(f"UniTuple(int64, 2)({LINE}, int64[::1])")
 def nearest_exchange(atoms: Bools, spare: Ints) -> tuple[int, int]:
     """Find the nearest atom and vacancy of a row of which the one can be spared and the other is lacking.
 
@@ -268,7 +268,7 @@ def nearest_exchange(atoms: Bools, spare: Ints) -> tuple[int, int]:
     return best_atom, best_vacancy
 
 
-@kernel(f"int64({GRID}, int64[::1])")
+@helper_kernel(f"int64({GRID}, int64[::1])")
 def row_of_nearest_exchange(atoms: Bools, spare: Ints) -> int:
     """Find the row with the nearest exchange; -1 if no row has one."""
     best_row, best = -1, len(spare) + 1
@@ -279,7 +279,7 @@ def row_of_nearest_exchange(atoms: Bools, spare: Ints) -> int:
     return best_row
 
 
-@kernel(f"UniTuple(int64, 3)({GRID}, int64[::1])")
+@helper_kernel(f"UniTuple(int64, 3)({GRID}, int64[::1])")
 def nearest_unlocking(atoms: Bools, spare: Ints) -> tuple[int, int, int]:
     """Find the shortest move within a column after which a row has an exchange.
 
@@ -309,7 +309,7 @@ def nearest_unlocking(atoms: Bools, spare: Ints) -> tuple[int, int, int]:
     return best_col, best_atom, best_goal
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64)")
 def supply_columns(plan: Growing, atoms: Bools, spare: Ints, limit: int) -> Growing:
     """Give every column as many atoms as it needs, row by row, the row with the nearest exchange first.
 

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.plugin import kernel
+from labseq.plugin import helper_kernel, kernel
 from labseq_scans.kernels_lines import (
     GRID,
     GROWING,
@@ -30,7 +30,7 @@ Scans = tuple[Ints, int]
 SCANS: Final = "Tuple((int64[::1], int64))"
 
 
-@kernel(f"{SCANS}({SCANS}, int64)")
+@helper_kernel(f"{SCANS}({SCANS}, int64)")
 def add_scan(scans: Scans, n_lines: int) -> Scans:
     """Add a scan that passes ``n_lines``."""
     passed, n_scans = scans
@@ -42,7 +42,7 @@ def add_scan(scans: Scans, n_lines: int) -> Scans:
     return passed, n_scans + 1
 
 
-@kernel(f"void({GRID}, int64, int64, int64[::1])")
+@helper_kernel(f"void({GRID}, int64, int64, int64[::1])")
 def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
     """Measure how far the nearest atom beside each vacancy of a column is.
 
@@ -62,7 +62,7 @@ def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
             other += side
 
 
-@kernel("int64(int64[::1], bool_[::1], int64)")
+@helper_kernel("int64(int64[::1], bool_[::1], int64)")
 def choose_nearest(distance: Ints, chosen: Bools, n_wanted: int) -> int:
     """Mark the rows with the least distances above 0, ``n_wanted`` at most; return the largest of them."""
     farthest = 0
@@ -78,7 +78,9 @@ def choose_nearest(distance: Ints, chosen: Bools, n_wanted: int) -> int:
     return farthest
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64, int64, int64[::1], bool_[::1], int64)")
+@helper_kernel(
+    f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64, int64, int64[::1], bool_[::1], int64)"
+)
 def fetch(
     plan: Growing,
     atoms: Bools,
@@ -119,7 +121,7 @@ def fetch(
     return plan
 
 
-@kernel(f"Tuple(({GROWING}, {SCANS}))({GROWING}, {SCANS}, bool_[:, ::1], int64[::1], int64)")
+@helper_kernel(f"Tuple(({GROWING}, {SCANS}))({GROWING}, {SCANS}, bool_[:, ::1], int64[::1], int64)")
 def presort(plan: Growing, scans: Scans, atoms: Bools, spare: Ints, limit: int) -> tuple[Growing, Scans]:
     """Supply the columns that lack atoms, in turns, until none does or nothing helps.
 
@@ -153,7 +155,7 @@ def presort(plan: Growing, scans: Scans, atoms: Bools, spare: Ints, limit: int) 
     return plan, scans
 
 
-@kernel("int64(int64[:, ::1], int64[:, ::1], int64[::1], int64, int64, int64, int64)")
+@helper_kernel("int64(int64[:, ::1], int64[:, ::1], int64[::1], int64, int64, int64, int64)")
 def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i: int, sense: int) -> int:
     """Row where a scan drops atom ``i`` of a column: its goal or before the next atom; its own if it stays.
 
@@ -170,7 +172,7 @@ def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i
     return max(end, place[col, i] * sense) * sense
 
 
-@kernel(f"{GROWING}({GROWING}, int64[:, ::1], int64[:, ::1], int64[::1], int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, int64[:, ::1], int64[:, ::1], int64[::1], int64, int64)")
 def scan(plan: Growing, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limit: int) -> Growing:
     """Move a row of tweezers over all rows once; each carries one atom of its column at a time.
 
@@ -214,7 +216,7 @@ def scan(plan: Growing, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limi
     return plan
 
 
-@kernel(f"Tuple(({GROWING}, {SCANS}))({GROWING}, {SCANS}, {GRID}, {GRID}, {GRID}, int64, boolean)")
+@helper_kernel(f"Tuple(({GROWING}, {SCANS}))({GROWING}, {SCANS}, {GRID}, {GRID}, {GRID}, int64, boolean)")
 def sort_columns(
     plan: Growing, scans: Scans, atoms: Bools, fill: Bools, clear: Bools, limit: int, may_eject: bool
 ) -> tuple[Growing, Scans]:
@@ -244,7 +246,7 @@ def sort_columns(
     return plan, scans
 
 
-@kernel(f"{SCANS}({SCANS}, {GROWING}, int64, int64)")
+@helper_kernel(f"{SCANS}({SCANS}, {GROWING}, int64, int64)")
 def scans_of_exchanges(scans: Scans, plan: Growing, first_move: int, n_lines: int) -> Scans:
     """Add a scan for each batch from a move on: over the lines between its outermost sites."""
     log, n_moves, _ = plan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labseq.plugin import kernel
+from labseq.plugin import helper_kernel, kernel
 from labseq_scans.kernels_lines import (
     GRID,
     GROWING,
@@ -19,7 +19,7 @@ from labseq_scans.kernels_lines import (
 )
 
 
-@kernel(f"int64[:, ::1]({GRID})")
+@helper_kernel(f"int64[:, ::1]({GRID})")
 def fill_rows(fill: Bools) -> Ints:
     """List the rows of each column's fill sites, int64 (n_cols, n_rows + 1); ``n_rows`` after the last."""
     n_rows, n_cols = fill.shape
@@ -33,7 +33,7 @@ def fill_rows(fill: Bools) -> Ints:
     return rows
 
 
-@kernel("void(bool_[::1], int64[:, ::1], int64[::1], bool_[::1])")
+@helper_kernel("void(bool_[::1], int64[:, ::1], int64[::1], bool_[::1])")
 def choose_columns(atoms: Bools, rows: Ints, piled: Ints, chosen: Bools) -> None:
     """Choose the columns that the atoms of a row go to: those whose next open target row is the uppermost.
 
@@ -61,7 +61,7 @@ def choose_columns(atoms: Bools, rows: Ints, piled: Ints, chosen: Bools) -> None
         piled[col] += chosen[col]
 
 
-@kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, int64)")
 def pile_up(plan: Growing, atoms: Bools, fill: Bools, limit: int) -> Growing:
     """Arrange row after row, from the top, until each target site has its atom in its column."""
     n_rows, n_cols = atoms.shape

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel, kernel
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -37,7 +37,7 @@ NO_END: Final = -1
 N_DIRECTIONS: Final = 4
 
 
-@kernel(f"bool_[::1]({GRID})")
+@helper_kernel(f"bool_[::1]({GRID})")
 def with_margin(sites: Bools) -> Bools:
     """Flatten a mask, with a margin of one site, False there."""
     n_rows, n_cols = sites.shape
@@ -49,20 +49,20 @@ def with_margin(sites: Bools) -> Bools:
     return flat
 
 
-@kernel(f"int64[::1]({const('int64', 1)}, int64)")
+@helper_kernel(f"int64[::1]({const('int64', 1)}, int64)")
 def sites_with_margin(sites: Ints, n_cols: int) -> Ints:
     """Renumber sites, row * n_cols + col without the margin."""
     return (sites // n_cols + 1) * (n_cols + 2) + sites % n_cols + 1
 
 
-@kernel(f"{BOARD}({GRID})")
+@helper_kernel(f"{BOARD}({GRID})")
 def board_of(occupied: Bools) -> Board:
     """Put the atoms of a grid onto a board."""
     inside = with_margin(np.ones(occupied.shape, np.bool_))
     return with_margin(occupied), inside, occupied.shape[1] + 2
 
 
-@kernel("int64[::1](int64[::1], int64, int64)")
+@helper_kernel("int64[::1](int64[::1], int64, int64)")
 def trace(came_from: Ints, state: int, n_sites: int) -> Ints:
     """List the sites of the states that led to a state, beginning with its own."""
     n = 0
@@ -78,7 +78,7 @@ def trace(came_from: Ints, state: int, n_sites: int) -> Ints:
     return path
 
 
-@kernel(f"int64[::1]({BOARD}, {SITES}, int64[::1])")
+@helper_kernel(f"int64[::1]({BOARD}, {SITES}, int64[::1])")
 def cheapest_path(board: Board, starts: Bools, end_cost: Ints) -> Ints:
     """Find the path from a start to an end that crosses the fewest atoms; then the shortest and straightest.
 
@@ -140,13 +140,13 @@ Growing = tuple[Moves, Bools, int]
 GROWING: Final = "Tuple((int16[:, ::1], bool_[::1], int64))"
 
 
-@kernel(f"{GROWING}(int64)")
+@helper_kernel(f"{GROWING}(int64)")
 def empty_plan(n_sites: int) -> Growing:
     """Make the arrays of a plan for a grid of ``n_sites``."""
     return np.empty((n_sites, 4), np.int16), np.empty(n_sites, np.bool_), 0
 
 
-@kernel(f"{GROWING}({GROWING}, int64, int64, int64, boolean)")
+@helper_kernel(f"{GROWING}({GROWING}, int64, int64, int64, boolean)")
 def add_batch(plan: Growing, source: int, goal: int, width: int, goes_on: bool) -> Growing:
     """Add a straight move of one atom; ``goes_on`` if the tweezer holds it since the batch before."""
     moves, linked, n = plan
@@ -164,7 +164,7 @@ def add_batch(plan: Growing, source: int, goal: int, width: int, goes_on: bool) 
     return moves, linked, n + 1
 
 
-@kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1], int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1], int64, int64)")
 def carry(plan: Growing, board: Board, path: Ints, start: int, stop: int) -> Growing:
     """Carry the atom at ``path[start]`` to ``path[stop]``, by a batch for each straight piece.
 
@@ -181,7 +181,7 @@ def carry(plan: Growing, board: Board, path: Ints, start: int, stop: int) -> Gro
     return plan
 
 
-@kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1])")
+@helper_kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1])")
 def shift(plan: Growing, board: Board, path: Ints) -> Growing:
     """Move every atom of a path on to the next free place towards the path's first site, which is free."""
     free = 0
@@ -192,7 +192,7 @@ def shift(plan: Growing, board: Board, path: Ints) -> Growing:
     return plan
 
 
-@kernel(f"{GROWING}({GROWING}, {BOARD}, {GRID}, {GRID}, boolean)")
+@helper_kernel(f"{GROWING}({GROWING}, {BOARD}, {GRID}, {GRID}, boolean)")
 def clear_surplus(
     plan: Growing, board: Board, fill_sites: Bools, clear_sites: Bools, may_eject: bool
 ) -> Growing:
@@ -257,7 +257,7 @@ def plan_compression(
     return clear_surplus(plan, board, fill_sites, clear_sites, may_eject)
 
 
-@kernel(f"int64[::1]({BOARD}, {SITES})")
+@helper_kernel(f"int64[::1]({BOARD}, {SITES})")
 def distance_in_the_open(board: Board, starts: Bools) -> Ints:
     """Measure how far free sites are from the nearest start, along free sites; -1 where no path leads."""
     atoms, inside, width = board
@@ -282,7 +282,7 @@ def distance_in_the_open(board: Board, starts: Bools) -> Ints:
     return distance
 
 
-@kernel(f"int64(int64[::1], {SITES})")
+@helper_kernel(f"int64(int64[::1], {SITES})")
 def farthest(distance: Ints, sites: Bools) -> int:
     """Find the marked site that is farthest; -1 if none is reached."""
     found = -1
@@ -292,7 +292,7 @@ def farthest(distance: Ints, sites: Bools) -> int:
     return found
 
 
-@kernel(f"int64[::1]({BOARD}, {SITES}, int64[::1])")
+@helper_kernel(f"int64[::1]({BOARD}, {SITES}, int64[::1])")
 def opening(board: Board, holes: Bools, distance: Ints) -> Ints:
     """Find the path of an atom between a closed region and the open into the region's depth, its goal first.
 
@@ -351,7 +351,7 @@ def plan_clusters(occupied: Bools, fill_sites: Bools, clear_sites: Bools, may_ej
     return clear_surplus(plan, board, fill_sites, clear_sites, may_eject)
 
 
-@kernel("int64[::1](int64, int64, int64, boolean)")
+@helper_kernel("int64[::1](int64, int64, int64, boolean)")
 def l_shaped(source: int, goal: int, width: int, row_first: bool) -> Ints:
     """List the sites of the L from a source to a goal, along the source's row first or last."""
     down = goal // width - source // width
@@ -369,7 +369,7 @@ def l_shaped(source: int, goal: int, width: int, row_first: bool) -> Ints:
     return path
 
 
-@kernel(f"int64({SITES}, int64[::1])")
+@helper_kernel(f"int64({SITES}, int64[::1])")
 def n_in_the_way(atoms: Bools, path: Ints) -> int:
     """Count the atoms on a path, including that on its goal, but not that on its source."""
     n = 0
@@ -379,7 +379,7 @@ def n_in_the_way(atoms: Bools, path: Ints) -> int:
     return n
 
 
-@kernel(f"Tuple((int64, boolean))({SITES}, int64, int64, int64)")
+@helper_kernel(f"Tuple((int64, boolean))({SITES}, int64, int64, int64)")
 def better_l(atoms: Bools, source: int, goal: int, width: int) -> tuple[int, bool]:
     """Atoms in the way on the better of the two L's, and whether it goes along the row first."""
     n_row_first = n_in_the_way(atoms, l_shaped(source, goal, width, True))
@@ -387,7 +387,7 @@ def better_l(atoms: Bools, source: int, goal: int, width: int) -> tuple[int, boo
     return min(n_row_first, n_column_first), n_row_first <= n_column_first
 
 
-@kernel(f"Tuple(({GROWING}, int64))({GROWING}, {BOARD}, int64[::1], int64[::1])")
+@helper_kernel(f"Tuple(({GROWING}, int64))({GROWING}, {BOARD}, int64[::1], int64[::1])")
 def carry_the_free(plan: Growing, board: Board, goal_of: Ints, waiting: Ints) -> tuple[Growing, int]:
     """Move every waiting atom that has a free path to its goal; go through the list once.
 
@@ -418,7 +418,7 @@ def carry_the_free(plan: Growing, board: Board, goal_of: Ints, waiting: Ints) ->
     return plan, n_left
 
 
-@kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1], int64[::1])")
+@helper_kernel(f"{GROWING}({GROWING}, {BOARD}, int64[::1], int64[::1])")
 def exchange(plan: Growing, board: Board, goal_of: Ints, waiting: Ints) -> Growing:
     """Let the last atom in the way go on to the goal, and the one that was to go there take its part.
 

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel, kernel
 from labseq_spcm.limits import DDS_MIN_TICKS, DDS_TICK_S
 
 Words = NDArray[np.uint16]
@@ -68,7 +68,7 @@ def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
         out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
 
 
-@kernel("float64(int64, float64)")
+@helper_kernel("float64(int64, float64)")
 def course_at(course: int, u: float) -> float:
     """Part of its change that a frequency has covered; as :meth:`labseq.plugin.FrequencyCourse.fraction`."""
     if course == 0:
@@ -80,14 +80,14 @@ def course_at(course: int, u: float) -> float:
     return s if u <= 0.5 else 1.0 - s
 
 
-@kernel(f"float64({TONES}, int64, float64)")
+@helper_kernel(f"float64({TONES}, int64, float64)")
 def amplitude_at(tones: Reals, tone: int, u: float) -> float:
     """Amplitude of a tone after a fraction u of its segment: its square changes linearly."""
     start, end = tones[START, tone], tones[END, tone]
     return np.sqrt(start * start + (end * end - start * start) * min(1.0, max(0.0, u)))
 
 
-@kernel(f"void({TONES}, int64, int64, float64[::1])")
+@helper_kernel(f"void({TONES}, int64, int64, float64[::1])")
 def widest_ramp(tones: Reals, first: int, last: int, widest: Reals) -> None:
     """Put the start and end amplitude of the tone that changes most into ``widest``."""
     for tone in range(first, last):
@@ -96,7 +96,7 @@ def widest_ramp(tones: Reals, first: int, last: int, widest: Reals) -> None:
             widest[0], widest[1] = start, end
 
 
-@kernel("int64(float64[::1], int64, float64, float64[::1])")
+@helper_kernel("int64(float64[::1], int64, float64, float64[::1])")
 def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
     """Cut a segment into steps: their ends as fractions of its duration; returns how many steps."""
     start, end = widest[0], widest[1]
@@ -113,7 +113,9 @@ def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
     return n_steps
 
 
-@kernel(f"boolean({OFFSETS}, {TONES}, int64, float64, int64, int64, int64[::1], bool_[::1], bool_[::1])")
+@helper_kernel(
+    f"boolean({OFFSETS}, {TONES}, int64, float64, int64, int64, int64[::1], bool_[::1], bool_[::1])"
+)
 def assign(
     offsets: Shorts, tones: Reals, segment: int, before_s: float, first_core: int, last_core: int,
     core_of: Ints, set_phase: Bools, used: Bools,
@@ -151,7 +153,7 @@ def assign(
     return True
 
 
-@kernel("int64(int64, float64, int32[::1], float64[::1], int64)")
+@helper_kernel("int64(int64, float64, int32[::1], float64[::1], int64)")
 def add_command(register: int, value: float, registers: Shorts, values: Reals, n: int) -> int:
     """Add a command."""
     registers[n] = register
@@ -159,7 +161,7 @@ def add_command(register: int, value: float, registers: Shorts, values: Reals, n
     return n + 1
 
 
-@kernel(
+@helper_kernel(
     f"int64({CORES}, int64, float64, float64, float64, float64, float64[:, ::1], int32[::1], float64[::1],"
     " int64)"
 )
@@ -181,7 +183,7 @@ def drive_core(
     return n
 
 
-@kernel(f"int64({CORES}, bool_[::1], float64[:, ::1], int32[::1], float64[::1], int64)")
+@helper_kernel(f"int64({CORES}, bool_[::1], float64[:, ::1], int32[::1], float64[::1], int64)")
 def silence(cores: Ints, keep: Bools, now: Reals, registers: Shorts, values: Reals, n: int) -> int:
     """Add the commands that silence all cores but some."""
     for at in range(len(cores)):
@@ -190,7 +192,7 @@ def silence(cores: Ints, keep: Bools, now: Reals, registers: Shorts, values: Rea
     return n
 
 
-@kernel(
+@helper_kernel(
     f"int64({TONES}, int64, int64, {CORES}, int64[::1], bool_[::1], int64, boolean, float64, float64,"
     " float64, float64, float64[:, ::1], int32[::1], float64[::1], int64)"
 )

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel, kernel
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ collided."""
 N_COLUMNS = 7
 
 
-@kernel("UniTuple(float64, 4)(float64, float64, float64, float64, float64, float64)")
+@helper_kernel("UniTuple(float64, 4)(float64, float64, float64, float64, float64, float64)")
 def pull(
     x: float, y: float, z: float, depth: float, waist: float, rayleigh: float
 ) -> tuple[float, float, float, float]:
@@ -75,7 +75,7 @@ def energies(state: Floats, sites: Floats, depth: Floats, waist: float, rayleigh
     return found
 
 
-@kernel(f"Tuple((int64, float64))({TABLE}, int64, float64)")
+@helper_kernel(f"Tuple((int64, float64))({TABLE}, int64, float64)")
 def nearest(tracks: Floats, k: int, place: float) -> tuple[int, float]:
     """The tone nearest to a place, in sites, that is on at frame k or the next, and its distance."""
     best, least = -1, np.inf
@@ -102,7 +102,9 @@ def course(tracks: Floats, depth: Floats, k: int, j: int) -> tuple[float, float,
     return here, there - here, first, last - first
 
 
-@kernel(f"boolean({VECTOR}, {TABLE}, {TABLE}, {TABLE}, {TABLE}, int64, {TABLE}, float64, float64, {OUTPUT})")
+@helper_kernel(
+    f"boolean({VECTOR}, {TABLE}, {TABLE}, {TABLE}, {TABLE}, int64, {TABLE}, float64, float64, {OUTPUT})"
+)
 def find_tweezer(
     atom: Floats,
     rows: Floats,
@@ -132,7 +134,7 @@ def find_tweezer(
     return min(math.hypot(x, y), math.hypot(x - tweezer[2], y - tweezer[3])) < reach
 
 
-@kernel(f"void({OUTPUT}, {VECTOR}, float64, {VECTOR}, {VECTOR}, float64, int64)")
+@helper_kernel(f"void({OUTPUT}, {VECTOR}, float64, {VECTOR}, {VECTOR}, float64, int64)")
 def move(
     atom: Floats, site: Floats, depth: float, tweezer: Floats, beams: Floats, duration: float, n_steps: int
 ) -> None:
@@ -159,7 +161,9 @@ def move(
     atom[0], atom[1], atom[2], atom[3], atom[4], atom[5] = x, y, z, vx, vy, vz
 
 
-@kernel(f"Tuple((boolean, float64))({VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, {OUTPUT}, float64)")
+@helper_kernel(
+    f"Tuple((boolean, float64))({VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, {OUTPUT}, float64)"
+)
 def check_bound(
     atom: Floats, site: Floats, depth: float, tweezer: Floats, beams: Floats, record: Floats, t_s: float
 ) -> tuple[bool, float]:
@@ -188,7 +192,7 @@ def check_bound(
     return energy < 0.0 or (near and abs(z) < HIGH * beams[3]), energy
 
 
-@kernel(f"void({VECTOR}, {TABLE}, {OUTPUT}, float64, float64)")
+@helper_kernel(f"void({VECTOR}, {TABLE}, {OUTPUT}, float64, float64)")
 def record_loss(atom: Floats, plane: Floats, record: Floats, t_s: float, collided: float) -> None:
     """Record when and where an atom was lost, and whether in a collision."""
     x, y = atom[0] - plane[0, 0], atom[1] - plane[0, 1]
@@ -197,7 +201,7 @@ def record_loss(atom: Floats, plane: Floats, record: Floats, t_s: float, collide
     record[LOST_COL] = plane[4, 0] * x + plane[4, 1] * y
 
 
-@kernel(f"float64({VECTOR}, {TABLE}, {TABLE}, {OUTPUT})")
+@helper_kernel(f"float64({VECTOR}, {TABLE}, {TABLE}, {OUTPUT})")
 def find_site(atom: Floats, plane: Floats, static_depth: Floats, site: Floats) -> float:
     """Find the site nearest to an atom: its position, row and column; returns its depth."""
     x, y = atom[0] - plane[0, 0], atom[1] - plane[0, 1]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -20,7 +20,7 @@ YOUNG = 8
 """A track with fewer frames than this gives way to an older one."""
 
 
-@kernel(f"int64({POWER}, int64, float64, int64, int64[::1])")
+@helper_kernel(f"int64({POWER}, int64, float64, int64, int64[::1])")
 def find_peaks(power: NDArray[np.float32], k: int, threshold: float, reach: int, found: Ints) -> int:
     """Find the peaks of spectrum k, each the greatest within ``reach`` bins, rising; returns how many."""
     n = 0

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, kernel
+from labseq.plugin import const, helper_kernel, kernel
 from labseq_virtual.handover import (
     ADIABATIC_DEPTH,
     AT_REST,
@@ -72,7 +72,7 @@ def moves(tones: Floats) -> bool:
     return furthest > AT_REST
 
 
-@kernel(f"boolean({TABLE})")
+@helper_kernel(f"boolean({TABLE})")
 def crowded(tones: Floats) -> bool:
     """Whether any tone is too close to the next one in the list."""
     for k in range(1, len(tones)):
@@ -82,7 +82,7 @@ def crowded(tones: Floats) -> bool:
     return False
 
 
-@kernel(f"boolean[::1]({TABLE})")
+@helper_kernel(f"boolean[::1]({TABLE})")
 def find_mixed(tones: Floats) -> Mask:
     """Which tones come too close to another, or pass it (n_tones,)."""
     mixed = np.zeros(len(tones), np.bool_)
@@ -96,7 +96,7 @@ def find_mixed(tones: Floats) -> Mask:
     return mixed
 
 
-@kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1])")
+@helper_kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1])")
 def mix(row: Floats, col: Floats, state: States) -> int:
     """Rule 3: atoms on tones that mix are lost; returns their number."""
     if not (crowded(row) or crowded(col)):
@@ -111,7 +111,7 @@ def mix(row: Floats, col: Floats, state: States) -> int:
     return n_lost
 
 
-@kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64[:, ::1], int64[::1])")
+@helper_kernel(f"int64({TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64[:, ::1], int64[::1])")
 def find_paths(
     row: Floats, col: Floats, state: States, depth: Floats, min_depth: float, paths: Floats, work: Ints
 ) -> int:
@@ -131,7 +131,7 @@ def find_paths(
     return n
 
 
-@kernel(f"UniTuple(int64, 2)({TABLE}, int64, int64, int64, float64)")
+@helper_kernel(f"UniTuple(int64, 2)({TABLE}, int64, int64, int64, float64)")
 def span(paths: Floats, n: int, axis: int, n_sites: int, tolerance: float) -> tuple[int, int]:
     """Range of the rows (axis 0) or columns (axis 1) that n paths come close to: first, last + 1."""
     low, high = math.inf, -math.inf
@@ -142,7 +142,7 @@ def span(paths: Floats, n: int, axis: int, n_sites: int, tolerance: float) -> tu
     return max(first, 0), min(last + 1, n_sites)
 
 
-@kernel(f"int64({TABLE}, int64, int64, int64, float64)")
+@helper_kernel(f"int64({TABLE}, int64, int64, int64, float64)")
 def first_to_hit(paths: Floats, n: int, r: int, c: int, tolerance: float) -> int:
     """Which of n paths passes over a site first; -1 if none does."""
     first, soonest = -1, math.inf
@@ -155,7 +155,7 @@ def first_to_hit(paths: Floats, n: int, r: int, c: int, tolerance: float) -> int
     return first
 
 
-@kernel(
+@helper_kernel(
     f"int64(boolean[:, ::1], {TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64, float64[:, ::1], "
     "int64[::1])"
 )
@@ -199,7 +199,7 @@ STATES = "int8[:, ::1]"
 NUMBERS = "int64[::1]"
 
 
-@kernel(f"float64(float64, {TABLE})")
+@helper_kernel(f"float64(float64, {TABLE})")
 def interpolate(x: float, table: Floats) -> float:
     """Linear interpolation in a table (2, n) of x, rising, and y; constant beyond its ends."""
     if x <= table[0, 0]:
@@ -211,27 +211,27 @@ def interpolate(x: float, table: Floats) -> float:
     return float(table[1, -1])
 
 
-@kernel("float64(float64)")
+@helper_kernel("float64(float64)")
 def exceeds(energy_over_kt: float) -> float:
     """Probability that the thermal energy in a harmonic well in three dimensions exceeds a value."""
     x = max(energy_over_kt, 0.0)
     return math.exp(-x) * (1.0 + x + x * x / 2.0)
 
 
-@kernel("float64(float64)")
+@helper_kernel("float64(float64)")
 def kinetic_exceeds(energy_over_kt: float) -> float:
     """Probability that the kinetic energy in three dimensions exceeds a value (Maxwell's constants)."""
     root = math.sqrt(max(energy_over_kt, 0.0))
     return math.erfc(root) + 2.0 / math.sqrt(math.pi) * root * math.exp(-root * root)
 
 
-@kernel(f"float64(float64, int64, {VECTOR})")
+@helper_kernel(f"float64(float64, int64, {VECTOR})")
 def mobile_depth(power: float, n_further: int, constants: Floats) -> float:
     """Depth of a mobile tweezer in kelvin; ``power``: power of its tones relative to the intended one."""
     return float(constants[MOBILE_DEPTH] * power / (1.0 + constants[DEPTH_DROP] * n_further))
 
 
-@kernel(f"boolean(float64, float64, float64, {TABLE})")
+@helper_kernel(f"boolean(float64, float64, float64, {TABLE})")
 def takes(mobile: float, static: float, distance_m: float, merging: Floats) -> bool:
     """Whether a mobile tweezer that switches on takes the atom of a static one; depths in kelvin."""
     if mobile <= static:
@@ -240,7 +240,7 @@ def takes(mobile: float, static: float, distance_m: float, merging: Floats) -> b
     return distance_m < interpolate(log_ratio, merging)
 
 
-@kernel(f"float64(float64, float64, int64, {VECTOR})")
+@helper_kernel(f"float64(float64, float64, int64, {VECTOR})")
 def shallow(mobile: float, speed_m_s: float, n_further: int, constants: Floats) -> float:
     """Probability that an atom falls out of a mobile tweezer that is too shallow for its speed."""
     if constants[ADIABATIC_DEPTH] == 0.0:
@@ -256,7 +256,7 @@ def shallow(mobile: float, speed_m_s: float, n_further: int, constants: Floats) 
     return float(constants[SHALLOW_LOSS] * part)
 
 
-@kernel(f"float64(float64, float64, float64, float64, {VECTOR})")
+@helper_kernel(f"float64(float64, float64, float64, float64, {VECTOR})")
 def spilled(static: float, ratio: float, distance_m: float, ramp_s: float, constants: Floats) -> float:
     """Probability that an atom dropped off near a site does not stay there.
 
@@ -275,7 +275,7 @@ def spilled(static: float, ratio: float, distance_m: float, ramp_s: float, const
     return slow + part * (max(sudden, slow) - slow)
 
 
-@kernel(f"UniTuple(float64, 3)(float64, float64, float64, float64, int64, float64, float64, {VECTOR})")
+@helper_kernel(f"UniTuple(float64, 3)(float64, float64, float64, float64, int64, float64, float64, {VECTOR})")
 def risks(
     static: float,
     mobile: float,
@@ -316,7 +316,7 @@ def risks(
     )
 
 
-@kernel(f"Tuple((int64, int64, float64, boolean))(float64, float64, {TABLE}, {VECTOR})")
+@helper_kernel(f"Tuple((int64, int64, float64, boolean))(float64, float64, {TABLE}, {VECTOR})")
 def nearest_site(row: float, col: float, static: Floats, constants: Floats) -> tuple[int, int, float, bool]:
     """The site nearest to a position, its distance in metres, and whether the position is in the grid."""
     r, c = round(row), round(col)
@@ -330,7 +330,7 @@ def nearest_site(row: float, col: float, static: Floats, constants: Floats) -> t
     return r, c, away_m, inside
 
 
-@kernel(f"void({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {VECTOR}, {TABLE})")
+@helper_kernel(f"void({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {VECTOR}, {TABLE})")
 def pick_up(
     occupied: Mask,
     static: Floats,
@@ -353,7 +353,7 @@ def pick_up(
                 occupied[r, c] = False
 
 
-@kernel("int64(boolean[:, ::1], int64[::1], int64)")
+@helper_kernel("int64(boolean[:, ::1], int64[::1], int64)")
 def land(occupied: Mask, sites: Ints, n: int) -> int:
     """Put n atoms on their sites, all at once; atoms that share a site are lost; returns their number."""
     n_lost = 0
@@ -372,7 +372,7 @@ def land(occupied: Mask, sites: Ints, n: int) -> int:
     return n_lost
 
 
-@kernel(
+@helper_kernel(
     f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {TABLE}, int64, float64, float64, "
     f"{TABLE}, int64, {VECTOR}, {NUMBERS}, {NUMBERS})"
 )
@@ -430,7 +430,7 @@ INSTANT_S = 1e-12
 """Duration assumed for a segment of duration 0, in seconds."""
 
 
-@kernel(f"int64({TABLE}, int64, int64)")
+@helper_kernel(f"int64({TABLE}, int64, int64)")
 def count_on(tones: Floats, one: int, other: int) -> int:
     """Number of tones that are on in both of two columns (start and end, or the same column twice)."""
     n = 0
@@ -439,7 +439,7 @@ def count_on(tones: Floats, one: int, other: int) -> int:
     return n
 
 
-@kernel(f"int64({TABLE})")
+@helper_kernel(f"int64({TABLE})")
 def count_lit(tones: Floats) -> int:
     """Number of tones that are on at the start or at the end."""
     n = 0
@@ -448,7 +448,7 @@ def count_lit(tones: Floats) -> int:
     return n
 
 
-@kernel(f"boolean({TABLE}, {TABLE})")
+@helper_kernel(f"boolean({TABLE}, {TABLE})")
 def any_lit(row: Floats, col: Floats) -> bool:
     """Whether any crossing is on at the start or at the end."""
     at_start = count_on(row, ON_START, ON_START) * count_on(col, ON_START, ON_START)
@@ -468,7 +468,7 @@ def max_drop_offs(
     return n
 
 
-@kernel(f"int64({STATES}, {TABLE}, {TABLE})")
+@helper_kernel(f"int64({STATES}, {TABLE}, {TABLE})")
 def count_held(state: States, row: Floats, col: Floats) -> int:
     """Number of crossings that hold an atom."""
     n = 0
@@ -478,7 +478,7 @@ def count_held(state: States, row: Floats, col: Floats) -> int:
     return n
 
 
-@kernel(f"boolean({TABLE}, {TABLE}, float64)")
+@helper_kernel(f"boolean({TABLE}, {TABLE}, float64)")
 def unchanged(before: Floats, now: Floats, tolerance: float) -> bool:
     """Whether the tones continue in the same order, as they nearly always do."""
     if len(before) != len(now):
@@ -489,7 +489,7 @@ def unchanged(before: Floats, now: Floats, tolerance: float) -> bool:
     return furthest <= tolerance
 
 
-@kernel(f"{NUMBERS}({TABLE}, {TABLE}, float64)")
+@helper_kernel(f"{NUMBERS}({TABLE}, {TABLE}, float64)")
 def match(before: Floats, now: Floats, tolerance: float) -> Ints:
     """For each tone the nearest one of the segment before (n_tones,); -1 where none is close enough.
 
@@ -510,7 +510,7 @@ def match(before: Floats, now: Floats, tolerance: float) -> Ints:
     return nearest
 
 
-@kernel(f"void({TABLE}, {TABLE}, {STATES}, {OUTPUT}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, float64)")
+@helper_kernel(f"void({TABLE}, {TABLE}, {STATES}, {OUTPUT}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, float64)")
 def follow(
     old_row: Floats,
     old_col: Floats,
@@ -538,7 +538,7 @@ def follow(
                 state[i, j], risk[i, j] = NEW if lit else DARK, 0.0
 
 
-@kernel(f"void({TABLE}, {TABLE}, {STATES}, {TABLE}, {OUTPUT}, int64, float64, {VECTOR})")
+@helper_kernel(f"void({TABLE}, {TABLE}, {STATES}, {TABLE}, {OUTPUT}, int64, float64, {VECTOR})")
 def run_risks(
     row: Floats,
     col: Floats,
@@ -560,7 +560,7 @@ def run_risks(
                 risk[i, j] = max(risk[i, j], shallow(depth[i, j], speed_m_s, n_further, constants))
 
 
-@kernel(f"int64({OFFSETS}, int64)")
+@helper_kernel(f"int64({OFFSETS}, int64)")
 def max_tones(offsets: Offsets, n_segments: int) -> int:
     """Largest number of tones of an axis in one of the first segments."""
     most = 0
@@ -569,7 +569,7 @@ def max_tones(offsets: Offsets, n_segments: int) -> int:
     return most
 
 
-@kernel(
+@helper_kernel(
     f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {OUTPUT}, float64, float64, float64, "
     f"{TABLE}, int64, {VECTOR}, {TABLE}, {OUTPUT}, {NUMBERS}, {NUMBERS})"
 )

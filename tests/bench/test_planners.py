@@ -75,7 +75,7 @@ def without_times(values: Any) -> Any:
 def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Long work is shared after a while; two conditions, and a planner that fails."""
     monkeypatch.setattr(bench, "ALONE_S", 0.0)
-    monkeypatch.setattr(bench, "_n_cores", lambda: 2)
+    monkeypatch.setattr(bench, "n_cores", lambda: 2)
     entries = (PlannerEntry("moody"), PlannerEntry("psca"))
     conditions = (*SMALL.conditions, Condition((6, 7), "compact:3x3", 0.5))
     comparison = replace(SMALL, planner_entries=entries, conditions=conditions)

@@ -111,7 +111,7 @@ class Script:
 
     def __iter__(self) -> Iterator[Event]:
         run_dir = "data/2026-01-02/0001_compact-225"
-        yield "compiling", {"module": "labseq_psca.kernels"}
+        yield "compiling", {"about_s": 6.4}
         yield "compiled", {"duration_s": 6.0}
         yield "run_starting", {"record": self.run, "run_dir": run_dir}
         yield "run_started", {"record": self.run, "run_dir": run_dir}

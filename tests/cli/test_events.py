@@ -20,7 +20,7 @@ def lines_of(events: Any) -> list[str]:
 
 def test_a_run_in_lines(fake: Any) -> None:
     assert lines_of(fake.script(fake.run())) == [
-        "compiling labseq_psca.kernels; later runs find it in the cache",
+        "compiling kernels, about 6 s; later runs find them in the cache",
         "compiled in 6 s",
         "data/2026-01-02/0001_compact-225: 20 shots, seed 1, profile virtual, simulated",
         "shot 0  defect-free after 2 cycles  filling 100.0 %  1.9 s",

@@ -13,6 +13,7 @@ from hypothesis.strategies import SearchStrategy
 from numpy.typing import NDArray
 
 from labseq.errors import LabseqError
+from labseq.kernel import load_kernels
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.roles import Context, NeedsWarmUp, Planner
@@ -433,6 +434,7 @@ class PlannerContract:
         planner = factory(self.context(target.shape))
         if isinstance(planner, NeedsWarmUp):
             planner.warm()
+            load_kernels()
         return planner
 
     def on_examples(self, check: Check, *, served: bool = False) -> None:
