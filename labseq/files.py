@@ -239,8 +239,8 @@ def packaged_sequences_dir() -> Path:
 def profile_dir(profile: Path) -> Path:
     """The folder for data of a profile, such as its calibrations: the folder of the profile's file.
 
-    For a profile that comes with labseq it is ./hardware_profiles, where a copy of the profile would be: others
-    use the same file from other working folders, in a wheel or a copy of the repository.
+    For a profile that comes with labseq it is ./hardware_profiles, where a copy of the profile would be,
+    because its file is used from other working folders as well.
     """
     is_packaged = profile.resolve().parent == packaged_profiles_dir().resolve()
     return Path(PROFILES).absolute() if is_packaged else profile.parent

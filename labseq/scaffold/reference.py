@@ -29,7 +29,7 @@ from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
 from labseq.messages import clean, closest
 from labseq.registry import KINDS, Entry, Registry
 from labseq.roles import EVENTS
-from labseq.scaffold.words import default_of, value_of
+from labseq.scaffold.words import default_of, docstring, summary, value_of
 from labseq.settings import Choice
 from labseq.units import EXAMPLES, UNITS, unit_names
 
@@ -244,46 +244,6 @@ def units() -> list[Block]:
     """A row per dimension, with its units."""
     rows = [(one, f"`{EXAMPLES[one]}`", ", ".join(f"`{unit}`" for unit in unit_names(one))) for one in UNITS]
     return [Table(("quantity", "example", "units"), rows)]
-
-
-# Docstrings
-
-_TITLES: Final = {"Args": "Arguments", "Attributes": "Fields"}
-_SECTION: Final = re.compile(r"^(Args|Attributes|Example|Raises|Returns):$", re.MULTILINE)
-_ITEM: Final = re.compile(r"^(\*{0,2}\w+): ", re.MULTILINE)
-
-
-def summary(*documented: object) -> str:
-    """The first paragraph of the first docstring that there is, on one line."""
-    own = (one for one in documented if inspect.isroutine(one) or isinstance(one, type))
-    texts = (" ".join(_parts(one)[""].partition("\n\n")[0].split()) for one in own)
-    return next(filter(None, texts), "")
-
-
-def docstring(documented: object) -> str:
-    """A docstring as Markdown, without its examples: its text, then a list for each section."""
-    texts: list[str] = []
-    for title, text in _parts(documented).items():
-        if not title:
-            texts.append(text)
-        elif title != "Example":
-            texts.append(f"{_TITLES.get(title, title)}:\n\n{_items(text)}")
-    return "\n\n".join(texts)
-
-
-def _parts(documented: object) -> dict[str, str]:
-    """The text of a Google-style docstring by section; the text before them is ""."""
-    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(documented) or "").replace("``", "`")
-    before, *sections = _SECTION.split(text)
-    bodies = [textwrap.dedent(body.strip("\n")) for body in sections[1::2]]
-    return {"": before.strip(), **dict(zip(sections[::2], bodies, strict=True))}
-
-
-def _items(text: str) -> str:
-    items = [" ".join(item.split()) for item in re.split(r"\n(?=\S)", text.strip())]
-    if not all(_ITEM.match(item) for item in items):
-        return text
-    return "\n".join(_ITEM.sub(r"- `\1`: ", item, count=1) for item in items)
 
 
 def definition(function: Callable[..., Any], *, is_value: bool = False, name: str = "") -> Definition:

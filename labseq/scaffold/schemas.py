@@ -9,9 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from inspect import cleandoc
 from pathlib import Path
-from types import FunctionType
 from typing import Any, Final, Literal, TypeAlias, cast
 
 from pydantic import BaseModel
@@ -23,6 +21,7 @@ from labseq.config.scan import AdaptiveChoice
 from labseq.config.sequence import AnalysisChoice, SequenceSpec, StepPolicySettings
 from labseq.files import whole_file
 from labseq.registry import Entry, Registry
+from labseq.scaffold.words import summary
 from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings, si_of
 from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
 
@@ -344,14 +343,7 @@ class _FileSchema:
 
 def _about(entry: Entry) -> str:
     """The first paragraph of the docstring of a plugin, on one line."""
-    has_docstring = isinstance(entry.factory, type | FunctionType)
-    for text in (
-        entry.factory.__doc__ if has_docstring else "",
-        entry.settings_model and entry.settings_model.__doc__,
-    ):
-        if text:
-            return " ".join(cleandoc(text).split("\n\n")[0].replace("``", "`").split())
-    return f"{entry.kind.replace('_', ' ')} of {entry.origin}"
+    return summary(entry.factory, entry.settings_model) or f"{entry.kind.replace('_', ' ')} of {entry.origin}"
 
 
 def _grid_scan() -> JsonSchema:

@@ -1,9 +1,11 @@
-"""Types, limits and defaults of settings, in the words of somebody who writes YAML."""
+"""Types, limits and defaults of settings in the words of somebody who writes YAML; docstrings as Markdown."""
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
+import textwrap
 import types
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -223,3 +225,41 @@ def _quantity(value: float, dimension: str) -> str:
     """With as many digits as it needs to be read back the same."""
     texts = (format_quantity(value, dimension, digits) for digits in range(3, 16))
     return next((t for t in texts if math.isclose(parse_quantity(t, dimension), value)), str(value))
+
+
+_TITLES: Final = {"Args": "Arguments", "Attributes": "Fields"}
+_SECTION: Final = re.compile(r"^(Args|Attributes|Example|Raises|Returns):$", re.MULTILINE)
+_ITEM: Final = re.compile(r"^(\*{0,2}\w+): ", re.MULTILINE)
+
+
+def summary(*documented: object) -> str:
+    """The first paragraph of the first docstring that there is, on one line."""
+    own = (one for one in documented if inspect.isroutine(one) or isinstance(one, type))
+    texts = (" ".join(_sections(one)[""].partition("\n\n")[0].split()) for one in own)
+    return next(filter(None, texts), "")
+
+
+def docstring(documented: object) -> str:
+    """A docstring as Markdown, without its examples: its text, then a list for each section."""
+    texts: list[str] = []
+    for title, text in _sections(documented).items():
+        if not title:
+            texts.append(text)
+        elif title != "Example":
+            texts.append(f"{_TITLES.get(title, title)}:\n\n{_items(text)}")
+    return "\n\n".join(texts)
+
+
+def _sections(documented: object) -> dict[str, str]:
+    """The text of a Google-style docstring by section; the text before them is ""."""
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(documented) or "").replace("``", "`")
+    before, *sections = _SECTION.split(text)
+    bodies = [textwrap.dedent(body.strip("\n")) for body in sections[1::2]]
+    return {"": before.strip(), **dict(zip(sections[::2], bodies, strict=True))}
+
+
+def _items(text: str) -> str:
+    items = [" ".join(item.split()) for item in re.split(r"\n(?=\S)", text.strip())]
+    if not all(_ITEM.match(item) for item in items):
+        return text
+    return "\n".join(_ITEM.sub(r"- `\1`: ", item, count=1) for item in items)
