@@ -5,7 +5,7 @@ from typing import Annotated, Final
 
 import typer
 
-from labseq.console.options import file_kinds, new_kinds, profile_names
+from labseq.console.options import Plugins, file_kinds, new_kinds, profile_names
 
 NEW_EXAMPLES: Final = """\b
 Examples:
@@ -18,14 +18,6 @@ Examples:
   labseq schema sequence -o .labseq/sequence.schema.json
   labseq schema profile --plugins my_plugins
 """
-PluginFolders = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="DIR",
-        help="Folder of plugins to include; may be given several times. Default: the folder plugins, if it "
-        "exists.",
-    ),
-]
 EXPLAIN_EXAMPLES: Final = """\b
 Examples:
   labseq explain
@@ -94,7 +86,14 @@ def schema(
             "--output", "-o", metavar="FILE", help="Write the schema to this file instead of stdout."
         ),
     ] = None,
-    plugins: PluginFolders = None,
+    plugins: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of plugins whose settings the schema includes; may be given several times. Default: "
+            "the folder plugins, if it exists.",
+        ),
+    ] = None,
 ) -> None:
     """Write the JSON schema of sequences or profiles for editors, with the settings of every plugin."""
     from labseq.scaffold.terminal import write_schema
@@ -112,12 +111,12 @@ def explain(
             show_default=False,
         ),
     ] = None,
-    plugins: PluginFolders = None,
+    _plugins: Plugins = None,
 ) -> None:
     """Explain a key of a file, a step, a plugin, a command, a figure, an error or a unit.
 
-    It is the text of the reference pages, with the plugins of this computer and of the folder plugins.
+    It is the text of the reference pages, with the installed plugins and those of --plugins.
     """
     from labseq.scaffold.terminal import explain_topic
 
-    explain_topic(" ".join(what or ()), plugins, context.find_root().command)
+    explain_topic(" ".join(what or ()), context.find_root().command)

@@ -13,7 +13,6 @@ from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
 from labseq.files import PLUGINS
 from labseq.messages import clean, did_you_mean, listing
-from labseq.plugins import PluginHost
 from labseq.registry import KINDS
 from labseq.scaffold.new import CreatedFiles, make_file, make_plugin
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, SCHEMA_FOLDER, schema_text
@@ -60,7 +59,9 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
     if kind not in FILE_KINDS:
         what = f"there is no schema of a '{clean(kind)}'"
         raise ConfigError(Problem(what, expected=listing(FILE_KINDS), hint=did_you_mean(kind, FILE_KINDS)))
-    text = schema_text(kind, _host(plugins).registry)
+    if plugins is None:
+        plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
+    text = schema_text(kind, load_plugins(plugins).registry)
     if output is None:
         say(text.rstrip())
         return
@@ -71,7 +72,7 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
     say(f"wrote {output}")
 
 
-def explain_topic(what: str, plugins: Sequence[Path] | None, program: Any) -> None:
+def explain_topic(what: str, program: Any) -> None:
     """Print what is known of a key, a plugin, a command, ...; without a name, what there is to explain.
 
     Args:
@@ -82,22 +83,20 @@ def explain_topic(what: str, plugins: Sequence[Path] | None, program: Any) -> No
     """
     from labseq.scaffold.reference import find, overview, plain, topics
 
-    host = _host(plugins)
-    for info in (one for one in host.infos if one.state == "failed"):
-        say(f"warning: plugin '{info.name}' did not load: {info.reason}", stream=sys.stderr)
+    host = load_plugins()
+    left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
+    left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
     found = topics(host.registry, program)
     width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
-    names = find(found, what) if what else []
+    try:
+        names = find(found, what) if what else []
+    except ConfigError:
+        say(*left_out, stream=sys.stderr)
+        raise
     if len(names) == 1:
         say(names[0], "", *plain(found[names[0]].blocks(), width))
     elif names:
         say(f"{what} can be:", "", *plain(overview(found, names), width))
     else:
         say("labseq explain WHAT, for example labseq explain step image", "", *plain(overview(found), width))
-
-
-def _host(plugins: Sequence[Path] | None) -> PluginHost:
-    """The plugins: the installed ones, and those in folders."""
-    if plugins is None:
-        plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
-    return load_plugins(plugins)
+        say(*left_out, stream=sys.stderr)

@@ -113,7 +113,7 @@ def test_an_explanation(words: list[str], shown: str, here: Path, capsys: pytest
     hook = "@hookimpl\ndef labseq_register(registry):\n    registry.planner('spiral', object)\n"
     text = f"from labseq.plugin import hookimpl\nLABSEQ_API = 1\n\n{hook}"
     (here / "plugins" / "spirals.py").write_text(text)
-    assert code_of("explain", *words) == 0
+    assert code_of("explain", *words, "--plugins", "plugins") == 0
     out, err = capsys.readouterr()
     assert re.search(shown, out, re.DOTALL), out
     assert (max(map(len, out.splitlines())) <= 110, err) == (True, "")
@@ -123,6 +123,9 @@ def test_nothing_of_that_name_to_explain(here: Path, capsys: pytest.CaptureFixtu
     (here / "plugins").mkdir()
     (here / "plugins" / "broken.py").write_text("LABSEQ_API = 1\n1 / 0\n")
     assert code_of("explain", "stpe", "image") == 2
+    not_included = f"{Path('plugins') / 'broken.py'} is not included: use --plugins plugins\n"
+    assert capsys.readouterr().err.startswith(not_included)
+    assert code_of("explain", "stpe", "image", "--plugins", "plugins") == 2
     err = capsys.readouterr().err
-    assert "warning: plugin 'broken' did not load: ZeroDivisionError" in err
+    assert err.startswith("broken did not load: ZeroDivisionError: division by zero")
     assert "there is nothing called 'stpe image' to explain; did you mean 'step image'?" in err
