@@ -52,9 +52,10 @@ class Lights:
             if role in self._wires:
                 self._wires[role](t_s)
 
-    def tweezers_off(self, program: LineProgram) -> list[tuple[float, float]]:
-        """When a program turns the static tweezers off and on again, in seconds from its start."""
-        return [span for name in self._switches for span in program.spans(name)]
+    def tweezers_off(self, program: LineProgram) -> tuple[list[tuple[float, float]], bool]:
+        """When a program turns the static tweezers off, in seconds from its start; whether they stay off."""
+        stay_off = any(program.on[-1, program.lines.index(name)] for name in self._switches)
+        return [span for name in self._switches for span in program.spans(name)], stay_off
 
     def fraction_on(self, kind: str, start_s: float, end_s: float) -> float:
         """Fraction of an interval during which a kind of light is on, that is, all its lines are."""

@@ -158,8 +158,10 @@ class VirtualSimulation(Simulation):
             self._static.drive(signal)
         elif role == "lines" and isinstance(signal, LineProgram):
             self._lights.switch(signal, t_start_s)
-            for start_s, end_s in self._lights.tweezers_off(signal):
+            spans, stay_off = self._lights.tweezers_off(signal)
+            for start_s, end_s in spans:
                 self._release(t_start_s + start_s, end_s - start_s)
+            self._lost["light"] += self._static.block(self._occupied, is_blocked=stay_off)
         else:
             text = f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram"
             text += ", 'static_tweezers' with a DepthRamp or TweezerAmplitudes, or 'lines' with a LineProgram"

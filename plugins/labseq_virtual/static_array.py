@@ -29,6 +29,7 @@ class StaticArray:
         self._response: tuple[Floats, Floats] = np.ones(grid.n_rows), np.ones(grid.n_cols)
         self._power: tuple[Floats, Floats] = self._response
         self._level = 0.0
+        self._is_blocked = False
         self._source: ToneSource | None = None
 
     def draw(self, random: np.random.Generator) -> None:
@@ -47,7 +48,7 @@ class StaticArray:
     def depth(self) -> Floats:
         """Depth of each site now, float64 (n_rows, n_cols)."""
         rows, cols = (power * response for power, response in zip(self._power, self._response, strict=True))
-        return self._level * self._site * rows[:, None] * cols
+        return (0.0 if self._is_blocked else self._level) * self._site * rows[:, None] * cols
 
     def holds(self) -> NDArray[np.bool_]:
         """Which sites are deep enough to hold an atom, bool (n_rows, n_cols)."""
@@ -55,7 +56,7 @@ class StaticArray:
 
     def switch_off(self) -> None:
         """Turn the light off and disconnect the outputs."""
-        self._level = 0.0
+        self._level, self._is_blocked = 0.0, False
         self._source = None
 
     def connect_outputs(self, source: ToneSource) -> None:
@@ -86,6 +87,18 @@ class StaticArray:
         """Set the amplitudes of the tones."""
         rows, cols = amplitudes.row, amplitudes.column
         self._power = (rows * len(rows)) ** 2, (cols * len(cols)) ** 2
+
+    def block(self, occupied: NDArray[np.bool_], *, is_blocked: bool) -> int:
+        """Block the light by a line that turns it off, or let it pass.
+
+        Returns:
+            Number of atoms lost.
+        """
+        if is_blocked == self._is_blocked:
+            return 0
+        before, self._is_blocked = np.count_nonzero(occupied), is_blocked
+        occupied &= self.holds()
+        return int(before - np.count_nonzero(occupied))
 
     def release(self, dark_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator) -> int:
         """Let the atoms fly while the light is off, and recapture those that the same tweezer then binds.

@@ -1,11 +1,11 @@
-"""Ramps of the static tweezers in a shot, and their depth at the start of the next."""
+"""Ramps and releases of the static tweezers in a shot, and their depth at the start of the next."""
 
 from typing import Any
 
 import pytest
 
-from labseq.builtin.steps import RampStep
-from labseq.errors import DeviceTimeoutError, TransientError
+from labseq.builtin.steps import RampStep, ReleaseStep
+from labseq.errors import DeviceError, DeviceTimeoutError, TransientError
 from labseq.model import LineSpec
 from labseq.sequencer.lab import Timeouts
 from labseq.testing.fakes import RecordingLines
@@ -99,6 +99,37 @@ def test_lines_are_played_with_a_ramp() -> None:
     ]
     (fire,), (ramp,) = (rig.lab.calls.of(name) for name in ("lines.fire", "static_tweezers.ramp"))
     assert ramp.t_s == pytest.approx(fire.t_s + 1e-3)
+
+
+RELEASE = ("release", ReleaseStep(given(duration=10e-6)))
+TRAPS_OFF = LineSpec("traps_off", 7, frozenset({"release"}), turns_off="static_tweezers")
+
+
+def test_a_release_by_a_line_is_one_program_that_ends_with_the_light_on() -> None:
+    rig = Rig((LOAD, RELEASE, IMAGE), line_specs=[TRAPS_OFF])
+    rig.run()
+    lines = rig.lab.lines
+    assert isinstance(lines, RecordingLines)
+    (program,) = (one for one in lines.programs if one.kind == "release")
+    assert (program.t_s.tolist(), program.on[:, 0].tolist()) == ([0.0, 10e-6], [True, False])
+    assert not rig.lab.calls.of("static_tweezers.release")
+    (step,) = (step for step in rig.record().steps if step.name == "release")
+    assert (step.timed_by, step.planned_s, step.achieved_s) == ("lines", 10e-6, 10e-6)
+
+
+@pytest.mark.parametrize("fails", ["lines.fire", "lines.wait", "static_tweezers.release"])
+def test_a_release_that_fails_leaves_no_line_on_and_ends_in_the_safe_state(fails: str) -> None:
+    device = fails.partition(".")[0]
+    specs = [TRAPS_OFF] if device == "lines" else []
+    failure: list[BaseException | None] = [DeviceError(device, "broken")]
+    if fails == "lines.wait":
+        failure = [None, *failure]  # the first is that of `load`
+    rig = Rig((LOAD, RELEASE, IMAGE), line_specs=specs, fail_on={fails: failure})
+    with pytest.raises(DeviceError, match="broken"):
+        rig.run()
+    assert [name for name in rig.made_safe() if name != "lines"] == SAFE_ORDER
+    lines = rig.lab.lines
+    assert lines is None or "lines" in rig.made_safe()
 
 
 def test_tweezers_that_hang_in_a_ramp_end_the_run() -> None:

@@ -289,6 +289,41 @@ def test_ramps_of_no_duration_switch_from_one_sample_to_the_next(tmp_path: Path)
     assert not np.isnan(course).any(), "a phase jumped"
 
 
+def test_a_release_is_silence_for_its_samples_and_the_loop_runs_on(tmp_path: Path) -> None:
+    with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
+        rig.tweezers.start()
+        assert rig.tweezers.release(50.2e-6) == 60 / 1.2e6
+        assert rig.tweezers.describe()["depth"] == 1.0
+    samples = recorded(tmp_path)
+    full = at_full_depth(samples)
+    wave = np.resize(samples[full.start : full.start + SMALL_LOOP], full.stop - full.start)
+    kept = samples[full] == wave  # to the last bit: no phase jumps, no other amplitude
+    (dark,) = np.flatnonzero(np.diff(np.flatnonzero(np.concatenate([[True], kept, [True]]))) > 1)
+    assert np.count_nonzero(~kept) == 60
+    assert not samples[full][dark : dark + 60].any()
+
+
+def test_a_ramp_that_comes_during_a_release_starts_from_the_dark_at_once() -> None:
+    output = switched_on()
+    output.release(10 * BLOCK)
+    assert not played(output, BLOCK).any()
+    assert not output.steady
+    output.ramp(0.0, BLOCK)  # the safe state
+    assert not played(output, BLOCK).any()
+    assert output.steady
+    output.ramp(1.0, 1)
+    played(output, 1)
+    output.release(BLOCK)
+    output.ramp(1.0, BLOCK)  # the next shot
+    course = np.abs(played(output, BLOCK)[0]) ** 4
+    assert course[0] < 2 / BLOCK
+    assert course[-1] == pytest.approx(1.0, abs=1e-4)
+    output.release(100)
+    assert not played(output, 100).any()
+    assert output.steady
+    assert played(output, 1).any()
+
+
 def test_new_amplitudes_are_faded_in(tmp_path: Path) -> None:
     with opened(arguments=f"folder={tmp_path},record=10000000", fade=0.005) as rig:
         rig.tweezers.start()

@@ -19,6 +19,8 @@ from labseq.plugin import (
     DepthRamp,
     DeviceError,
     LimitError,
+    LineProgram,
+    LineSpec,
     MotionSpec,
     Plan,
     RandomStream,
@@ -317,6 +319,26 @@ def test_atoms_are_lost_in_a_dark_moment_between_two_reads_of_the_outputs() -> N
     outputs.queued = [equal(0.0), equal()]
     assert static.receive_until(1.0, occupied, np.random.default_rng(1))["light"] == 12 * 15
     assert static.holds().all()
+
+
+def test_a_line_that_stays_on_after_a_release_loses_the_atoms_and_lets_none_load() -> None:
+    line = LineSpec("off", 7, frozenset({"release"}), turns_off="static_tweezers")
+    context = Context("simulation", ARRAY_GRID, lines=(line,))
+    simulation = VirtualSimulation(SimulationSettings(loading=1.0, temperature=1e-6), context)
+    simulation.open()
+    simulation.begin_shot()
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    n_left = list[int]()
+    for t_s, states in ((0.0, [False]), (2.0, [True, False]), (3.0, [True, True]), (4.0, [True])):
+        if t_s in (0.0, 4.0):
+            simulation.load(t_s + 0.5, 0.5)
+        times = np.array([0.0, 5e-6][: len(states)])
+        on = np.array(states)[:, np.newaxis]
+        simulation.play("lines", LineProgram("release", ("off",), times, on, 0.0, 5e-6), t_s + 1.0)
+        n_left.append(int(simulation.truth().sum()))
+    assert n_left[0] == 12 * 15
+    assert n_left[1] > 0.9 * n_left[0]
+    assert n_left[2:] == [0, 0]
 
 
 def test_outputs_are_ignored_after_the_light_was_switched_off() -> None:

@@ -31,6 +31,12 @@ class NeverTurnsOff(RecordingStaticTweezers):
         super().ramp(depth, duration_s)
 
 
+class ReleasesLater(RecordingStaticTweezers):
+    def release(self, duration_s: float) -> float:
+        self.use("release", duration_s)
+        return duration_s
+
+
 class NormalizesInPlace(RecordingStaticTweezers):
     def load(self, amplitudes: Any) -> None:
         super().load(amplitudes)
@@ -57,6 +63,7 @@ STATIC = Planted(
         (StartsAgain, "test_starts_twice"),
         (StaysShallow, "test_starts_after_a_ramp"),
         (NeverTurnsOff, "test_ramps"),
+        (ReleasesLater, "test_releases"),
         (NormalizesInPlace, "test_loads_amplitudes"),
         (RampsBeforeItLooks, "test_refuses_what_exceeds_limits"),
         (LoadsAnything, "test_refuses_what_exceeds_limits"),

@@ -114,6 +114,25 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
                 with doing(f"ramp({depth}, {duration_s})"):
                     tweezers.ramp(depth, duration_s)
 
+    @promise("release(), if `facts` offer it, returns the time without light, when the light is on again")
+    def test_releases(self, factory: Factory[StaticTweezers]) -> None:
+        """The device itself turns the light on again."""
+        with self.opened(factory) as (tweezers, context):
+            shortest_s = tweezers.facts.shortest_release_s if offers(tweezers, "facts") else math.inf
+            if shortest_s == math.inf:
+                return
+            tweezers.start()
+            wanted_s, start_s = max(2 * shortest_s, 1e-5), context.clock.now()
+            released_s = tweezers.release(wanted_s)
+            step_s = tweezers.facts.resolution_s
+            assert abs(released_s - wanted_s) <= step_s, f"release({wanted_s}) returned {released_s} s"
+            passed_s = context.clock.now() - start_s
+            assert passed_s >= wanted_s - step_s, f"release({wanted_s}) returned after {passed_s} s"
+            depth = tweezers.describe().get("depth", 1.0)
+            assert depth == 1.0, f"the depth is {depth} after release(); expected 1"
+            for duration_s in (-wanted_s, 0.0, float("nan")):
+                refusal(LimitError, f"release({duration_s})", tweezers.release, duration_s)
+
     @promise("load() takes None, or one amplitude for each row and column, and leaves them untouched")
     def test_loads_amplitudes(self, factory: Factory[StaticTweezers]) -> None:
         """Calibrated ones, then given ones."""
