@@ -17,8 +17,7 @@ from pathlib import Path
 from labseq import SiteGrid, TargetPattern
 from labseq.config.document import Document
 from labseq.pictures.targets import save_target
-from labseq.session import load_plugins
-from labseq.session.chosen import construct_target, resolve
+from labseq.session.chosen import construct_target, load_plugins, resolve
 from labseq.settings import PatternChoice
 
 DOCS = Path(__file__).parent

@@ -57,7 +57,7 @@ _HOMES = {
         "Run",
         "open_run",
     ),
-    "labseq.session": ("Session",),
+    "labseq.session.session": ("Session",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

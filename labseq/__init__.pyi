@@ -48,8 +48,6 @@ from labseq.recording import (
     Run as Run,
     open_run as open_run,
 )
-from labseq.session import (
-    Session as Session,
-)
+from labseq.session.session import Session as Session
 
 __version__: str

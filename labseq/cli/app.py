@@ -148,7 +148,7 @@ def run(
 ) -> None:
     """Run a sequence and record every shot."""
     from labseq.cli.run import run_sequence
-    from labseq.session import Options
+    from labseq.session.options import Options
 
     options = Options(
         profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime

@@ -22,10 +22,10 @@ from labseq.console.text import age_text, clock_time, columns, encodes, plural, 
 from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.sequencer.policies import StepPolicy
-from labseq.session import Assembly, Session
-from labseq.session.assembly import Search
+from labseq.session.assembly import Assembly, Search
 from labseq.session.check import CheckReport, Rehearsal, check
 from labseq.session.chosen import DryRun
+from labseq.session.session import Session
 from labseq.units import format_quantity
 
 BAR_WIDTH: Final = 30

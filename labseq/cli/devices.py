@@ -16,8 +16,8 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
 from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
-from labseq.session import CheckedDevice, DevicesReport, check_devices, load_plugins, make_profile_safe
-from labseq.session.chosen import DryRun
+from labseq.session.chosen import DryRun, load_plugins
+from labseq.session.safe import CheckedDevice, DevicesReport, check_devices, make_profile_safe
 from labseq.units import format_quantity
 
 _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")

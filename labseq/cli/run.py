@@ -24,7 +24,8 @@ from labseq.messages import visible
 from labseq.queue.queue import Queue
 from labseq.recording import Run, data_root, open_run
 from labseq.roles import RunObserver
-from labseq.session import Options, Session
+from labseq.session.options import Options
+from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text, running_here
 
 

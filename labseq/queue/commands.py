@@ -58,7 +58,7 @@ def add(
     The entry keeps the text of the sequence as it is now: later changes of the file have no effect on it.
     """
     from labseq.queue.terminal import add_entry
-    from labseq.session import Options
+    from labseq.session.options import Options
 
     options = Options(
         profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime

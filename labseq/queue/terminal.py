@@ -15,7 +15,7 @@ from labseq.messages import clean
 from labseq.plain import dumps
 from labseq.queue.queue import Entry, Opening, Queue, QueueRun
 from labseq.recording import data_root
-from labseq.session import Options
+from labseq.session.options import Options
 
 _HEADER = ("id", "state", "sequence", "added", "options")
 

@@ -117,6 +117,6 @@ def explain(
 
     It is the text of the reference pages, with the installed plugins and those of --plugins.
     """
-    from labseq.scaffold.terminal import explain_topic
+    from labseq.scaffold.reference import explain_topic
 
     explain_topic(" ".join(what or ()), context.find_root().command)

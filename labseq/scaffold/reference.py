@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import inspect
 import re
+import shutil
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,11 +27,14 @@ from labseq.config.scan import AdaptiveChoice
 from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec, StepPolicySettings
 from labseq.config.validation import models_at
 from labseq.console.errors import EXIT_CODES, exit_code_of
+from labseq.console.output import say
 from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
+from labseq.files import PLUGINS
 from labseq.messages import clean, closest
 from labseq.registry import KINDS, Entry, Registry
 from labseq.roles import EVENTS
 from labseq.scaffold.words import default_of, docstring, summary, value_of
+from labseq.session.chosen import load_plugins
 from labseq.settings import Choice
 from labseq.units import EXAMPLES, UNITS, unit_names
 
@@ -474,6 +479,8 @@ def _meaning(found: Any, parameter: Any) -> str:
 
 # What can be looked up
 
+MAX_WIDTH: Final = 110
+"""Widest line of an explanation."""
 _TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
     "unit": ("quantities and their units", units),
     "figure": ("numbers of each shot: to plot, to optimise in a scan, to watch in a policy", figures),
@@ -621,3 +628,31 @@ def _begins(key: tuple[str, ...], words: tuple[str, ...]) -> bool:
 
 def _folded(name: str) -> tuple[str, ...]:
     return tuple(name.lower().replace("-", "_").replace(".", " ").split())
+
+
+def explain_topic(what: str, program: Any) -> None:
+    """Print what is known of a key, a plugin, a command, ...; without a name, what there is to explain.
+
+    Args:
+        program: The command ``labseq``, as typer sees it.
+
+    Raises:
+        ConfigError: There is no such thing.
+    """
+    host = load_plugins()
+    left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
+    left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
+    found = topics(host.registry, program)
+    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    try:
+        names = find(found, what) if what else []
+    except ConfigError:
+        say(*left_out, stream=sys.stderr)
+        raise
+    if len(names) == 1:
+        say(names[0], "", *plain(found[names[0]].blocks(), width))
+    elif names:
+        say(f"{what} can be:", "", *plain(overview(found, names), width))
+    else:
+        say("labseq explain WHAT, for example labseq explain step image", "", *plain(overview(found), width))
+        say(*left_out, stream=sys.stderr)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
 
 from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
@@ -17,9 +14,6 @@ from labseq.registry import KINDS
 from labseq.scaffold.new import CreatedFiles, make_file, make_plugin
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, SCHEMA_FOLDER, schema_text
 from labseq.session.chosen import load_plugins
-
-MAX_WIDTH: Final = 110
-"""Widest line of an explanation."""
 
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
@@ -70,33 +64,3 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
             output.parent.mkdir(exist_ok=True)
     write_text(output, text)
     say(f"wrote {output}")
-
-
-def explain_topic(what: str, program: Any) -> None:
-    """Print what is known of a key, a plugin, a command, ...; without a name, what there is to explain.
-
-    Args:
-        program: The command ``labseq``, as typer sees it.
-
-    Raises:
-        ConfigError: There is no such thing.
-    """
-    from labseq.scaffold.reference import find, overview, plain, topics
-
-    host = load_plugins()
-    left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
-    left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
-    found = topics(host.registry, program)
-    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
-    try:
-        names = find(found, what) if what else []
-    except ConfigError:
-        say(*left_out, stream=sys.stderr)
-        raise
-    if len(names) == 1:
-        say(names[0], "", *plain(found[names[0]].blocks(), width))
-    elif names:
-        say(f"{what} can be:", "", *plain(overview(found, names), width))
-    else:
-        say("labseq explain WHAT, for example labseq explain step image", "", *plain(overview(found), width))
-        say(*left_out, stream=sys.stderr)

@@ -16,7 +16,8 @@ import labseq
 from labseq.calibration.measure import METHODS
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationKind, SiteGrid
-from labseq.session import Options, assemble
+from labseq.session.assembly import assemble
+from labseq.session.options import Options
 from labseq.testing.fakes import fake_calibration
 
 PROFILE = """grid: {rows: 6, cols: 6, spacing: 4.49 um}

@@ -9,7 +9,7 @@ import pytest
 
 from labseq.cli.check import check_sequence
 from labseq.cli.show import show_run
-from labseq.session import Session
+from labseq.session.session import Session
 
 ROOT = Path(__file__).parents[2]
 SCAN = ROOT / "sequences" / "scan_dop.yaml"

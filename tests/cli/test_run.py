@@ -15,7 +15,7 @@ from labseq.cli.run import run_sequence
 from labseq.console.output import discard_unwritten
 from labseq.errors import ConfigError, DeviceError, Problem, RecordingError, StopRequested
 from labseq.recording import RunWriter
-from labseq.session import Options
+from labseq.session.options import Options
 
 NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction": None}
 

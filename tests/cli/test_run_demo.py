@@ -12,7 +12,7 @@ import labseq
 from labseq.cli import main, run as demo
 from labseq.errors import ConfigError
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
-from labseq.session import Session
+from labseq.session.session import Session
 
 
 @pytest.fixture(autouse=True)

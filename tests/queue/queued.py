@@ -9,7 +9,7 @@ import pytest
 
 from labseq.errors import LabseqError
 from labseq.queue.queue import Entry, Opening, Queue, QueueRun
-from labseq.session import Options
+from labseq.session.options import Options
 
 SEQUENCE = """
 labseq: 1

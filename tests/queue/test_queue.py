@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from labseq.errors import ConfigError, RecordingError
 from labseq.files import Process
 from labseq.queue.queue import Entry, Queue
-from labseq.session import Options
+from labseq.session.options import Options
 
 from .queued import SEQUENCE, add, queue
 

@@ -14,7 +14,7 @@ from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.files import Process
 from labseq.queue.queue import Opening, Queue, QueueRun
 from labseq.recording import open_run
-from labseq.session import Session
+from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop
 
 from .queued import PROFILE, SEQUENCE, Taking, add, queue, states

@@ -19,7 +19,7 @@ import pytest
 import labseq
 from labseq.config.document import Document
 from labseq.registry import KINDS
-from labseq.session import load_plugins
+from labseq.session.chosen import load_plugins
 from tests.nested import run_pytest
 
 

@@ -13,8 +13,8 @@ import pytest
 import labseq
 from labseq.errors import DeviceError
 from labseq.recording import lock_files, marker_roots
-from labseq.session import check_devices, make_profile_safe, resolve_profile
-from labseq.session.safe import lock_devices
+from labseq.session.profile import resolve_profile
+from labseq.session.safe import check_devices, lock_devices, make_profile_safe
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import OWN_DEVICE, PROFILE

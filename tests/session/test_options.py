@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError
-from labseq.session import Options, Session
+from labseq.session.options import Options
+from labseq.session.session import Session
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 

@@ -10,7 +10,7 @@ import pytest
 import labseq
 from labseq.errors import ConfigError
 from labseq.recording import find_dead_run, mark_active, marker_roots
-from labseq.session import SafeStateReport, make_profile_safe
+from labseq.session.safe import SafeStateReport, make_profile_safe
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import OWN_DEVICE, PROFILE as SMALL_PROFILE

@@ -19,7 +19,7 @@ import numba
 import pytest
 
 from labseq.cli import main
-from labseq.session import load_plugins
+from labseq.session.chosen import load_plugins
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 
