@@ -524,7 +524,8 @@ def part_text(n_read: int, run: Run) -> str:
 def note_of(run: Run) -> str:
     """The line below a picture's title: the run, its status, target and seed."""
     ended = "" if run.status == "complete" else f" ({run.status}, {len(run.shots)} of {run.n_shots} shots)"
-    atoms = f"{clean(run.target.name)}, {run.target.n_atoms} atoms"
+    target = run.target
+    atoms = "no target" if target.is_none else f"{clean(target.name)}, {target.n_atoms} atoms"
     kind = "simulated" if run.simulated else "measured"
     return f"{clean(run.path.parent.name)}/{clean(run.path.name)}{ended}: {atoms}, seed {run.seed}, {kind}"
 

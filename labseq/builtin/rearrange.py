@@ -76,6 +76,7 @@ class RearrangeStep(Step):
     step waits for the end of the window.
     """
 
+    needs_target = True
     needs_image = True
     takes_image = True
 

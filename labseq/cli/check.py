@@ -189,7 +189,7 @@ def _subject(assembly: Assembly) -> list[tuple[str, str]]:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
-    n_clear = int(target.clear.sum())
+    sites = f"{plural(target.n_atoms, 'atom')}, {plural(int(target.clear.sum()), 'site')} to be empty"
     simulated = ", dry run" if assembly.dry_run != "off" else ", simulated" * assembly.virtual_time
     return [
         ("sequence", f"{spec.name} ({assembly.document.path})"),
@@ -198,7 +198,7 @@ def _subject(assembly: Assembly) -> list[tuple[str, str]]:
             "grid",
             f"{grid.n_rows} x {grid.n_cols}, {grid.lattice}, {format_quantity(grid.spacing_m, 'length')}",
         ),
-        ("target", f"{target.name}, {plural(target.n_atoms, 'atom')}, {plural(n_clear, 'site')} to be empty"),
+        *([] if target.is_none else [("target", f"{target.name}, {sites}")]),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
         *(
             ("calibration", f"{one.kind} {one.id}, {age_text(age_s(one))} old, {quality_text(one)}")

@@ -260,13 +260,16 @@ def _caption(tally: Tally) -> list[Text]:
         return []
     image, target = tally.image, tally.record.target
     which = f"cycle {image.cycle}" if image.cycle >= 0 else f"step {image.step}"
+    head = [Text(), _line(f"shot {tally.image_shot}, image of {which}:")]
+    n_atoms = plural(int(image.occupancy.sum()), "atom")
+    if target.is_none:
+        return [*head, _line(n_atoms)]
     n_defects, n_surplus = target.n_defects(image.occupancy), target.n_surplus(image.occupancy)
     found = plural(n_defects, "defect") if n_defects or n_surplus else "defect-free"
     style = "green" if found == "defect-free" else ""
     if n_surplus:
         found += f", {n_surplus} surplus"
-    atoms = f"{int(image.occupancy.sum())} atoms, {found}"
-    return [Text(), _line(f"shot {tally.image_shot}, image of {which}:"), _line(atoms, style)]
+    return [*head, _line(f"{n_atoms}, {found}", style)]
 
 
 MIN_WIDTH: Final = 16

@@ -10,7 +10,7 @@ from typing import Any, Final
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.console.text import columns, count_of, plural
 from labseq.messages import clean
-from labseq.model.estimate import Estimate, Rate
+from labseq.model.estimate import Estimate, Rate, mean
 from labseq.recording import Run
 from labseq.recording.points import scan_points
 from labseq.units import format_quantity
@@ -35,12 +35,22 @@ def summary_lines(run: Run) -> list[str]:
         ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
         ("shots", f"{len(run.shots)} of {run.n_shots}{skipped}{kept}"),
         *_skipped_rows(run),
-        *statistics_rows(statistics),
+        *(_atom_rows(run) if run.target.is_none else statistics_rows(statistics)),
         ("duration", _duration(run)),
     ]
     if run.n_damaged_lines:
         rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
     return [*table, *([""] if table else []), *columns(rows)]
+
+
+def _atom_rows(run: Run) -> list[tuple[str, str]]:
+    """The atoms on the first and the last image of the shots of a run without a target."""
+    counts = [shot.summary.images.n_atoms for shot in run.shots if len(shot.summary.images)]
+    first, last = (mean([of_shot[i] for of_shot in counts]) for i in (0, -1))
+    return [
+        ("target", "none"),
+        *([("atoms", f"{first} on the first image, {last} on the last")] if counts else []),
+    ]
 
 
 def json_summary(run: Run | None) -> dict[str, Any]:

@@ -201,7 +201,10 @@ class SequenceSpec(Settings):
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
         default=None, description="seed of all random numbers; without one, each run draws a fresh one"
     )
-    target: Annotated[PatternChoice, placed_by_field] = Field(description="the pattern of atoms to end with")
+    target: Annotated[PatternChoice, placed_by_field] | None = Field(
+        default=None,
+        description="the pattern of atoms to end with; only a sequence that rearranges needs one",
+    )
     planner: Annotated[Choice, placed_by_field] = Field(description="what decides the moves")
     record_frames: Literal["all", "last", "none"] = Field(
         default="all", description="which camera frames of a shot are kept"

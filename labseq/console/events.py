@@ -128,7 +128,7 @@ def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: in
     if success:
         return seen or "defect-free"
     if math.isnan(filling_fraction):
-        return "not judged: no image"
+        return "not judged: no image" if n_atoms else "no target"
     n_defects = round((1.0 - filling_fraction) * n_atoms)
     found = plural(n_defects, "defect") if n_defects else "surplus atoms"
     return f"{found} ({seen})" if seen else found

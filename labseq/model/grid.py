@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +120,16 @@ class TargetPattern:
     def shape(self) -> tuple[int, int]:
         """(n_rows, n_cols)."""
         return self.fill.shape[0], self.fill.shape[1]
+
+    @classmethod
+    def none(cls, shape: tuple[int, int]) -> Self:
+        """The target of a sequence without one: every site may hold an atom, and no shot is judged."""
+        return cls(np.zeros(shape, np.bool_), np.zeros(shape, np.bool_), "none")
+
+    @property
+    def is_none(self) -> bool:
+        """Whether it asks nothing of any site."""
+        return not (self.fill.any() or self.clear.any())
 
     @property
     def n_atoms(self) -> int:

@@ -24,13 +24,15 @@ if TYPE_CHECKING:
 _Row: TypeAlias = Mapping[str, Any]
 
 _DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
+    "n_loaded": ("atoms on the first image", lambda row: _of_image(row, "n_atoms", 0)),
+    "n_atoms": ("atoms on the last image", lambda row: _of_image(row, "n_atoms", -1)),
     "n_defects": (
         "empty target sites on the last image",
-        lambda row: _last(row.get("images", {}).get("n_defects")),
+        lambda row: _of_image(row, "n_defects", -1),
     ),
     "n_surplus": (
         "atoms on the last image on sites that must be empty",
-        lambda row: _last(row.get("images", {}).get("n_surplus")),
+        lambda row: _of_image(row, "n_surplus", -1),
     ),
     "duration_s": (
         "sum of the steps on the session's clock",
@@ -155,8 +157,9 @@ def _fixed(row: _Row) -> dict[str, Any]:
     return found | {name: value(row) for name, (_, value) in _DERIVED.items()}
 
 
-def _last(values: Sequence[Any] | None) -> Any:
-    return values[-1] if values else None
+def _of_image(row: _Row, name: str, image: int) -> Any:
+    values = row.get("images", {}).get(name)
+    return values[image] if values else None
 
 
 def _duration_s(stage_s: Mapping[str, float | None]) -> float | None:

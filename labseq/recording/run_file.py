@@ -166,6 +166,7 @@ class Images:
         cycle: Index of the cycle that each ended, within its step; -1 for that of an ``image`` step.
         t_start_s: Start of each exposure, from the start of the shot.
         exposure_s: Exposure times.
+        n_atoms: Atoms on each.
         n_defects: Empty target sites on each.
         n_surplus: Atoms on each on sites that must be empty.
     """
@@ -173,6 +174,7 @@ class Images:
     cycle: tuple[int, ...] = ()
     t_start_s: tuple[float, ...] = ()
     exposure_s: tuple[float, ...] = ()
+    n_atoms: tuple[int, ...] = ()
     n_defects: tuple[int, ...] = ()
     n_surplus: tuple[int, ...] = ()
 
@@ -225,6 +227,7 @@ def summarise(shot: ShotRecord, target: TargetPattern) -> ShotSummary:
         cycle=tuple(image.cycle for image in shot.images),
         t_start_s=tuple(round(float(image.t_start_s), 9) for image in shot.images),
         exposure_s=tuple(float(image.exposure_s) for image in shot.images),
+        n_atoms=tuple(map(int, map(np.count_nonzero, occupancies))),
         n_defects=tuple(map(target.n_defects, occupancies)),
         n_surplus=tuple(map(target.n_surplus, occupancies)),
     )
@@ -283,6 +286,7 @@ def index_row(
         stage_s[timing.stage] = stage_s.get(timing.stage, 0.0) + timing.duration_s
     return {
         **{field.name: field.value(shot) for field in schema.SHOT if field.in_index},
+        "success": None if math.isnan(shot.filling_fraction) else shot.success,
         "counts": shot.status == "complete",
         "stage_s": stage_s,
         "parameters": to_plain(shot.parameters),
@@ -314,7 +318,7 @@ def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[
             yield f"{prefix}{name}", value
 
 
-_KINDS: Final = {"int64": int, "bool": bool, "text": str, "float64": float | int | None}
+_KINDS: Final = {"int64": int, "bool": bool | None, "text": str, "float64": float | int | None}
 _KINDS_IN_INDEX: Final = tuple((field.name, _KINDS[field.dtype]) for field in schema.SHOT if field.in_index)
 _ALWAYS: Final = ("shot", "attempt", "status", "success", "filling_fraction", "seen_defect_free_cycle")
 _NEEDED_IN_INDEX: Final = (

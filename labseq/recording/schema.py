@@ -174,7 +174,11 @@ SHOT: Final = (
     Field("error", "text", "why it did not complete, or empty"),
     Field("t_start_utc", "text", "wall time of its start, ISO 8601, UTC"),
     Field("t_end_utc", "text", "wall time of its end, ISO 8601, UTC"),
-    Field("success", "bool", "whether the last image step met the target"),
+    Field(
+        "success",
+        "bool",
+        "whether the last image step met the target; false (in the index null) where it is not judged",
+    ),
     Field("filling_fraction", "float64", "filling of the target on the last image step; nan without one"),
     Field(
         "seen_defect_free_cycle", "int64", "index of the first cycle whose image met the target; -1 if none"

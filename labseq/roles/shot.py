@@ -369,6 +369,7 @@ class Step(ABC):
     """One step of a shot.
 
     Attributes:
+        needs_target: Whether the sequence must have a target, because the step moves atoms towards it.
         needs_image: Whether an image must have been taken before it in the shot.
         takes_image: Whether it leaves an image to the steps after it.
         repeatable: Whether it may be retried in the same shot when it fails, because it leaves the atoms
@@ -384,6 +385,7 @@ class Step(ABC):
 
     needs_image: bool = False
     takes_image: bool = False
+    needs_target = False
     repeatable = False
     takes_time = True
     device_setting = ""

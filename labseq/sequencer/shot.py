@@ -343,7 +343,8 @@ class RunningShot:
         self.record.images.append(image)
         if cycle >= 0 and self.record.seen_defect_free_cycle < 0 and self.target.is_met_by(occupancy):
             self.record.seen_defect_free_cycle = cycle
-        self._emit("image", {"image": image, "filling_fraction": self.target.filling_fraction(occupancy)})
+        filling = math.nan if self.target.is_none else self.target.filling_fraction(occupancy)
+        self._emit("image", {"image": image, "filling_fraction": filling})
         return occupancy
 
     def _name_of_image(self, cycle: int) -> str:
@@ -372,7 +373,7 @@ class RunningShot:
 
     def judge(self) -> None:
         """Judge the shot on the image just taken; called by the ``image`` step alone."""
-        if self.occupancy is None:
+        if self.occupancy is None or self.target.is_none:
             return
         self.record.success = self.target.is_met_by(self.occupancy)
         self.record.filling_fraction = self.target.filling_fraction(self.occupancy)
@@ -405,7 +406,8 @@ class RunningShot:
             truth = self.call("simulation", timeout_s, simulation.truth)
             if truth is not None:
                 readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
-                readings["simulation.n_defects_true"] = self.target.n_defects(truth)
+                if not self.target.is_none:
+                    readings["simulation.n_defects_true"] = self.target.n_defects(truth)
         if offers(simulation, "losses"):
             losses = self.call("simulation", timeout_s, simulation.losses)
             readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})

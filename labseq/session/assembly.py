@@ -120,7 +120,10 @@ class Assembly:
         else:
             n, core = (3 if top == "shot" else 1), type(self.sequence)
             kind = {"shot": "step", "target": "pattern"}.get(top, top)
-            names = {"step": str(loc[2]) if len(loc) > 2 else "", "pattern": self.sequence.target.use}
+            names = {
+                "step": str(loc[2]) if len(loc) > 2 else "",
+                "pattern": self.sequence.target.use if self.sequence.target else "",
+            }
             is_planner = kind == "planner"
             found = None if is_planner else self.hardware.host.registry.find(kind, names.get(kind, ""))
             entry = self.planner.entry if is_planner else found
@@ -259,7 +262,7 @@ def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemColle
     host.load_entry_points()
     choices = [("pattern", sequence.target), ("planner", sequence.planner)]
     for kind, choice in choices:
-        if host.registry.find(kind, choice.use) is not None:
+        if choice is not None and host.registry.find(kind, choice.use) is not None:
             with found:
                 resolve(host, document, kind, choice)
     for spec in sequence.shot:
@@ -290,14 +293,16 @@ def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
 
 def make_target(
     hardware: ResolvedProfile, document: Document, sequence: SequenceSpec
-) -> tuple[TargetPattern, dict[str, Any]]:
-    """The target of a sequence, and its settings for the record.
+) -> tuple[TargetPattern, dict[str, Any] | None]:
+    """The target of a sequence, and its settings for the record; without one, the target that asks nothing.
 
     Raises:
         ConfigError: The pattern is unknown, its settings are invalid, or it does not fit on the grid.
         PluginLoadError: The pattern's plugin failed; names it.
     """
     choice, grid = sequence.target, hardware.grid
+    if choice is None:
+        return TargetPattern.none(grid.shape), None
     chosen = resolve(hardware.host, document, "pattern", choice)
     try:
         target = construct_target(chosen, grid)
@@ -332,6 +337,9 @@ def make_steps(
             if step.needs_image and not image_seen:
                 what = f"'{spec.kind}' needs an image before it in the shot"
                 raise document.error(spec.loc, what, "an 'image' step before it", key=True)
+            if getattr(step, "needs_target", False) and sequence.target is None:
+                what, hint = f"'{spec.kind}' needs a target", "target: {pattern: compact, rows: 10, cols: 10}"
+                raise document.error(spec.loc, what, "'target' in the sequence", f"write '{hint}'", key=True)
         # A wrong step counts as one that takes an image: the user may have intended one.
         image_seen = image_seen or step is None or step.takes_image
     return steps, dumps

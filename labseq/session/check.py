@@ -444,7 +444,7 @@ def _window_warnings(
     loaded = next(iter(rehearsals.values()))
     if loaded.n_filled < 0.9 * loaded.n_loadings:
         what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings allow to fill the target"
-        problems.append(document.problem(sequence.target.loc, what, "a smaller target, or better loading"))
+        problems.append(document.problem(("target",), what, "a smaller target, or better loading"))
     return problems
 
 

@@ -150,6 +150,8 @@ def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, Patt
         return empty, None, []
     if text.lower().endswith(YAML_SUFFIXES):
         document, sequence, _ = load_sequence(Path(text), origin)
+        if sequence.target is None:
+            raise ConfigError(Problem("this sequence has no target", visible(text), expected=_TARGET_FORMS))
         return document, sequence.target, plugin_paths(document, sequence.plugin_folders)
     name, settings = parse_target(text)
     option = f"--target {text}"

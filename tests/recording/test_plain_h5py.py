@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -10,6 +12,10 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.analysis.overview import overview
+from labseq.analysis.shot import save_shot, shot_picture
+from labseq.cli.show import shot_table
+from labseq.cli.summary import summary_lines
 
 SEQUENCE = """\
 labseq: 1
@@ -94,3 +100,24 @@ def test_what_is_set_or_scanned_is_a_number_in_si_with_its_unit(run: labseq.Run)
     assert table.attrs["units"][PICK_UP] == data[PICK_UP].attrs["units"] == data[HOLD].attrs["units"] == "s"
     assert data[HOLD].values.tolist() == [0.001, 0.02]
     assert not [name for name in table.columns if " " in name]
+
+
+def test_a_sequence_without_a_target_is_run_shown_and_drawn(tmp_path: Path) -> None:
+    steps = "[{load: {}}, {image: {}, name: before}, {wait: {duration: 10 ms}}, {image: {}, name: after}]"
+    path = tmp_path / "release.yaml"
+    path.write_text(f"labseq: 1\nname: release\nseed: 3\nshots: 2\nshot: {steps}\n", "utf-8")
+    with labseq.Session.open(path, output=tmp_path) as session:
+        run = session.run()
+    assert [(shot.row["success"], shot.row["filling_fraction"]) for shot in run.shots] == [(None, None)] * 2
+    assert [math.isnan(shot.filling_fraction) for shot in run.shots] == [True, True]
+    assert all("not judged" not in line and "defect" not in line for line in summary_lines(run))
+    assert any("on the first image" in line for line in summary_lines(run))
+    assert "no target" in shot_table(run)[1]
+    overview(run).save(tmp_path / "overview.png")
+    save_shot(tmp_path / "shot.png", shot_picture(run, 0))
+
+    path.write_text(path.read_text("utf-8").replace("{wait:", "{rearrange: {}}, {wait:"), "utf-8")
+    with pytest.raises(
+        labseq.ConfigError, match=r"5:.*'rearrange' needs a target; expected 'target' in the sequence"
+    ):
+        labseq.Session.open(path)
