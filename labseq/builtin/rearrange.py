@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from labseq.builtin.steps import PositiveDuration
 from labseq.plugin import (
+    COMPUTER,
     CycleRecord,
     DeviceError,
     Duration,
@@ -91,15 +92,15 @@ class RearrangeStep(Step):
         image_s = exposure_s + context.camera.readout_s + context.margin_s("image")
         all_made = self.settings.stop_when == "never"
         waited_out = all_made and self.settings.window_mode == "fixed"
+        by = COMPUTER if self.settings.window_mode == "fixed" else TimedBy("mobile_tweezers")
         entries: list[TimelineEntry] = []
         for cycle in range(self.settings.cycles):
             window_s = self.settings.window_of(cycle)
             min_duration_s, min_image_s = window_s if waited_out else 0.0, image_s if all_made else 0.0
             moves, image = f"cycle {cycle}: move", f"cycle {cycle}: image"
-            awg, camera = TimedBy("mobile_tweezers"), TimedBy("camera")
             entries += [
-                TimelineEntry(moves, window_s, min_duration_s, kind="rearrange", timed_by=awg),
-                TimelineEntry(image, image_s, min_image_s, 1, exposure_s, "image", camera),
+                TimelineEntry(moves, window_s, min_duration_s, kind="rearrange", timed_by=by),
+                TimelineEntry(image, image_s, min_image_s, 1, exposure_s, "image", TimedBy("camera")),
             ]
         return entries
 
