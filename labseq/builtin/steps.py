@@ -304,7 +304,7 @@ class FollowStep(Step):
 
 
 def wait_step(settings: WaitSettings) -> WaitStep | FollowStep:
-    """The step ``wait``: for a time, or for a signal."""
+    """Waits for a time, or for the signal of an external control system."""
     if settings.signal is None or settings.timeout is None:
         return WaitStep(settings)
     return FollowStep(settings.signal, settings.timeout, settings.device or "")

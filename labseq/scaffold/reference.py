@@ -237,11 +237,11 @@ def _about_entry(entry: Entry) -> str:
     return text if entry.origin == builtin.__name__ else f"{text} From the plugin `{entry.origin}`.".lstrip()
 
 
-def registered(registry: Registry, kind: str, heading: str = "###") -> list[Block]:
+def registered(registry: Registry, kind: str) -> list[Block]:
     """A section for everything that is registered for a kind of plugin."""
     blocks: list[Block] = []
     for entry in (one for one in registry.entries() if one.kind == kind):
-        blocks += [f"{heading} {kind.replace('_', ' ').capitalize()} `{entry.name}`", *entry_blocks(entry)]
+        blocks += [f"### {kind.replace('_', ' ').capitalize()} `{entry.name}`", *entry_blocks(entry)]
     return blocks or [f"labseq itself brings no {kind}."]
 
 
@@ -541,11 +541,15 @@ def _offered(entries: Iterable[Entry]) -> list[Block]:
 
 
 def _row_topics(name: str, blocks: Iterable[Block]) -> Iterator[tuple[str, Topic]]:
-    """A topic for each row of the tables."""
-    for table in (one for one in blocks if isinstance(one, Table)):
-        for row in table.rows:
-            key = _unmarked(row[0]).removeprefix("/entry/")
-            yield f"{name} {key}", Topic(_unmarked(row[-1]), partial(_blocks, Table, table.header, [row]))
+    """A topic for each row of the tables; the path of a table stands above it if there are several."""
+    group = ""
+    for block in blocks:
+        if isinstance(block, str):
+            group = block.partition("`: ")[0].rpartition("/")[2]
+        for row in block.rows if isinstance(block, Table) else ():
+            words = (name, group, _unmarked(row[0]).removeprefix("/entry/"))
+            topic = Topic(_unmarked(row[-1]), partial(_blocks, Table, block.header, [row]))
+            yield " ".join(filter(None, words)), topic
 
 
 def _key_topics(names: tuple[str, ...], model: type[BaseModel] | None) -> dict[str, Topic]:
@@ -602,7 +606,7 @@ def find(found: Mapping[str, Topic], what: str) -> list[str]:
         what: Words, with spaces or dots between: "step image", "profile.camera", "psca".
 
     Returns:
-        One name; several if the words end or begin several names.
+        One name; several if the words fit several names.
 
     Raises:
         ConfigError: There is no such topic.
@@ -611,7 +615,7 @@ def find(found: Mapping[str, Topic], what: str) -> list[str]:
     folded = {_folded(name): name for name in found}
     if words in folded:
         return [folded[words]]
-    ending = [name for key, name in folded.items() if key[-len(words) :] == words]
+    ending = [name for key, name in folded.items() if words[-1:] == key[-1:] and _has_in_order(key, words)]
     begun = [name for key, name in folded.items() if len(key) == len(words) and _begins(key, words)]
     if ending or begun:
         return ending or begun
@@ -622,12 +626,17 @@ def find(found: Mapping[str, Topic], what: str) -> list[str]:
     raise ConfigError(Problem(f"there is nothing called '{clean(what)}' to explain", hint=hint))
 
 
+def _has_in_order(key: tuple[str, ...], words: tuple[str, ...]) -> bool:
+    rest = iter(key)
+    return all(word in rest for word in words)
+
+
 def _begins(key: tuple[str, ...], words: tuple[str, ...]) -> bool:
     return key[:-1] == words[:-1] and key[-1].startswith(words[-1])
 
 
 def _folded(name: str) -> tuple[str, ...]:
-    return tuple(name.lower().replace("-", "_").replace(".", " ").split())
+    return tuple(name.lower().replace("-", "_").replace(".", " ").replace("/", " ").split())
 
 
 def explain_topic(what: str, program: Any) -> None:

@@ -41,12 +41,13 @@ _DIMENSIONS: Final = {
     if isinstance(found, BeforeValidator)
 }
 """What reads a quantity -> its dimension."""
-_NOUNS: Final = {
+_NOUNS: Final[dict[Any, str]] = {
     bool: "true or false",
     int: "whole number",
     float: "number",
     str: "text",
     Path: "path of a file",
+    Any: "any value",
 }
 
 

@@ -23,7 +23,7 @@ class ClimbSettings(Settings):
 
 
 class Climb:
-    """Implements :class:`labseq.plugin.Scanner`."""
+    """Steps from the best point along one address, up or down; halves the step if none is left."""
 
     def __init__(self, settings: ClimbSettings, space: ScanSpace) -> None:
         self._settings = settings

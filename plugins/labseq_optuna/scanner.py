@@ -31,7 +31,7 @@ class OptunaSettings(Settings):
 
 
 class OptunaScanner:
-    """Implements :class:`labseq.plugin.Scanner`.
+    """Chooses points by a sampler of Optuna, a package for optimisation.
 
     Raises:
         ConfigError: Optuna is not installed.

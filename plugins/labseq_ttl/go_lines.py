@@ -21,7 +21,7 @@ MORE: Final = "`go` rose again while labseq was busy, and was refused"
 
 
 def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
-    """The driver, with the start signal of an external control system if the profile has it."""
+    """The timing box, with the start signal of an external control system if the profile has it."""
     if settings.go is None:
         return TtlLines(settings, context)
     outputs = settings.go.outputs

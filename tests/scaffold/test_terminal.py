@@ -102,6 +102,8 @@ def test_mistakes_with_schemas(arguments: list[str], said: str, capsys: pytest.C
         (["profile.camera"], r"The plugins.*  virtual  +Frames of the simulation"),
         (["psca"], r"^planner psca\n.*  degree_of_parallelism  "),
         (["exposure"], r"^exposure can be:.*  step image exposure\s+exposure time.*step rearrange exposure"),
+        (["field", "confidence"], r"^field detection/confidence\n"),
+        (["n_batches"], r"figure n_batches .*column cycles n_batches "),
         (["figure", "filling"], r"^figure filling_fraction\n"),
         (["command", "bench", "planners"], r"labseq bench planners \[OPTIONS\]"),
         (["role", "camera"], r"^role Camera\n.*read\(timeout_s: float\) -> Frame\n    Wait for the oldest"),
