@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping
@@ -32,6 +33,8 @@ from labseq.units import expected, parse_any, parse_quantity, unit_names
 
 FOLDER: Final = "folder"
 """Key of pydantic's validation context: the folder of the file that the settings are in."""
+NEEDS_UNITS: Final = "needs_units"
+"""Key of pydantic's validation context: whether a quantity needs its unit, as in a file."""
 
 MAX_DURATION_S: Final = 30 * 86_400.0
 """Longest duration of any setting: far more than any run, and every clock can count it."""
@@ -41,7 +44,7 @@ class Settings(BaseModel):
     """Base of every settings model: immutable, refuses unknown keys, values in SI units.
 
     Subclass it for your plugin; give each field a description and, if possible, a default.
-    Quantities take a number in SI units or text such as "45 ms".
+    Quantities take text such as "45 ms"; in Python, also a number in SI units.
 
     Example:
         >>> class Mine(Settings):
@@ -75,7 +78,7 @@ def setting_error(
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Converts a number, or text with a unit, to SI.
+    """Converts text with a unit to SI; a number is in SI already, and comes from Python.
 
     Attributes:
         dimension: A key of :data:`labseq.units.UNITS`.
@@ -83,12 +86,16 @@ class Quantity:
 
     dimension: str
 
-    def __call__(self, value: Any) -> Any:
-        """Convert text; a number is in SI already."""
+    def __call__(self, value: Any, info: ValidationInfo) -> Any:
+        """The value in SI; in a file only 0 needs no unit, unless the zero depends on the unit."""
         if isinstance(value, str):
             return parse_quantity(value, self.dimension)
         if value is None or isinstance(value, bool | list | tuple | dict):
             raise ValueError(f"expected {expected(self.dimension)}")
+        is_zero = value == 0 and self.dimension != "temperature"
+        needs_none = is_zero or self.dimension == "fraction" or not math.isfinite(value)
+        if not needs_none and (info.context or {}).get(NEEDS_UNITS):
+            raise PydanticCustomError("unit_missing", "{dimension}", {"dimension": self.dimension})
         return value
 
 

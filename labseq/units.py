@@ -1,7 +1,7 @@
 """Quantities with units, converted to plain SI numbers.
 
 Only YAML files and displays use units such as "45 ms"; all values inside labseq and on disk
-are SI. A plain number is in SI.
+are SI. In Python a plain number is in SI; in a file it needs its unit.
 """
 
 from __future__ import annotations
@@ -94,8 +94,9 @@ def parse_quantity(text: str, dimension: str) -> float:
     if unit not in units:
         other = next((name for name, known in UNITS.items() if unit in known and unit), None)
         if not unit:
-            came = f"'{text}' has no unit"
-        elif other is not None:
+            hint = f"write {with_units(match[1], dimension)}"
+            raise ValueError(f"'{text}' has no unit; expected {expected(dimension)}; {hint}")
+        if other is not None:
             came = f"'{text}' is {_a(other)}, not {_a(dimension)}"
         else:
             came = f"'{unit}' in '{text}' is not a unit of {dimension}"
@@ -193,14 +194,24 @@ def expected(dimension: str) -> str:
 
     Example:
         >>> expected("time")
-        "a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
+        "a time such as '45 ms' (s, ms, us, ns, min, h)"
     """
     names = unit_names(dimension)
-    plain = "" if dimension == "fraction" else f" in {names[0]}"
+    plain = " or a plain number" if dimension == "fraction" else ""
     article = "an" if dimension == "angle" else "a"
-    return (
-        f"{article} {dimension} such as '{EXAMPLES[dimension]}' ({', '.join(names)}) or a plain number{plain}"
-    )
+    return f"{article} {dimension} such as '{EXAMPLES[dimension]}' ({', '.join(names)}){plain}"
+
+
+def with_units(number: str, dimension: str) -> str:
+    """A number as it is written, with the usual unit and with the SI unit, for messages.
+
+    Example:
+        >>> with_units("500", "time")
+        "'500 ms' or '500 s'"
+    """
+    units = [split_quantity(EXAMPLES[dimension])[1], unit_names(dimension)[0]]
+    units += ["degC"] if dimension == "temperature" else []
+    return " or ".join(f"'{number} {unit}'" for unit in units)
 
 
 def unit_names(dimension: str) -> list[str]:

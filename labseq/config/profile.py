@@ -538,7 +538,7 @@ class ProfileSpec(Settings):
 
 
 _VIRTUAL: Final = {"use": "virtual"}
-_NARROW: Final = {"step": 1.0}
+_NARROW: Final = {"step": "1 Hz"}
 _FALLBACKS: Final = FallbackValues(
     values={
         "labseq": FORMAT,
@@ -546,7 +546,7 @@ _FALLBACKS: Final = FallbackValues(
         "grid": {
             "rows": 1000,
             "cols": 1000,
-            "spacing": 1e-6,
+            "spacing": "1 um",
             "row_frequency": _NARROW,
             "column_frequency": _NARROW,
         },

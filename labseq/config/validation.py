@@ -17,7 +17,8 @@ from pydantic.fields import FieldInfo
 from labseq.config.yaml_nodes import Mark, Node, comma_hint, resolve
 from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, closest, did_you_mean, listing, shown
-from labseq.settings import FOLDER, NoSettings
+from labseq.settings import FOLDER, NEEDS_UNITS, NoSettings
+from labseq.units import expected as expected_quantity, with_units
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -51,6 +52,7 @@ class ValidationContext:
         drop: Keys that are left out.
         other_keys: Keys that belong to another model: messages list them as known.
         folder: Folder that the paths in it are relative to.
+        needs_units: Whether a quantity needs its unit, as in a file; otherwise numbers are in SI.
     """
 
     name: str
@@ -58,6 +60,7 @@ class ValidationContext:
     drop: Collection[str] = ()
     other_keys: Collection[str] = ()
     folder: Path = Path()
+    needs_units: bool = False
 
     def known_keys(self, model: type[BaseModel], loc: Loc) -> list[str]:
         """The keys of the mapping at a location."""
@@ -105,7 +108,7 @@ def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Fi
         return [Finding((), Problem(what, expected="a mapping of settings such as {key: value}"))]
     kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in context.drop}
     try:
-        return _validated(model, json.dumps(kept), {FOLDER: context.folder})
+        return _validated(model, json.dumps(kept), {FOLDER: context.folder, NEEDS_UNITS: context.needs_units})
     except ValidationError as error:
         return _findings(error, model, node, context)
     except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
@@ -365,6 +368,10 @@ def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Proble
     what = f"{name} is {shown(value, raw)}" if name else f"this is {shown(value, raw)}"
     if kind == "setting_error":
         return Problem(details["what"], expected=details["expected"], hint=details["hint"])
+    if kind == "unit_missing":
+        dimension, number = details["dimension"], raw or f"{value:.12g}"
+        what = f"{what}, without a unit"
+        return Problem(what, "", 0, 0, expected_quantity(dimension), f"write {with_units(number, dimension)}")
     if kind in ("value_error", "assertion_error"):
         return _of_validator(str(details.get("error", error["msg"])), name, what)
     if kind in _TYPES:

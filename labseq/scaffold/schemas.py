@@ -130,7 +130,7 @@ class _ExpressionGenerator(_Generator):
 
 
 def quantity_schema(dimension: str, *, expressions: bool = False) -> JsonSchema:
-    """A number in SI units, or text with one of the units.
+    """Text with one of the units; a number that needs none.
 
     Example:
         >>> quantity_schema("time")["type"]
@@ -212,11 +212,23 @@ def _tidy(schema: Any) -> Any:
         tidy["default"] = _with_unit(tidy["default"], node)
         if tidy["default"] is None or isinstance(tidy["default"], dict):  # an editor would insert it
             del tidy["default"]
-    if _DIMENSION in node and tidy.get("minimum", tidy.get("exclusiveMinimum", -1)) >= 0:
-        tidy["pattern"] = tidy["pattern"].replace(_SIGN, r"\+?", 1)  # a limit applies to plain numbers only
+    if _DIMENSION in node:
+        _limit_numbers(tidy, node[_DIMENSION])
     if "$ref" in tidy and len(tidy) > 1:  # draft 7 ignores everything next to a reference
         tidy = {"allOf": [{"$ref": tidy.pop("$ref")}], **tidy}
     return tidy
+
+
+def _limit_numbers(tidy: JsonSchema, dimension: str) -> None:
+    """Let a quantity be positive text if its limits say so, and a number only where that needs no unit."""
+    if tidy.get("minimum", tidy.get("exclusiveMinimum", -1)) >= 0:
+        tidy["pattern"] = tidy["pattern"].replace(_SIGN, r"\+?", 1)
+    if dimension == "fraction":
+        return
+    takes_zero = dimension != "temperature" and tidy.get("minimum", 0) <= 0 and "exclusiveMinimum" not in tidy
+    for limit in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum"):
+        tidy.pop(limit, None)
+    tidy |= {"minimum": 0, "maximum": 0} if takes_zero else {"type": "string"}
 
 
 def _with_unit(default: Any, node: Mapping[str, Any]) -> Any:

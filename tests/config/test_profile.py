@@ -182,7 +182,7 @@ camera: {use: virtual, readout: 5 ms} => camera: virtual
 rows: 20 => rows: 0
   5:9: rows is 0; expected at least 1
 4.49 um => 4.49 MHz
-  7:12: spacing: '4.49 MHz' is a frequency, not a length; expected a length such as '4.49 um' (m, mm, um, nm) or a plain number in m
+  7:12: spacing: '4.49 MHz' is a frequency, not a length; expected a length such as '4.49 um' (m, mm, um, nm)
 lattice: tri => latice: tri
   8:3: 'latice' is not a setting of 'grid'; expected one of rows, cols, spacing, lattice, shear, row_frequency, column_frequency; did you mean 'lattice'?
 shear: -1 => shear: 0
@@ -194,7 +194,7 @@ step: -1.6 MHz => step: 0
 speed: 130 um/ms => speed: 0
   18:10: speed is 0; expected more than 0
 speed: 130 um/ms => speed: 130 um
-  18:10: speed: '130 um' is a length, not a speed; expected a speed such as '130 um/ms' (m/s, mm/s, mm/ms, um/ms, um/us, um/s) or a plain number in m/s
+  18:10: speed: '130 um' is a length, not a speed; expected a speed such as '130 um/ms' (m/s, mm/s, mm/ms, um/ms, um/us, um/s)
   use: virtual⏎  band =>   band
   15:3: 'use' is missing from 'mobile_tweezers' (the name of a plugin)
 shutter: => camera:

@@ -22,7 +22,7 @@ def test_defaults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("window", "expected"), [("40 ms", [0.04] * 3), ("[60 ms, 0.05, 1e-2]", [0.06, 0.05, 0.01])]
+    ("window", "expected"), [("40 ms", [0.04] * 3), ("[60 ms, 0.05 s, 1e-2 s]", [0.06, 0.05, 0.01])]
 )
 def test_one_window_for_all_cycles_or_one_for_each(window: str, expected: list[float]) -> None:
     text = f"rearrange: {{cycles: 3, window: {window}}}"

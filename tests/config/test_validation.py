@@ -17,8 +17,8 @@ from labseq.config.validation import MAX_HINTS, validate_values
 from labseq.errors import ConfigError
 from labseq.settings import Duration, Fraction, Length, Settings
 
-LENGTH = "a length such as '4.49 um' (m, mm, um, nm) or a plain number in m"
-TIME = "a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
+LENGTH = "a length such as '4.49 um' (m, mm, um, nm)"
+TIME = "a time such as '45 ms' (s, ms, us, ns, min, h)"
 
 
 class Colour(Enum):
@@ -75,9 +75,9 @@ def problems(text: str, **options: Any) -> list[str]:
 
 def test_right_settings() -> None:
     model = validate(
-        "  fraction: 75 %\n  exposure: 3\n  pair: [1, 2]\n  files: [a]\n  path: x/y\n  colour: blue\n"
+        "  fraction: 75 %\n  exposure: 3 s\n  pair: [1, 2]\n  files: [a]\n  path: x/y\n  colour: blue\n"
         "  inner: {width: 4.49 um}\n  many: [{}, {count: 2}]\n  named: {a: {count: 3}}\n  either: [1]\n"
-        "  window: [60 ms, 0.1]\n  shape: none\n  pet: {kind: dog, tricks: [sit]}\n  else: 9\n  by_number: {'1': 2}"
+        "  window: [60 ms, 0.1 s]\n  shape: none\n  pet: {kind: dog, tricks: [sit]}\n  else: 9\n  by_number: {'1': 2}"
     )
     assert model.model_dump(exclude_defaults=True) == {
         "rows": 1,
@@ -117,8 +117,10 @@ files: a
   3:10: files is 'a'; expected a list ([a, b], or lines that begin with '- ')
 fraction: 120 %
   3:13: fraction is '120 %'; expected at most 1 (in SI units)
-exposure: 11
-  3:13: exposure is 11; expected at most 10
+exposure: 11 s
+  3:13: exposure is '11 s'; expected at most 10 (in SI units)
+exposure: 1.1e1
+  3:13: exposure is 1.1e1, without a unit; expected a time such as '45 ms' (s, ms, us, ns, min, h); write '1.1e1 ms' or '1.1e1 s'
 inner: [1]
   3:10: inner is a list; expected a mapping (key: value)
 inner: {{cuont: 1}}
@@ -143,8 +145,8 @@ window: 1 K
   3:11: window: '1 K' is a temperature, not a time; expected {TIME}
 window: {{}}
   3:11: window is a mapping; expected {TIME}
-window: [1, -2]
-  3:15: window.1 is -2; expected at least 0
+window: [1 s, -2 s]
+  3:17: window.1 is '-2 s'; expected at least 0
 shape: noen
   3:10: shape is 'noen'; expected 'none'
 shape: {{count: 0}}

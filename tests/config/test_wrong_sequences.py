@@ -178,9 +178,9 @@ cycles: 3 => cycles: 101
 cycles: 3 => cycles: 3 ms
   19:15: cycles is '3 ms'; expected a whole number
 exposure: 45 ms => exposure: 45 K
-  16:23: exposure: '45 K' is a temperature, not a time; expected a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s
+  16:23: exposure: '45 K' is a temperature, not a time; expected a time such as '45 ms' (s, ms, us, ns, min, h)
 exposure: 45 ms => exposure: 45 msec
-  16:23: exposure: 'msec' in '45 msec' is not a unit of time; expected a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s
+  16:23: exposure: 'msec' in '45 msec' is not a unit of time; expected a time such as '45 ms' (s, ms, us, ns, min, h)
 exposure: 45 ms => exposure: 0,5 ms
   16:23: exposure is 0; expected more than 0
 exposure: 45 ms => exposure: 0 ms
@@ -188,7 +188,7 @@ exposure: 45 ms => exposure: 0 ms
 exposure: 45 ms => exposure: 1e999
   16:23: exposure is 1e999; expected a finite number
 - 50 ms => - 50 MHz
-  22:11: window.1: '50 MHz' is a frequency, not a time; expected a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s
+  22:11: window.1: '50 MHz' is a frequency, not a time; expected a time such as '45 ms' (s, ms, us, ns, min, h)
         - 50 ms⏎ =>         - 50 ms⏎        - 40 ms⏎
   21:9: the list has 4 entries, but cycles is 3; expected 3, one per cycle
 stop_when: 'never' => stop_when: nevr

@@ -174,7 +174,7 @@ def test_a_dry_run_with_a_real_cameras_profile_sees_what_the_virtual_camera_sees
     done = run(str(profile), dry_run="full")
     assert done.simulated
     virtual = run(
-        "virtual", f"profile.camera.readout={done.record['devices']['camera'].get('readout_s', 5e-3)}"
+        "virtual", f"profile.camera.readout={done.record['devices']['camera'].get('readout_s', 5e-3)} s"
     )
     for shot, expected in zip(done.shots, virtual.shots, strict=True):
         np.testing.assert_array_equal(shot.occupancies, expected.occupancies)

@@ -283,7 +283,7 @@ def test_behind_a_closed_shutter_it_is_dark_and_the_light_still_takes_atoms(sens
         ),
         ("binning: 3", "128 x 128 pixels cannot be binned by 3; choose a `region`"),
         ("em_gain: 300", "the EM gain is 300; the limit is 1: a qCMOS sensor has no EM register; leave the"),
-        ("cooling: {temperature: -70}", "temperature is -70 K (-343 degC); expected -123 to 50 degC"),
+        ("cooling: {temperature: -70 K}", "temperature is -70 K (-343 degC); expected -123 to 50 degC"),
     ],
 )
 def test_settings_that_the_sensor_lacks_are_reported_with_their_line(

@@ -17,7 +17,7 @@ from labseq.session.check import check
 ROOT = Path(__file__).parents[2]
 SEQUENCE = (ROOT / "sequences" / "compact_225.yaml").read_text(encoding="utf-8")
 PROFILE = (ROOT / "hardware_profiles" / "virtual.yaml").read_text(encoding="utf-8")
-TIME = "expected a time such as '45 ms' (s, ms, us, ns, min, h) or a plain number in s"
+TIME = "expected a time such as '45 ms' (s, ms, us, ns, min, h)"
 NO_HOOK = "it implements no hook; write '@hookimpl' above 'def labseq_register'"
 
 CASES: list[tuple[str, dict[str, str], list[str]]] = [
