@@ -27,7 +27,7 @@ def test_defaults() -> None:
 def test_one_window_for_all_cycles_or_one_for_each(window: str, expected: list[float]) -> None:
     text = f"rearrange: {{cycles: 3, window: {window}}}"
     settings = Document.parse(text, "f.yaml").validate(RearrangeSettings, ("rearrange",))
-    assert [settings.window_of(cycle) for cycle in (1, 2, 3)] == expected
+    assert [settings.window_of(cycle) for cycle in range(3)] == expected
 
 
 def test_a_probe_reads_its_offset_with_units() -> None:

@@ -36,7 +36,7 @@ shot:
 """
 CHANGES = (
     "shot.before.exposure=80 ms",
-    "profile.mobile_tweezers.pick_up=0.0002",
+    "profile.mobile_tweezers.pick_up=0.0002 s",
     "planner.degree_of_parallelism=5",
 )
 EXPOSURE, PICK_UP, HOLD = (

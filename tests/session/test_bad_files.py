@@ -55,6 +55,18 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         ],
     ),
     (
+        "quantities without units",
+        {
+            "duration: 500 ms": "duration: 500",
+            "spacing: 4.49 um": "spacing: 4.49",
+            "window: 60 ms": "window: 0",
+        },
+        [
+            "p.yaml:16:12: spacing is 4.49, without a unit; expected a length such as '4.49 um' (m, mm, um, nm); write '4.49 um' or '4.49 m'",
+            "s.yaml:11:22: duration is 500, without a unit; expected a time such as '45 ms' (s, ms, us, ns, min, h); write '500 ms' or '500 s'",
+        ],
+    ),
+    (
         "a wrong grid says nothing of the target's size",
         {"rows: 20 ": "rows: -20 "},
         ["p.yaml:14:9: rows is -20; expected at least 1"],
@@ -93,7 +105,7 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
             "column_frequency: {centre: 100 MHz, step: 1.6 MHz}": "column_frequency: {centre: 100 MHz, step: 3 MHz}"
         },
         [
-            "p.yaml:23:21: moving atoms: the frequency of column tone 0 in batch 1 is 71.5 MHz; the limit is the band of 82 to 118 MHz"
+            "p.yaml:23:21: moving atoms: the frequency of column tone 0 in batch 0 is 71.5 MHz; the limit is the band of 82 to 118 MHz"
         ],
     ),
     (
@@ -198,7 +210,7 @@ def test_wrong_options_are_reported_with_the_files() -> None:
     [
         (
             "spacing: 4.49 um",
-            "spacing: 4.49",
+            "spacing: 4.49 m",
             "the region of interest of site (0, 0), according to the detector's settings, is rows ",
         ),
         ("threshold: 1630", "threshold: gone.npy", "thresholds cannot be read from 'gone.npy': No such file"),

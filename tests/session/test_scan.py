@@ -91,8 +91,8 @@ def test_a_shot_of_a_scan_is_the_same_as_in_a_run_with_its_values_set(tmp_path: 
     speed = "profile.mobile_tweezers.speed: [50 um/ms, 130 um/ms]"
     text = f"scan: {{{speed}, planner.degree_of_parallelism: [2, 5]}}\norder: shuffled\n"
     scanned = run(tmp_path, text)
-    for shot in scanned.shots:
-        overrides = [f"{address}={value}" for address, value in shot.parameters.items()]
+    for shot, point in zip(scanned.shots, scanned.record["scan"]["point_of_shot"], strict=True):
+        overrides = [f"{address}={value}" for address, value in scan_points(scanned)[point].written.items()]
         alone = run(tmp_path, "shots: 4\n", overrides=overrides).shots[shot.index]
         assert np.array_equal(shot.occupancies, alone.occupancies)
         assert [p.moves.tobytes() for p in shot.plans] == [p.moves.tobytes() for p in alone.plans]
