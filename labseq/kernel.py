@@ -66,7 +66,7 @@ class _Kernel:
     folder: Path | None
     is_helper: bool
     builds_on: frozenset[str]  # modules
-    is_loaded: bool = False
+    is_begun: bool = False
 
     @property
     def module(self) -> str:
@@ -238,10 +238,10 @@ def _load(one: _Kernel) -> None:
 
     dispatcher = one.dispatcher
     with global_compiler_lock:
-        if one.is_loaded:
+        if one.is_begun:  # it calls itself, or another thread was faster
             return
+        one.is_begun = True
         _PENDING.pop(id(dispatcher), None)
-        del dispatcher._compile_for_args, dispatcher.get_call_template  # noqa: SLF001
         try:
             try:
                 _build(one)
@@ -252,10 +252,11 @@ def _load(one: _Kernel) -> None:
                 dispatcher._cache.disable()  # noqa: SLF001
                 _build(one)
             dispatcher.disable_compile()
-            one.is_loaded = True
         except BaseException:
-            _defer(one)
+            one.is_begun = False
+            _PENDING[id(dispatcher)] = one
             raise
+        del dispatcher._compile_for_args, dispatcher.get_call_template  # noqa: SLF001
 
 
 def _build(one: _Kernel) -> None:

@@ -8,6 +8,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -158,6 +159,12 @@ def test_a_kernel_is_loaded_by_its_first_call(package: Package) -> None:
     again: Any = package.define()
     assert compiled_modules(lambda: again.top(0)) == []
     assert len(again.MIDDLE.overloads) == 0  # nothing has asked for it
+
+
+def test_threads_may_make_the_first_call_at_the_same_time(package: Package) -> None:
+    top = package.define()
+    with ThreadPoolExecutor(4) as threads:
+        assert [*threads.map(top.top, [0] * 4)] == [102] * 4
 
 
 def test_processes_fill_the_cache(package: Package, monkeypatch: pytest.MonkeyPatch) -> None:

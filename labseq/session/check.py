@@ -280,11 +280,12 @@ class CheckReport:
         return sum(bar.n_images for bar in self.bars)
 
 
-def check(session: Session) -> CheckReport:
+def check(session: Session, *, runs: bool = False) -> CheckReport:
     """Compute timeline, duration, disk space and warnings of a run; no device is opened.
 
     Args:
         session: An opened session; its sequence and profile have no errors.
+        runs: Whether a run follows; then the kernels of the devices are compiled with those of the planner.
 
     Raises:
         ConfigError: What a device or plugin would refuse in the first shot at some point of the run.
@@ -299,7 +300,7 @@ def check(session: Session) -> CheckReport:
             for point in each:
                 ask(point)
             points.raise_problems()
-        rehearsals, warnings = _rehearsed(points)
+        rehearsals, warnings = _rehearsed(points, runs)
         points.raise_problems()
         run_s = _run_s(session, points)
         timeline = points.timeline(first)
@@ -342,14 +343,14 @@ def _windows(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
     return {number: windows_s for number, windows_s in windows.items() if windows_s}
 
 
-def _rehearsed(points: _Points) -> tuple[dict[int, Rehearsal], list[Problem]]:
+def _rehearsed(points: _Points, runs: bool) -> tuple[dict[int, Rehearsal], list[Problem]]:
     """Rehearse the moves at every point with devices of its own: the results at the first, and warnings."""
     session, rehearsals, warnings = points.session, dict[int, Rehearsal](), list[Problem]()
     for n, (point, lab) in enumerate(points.labs()):
         windows = _windows(point.steps)
         if not windows:
             continue
-        session.warm(lab, devices=False)
+        session.warm(lab, devices=runs and n == 0)
         found, plans, failure = _rehearse(points.guard, lab, [*windows.values()], 1 if n else N_LOADINGS)
         points.ask_tweezers(point, lab, plans)
         if failure:

@@ -191,7 +191,7 @@ class Session:
                 _, writer = self._begin(roots[0])
                 writer.finish("complete")
                 return open_run(writer.run_dir)
-            warnings = [str(problem) for problem in check(self).warnings]
+            warnings = [str(problem) for problem in check(self, runs=True).warnings]
             labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
             lab = next(labs)
             for one in itertools.chain([lab], labs):
