@@ -3,12 +3,14 @@
 import gc
 import itertools
 import os
+import re
 import shutil
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from importlib.machinery import SourceFileLoader
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,6 +35,14 @@ if sys.dont_write_bytecode:  # else each process would compile the tests and num
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(_BYTECODE)
     sys.dont_write_bytecode = False
 
+OPTIONAL = (
+    *("PIL", "h5netcdf", "hdf5plugin", "matplotlib", "optuna", "pandas", "pyarrow", "pylablib", "pypylon"),
+    *("ruff", "sphinx", "tifffile", "xarray"),
+)
+_MISSING = [] if os.environ.get("LABSEQ_REQUIRE_ALL") else [m for m in OPTIONAL if find_spec(m) is None]
+_NEEDS_MISSING = re.compile(
+    rf"No module named '?({'|'.join(_MISSING)})\b|pip install [^\n]?labseq\[|No such file.*'ruff'"
+)
 _NUMBERS = itertools.count()
 _WRITE: Callable[..., None] = vars(SourceFileLoader)["_cache_bytecode"]
 
@@ -60,6 +70,29 @@ def _cache_bytecode(
     """Write bytecode, except of temporary files: a test may edit them within a second."""
     if not source.startswith(tempfile.gettempdir()):
         write(loader, source, bytecode, data)
+
+
+def _skip_if_something_is_missing(report: pytest.CollectReport | pytest.TestReport) -> None:
+    """A test that fails for want of an optional package is skipped, as `uv run pytest` installs none."""
+    told = [str(report.longrepr), *(text for _, text in report.sections)]
+    if _MISSING and report.failed and any(_NEEDS_MISSING.search(text) for text in told):
+        report.outcome = "skipped"
+        path, line, _ = getattr(report, "location", None) or (report.nodeid, 0, "")
+        report.longrepr = (path, line or 0, "Skipped: needs a package of `uv sync --all-extras --all-groups`")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    _skip_if_something_is_missing(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    report = yield
+    _skip_if_something_is_missing(report)
+    return report
 
 
 @pytest.fixture(autouse=True)

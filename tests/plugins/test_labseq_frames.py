@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from labseq_frames.camera import FramesCamera, FramesSettings
 from numpy.typing import NDArray
+from PIL import Image
 
 from labseq.model import ImageRecord, RunRecord, ShotRecord, TargetPattern
 from labseq.plugin import ConfigError, Context, DeviceError, Frame
 from labseq.recording import RunWriter
 from labseq.testing import CameraContract
 from labseq.testing.fakes import FakeClock
-
-IMAGE = pytest.importorskip("PIL.Image")
-TIFFFILE = pytest.importorskip("tifffile")
 
 UTC = "2026-11-20T10:00:00.000000+00:00"
 
@@ -65,12 +64,12 @@ def write_run(
 def write_pngs(folder: Path, frames: Stack) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for i, pixels in enumerate(frames):
-        IMAGE.fromarray(pixels).save(folder / f"frame{i}.png")
+        Image.fromarray(pixels).save(folder / f"frame{i}.png")
     return folder
 
 
 def write_tiff(file: Path, frames: Stack, **options: Any) -> Path:
-    TIFFFILE.imwrite(file, frames, photometric="minisblack", **options)
+    tifffile.imwrite(file, frames, photometric="minisblack", **options)
     return file
 
 
@@ -195,7 +194,7 @@ def test_several_stacks_are_played_one_after_the_other(tmp_path: Path) -> None:
 def test_stacks_of_many_kinds_give_the_same_counts(tmp_path: Path, options: dict[str, Any]) -> None:
     frames = stack_of(3, (20, 30))
     file = tmp_path / "x.tif"
-    TIFFFILE.imwrite(
+    tifffile.imwrite(
         file, frames, **({} if "imagej" in options else {"photometric": "minisblack"}), **options
     )
     player = Player(file).open()

@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from hypothesis import given, strategies as st
 from labseq_frames.camera import FramesCamera, FramesSettings
 from labseq_frames.files import natural
+from PIL import Image
 
 from labseq.plugin import ConfigError, Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
 from .test_labseq_frames import stack_of, write_run
-
-IMAGE = pytest.importorskip("PIL.Image")
-TIFFFILE = pytest.importorskip("tifffile")
 
 
 def pixels(height: int = 4, width: int = 6, dtype: str = "u2") -> Any:
@@ -97,9 +96,9 @@ def test_folders_and_files_that_hold_no_frames_are_refused(tmp_path: Path) -> No
     (folder / "x.tif").write_text("version https://git-lfs.github.com/spec/v1")
     assert "x.tif: cannot be read as a TIFF: not a TIFF file" in refusal(folder / "x.tif")
     text = "x.tif: is no run, so that `images: first` has no meaning"
-    TIFFFILE.imwrite(folder / "x.tif", pixels())
+    tifffile.imwrite(folder / "x.tif", pixels())
     assert text in refusal(folder / "x.tif", images="first")
-    IMAGE.fromarray(pixels()).save(folder / "x.png")
+    Image.fromarray(pixels()).save(folder / "x.png")
     assert "contains 1 PNG and 1 TIFF files; expected files of one kind" in refusal(folder)
 
 
@@ -118,7 +117,7 @@ def test_what_is_no_ordinary_file_is_not_read(tmp_path: Path) -> None:
     ],
 )
 def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, message: str) -> None:
-    IMAGE.new(mode, (6, 4)).save(tmp_path / "x.png")
+    Image.new(mode, (6, 4)).save(tmp_path / "x.png")
     text = refusal(tmp_path)
     assert "x.png: the picture is " in text
     assert f"{message} expected 16 bit gray; save the camera's own counts" in text
@@ -126,7 +125,7 @@ def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, mes
 
 def test_a_damaged_png_is_named(tmp_path: Path) -> None:
     for i in range(3):
-        IMAGE.fromarray(np.random.default_rng(i).integers(0, 9999, (40, 40)).astype("u2")).save(
+        Image.fromarray(np.random.default_rng(i).integers(0, 9999, (40, 40)).astype("u2")).save(
             tmp_path / f"x{i}.png"
         )
     whole = (tmp_path / "x1.png").read_bytes()
@@ -141,15 +140,15 @@ def test_a_damaged_png_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("dtype", "shape"), [("i2", (4, 6)), ("f4", (4, 6)), ("u2", (4, 6, 3))])
 def test_a_stack_of_other_numbers_is_refused(tmp_path: Path, dtype: str, shape: tuple[int, ...]) -> None:
-    TIFFFILE.imwrite(tmp_path / "x.tif", np.zeros(shape, dtype), photometric="rgb" if shape[2:] else None)
+    tifffile.imwrite(tmp_path / "x.tif", np.zeros(shape, dtype), photometric="rgb" if shape[2:] else None)
     came = f"{np.dtype(dtype).name}, {' x '.join(map(str, shape))}"
     assert f"page 0 is {came}; expected uint16, height x width" in refusal(tmp_path / "x.tif")
 
 
 def test_files_of_another_size_are_found_before_anything_is_played(tmp_path: Path) -> None:
     for i, height in enumerate((4, 4, 5)):
-        IMAGE.fromarray(pixels(height)).save(tmp_path / f"x{i}.png")
-        TIFFFILE.imwrite(tmp_path / f"x{i}.tif", pixels(height))
+        Image.fromarray(pixels(height)).save(tmp_path / f"x{i}.png")
+        tifffile.imwrite(tmp_path / f"x{i}.tif", pixels(height))
     for kind in ("png", "tif"):
         text = f"x2.{kind}: its frames have 5 x 6 pixels, those of x0.{kind} 4 x 6"
         assert text in refusal(tmp_path / f"*.{kind}")
@@ -160,7 +159,7 @@ def test_what_is_wrong_with_a_later_page_is_reported_when_it_comes(tmp_path: Pat
         ("size.tif", pixels(5), "page 2: the frame has 5 x 6 pixels, the first one 4 x 6"),
         ("dtype.tif", pixels(dtype="f4"), "page 2 is float32, 4 x 6; expected uint16"),
     ):
-        with TIFFFILE.TiffWriter(tmp_path / file) as stack:
+        with tifffile.TiffWriter(tmp_path / file) as stack:
             for page in (pixels(), pixels(), later):
                 stack.write(page, contiguous=False)
         assert message in failure(tmp_path / file, 2)
@@ -168,7 +167,7 @@ def test_what_is_wrong_with_a_later_page_is_reported_when_it_comes(tmp_path: Pat
 
 def test_a_stack_that_is_cut_off_never_counts_as_a_shorter_one(tmp_path: Path) -> None:
     file = tmp_path / "x.tif"
-    TIFFFILE.imwrite(file, np.stack([pixels(20, 20)] * 6), photometric="minisblack")
+    tifffile.imwrite(file, np.stack([pixels(20, 20)] * 6), photometric="minisblack")
     whole = file.read_bytes()
     for length in range(0, len(whole), 193):
         file.write_bytes(whole[:length])
@@ -179,7 +178,7 @@ def test_a_stack_that_is_cut_off_never_counts_as_a_shorter_one(tmp_path: Path) -
 
 
 def test_a_stack_that_hides_its_frames_behind_one_page_is_refused(tmp_path: Path) -> None:
-    with TIFFFILE.TiffWriter(tmp_path / "x.tif") as stack:
+    with tifffile.TiffWriter(tmp_path / "x.tif") as stack:
         stack.write(np.stack([pixels()] * 3), photometric="minisblack", truncate=True)
     text = refusal(tmp_path / "x.tif")
     assert "holds 3 x 4 x 6 counts behind a single page" in text
@@ -214,8 +213,8 @@ def test_a_shot_that_is_damaged_or_gone_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("module", "write", "name"),
     [
-        ("tifffile", lambda file: TIFFFILE.imwrite(file, pixels()), "x.tif"),
-        ("PIL.Image", lambda file: IMAGE.fromarray(pixels()).save(file), "x.png"),
+        ("tifffile", lambda file: tifffile.imwrite(file, pixels()), "x.tif"),
+        ("PIL.Image", lambda file: Image.fromarray(pixels()).save(file), "x.png"),
     ],
 )
 def test_a_package_that_is_missing_is_named_with_the_command_that_installs_it(
