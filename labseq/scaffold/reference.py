@@ -546,10 +546,11 @@ def _row_topics(name: str, blocks: Iterable[Block]) -> Iterator[tuple[str, Topic
     for block in blocks:
         if isinstance(block, str):
             group = block.partition("`: ")[0].rpartition("/")[2]
-        for row in block.rows if isinstance(block, Table) else ():
-            words = (name, group, _unmarked(row[0]).removeprefix("/entry/"))
-            topic = Topic(_unmarked(row[-1]), partial(_blocks, Table, block.header, [row]))
-            yield " ".join(filter(None, words)), topic
+        elif isinstance(block, Table):
+            for row in block.rows:
+                words = (name, group, _unmarked(row[0]).removeprefix("/entry/"))
+                topic = Topic(_unmarked(row[-1]), partial(_blocks, Table, block.header, [row]))
+                yield " ".join(filter(None, words)), topic
 
 
 def _key_topics(names: tuple[str, ...], model: type[BaseModel] | None) -> dict[str, Topic]:
