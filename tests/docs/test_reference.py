@@ -211,7 +211,8 @@ def snake_case(name: str) -> str:
 def test_every_public_name_says_what_it_is() -> None:
     (table,) = SCRIPT.names()
     stub = (ROOT / "labseq" / "__init__.pyi").read_text("utf-8")
-    assert [row[0].strip("`") for row in table.rows] == sorted(re.findall(r"\b(\w+) as \1\b", stub))
+    names = sorted({*re.findall(r"\b(\w+) as \1\b", stub)} - {"plugin"})  # a module, on a page of its own
+    assert [row[0].strip("`") for row in table.rows] == names
     assert [row[0] for row in table.rows if len(row[1].split()) < 3] == []
 
 
