@@ -93,8 +93,8 @@ _ELSEWHERE: Final = "choose another place with --output or LABSEQ_DATA"
 _ADVICE: Final = {
     errno.ENOSPC: f"the disk is full; free some space, or {_ELSEWHERE}",
     errno.EDQUOT: f"your disk quota is used up; free some space, or {_ELSEWHERE}",
-    errno.EACCES: f"labseq may not write there; {_ELSEWHERE}",
-    errno.EPERM: f"labseq may not write there; {_ELSEWHERE}",
+    errno.EACCES: f"labseq has no permission to write there; {_ELSEWHERE}",
+    errno.EPERM: f"labseq has no permission to write there; {_ELSEWHERE}",
     errno.EROFS: f"the disk is read-only; {_ELSEWHERE}",
     errno.ENOTDIR: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
     errno.EEXIST: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",

@@ -131,7 +131,7 @@ def parse_any(text: str) -> tuple[float, str]:
     unit = split_quantity(text)[1]
     dimension = "temperature" if unit == "degC" else dimension_of(unit)
     if not dimension:
-        raise ValueError(f"'{text}' is no number with a unit")
+        raise ValueError(f"'{text}' is not a number with a unit")
     return parse_quantity(text, dimension), dimension
 
 

@@ -97,7 +97,7 @@ AT_LOADING = [
     (
         TOP,
         "class Odd(Exception):\n    def __str__(self): raise KeyError\nraise Odd",
-        "Odd: (its text cannot be had: KeyError)",
+        "Odd: (its text cannot be read: KeyError)",
     ),
     (TOP, "import labseq\nraise labseq.DeviceError('camera', 'no cable')", "DeviceError: camera: no cable ("),
     (
@@ -107,7 +107,7 @@ AT_LOADING = [
     ),
     ("LABSEQ_API = 1", "LABSEQ_API = 2", "LABSEQ_API 2; this labseq has LABSEQ_API = 1; up"),
     ("LABSEQ_API = 1", "", "does not state LABSEQ_API; this labseq has LABSEQ_API = 1"),
-    ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is no whole number"),
+    ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is not a whole number"),
     ("def labseq_register", "def labseq_regster", "unknown hook 'labseq_regster'"),
     (
         TOP,

@@ -491,7 +491,7 @@ def _indices(text: str, known: Collection[int]) -> Iterator[int]:
         match = _RANGE.fullmatch(part)
         if match is None:
             raise ConfigError(
-                Problem(f"'{clean(part)}' is no shot", source, expected="numbers such as 3,5-9")
+                Problem(f"'{clean(part)}' is not a shot", source, expected="numbers such as 3,5-9")
             )
         first, last = int(match[1]), int(match[2] or match[1])
         if last < first:

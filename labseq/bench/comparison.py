@@ -99,7 +99,7 @@ def parse_planners(text: str) -> tuple[PlannerEntry, ...]:
         settings = [setting.partition("=") for setting in _SETTING_SEPARATOR.split(rest)] if rest else []
         if not _NAME.fullmatch(name.strip()) or not all(key.strip() and value for key, _, value in settings):
             expected = "names with commas between them, each perhaps with settings: psca,psca:variant=paper"
-            raise ConfigError(Problem("this is no list of planners", option, expected=expected))
+            raise ConfigError(Problem("this is not a list of planners", option, expected=expected))
         words = tuple((key.strip(), value.strip()) for key, _, value in settings)
         planner_entry = PlannerEntry(name.strip(), words)
         if planner_entry in planner_entries:
@@ -121,7 +121,7 @@ def parse_grid(text: str) -> tuple[int, int]:
     shape = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= n <= MAX_SITES for n in shape):
         expected = f"ROWSxCOLS, 1 to {MAX_SITES} each, for example 20x20"
-        raise ConfigError(Problem("this is no size of a grid", clean(f"--grid {text}"), expected=expected))
+        raise ConfigError(Problem("this is not a grid size", clean(f"--grid {text}"), expected=expected))
     return shape
 
 
@@ -138,7 +138,7 @@ def parse_loading(text: str) -> float:
         probability = -1.0
     if not 0.0 <= probability <= 1.0:
         expected = "a number from 0 to 1, or 0 % to 100 %"
-        raise ConfigError(Problem("this is no probability", clean(f"--loading {text}"), expected=expected))
+        raise ConfigError(Problem("this is not a probability", clean(f"--loading {text}"), expected=expected))
     return probability
 
 

@@ -32,7 +32,7 @@ def check_samples_file(path: Path) -> None:
     """
     name, expected = visible(str(path)), f"a file that ends in {SUFFIX}"
     if path.suffix.lower() != SUFFIX:
-        raise ConfigError(Problem("this is no name of an NPZ file", name, expected=expected))
+        raise ConfigError(Problem("this is not the name of an NPZ file", name, expected=expected))
     if not is_folder(path.parent):
         folder = visible(str(path.parent))
         raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))

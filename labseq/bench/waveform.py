@@ -98,7 +98,7 @@ def _parse(text: str) -> SampleRate:
     if not 0 < rate_hz <= MAX_RATE_HZ:
         most = format_quantity(MAX_RATE_HZ, "frequency")
         raise ConfigError(
-            Problem("this is no sample rate", option, expected=f"more than 0 Hz, at most {most}")
+            Problem("this is not a sample rate", option, expected=f"more than 0 Hz, at most {most}")
         )
     return SampleRate(rate_hz, option)
 

@@ -372,6 +372,6 @@ def analyse_overlay(data: CalibrationData) -> AnalysisResult:
 def offset_text(fit: OverlayFit, probed: ProbeCounts) -> str:
     """The position of the mobile tweezers in the run, as text."""
     along, across = (format_quantity(float(-centre), "length") for centre in fit.centre_m)
-    use = " beyond the correction of the overlay in use" if np.any(probed.in_use_m) else ""
-    where = f"{along} along a row and {across} from row to row away from the sites{use}"
-    return f"{fit.n_atoms} atoms: the mobile tweezers were {where}"
+    use = ", in addition to the correction in use" if np.any(probed.in_use_m) else ""
+    where = f"from the sites by {along} along rows and {across} from row to row{use}"
+    return f"{fit.n_atoms} atoms: the mobile tweezers were offset {where}"

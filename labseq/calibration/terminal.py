@@ -16,6 +16,7 @@ from labseq.calibration.compare import Difference, age_s, compare, quality_text,
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.calibration.store import Damaged, Store, Stored, grid_text
 from labseq.config.profile import OFF, CalibrationChoices
+from labseq.console.errors import lines_of
 from labseq.console.events import LASTING, LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.text import age_text, columns
@@ -190,7 +191,7 @@ def _kind(name: str, value: str) -> CalibrationKind:
             return kind
     if name in CALIBRATION_KINDS:
         raise ConfigError(Problem(f"{name} is '{clean(value)}'", expected=f"'{OFF}', or just an id"))
-    what, hint = f"'{clean(name)}' is no kind of calibration", did_you_mean(name, CALIBRATION_KINDS)
+    what, hint = f"'{clean(name)}' is not a kind of calibration", did_you_mean(name, CALIBRATION_KINDS)
     raise ConfigError(Problem(what, expected=listing(CALIBRATION_KINDS), hint=hint))
 
 
@@ -225,12 +226,17 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
             only stored.
         LabseqError: The calibration failed.
     """
-    method = METHODS.get(kind)
-    if method is None:
-        what, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
-        raise ConfigError(Problem(what, expected=listing(METHODS), hint=hint))
     answer = stdout_to_stderr() if as_json else None
-    outcome = calibrate(method, request, _Progress())
+    try:
+        method = METHODS.get(kind)
+        if method is None:
+            what, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
+            raise ConfigError(Problem(what, expected=listing(METHODS), hint=hint))
+        outcome = calibrate(method, request, _Progress())
+    except BaseException as error:
+        if answer is not None:
+            answer(as_line({"kind": kind, "id": None, "in_use": False, "error": "\n".join(lines_of(error))}))
+        raise
     if answer is None:
         say(*summary_lines(outcome))
     else:

@@ -299,7 +299,10 @@ def _check_enough(two: Bools, by_site: Floats, detector: str) -> None:
         remedy = "check the loading, the light, and that the sites are where the atoms are"
         if np.ptp(by_site) == 0:
             remedy = "all signals are equal: black or saturated frames"
-        raise DeviceError(detector, f"{n_one} of {len(two)} sites show one peak, not two; {remedy}")
+        raise DeviceError(
+            detector,
+            f"{n_one} of {len(two)} sites show one peak in the histogram of the counts, not two; {remedy}",
+        )
 
 
 def _with_single_peaks(peaks: _SitePeaks, by_site: Floats) -> tuple[_SitePeaks, Bools, Bools]:

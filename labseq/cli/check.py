@@ -21,6 +21,7 @@ from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.text import age_text, clock_time, columns, encodes, plural, settings_text, size_text
 from labseq.messages import clean
 from labseq.model import TimelineEntry
+from labseq.recording import data_root
 from labseq.sequencer.policies import StepPolicy
 from labseq.session.assembly import Assembly, Search
 from labseq.session.check import CheckReport, Rehearsal, check
@@ -252,9 +253,13 @@ def _totals(checked: CheckReport, assembly: Assembly) -> list[tuple[str, str]]:
     points = f"at most {points}" if assembly.search is not None else points
     size = "of unknown size" if checked.shot_bytes is None else f"{size_text(checked.shot_bytes)} each"
     disk = "unknown" if checked.shot_bytes is None else f"{size_text(n * checked.shot_bytes)} at most"
+    root = next(
+        folder for folder in (data_root().absolute(), *data_root().absolute().parents) if folder.exists()
+    )
+    free = size_text(shutil.disk_usage(root).free)
     return [
         ("shot", f"{shot[0]} to {shot[1]}, {plural(checked.n_images, 'image')} at most, {size}"),
-        ("run", f"{points}{plural(n, 'shot')}, {run[0]} to {run[1]}, {disk} on disk"),
+        ("run", f"{points}{plural(n, 'shot')}, {run[0]} to {run[1]}, {disk} on disk, {free} free"),
     ]
 
 
@@ -263,7 +268,7 @@ def _rehearsed(checked: CheckReport) -> list[tuple[str, str]]:
         return []
     found = _quantiles(checked.rehearsal)
     median, p95 = (format_quantity(found[name], "time") for name in ("median", "p95"))
-    text = f"{median} (median), {p95} (95 %), on {checked.rehearsal.n_loadings} random loadings"
+    text = f"median {median}, 95th percentile {p95}, over {checked.rehearsal.n_loadings} random loadings"
     return [("first cycle", text)]
 
 

@@ -31,13 +31,15 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     import typer
 
     from labseq.cli.app import app
-    from labseq.console.errors import report
+    from labseq.console.errors import EXIT_INTERRUPTED, report
 
     arranged = arrange(sys.argv[1:] if arguments is None else arguments)
     usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # this class has no public name
     replace_unencodable()
     try:
         code = app(args=arranged, prog_name="labseq", standalone_mode=False) or 0
+        if code == EXIT_INTERRUPTED:  # typer has caught the exception
+            report(KeyboardInterrupt())
     except SystemExit as leaving:
         code = leaving.code
     except usage_error as error:

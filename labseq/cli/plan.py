@@ -80,7 +80,7 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
     n_atoms, n_sites = int(moves.occupancy.sum()), moves.target.n_atoms
     if moves.n_missing_atoms:
         too_few = (
-            f"{plural(n_atoms, 'atom')} for {plural(n_sites, 'target site')}, {moves.n_missing_atoms} too few"
+            f"{plural(n_atoms, 'atom')} for {plural(n_sites, 'target site')}, {moves.n_missing_atoms} short"
         )
         texts.append(f"{too_few}; the plan fills {moves.n_filled}")
     elif n_defects:

@@ -17,7 +17,7 @@ from labseq.cli.summary import json_summary, summary_lines
 from labseq.console.errors import lines_of
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import existing_run
-from labseq.console.text import plural
+from labseq.console.text import plural, quoted
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import visible
@@ -125,7 +125,7 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
     folder = find_running(None if run is None else existing_run(run), profile)
     ask_to_stop(folder)
     say(f"{folder} ({owner_text(folder)}) ends after its current shot")
-    say(f"resume it later with: labseq resume {folder}")
+    say(f"resume it later with: labseq resume {quoted(folder)}")
     while wait and is_running(folder):
         time.sleep(POLL_S)
     if wait:
@@ -173,7 +173,7 @@ def beginning(session: Session) -> list[str]:
 
 def ending(run_dir: Path) -> list[str]:
     """The commands suggested after the run."""
-    run = f'"{run_dir}"' if " " in str(run_dir) else str(run_dir)
+    run = quoted(run_dir)
     has_matplotlib = importlib.util.find_spec("matplotlib") is not None
     needs = "" if has_matplotlib else '; first: pip install "labseq[plot]"'
     rows = [
@@ -199,7 +199,7 @@ def copy_files(folder: Path) -> None:
     copies = list(_copies(folder))
     if taken := [new for _, new in copies if new.exists()]:
         more = f" (and {plural(len(taken) - 1, 'more file')})" if len(taken) > 1 else ""
-        what = f"this file exists already{more}; nothing was copied"
+        what = f"this file already exists{more}; nothing was copied"
         raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without them"))
     for old, new in copies:
         try:
@@ -210,10 +210,10 @@ def copy_files(folder: Path) -> None:
                 Problem(f"it cannot be written: {error.strerror}", visible(str(new)))
             ) from error
     say(
-        f"{plural(len(copies), 'file')} copied to sequences and hardware_profiles in {visible(str(folder))}. "
-        "Run the copy there:",
+        f"{plural(len(copies), 'file')} copied to sequences and hardware_profiles in {visible(str(folder))}.",
+        "To run the copies, change to that folder:",
         f"  labseq run sequences/{SEQUENCE}.yaml",
-        "A sequence with 'profile: virtual' now uses the copy in ./hardware_profiles.",
+        "There, 'profile: virtual' means the copy in ./hardware_profiles.",
     )
 
 

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from labseq.cli.summary import json_points, json_summary, point_table, shortened, summary_lines
+from labseq.cli.summary import MAX_ROWS, json_points, json_summary, point_table, summary_lines
 from labseq.console.errors import lines_of
-from labseq.console.events import outcome
+from labseq.console.events import outcome, scanned_values
 from labseq.console.output import as_line, say
 from labseq.console.runs import chosen_run
 from labseq.console.text import columns, percent, settings_text
@@ -62,7 +62,7 @@ def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) 
     elif wanted.any:
         say(*_table_lines(run, wanted))
     else:
-        say(*shortened(shot_table(run)), "", *summary_lines(run))
+        say(*shot_table(run, most=MAX_ROWS), "", *summary_lines(run))
 
 
 def _table_lines(run: Run, wanted: Tables) -> list[str]:
@@ -94,7 +94,7 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
     return values
 
 
-def shot_table(run: Run, *, details: bool = False) -> list[str]:
+def shot_table(run: Run, *, details: bool = False, most: int = 0) -> list[str]:
     """A row per shot; with details also scanned values, batches, and attempts that did not complete."""
     addresses: list[str] = [str(one) for one in run.scan.get("addresses", ())] if details else []
     header = ["shot", *map(clean, addresses), "outcome", "filling", "cycles", "atom moves", "shot time"]
@@ -102,7 +102,7 @@ def shot_table(run: Run, *, details: bool = False) -> list[str]:
     at = 1 + len(addresses)
     if details:
         header.insert(at + 3, "batches")
-    return columns([header, *rows], right=[i for i in range(len(header)) if i != at])
+    return columns([header, *rows], right=[i for i in range(len(header)) if i != at], most=most)
 
 
 def _all_attempts(run: Run) -> list[Shot]:
@@ -118,20 +118,12 @@ def _shot_row(shot: Shot, run: Run, *, details: bool) -> tuple[str, ...]:
     time_s = shot_time_s(shot)
     return (
         str(shot.index),
-        *(_scanned_values(shot, run.scan) if details else ()),
+        *(scanned_values(run.scan, shot.index, shot.parameters) if details else ()),
         result,
         percent(shot.filling_fraction),
         *(str(row.get(name, "-")) for name in counts),
         format_quantity(time_s, "time") if time_s else "-",
     )
-
-
-def _scanned_values(shot: Shot, scan: Mapping[str, Any]) -> list[str]:
-    """The scanned values of a shot, in the units of the sequence."""
-    try:
-        return [clean(str(word)) for word in scan["written"][scan["point_of_shot"][shot.index]]]
-    except (KeyError, IndexError, TypeError):  # run.json is damaged
-        return ["-"] * len(scan.get("addresses", ()))
 
 
 def shot_time_s(shot: Shot) -> float:

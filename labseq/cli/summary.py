@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any, Final
 
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
-from labseq.console.text import columns, count_of, plural
+from labseq.console.text import columns, count_of, plural, quoted
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, Rate, mean
 from labseq.recording import Run
@@ -27,7 +27,7 @@ NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
 def summary_lines(run: Run) -> list[str]:
     """A table of the run's points or cycles, and its statistics. Shots and cycles are counted from 0."""
     statistics = statistics_of(run.shots, run.target)
-    table = shortened(point_table(run)) or cycle_table(statistics)
+    table = point_table(run, MAX_ROWS) or cycle_table(statistics)
     skipped = f", {len(run.skipped)} skipped" if run.skipped else ""
     kept = f", {plural(len(run.attempts), 'attempt')} kept that did not complete" if run.attempts else ""
     rows = [
@@ -40,7 +40,10 @@ def summary_lines(run: Run) -> list[str]:
     ]
     if run.n_damaged_lines:
         rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
-    return [*table, *([""] if table else []), *columns(rows)]
+    resume = (
+        [f"resume it with: labseq resume {quoted(run.path)}"] if run.status in ("stopped", "failed") else []
+    )
+    return [*table, *([""] if table else []), *columns(rows), *resume]
 
 
 def _atom_rows(run: Run) -> list[tuple[str, str]]:
@@ -81,16 +84,8 @@ def json_points(run: Run) -> list[dict[str, Any]]:
     ]
 
 
-def shortened(table: list[str]) -> list[str]:
-    """Shorten a long table to its header, first and last rows."""
-    if len(table) - 1 <= MAX_ROWS:
-        return table
-    half = MAX_ROWS // 2
-    return [*table[: half + 1], "...", *table[-half:]]
-
-
-def point_table(run: Run) -> list[str]:
-    """A row per point of the scan; empty without a scan.
+def point_table(run: Run, most: int = 0) -> list[str]:
+    """A row per point of the scan, at most so many if given; empty without a scan.
 
     If no shot is judged, the images at the end of the last cycles are used.
     """
@@ -107,7 +102,7 @@ def point_table(run: Run) -> list[str]:
         )
     after = "" if is_judged else ", last cycle"
     header = (*map(clean, points[0][0].written), "shots", f"filling{after}", f"defect-free{after}")
-    return columns([header, *rows], right=range(len(header) - 1))
+    return columns([header, *rows], right=range(len(header) - 1), most=most)
 
 
 def cycle_table(statistics: Statistics) -> list[str]:

@@ -472,7 +472,7 @@ class _Evaluator:
                 names[address] = self.results.get(other) or self._written(other, address, at + parsed.shift)
             result = _Evaluation(text, parsed, names).value(parsed.tree)
             if result.powers not in _DIMENSIONS:
-                what = f"the result is in {result.unit}, which is no unit of any setting"
+                what = f"the result is in {result.unit}, which is not a unit of any setting"
                 raise ExpressionError(what, at=0)
         except ExpressionError as error:
             self.report(node, error)

@@ -129,12 +129,12 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
         raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_EXPECTED))
     document = _parse_json(decode(data, name), name)
     if not isinstance(document, dict) or "batches" not in document:
-        raise ConfigError(Problem("this is no plan", name, expected=_EXPECTED))
+        raise ConfigError(Problem("this is not a plan", name, expected=_EXPECTED))
     values = cast("Mapping[str, Any]", document)
     header = validate_values(_Header, values, name)
     batches = values["batches"]
     if not isinstance(batches, list):
-        raise ConfigError(Problem("'batches' is no list", name, expected=_EXPECTED))
+        raise ConfigError(Problem("'batches' is not a list", name, expected=_EXPECTED))
     grid = header.grid.model()
     return PlanFile(
         planner=header.planner,
@@ -152,7 +152,7 @@ def _batches(batches: list[object], name: str) -> list[Batch]:
     for i, batch in enumerate(batches):
         where = f"{name}, batch {i}"
         if not isinstance(batch, dict):
-            raise ConfigError(Problem("this is no batch", where, expected='{"from": [...], "to": [...]}'))
+            raise ConfigError(Problem("this is not a batch", where, expected='{"from": [...], "to": [...]}'))
         made.append(validate_values(BatchFile, cast("Mapping[str, Any]", batch), where).model())
     return made
 
@@ -161,14 +161,14 @@ def _parse_json(text: str, name: str) -> object:
     try:
         return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats)
     except json.JSONDecodeError as error:
-        what = f"this is no JSON: {error.msg[:1].lower()}{error.msg[1:]}"
+        what = f"this is not JSON: {error.msg[:1].lower()}{error.msg[1:]}"
         raise ConfigError(Problem(what, name, error.lineno, error.colno, _EXPECTED)) from error
     except _NoPlanError as error:
-        what = f"this is no plan: {error}"
+        what = f"this is not a plan: {error}"
     except RecursionError:
-        what = "this is no plan: it is nested too deeply"
+        what = "this is not a plan: it is nested too deeply"
     except ValueError:  # Python refuses numbers with thousands of digits
-        what = "this is no plan: a number in it has too many digits"
+        what = "this is not a plan: a number in it has too many digits"
     raise ConfigError(Problem(what, name, expected=_EXPECTED))
 
 

@@ -207,7 +207,7 @@ class EndsSettings(Settings):
     low: End = Field(alias="from", description="least value")
     high: End = Field(alias="to", description="greatest value")
     steps: Points | None = Field(
-        default=None, description="number of equal steps between the values; without it any value will do"
+        default=None, description="number of equal steps between the values; without it any value is allowed"
     )
 
 
@@ -217,14 +217,17 @@ class AdaptiveChoice(Choice):
     over: dict[str, EndsSettings] = Field(
         min_length=1, max_length=MAX_RANGES, description="addresses and their ranges"
     )
-    maximise: Text | None = Field(default=None, description="figure of the run's index to climb on")
-    minimise: Text | None = Field(default=None, description="the same, where less is better")
-    points: Points | None = Field(default=None, description="the most points")
+    maximise: Text | None = Field(default=None, description="figure of the run's index to maximise")
+    minimise: Text | None = Field(default=None, description="figure of the run's index to minimise")
+    points: Points | None = Field(default=None, description="maximum number of points")
 
     @model_validator(mode="after")
     def _has_one_aim(self) -> Self:
         if self.maximise is None and self.minimise is None:
-            raise setting_error("the scan has no aim", "'maximise' or 'minimise' with the name of a figure")
+            raise setting_error(
+                "the scan has neither 'maximise' nor 'minimise'",
+                "'maximise' or 'minimise' with the name of a figure",
+            )
         if self.maximise is not None and self.minimise is not None:
             what = "'maximise' and 'minimise' are both given"
             raise setting_error(what, "one of them", at=("minimise",), key=True)
@@ -441,7 +444,7 @@ def _read_adaptive(
         shots = document.get(("shots",))
         n_points = math.ceil(shots / repeats) if type(shots) is int and shots >= 1 else 0
         if not n_points:
-            what = "'points' is missing from 'scan' (the most points)"
+            what = "'points' is missing from 'scan' (the maximum number of points)"
             found.add(document.error(("scan",), what, "a whole number"))
     found.raise_any()
     if not groups:
@@ -608,7 +611,7 @@ def values_of(node: Node, address: str, name: str) -> list[Node]:
         raise scan_error(node.mark, name, what, _VALUES)
     kind, given = next(iter(node.value.items()))
     if kind not in _FORMS:
-        what = f"'{clean(kind)}' is no way to give values"
+        what = f"'{clean(kind)}' is not a way to give values"
         raise scan_error(node.keys[kind], name, what, listing(_FORMS), did_you_mean(kind, _FORMS))
     if not isinstance(given.value, list) or len(given.value) != 3:
         raise scan_error(given.mark, name, f"{kind} is {shown(given.plain(), given.raw)}", _FORMS[kind])

@@ -476,4 +476,4 @@ def node_of(value: Any, mark: Mark) -> Node:
         return Node(value, mark)
     kind = type(cast("object", value)).__name__
     expected = "a number, text, list or dict"
-    raise ConfigError(mark.problem("", f"a value of type {kind} is no setting", expected))
+    raise ConfigError(mark.problem("", f"a value of type {kind} is not a setting", expected))

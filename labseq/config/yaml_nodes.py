@@ -467,7 +467,7 @@ _RULES: Final = (
         "one mapping and nothing after it",
     ),
     _Rule("YAML d(?:irective|ocument)", "this is not a version of YAML that labseq reads", "YAML 1.2"),
-    _Rule("", "this is no YAML directive", hint=_QUOTE_IT, context="a directive"),
+    _Rule("", "this is not a YAML directive", hint=_QUOTE_IT, context="a directive"),
 )
 
 

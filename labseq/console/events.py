@@ -9,8 +9,9 @@ from typing import Any, Final, TextIO
 
 from labseq.console.output import compiling_text, say
 from labseq.console.text import percent, plural
+from labseq.messages import clean
 from labseq.model import RunRecord, ShotRecord
-from labseq.units import format_quantity
+from labseq.units import format_quantity, written
 
 LASTING: Final = frozenset(
     {"settling", "compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
@@ -83,7 +84,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "scan_point":
             return point_text(values)
         case "scan_ended":
-            return f"{values['scanner']} needs no more points"
+            return f"{values['scanner']} has converged"
         case "device_command":
             return f"shot {values['shot']}: {values['device']}: {values['command']}"
         case _:
@@ -100,13 +101,14 @@ def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
 
 def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
     """A line about a shot that is over."""
+    name = f"shot {shot.shot_index}"
+    if run is not None and (at := point_of_shot(run.scan, shot.shot_index, shot.parameters)):
+        name += f"  {at}"
     if shot.status != "complete":
-        return f"shot {shot.shot_index}  {shot.status}" + (
-            f": {shot.error}" if shot.status == "failed" else ""
-        )
+        return f"{name}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
     n_atoms = run.target.n_atoms if run is not None else 0
     ended = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)
-    parts = [f"shot {shot.shot_index}", ended]
+    parts = [name, ended]
     if not math.isnan(shot.filling_fraction):
         parts.append(f"filling {percent(shot.filling_fraction)}")
     if shot.n_missing_atoms:
@@ -115,8 +117,34 @@ def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
     return "  ".join([*parts, format_quantity(duration_s, "time")])
 
 
+def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> str:
+    """The scanned values of a shot with their units, named by the end of the address; "" without a scan.
+
+    Example:
+        >>> scan = {"addresses": ["shot.0.load.duration"], "written": [["5 ms"]], "point_of_shot": [0]}
+        >>> point_of_shot(scan, 0, {})
+        'duration 5 ms'
+    """
+    addresses = [str(address) for address in scan.get("addresses", ())]
+    names = [address.rpartition(".")[2] for address in addresses]
+    if len({*names}) < len(names):
+        names = addresses
+    return ", ".join(map(" ".join, zip(names, scanned_values(scan, shot, parameters), strict=True)))
+
+
+def scanned_values(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> list[str]:
+    """The scanned values of a shot, in the units of the sequence; "-" where the record does not have them."""
+    try:
+        if "written" not in scan:  # an adaptive scan in progress: its record has no points yet
+            values = [parameters[address] for address in scan["addresses"]]
+            return [written(v, unit) for v, unit in zip(values, scan["units"], strict=True)]
+        return [clean(str(word)) for word in scan["written"][scan["point_of_shot"][shot]]]
+    except (KeyError, IndexError, TypeError, ValueError):  # run.json is damaged
+        return ["-"] * len(scan.get("addresses", ()))
+
+
 def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: int) -> str:
-    """How a shot ended; ``seen_cycle`` is the index of the first cycle that met the target, or -1.
+    """How a shot ended; ``seen_cycle``: index of the first cycle that met the target, or -1.
 
     Example:
         >>> outcome(True, 1, 1.0, 225)

@@ -103,7 +103,7 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
     serial: Any = importlib.import_module("serial")
     if port.startswith(("socket://", "rfc2217://")) and not is_network_port(port):
         expected = "socket://host:port or rfc2217://host:port, with a port from 1 to 65535"
-        raise DeviceError(device, f"cannot open {port}: it is no network port; expected {expected}")
+        raise DeviceError(device, f"cannot open {port}: it is not a network port; expected {expected}")
     if "://" in port:
         options.pop("write_timeout", None)
     else:
@@ -153,10 +153,10 @@ def _reason(error: BaseException) -> str:
     if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY) or "PermissionError(13" in text:
         return "another program has it open, or another device of this profile; close that"
     if number == errno.EACCES:
-        return "you may not; ask for membership of the group that it belongs to (often 'dialout')"
+        return "permission denied; ask to be added to the group that owns it (often 'dialout')"
     if number == errno.ENOENT or "FileNotFoundError" in text:
         return f"there is no such port; expected {ports_text()}; is it plugged in, and switched on?"
     first = error.__context__  # termios' own, which has its number among its arguments
     if number == errno.EISDIR or (first is not None and errno.ENOTTY in first.args):
-        return f"it is no serial port; expected {ports_text()}"
+        return f"it is not a serial port; expected {ports_text()}"
     return re.sub(r"^(\[Errno \d+\] )?[Cc]ould not [^:]*: ", "", text)

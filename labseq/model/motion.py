@@ -68,7 +68,7 @@ class RfSpec:
         if any(not value > 0 for value in (self.full_scale_v, self.max_peak_v, self.max_mean_power_w)):
             raise ValueError("voltages and powers must be above 0")
         if any(not value >= 0 for value in (self.min_spacing_hz, self.snap_within_m, self.phase_seed)):
-            raise ValueError("least spacing, snapping distance and seed cannot be negative")
+            raise ValueError("minimum spacing, snapping distance and seed cannot be negative")
         if not math.isfinite(self.amplifier_gain_db):
             raise ValueError(f"the amplifier's gain is {self.amplifier_gain_db} dB; expected a number")
 

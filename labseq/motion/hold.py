@@ -59,7 +59,7 @@ def hold_program(
 
     Raises:
         LimitError: A tone leaves its band, comes too near to another, or breaks another limit.
-        ValueError: Sites or offsets are not of the grid's shape, or a value is no number.
+        ValueError: Sites or offsets are not of the grid's shape, or a value is not a number.
     """
     _check_band(grid, motion, sites, offset_m)
     batches = list(_batches(grid, motion, sites, offset_m))

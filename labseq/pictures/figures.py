@@ -39,13 +39,13 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
     """
     name, wanted = str(path), f"a file that ends in {' or '.join(endings)}"
     if path.suffix.lower() not in endings:
-        what = f"this is no name of a {' or '.join(ending[1:].upper() for ending in endings)} file"
+        what = f"this is not the name of a {' or '.join(ending[1:].upper() for ending in endings)} file"
         raise ConfigError(Problem(what, name, expected=wanted))
     try:
         has_folder, is_folder = path.parent.is_dir(), path.is_dir()
         is_odd = path.exists() and not path.is_file()
     except OSError as error:  # a name that is too long
-        raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", name)) from error
+        raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", name)) from error
     if not has_folder:
         raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
     if is_odd:

@@ -113,7 +113,7 @@ def format_error(error: BaseException) -> str:
     try:
         text = str(error)
     except (Exception, SystemExit) as another:  # noqa: BLE001 - it may raise anything
-        text = f"(its text cannot be had: {type(another).__name__})"
+        text = f"(its text cannot be read: {type(another).__name__})"
     text = " ".join(f"{type(error).__name__}: {text[: 2 * MAX_ERROR]}".split()).rstrip(":")
     text = "".join(c if c.isprintable() else "?" for c in text)
     return text if len(text) <= MAX_ERROR else f"{text[:MAX_ERROR]} ..."

@@ -57,7 +57,7 @@ def check_api(module: ModuleType, owner: Owner) -> None:
         raise owner.fault(f"it does not state LABSEQ_API; {here}; {remedy}")
     came = f"it was written for LABSEQ_API {written_for!r:.100}"
     if type(written_for) is not int:
-        raise owner.fault(f"{came}, which is no whole number; {here}")
+        raise owner.fault(f"{came}, which is not a whole number; {here}")
     remedy = "update labseq, or take an older version of the plugin"
     if written_for < LABSEQ_API:
         remedy = "take a newer version of the plugin, or adapt it (the changelog says what has changed)"
@@ -245,7 +245,7 @@ class PluginHost:
             return
         info = PluginInfo(name, str(path), source=str(path))
         if not name.isidentifier():
-            reason = "its name is no Python name: letters, digits and '_' only; rename it"
+            reason = "its name is not a Python name: letters, digits and '_' only; rename it"
             self._infos[name] = replace(info, state="failed", reason=reason)
         elif not self._load(info, partial(plugin_location, path), partial(import_file, name, path)):
             forget(name)

@@ -269,7 +269,7 @@ class _Check:
             with suppress(RecordingError):  # reported where its runs are looked for
                 for name in names_in(folder):
                     if _CLAIM.fullmatch(name) and not _is_young(folder / name):
-                        self._quarantine("a claim on a run's number that was left", folder / name, folder)
+                        self._quarantine("a leftover reservation of a run's number", folder / name, folder)
         active = self.folder / ACTIVE_FOLDER
         self.check_holders(active)
         for name in names_in(active):
@@ -283,7 +283,7 @@ class _Check:
 
     def _report_missing_run_file(self, shots: Path) -> None:
         if any(name.endswith(".h5") for name in names_in(shots)):
-            remedy = "left: take it from a backup, then run this again"
+            remedy = "left as it is: restore it from a backup, then run this again"
             self._add(f"{folders.RUN_FILE} is missing", self.folder, remedy)
         else:
             what = "the run died while its folder was made; it holds no shots"
@@ -316,7 +316,7 @@ class _Check:
             ):
                 of_file.setdefault(row["file"], []).append((line, row))
             else:
-                index.remove(line, "a line of the index is no shot's")
+                index.remove(line, "a line of the index is not a shot's")
         counted = {row["shot"] for same in of_file.values() for _, row in same if row["counts"]}
         for file, same in of_file.items():
             self.n_whole += self._check_file(self.folder / file, same, index)
@@ -326,7 +326,7 @@ class _Check:
                 if row is not None:
                     # The last line of a shot counts, so another line of this shot keeps counting.
                     index.kept.insert(0 if row["shot"] in counted else len(index.kept), dumps(row).encode())
-                    remedy = "line added: the file is whole"
+                    remedy = "line added: the file is intact"
                     index.problems.append(("no line in the index", folder / name, remedy))
                     self.n_whole += 1
         self._save(index)

@@ -43,11 +43,11 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
         raise ConfigError(Problem(f"a {kind} file holds no frames", "--frames", hint="use --to archive"))
     if path.suffix.lower() != ENDINGS[kind]:
         wanted = f"a file that ends in {ENDINGS[kind]}"
-        raise ConfigError(Problem(f"this is no name of a {kind} file", str(path), expected=wanted))
+        raise ConfigError(Problem(f"this is not the name of a {kind} file", str(path), expected=wanted))
     try:
         has_folder, there = path.parent.is_dir(), [one for one in files_of(kind, path) if one.exists()]
     except OSError as error:  # for a name that is too long
-        raise ConfigError(Problem(f"this is no name of a file: {error.strerror}", str(path))) from error
+        raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", str(path))) from error
     if not has_folder:
         raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
     odd = [one for one in there if not one.is_file()]
@@ -55,7 +55,7 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
         raise ConfigError(Problem("this is not an ordinary file", str(odd[0]), hint="choose another name"))
     if there and not replace:
         hint = "choose another name, or replace it with --force"
-        raise ConfigError(Problem("this file is there already", str(there[0]), hint=hint))
+        raise ConfigError(Problem("this file already exists", str(there[0]), hint=hint))
     packages = {"parquet": ("pandas", "pyarrow"), "netcdf": ("xarray", "h5netcdf")}
     check_installed(*packages.get(kind, ()))
 

@@ -131,5 +131,5 @@ def find_run(path: Path) -> Path:
 
 def _without_run_file(folder: Path) -> str:
     if any((folder / SHOTS_FOLDER).glob("*.h5")):
-        return f"holds shots, but its {RUN_FILE} is gone; take that from a backup"
+        return f"holds shots, but its {RUN_FILE} is gone; restore that from a backup"
     return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"

@@ -31,7 +31,7 @@ def reporting_damage(run_dir: Path) -> Generator[None]:
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        reason = f"has a damaged scan: {error!r}; take it from a backup"
+        reason = f"has a damaged scan: {error!r}; restore it from a backup"
         raise RecordingError(run_dir / RUN_FILE, reason) from error
 
 

@@ -93,11 +93,11 @@ def read_run(folder: Path) -> dict[str, Any]:
     path = folder / RUN_FILE
     record = parse_object(read_file(path))
     if record is None or record.get("format") != schema.RUN_FORMAT:
-        raise RecordingError(path, "is damaged, or not labseq's; take it from a backup")
+        raise RecordingError(path, "is damaged, or not labseq's; restore it from a backup")
     check_version(path, str(record.get("format_version")), schema.RUN_FORMAT_VERSION)
     wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
     if wrong:
-        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; take it from a backup")
+        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; restore it from a backup")
     return record
 
 
@@ -111,7 +111,7 @@ def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
         target = record["target"]
         return TargetPattern(_grid(target["fill"]), _grid(target["clear"]), str(target["name"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(path, f"has a damaged target: {error!r}; take it from a backup") from error
+        raise RecordingError(path, f"has a damaged target: {error!r}; restore it from a backup") from error
 
 
 def _rows(sites: NDArray[np.bool_]) -> list[str]:

@@ -183,7 +183,7 @@ class Shot:
             RecordingError: A byte has changed since it was written.
         """
         if hashlib.sha256(read_file(self.file)).hexdigest() != self.row.get("sha256"):
-            raise RecordingError(self.file, "has changed since it was written; take it from a backup")
+            raise RecordingError(self.file, "has changed since it was written; restore it from a backup")
 
     @property
     def _content(self) -> ShotContent:

@@ -243,7 +243,7 @@ def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
 @contextlib.contextmanager
 def _opened(path: Path) -> Generator[Any]:
     if not path.is_file():
-        raise RecordingError(path, "is missing; take it from a backup, or delete its line from the index")
+        raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
     try:
         # A finished file never changes, and locks fail on network folders.
         with h5py.File(path, "r", locking=False) as file:
@@ -252,7 +252,7 @@ def _opened(path: Path) -> Generator[Any]:
             check_version(path, str(file.attrs.get("format_version")), schema.FORMAT_VERSION)
             yield cast("Any", file["entry"])
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise RecordingError(path, f"is damaged: {error}; take it from a backup") from error
+        raise RecordingError(path, f"is damaged: {error}; restore it from a backup") from error
 
 
 def _record(entry: Any) -> ShotRecord:

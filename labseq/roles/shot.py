@@ -447,7 +447,7 @@ EVENTS: Final = {
     "shots_skipped": "a policy skipped shots, with the reason",
     "scan_point": "a shot of an adaptive scan is on disk: the point so far, and the best one",
     "scan_ended": "the scanner chose no further point",
-    "warning": "something that the user should know; the run goes on",
+    "warning": "something that the user should know; the run continues",
     "safe_state": "a device was brought to its safe state, or could not be",
     "closed": "a device was closed, or could not be",
     "run_finished": "the run has ended, in whatever way; all devices are in their safe state",

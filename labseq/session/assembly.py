@@ -375,7 +375,7 @@ def _grid_note(hardware: ResolvedProfile) -> str:
     return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(hardware.document, 'grid')}"
 
 
-CLIMBED: Final = "to climb on"
+CLIMBED: Final = "to optimise"
 """The purpose of the figure, for messages."""
 
 
@@ -482,11 +482,11 @@ def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name
     """The range of an axis, if its ends are numbers that the settings model accepts unchanged."""
     low, high = ends.low.si, ends.high.si
     if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
-        what = f"'{clean(axis.address)}' is no number, or not the one that is written"
+        what = f"'{clean(axis.address)}' is not a number, or not the one that is written"
         raise ConfigError(axis.key.problem(name, what, "an address of a number or quantity"))
     is_whole = all(type(value) is int for value in resolved)
     if is_whole and ends.n_steps and (high - low) % ends.n_steps:
-        what = f"{ends.n_steps} equal steps from {low:g} to {high:g} are no whole ones"
+        what = f"{ends.n_steps} equal steps from {low:g} to {high:g} are not whole numbers"
         raise ConfigError(
             axis.key.problem(name, what, f"a number of steps that {high - low:g} is a multiple of")
         )

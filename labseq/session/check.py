@@ -437,14 +437,14 @@ def _window_warnings(
             what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
             share = f"{n_fit} of {rehearsal.n_loadings} fit"
             problems.append(
-                document.problem(loc, f"{what} ({share})", f"about {enough}, which 19 of 20 fit into")
+                document.problem(loc, f"{what} ({share})", f"about {enough}, enough for 95 % of the plans")
             )
         elif shortest < np.median(rehearsal.first_batch_s):
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
             problems.append(document.problem(loc, what, "more than the overheads of a cycle and a batch"))
     loaded = next(iter(rehearsals.values()))
     if loaded.n_filled < 0.9 * loaded.n_loadings:
-        what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings allow to fill the target"
+        what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings have enough atoms for the target"
         problems.append(document.problem(("target",), what, "a smaller target, or better loading"))
     return problems
 

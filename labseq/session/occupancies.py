@@ -137,7 +137,7 @@ def _random(text: str, seed: int | None) -> Source:
     expected = "random:ROWSxCOLS@P, for example random:20x20@0.75"
     match = _RANDOM.fullmatch(text)
     if match is None:
-        raise ConfigError(Problem("this is no occupancy", clean(text), expected=expected))
+        raise ConfigError(Problem("this is not an occupancy", clean(text), expected=expected))
     rows, cols = int(match[1]), int(match[2])
     try:
         probability = parse_quantity(match[3], "fraction")

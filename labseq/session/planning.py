@@ -175,7 +175,7 @@ def parse_target(text: str) -> tuple[str, dict[str, str]]:
         ('ring', {'radius': '4', 'origin': '[2, 3]'})
     """
     match = _TARGET.fullmatch(text)
-    wrong = Problem("this is no target", clean(f"--target {text}"), expected=_TARGET_FORMS)
+    wrong = Problem("this is not a target", clean(f"--target {text}"), expected=_TARGET_FORMS)
     if match is None:
         raise ConfigError(wrong)
     settings: dict[str, str] = {}
@@ -215,7 +215,7 @@ def _make_target(
 def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override]) -> ChosenPlugin:
     option = f"--planner {request.planner}"
     if not _NAME.fullmatch(request.planner):
-        raise ConfigError(Problem("this is no name of a planner", clean(option), expected="a name"))
+        raise ConfigError(Problem("this is not the name of a planner", clean(option), expected="a name"))
     overrides = [Override("planner.use", request.planner, option)]
     if request.degree_of_parallelism is not None:
         dop = str(request.degree_of_parallelism)

@@ -39,7 +39,7 @@ def check_figure(
         document: The sequence.
         place: Place of its name in the file.
         figure: Its name.
-        purpose: Its use: "to climb on".
+        purpose: Its use: "to optimise".
         steps: The steps of a shot, or None if some have errors.
 
     Raises:
@@ -60,7 +60,7 @@ def missing_figure(shot: int, figure: str, purpose: str, figures: Iterable[str])
     Args:
         shot: Its index.
         figure: Name of the figure.
-        purpose: Its use: "to climb on".
+        purpose: Its use: "to optimise".
         figures: Names of the figures that it has.
     """
     known = list(figures)

@@ -79,7 +79,9 @@ class ResumableRun:
             if not (isinstance(error.__cause__, OSError) and knows_no_locks(error.__cause__)):
                 raise
             holder = None
-            warnings.append(f"{folder} has no locks: another process could resume the run at the same time")
+            warnings.append(
+                f"{folder} does not support file locks: another process could resume the run at the same time"
+            )
         if holder is not None:
             raise _refused(folder, f"another process resumes it already: {holder}")
         try:
@@ -167,7 +169,7 @@ class ResumableRun:
         today = run_record(assembly, self.run.seed, options.changes(), scan_run.record(), Path.cwd())
         for what in ("n_shots", "scan", "target"):
             if found := differences(record, today, what):
-                raise _refused(folder, f"its shots would be others today: {found[0]}")
+                raise _refused(folder, f"its shots would differ today: {found[0]}")
         self.changes += tuple(changes_between(record, today))
         if self.changes and not accept:
             problems = [Problem(str(change), str(folder)) for change in self.changes]
@@ -208,7 +210,7 @@ def _check(folder: Path) -> None:
     record = read_run(folder)
     wrong = [name for name, kind in _NEEDED.items() if not isinstance(record.get(name), kind)]
     if wrong:
-        what = f"is damaged: it has no valid '{wrong[0]}'; take it from a backup"
+        what = f"is damaged: it has no valid '{wrong[0]}'; restore it from a backup"
         raise RecordingError(folder / RUN_FILE, what)
 
 

@@ -70,8 +70,8 @@ def lock_devices(
                 holder = lock.take()
             except OSError as error:
                 if knows_no_locks(error):
-                    text = f"the folder {file.parent} knows no locks: nothing keeps a run on another computer"
-                    warn(f"{text} from the same devices")
+                    text = f"the folder {file.parent} does not support file locks"
+                    warn(f"{text}: nothing keeps a run on another computer from the same devices")
                 continue
             if holder is None:
                 stack.callback(lock.release)
@@ -83,7 +83,7 @@ def lock_devices(
                 raise DeviceError(hardware.profile.name, _refusal(holder))
         else:
             if not locks:
-                warn("no lock could be had: nothing keeps another run from the same devices")
+                warn("no file could be locked: nothing keeps another run from the same devices")
 
         def describe(text: str) -> None:
             for lock in locks:

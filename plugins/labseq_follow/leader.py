@@ -216,7 +216,7 @@ class LeaderDevice(Device):
         with self._changed:
             self._check_open()
             if self._failure is not None:
-                raise DeviceError(self._name, f"it does not listen any more: {self._failure!r}")
+                raise DeviceError(self._name, f"it no longer listens: {self._failure!r}")
             taken = self._dialogue.take(self._link.now())
             if taken is None:
                 self._changed.wait(longest_s)  # the caller looks again at once

@@ -180,7 +180,7 @@ class TcpLink(Link):
         leader.settimeout(SEND_S)
         if self._leader is not None:
             _turn_away(leader)
-            return [("note", f"{who[0]}:{who[1]} connected while another leads, and was turned away")]
+            return [("note", f"{who[0]}:{who[1]} connected while another one is in control, and was refused")]
         leader.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         leader.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in KEEPALIVE:

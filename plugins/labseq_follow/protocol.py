@@ -75,7 +75,7 @@ class Dialogue:
             self._go = None
         elif self._go is not None and not self._go.answered:
             self._go.answered = "gone"
-            self.note("its shot goes on; its result will not be sent")
+            self.note("its shot continues; its result will not be sent")
 
     def receive_line(self, line: str, now_s: float) -> list[str]:
         """Handle a line that came."""

@@ -96,7 +96,7 @@ def find_source(path: Path, images: Literal["all", "first"] = "all") -> Source:
         raise BadFramesError(path, f"cannot be read: {reason}", hint="check path and rights") from error
     if images == "first" and source.about["source"] != "run":
         hint = "leave `images` out, or give a run's folder"
-        raise BadFramesError(path, "is no run, so that `images: first` has no meaning", hint=hint)
+        raise BadFramesError(path, "is not a run, so that `images: first` has no meaning", hint=hint)
     return source
 
 
@@ -138,7 +138,9 @@ def _matching(path: Path) -> list[Path]:
     try:
         files = [file for file in root.glob(pattern) if file.is_file()]
     except (ValueError, NotImplementedError) as error:
-        raise BadFramesError(path, f"is no pattern: {str(error).lower()}", "one like frames/*.png") from error
+        raise BadFramesError(
+            path, f"is not a pattern: {str(error).lower()}", "one like frames/*.png"
+        ) from error
     if not files:
         raise BadFramesError(path, f"no file in {root} matches", hint="check the pattern")
     return files
@@ -265,7 +267,7 @@ def _png_pictures(files: Sequence[Path]) -> Generator[Picture]:
             with pillow.open(file, formats=["PNG"]) as opened:
                 pixels = np.asarray(opened)
         except Exception as error:  # Pillow raises SyntaxError, OSError, ValueError, zlib.error ...
-            raise BadFramesError(file, f"is damaged: {error}", hint="take it from a backup") from error
+            raise BadFramesError(file, f"is damaged: {error}", hint="restore it from a backup") from error
         yield Picture(pixels.astype(np.uint16), str(file))  # older versions of Pillow give int32
 
 
@@ -274,7 +276,7 @@ def _png_shape(file: Path) -> tuple[int, int]:
     with file.open("rb") as opened:
         header = opened.read(PNG_HEADER_BYTES)
     if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
-        raise BadFramesError(file, "is not a PNG", hint="take it from a backup, or leave it out")
+        raise BadFramesError(file, "is not a PNG", hint="restore it from a backup, or leave it out")
     width, height, depth, colour = struct.unpack(">IIBB", header[16:])
     if (depth, colour) != (16, 0):
         text = f"the picture is {depth} bit {PNG_COLOURS.get(colour, 'of an unknown kind')}"
@@ -327,7 +329,7 @@ def _opened_tiff(tifffile: Any, file: Path) -> Generator[Any]:
         raise
     except Exception as error:  # damaged data make it raise ValueError, zlib.error, struct.error ...
         raise BadFramesError(
-            file, f"cannot be read as a TIFF: {error}", hint="take it from a backup"
+            file, f"cannot be read as a TIFF: {error}", hint="restore it from a backup"
         ) from error
 
 
@@ -350,7 +352,7 @@ def _count_pages(file: Path, stack: Any) -> int:
         _LOG.removeHandler(handler)
     if messages:
         text = f"is cut off or damaged after page {n_pages - 1} ({messages[0]})"
-        raise BadFramesError(file, text, hint="take it from a backup")
+        raise BadFramesError(file, text, hint="restore it from a backup")
     if n_pages == 1 and stack.series[0].size > stack.pages[0].size:
         shape = format_shape(stack.series[0].shape)
         text = f"holds {shape} counts behind a single page, as large ImageJ stacks do"

@@ -60,7 +60,7 @@ class Template:
         try:
             found = list(string.Formatter().parse(text))
         except ValueError as error:
-            problem = f"'{text}' is no template: {error}"
+            problem = f"'{text}' is not a template: {error}"
             raise ValueError(f"{problem}; expected {{name}} or {{name:format}}; {{{{ for a brace") from None
         for literal, name, spec, conversion in found:
             if name is None:
@@ -146,7 +146,7 @@ def _written(value: Sent, piece: Piece) -> str:
         return format(value, spec)
     except ValueError as error:
         kind = {float: "a float", int: "a whole number", str: "text"}[type(value)]
-        problem = f"'{{{piece.name}:{piece.spec}}}' is no format of {kind}: {error}"
+        problem = f"'{{{piece.name}:{piece.spec}}}' is not a format of {kind}: {error}"
         raise ValueError(f"{problem}; expected one such as .3f or 03d") from None
 
 
@@ -191,7 +191,7 @@ def compiled(pattern: str) -> re.Pattern[str]:
     try:
         return re.compile(pattern, re.DOTALL)
     except re.error as error:
-        text = f"'{pattern}' is no regular expression: {error}"
+        text = f"'{pattern}' is not a regular expression: {error}"
         raise ValueError(f"{text}; expected one; put a \\ before a special character") from None
 
 

@@ -319,7 +319,9 @@ class SerialSettings(Settings):
         if is_url and not (scheme in _SCHEMES and is_network_port(self.port or "")):
             known = " or ".join(f"{one}://host:port" for one in _SCHEMES)
             raise setting_error(
-                f"'{clean(self.port or '')}' is no port", f"{known}, or a port of this computer", at=("port",)
+                f"'{clean(self.port or '')}' is not a port",
+                f"{known}, or a port of this computer",
+                at=("port",),
             )
         return self
 

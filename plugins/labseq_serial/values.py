@@ -75,7 +75,7 @@ class Unit:
         """
         number = self._number(given)
         if not math.isfinite(number):
-            raise ValueError(f"{number} is no number; expected a finite one")
+            raise ValueError(f"{number} is not a number; expected a finite one")
         return number
 
     def _number(self, given: object) -> float:

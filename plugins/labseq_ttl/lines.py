@@ -333,7 +333,7 @@ class TtlLines(Lines):
             self._was_reset(*numbers)
         elif what == "off":
             self._forget()
-            text = "the box was told to turn all lines off, but not by this driver"
+            text = "the box received a command to turn all lines off, but not from this driver"
             raise DeviceError(self._name, f"{text}; does another program use it?")
         elif what == "alone":
             self._forget()

@@ -142,7 +142,7 @@ def test_each_model_finds_its_parameters_from_its_own_starting_values(model: str
         ),
         ({"model": "release_recapture", "settings": None}, "the fit needs depth and waist and wavelength"),
         ({"model": "linear", "given": {"slop": "1"}}, "the fit has no parameter 'slop'; expected one of"),
-        ({"model": "linear", "given": {"slope": "fast"}}, "slope: 'fast' is no number with a unit"),
+        ({"model": "linear", "given": {"slope": "fast"}}, "slope: 'fast' is not a number with a unit"),
     ],
 )
 def test_a_fit_that_cannot_be_made_is_refused(arguments: dict[str, object], printed: str) -> None:

@@ -30,7 +30,7 @@ def test_a_hidden_offset_is_found_and_corrected(tmp_path: Path, make_lab: Any) -
     assert first.stored.picture is not None
     again = lab.calibrate("overlay", seed=2, shots=N_POINTS)
     assert again.stored.entry.values["offset_m"] == pytest.approx(HIDDEN_M, abs=100e-9)
-    assert "beyond the correction of the overlay in use" in again.summary_lines[0]
+    assert "in addition to the correction in use" in again.summary_lines[0]
     lab.store.use_none("overlay")  # the correction that was in use during the run counts
     assert lab.calibrate("overlay", source=again.run.path).stored.entry.id == again.stored.entry.id
 

@@ -175,7 +175,7 @@ def test_a_calibration_is_put_to_use_and_none(store: Store, capsys: pytest.Captu
     [
         (
             "overly=off",
-            "'overly' is no kind of calibration; expected one of sites, .*; did you mean 'overlay'",
+            "'overly' is not a kind of calibration; expected one of sites, .*; did you mean 'overlay'",
         ),
         ("overlay=on", "overlay is 'on'; expected 'off', or just an id"),
     ],

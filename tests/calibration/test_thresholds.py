@@ -119,7 +119,8 @@ def test_sites_with_one_peak_are_listed_and_get_the_others_threshold() -> None:
 def test_one_peak_on_all_sites_is_an_error(loading: float) -> None:
     signals = Emccd(np.random.default_rng(6)).draw(200, loading)
     with pytest.raises(
-        DeviceError, match=r"detector: .* of 144 sites show one peak, not two; check the loading"
+        DeviceError,
+        match=r"of 144 sites show one peak in the histogram of the counts, not two; check the loading",
     ):
         fitted(signals)
 

@@ -51,7 +51,7 @@ def test_what_is_left_makes_the_exit_code(run_dir: Path, call: Any) -> None:
     (run_dir / "run.json").write_bytes(b"")
     code, out, _ = call("doctor")
     assert code == 1
-    assert "take it from a backup" in out
+    assert "restore it from a backup" in out
     assert out.endswith("1 defect found: 0 repaired, 1 left\n")
 
 

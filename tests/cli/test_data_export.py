@@ -32,7 +32,7 @@ def test_an_existing_file_is_replaced_by_force_only(run_dir: Path, call: Any) ->
     Path("a.csv").write_text("old")
     code, _, err = call("export", str(run_dir), "-o", "a.csv")
     assert code == 2
-    assert "a.csv: this file is there already" in err
+    assert "a.csv: this file already exists" in err
     assert Path("a.csv").read_text() == "old"
     assert call("export", str(run_dir), "-o", "a.csv", "--force")[0] == 0
     assert Path("a.csv").read_text() != "old"

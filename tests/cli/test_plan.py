@@ -106,7 +106,7 @@ def test_what_falls_short_is_reported() -> None:
     n_atoms = int(moves.occupancy.sum())
     assert warnings(moves, short) == [
         "--dop 30: planned with 20, the maximum that the planner and the machine allow",
-        f"{n_atoms} atoms for 16 target sites, {16 - n_atoms} too few; the plan fills {n_atoms}",
+        f"{n_atoms} atoms for 16 target sites, {16 - n_atoms} short; the plan fills {n_atoms}",
     ]
     assert warnings(plan_moves(REQUEST), REQUEST) == []
 

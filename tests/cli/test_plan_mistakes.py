@@ -26,7 +26,7 @@ BAD = [
         ["letter.txt", *COMPACT],
         "letter.txt:2:5: 'o' is no site; expected 0 or '.' for an empty site, 1 or '#'",
     ),
-    (["random:20x@0.75", *COMPACT], "random:20x@0.75: this is no occupancy; expected random:ROWSxCOLS@P"),
+    (["random:20x@0.75", *COMPACT], "random:20x@0.75: this is not an occupancy; expected random:ROWSxCOLS@P"),
     (["text.h5#1", *COMPACT], "text.h5: "),
     ([RANDOM], "--target is missing; expected a pattern such as kagome:15x15"),
     ([RANDOM, "--target", "compact:21x21"], "the limit is the grid of 20 rows x 20 columns"),
@@ -36,7 +36,7 @@ BAD = [
     ([RANDOM, *COMPACT, "--dop", "0"], "--dop 0: degree_of_parallelism is 0; expected at least 1"),
     ([RANDOM, *COMPACT, "--origin", "9,9"], "row 9, column 9; the limit is rows 0 to 5 and columns 0 to 5"),
     ([RANDOM, *COMPACT, "--profile", "virtul"], "did you mean 'virtual'?"),
-    ([RANDOM, *COMPACT, "--png", "a.jpg"], "a.jpg: this is no name of a PNG file"),
+    ([RANDOM, *COMPACT, "--png", "a.jpg"], "a.jpg: this is not the name of a PNG file"),
     ([RANDOM, *COMPACT, "--json", "gone/a.json"], "gone/a.json: it cannot be written"),
 ]
 

@@ -97,14 +97,14 @@ def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, cal
 
 BAD = [
     (["gone.json"], "gone.json: there is no such file; did you mean 'one.json'?"),
-    (["one.json"], "one.json: this is no plan; expected what 'labseq plan --json' writes"),
-    (["half.json"], "half.json:1:13: this is no JSON: expecting value"),
+    (["one.json"], "one.json: this is not a plan; expected what 'labseq plan --json' writes"),
+    (["half.json"], "half.json:1:13: this is not JSON: expecting value"),
     (["random:6x6@0.7"], "--target is missing"),
     ([*WORDS, "--batches", "9-99"], "there are no such batches; expected a number from 0 to "),
     ([*WORDS, "--batches", "first"], "--batches first: these are no batches"),
     ([*WORDS, "--sample-rate", "1"], "cannot be sampled at 1 Hz; expected more than 211.2 MHz"),
     ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),
-    ([*WORDS, "--npz", "a.npy"], "a.npy: this is no name of an NPZ file"),
+    ([*WORDS, "--npz", "a.npy"], "a.npy: this is not the name of an NPZ file"),
     (["one.json", "--json", "one.json"], "one.json: this file is named twice, and one would replace the"),
     ([*WORDS, "--json", "folder.json", "--npz", "a.npz"], "folder.json: it cannot be written: Is a"),
     (["random:3x3@1", "--seed", "1", "--target", "compact:3x3"], "there is nothing to play"),

@@ -96,7 +96,7 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("= sni(1)", "7: there is no function 'sni'; expected one of"),
         ("= __import__('os')", "18: ''' is not allowed here"),
         ("= variables.n.real", "has no 'real' in it"),
-        ("= 1 s * 1 s", "5: the result is in s^2, which is no unit of any setting"),
+        ("= 1 s * 1 s", "5: the result is in s^2, which is not a unit of any setting"),
         ("= (1 m) ** 13", "13: powers of units go up to 12"),
         ("= it", "7: this is a circular reference: it -> it"),
         (f"= {'-' * 300}1", f"the expression has more than {MAX_PARTS} parts"),
@@ -229,7 +229,7 @@ def test_expressions_come_out_as_the_reference_works_them_out(tree: Worked) -> N
     if len(text) + 2 > MAX_LENGTH or not math.isfinite(expected):
         return
     if wanted not in POWERS.values():
-        assert "no unit of any setting" in refused(f"'= {text}'") or "powers of units" in refused(
+        assert "not a unit of any setting" in refused(f"'= {text}'") or "powers of units" in refused(
             f"'= {text}'"
         )
         return

@@ -47,10 +47,10 @@ def test_a_plan_is_read_as_it_was_written() -> None:
 
 
 BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
-    (lambda v: v.pop("batches"), "plan.json: this is no plan; expected what 'labseq plan --json' writes"),
+    (lambda v: v.pop("batches"), "plan.json: this is not a plan; expected what 'labseq plan --json' writes"),
     (lambda v: v.pop("grid"), "plan.json: 'grid' is missing (the sites that it is for)"),
-    (lambda v: v.update(batches=7), "plan.json: 'batches' is no list"),
-    (lambda v: v["batches"].append(7), "plan.json, batch 2: this is no batch"),
+    (lambda v: v.update(batches=7), "plan.json: 'batches' is not a list"),
+    (lambda v: v["batches"].append(7), "plan.json, batch 2: this is not a batch"),
     (lambda v: v["batches"][1]["to"].append([0, 0]), "batch 1: 'from' has 1 sites, 'to' has 2"),
     (lambda v: v["batches"][0].update(to=[[0, 1.5]]), "batch 0: to.0.1 is 1.5; expected a whole number"),
     (lambda v: v["batches"][0].update(to=[[0, 99999]]), "batch 0: to.0.1 is 99999; expected at most 2000"),
@@ -59,7 +59,7 @@ BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v["target"].update(fill=[[0, 1], [0]]), "'fill' is not of the grid's shape; expected 2 rows"),
     (lambda v: v["target"].update(clear=v["target"]["fill"]), "a site cannot be in both fill and clear"),
     (lambda v: v["occupancy"][0].__setitem__(0, 2), "occupancy.0.0 is 2; expected at most 1"),
-    (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is no plan: it contains NaN"),
+    (lambda v: v["grid"].update(spacing_m=float("nan")), "plan.json: this is not a plan: it contains NaN"),
     (lambda v: v["grid"].update(spacing_m=4.49), "spacing_m is 4.49; expected at most 0.001"),
     (lambda v: v.update(planner="\x1b[31mred"), "name is '\\x1b[31mred', with '\\x1b' in it"),
     (lambda v: v.update(degree_of_parallelism=0), "degree_of_parallelism is 0; expected at least 1"),
@@ -78,11 +78,11 @@ def test_a_wrong_plan_is_refused_with_its_batch(
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"", "plan.json:1:1: this is no JSON: expecting value"),
-        (b'{\n"batches": [1,\n', "plan.json:3:1: this is no JSON: expecting value"),
-        (b'{"batches": [], "batches": []}', "this is no plan: 'batches' occurs in it twice"),
+        (b"", "plan.json:1:1: this is not JSON: expecting value"),
+        (b'{\n"batches": [1,\n', "plan.json:3:1: this is not JSON: expecting value"),
+        (b'{"batches": [], "batches": []}', "this is not a plan: 'batches' occurs in it twice"),
         (b'{"batches": ' + b"9" * 5000 + b"}", "a number in it has too many digits"),
-        (b"[" * 100_000, "this is no plan: it is nested too deeply; expected what 'labseq plan --json'"),
+        (b"[" * 100_000, "this is not a plan: it is nested too deeply; expected what 'labseq plan --json'"),
         (b"\xff", "byte 0xFF at offset 0 is not UTF-8"),
         (b" " * (MAX_BYTES + 1), "it is larger than 4 MiB"),
         (json.dumps(document()).replace("4.49e-06", "1e999").encode(), "expected a finite number"),

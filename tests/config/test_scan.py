@@ -131,7 +131,7 @@ BAD = [
     ("scan: {}", "1:7: scan is empty"),
     ("scan: [3]", "1:8: a group of the scan is 3"),
     ("scan: {shot.sort.window: 5 ms}", "1:26: the scan of 'shot.sort.window' is '5 ms'; expected a list"),
-    ("scan: {shot.sort.window: {linspce: [1, 2, 3]}}", "1:27: 'linspce' is no way to give values"),
+    ("scan: {shot.sort.window: {linspce: [1, 2, 3]}}", "1:27: 'linspce' is not a way to give values"),
     ("scan: {shot.sort.window: {linspace: [1, 2]}}", "1:37: linspace is"),
     ("scan: {shot.sort.window: {linspace: [1 ms, 2 ms, 1]}}", "1:50: the number of values is 1"),
     (

@@ -239,7 +239,11 @@ def test_python_and_numpy_values() -> None:
         (Model, {"rows": 1, "rwos": 3}, "'rwos' is not a setting of it; expected one of rows, fraction, "),
         (Model, {"rows": 1, "pair": (1, None)}, "pair.1 is empty; expected a whole number"),
         (Model, {"rows": 1, "fraction": float("nan")}, "fraction is nan; expected a finite number"),
-        (Model, {"rows": object()}, "a value of type object is no setting; expected a number, text, list or"),
+        (
+            Model,
+            {"rows": object()},
+            "a value of type object is not a setting; expected a number, text, list or",
+        ),
         (Model, {"rows": 1, "window": 1e300}, "window is 1e+300; expected at most 720 h, which is 30 days"),
         (None, {"a": 1}, "it takes no settings, but 'a' is given; remove it"),
     ],

@@ -76,7 +76,7 @@ def test_the_planners_of_the_tutorial(
     pretend_installed(Path("labseq-helix"))
     run(rest)
     warned = capsys.readouterr().err  # `mine` leaves much unfilled, as the page says
-    assert re.fullmatch(r"warning: .* loadings allow to fill the target;.*\n.*\n.*\n", warned)
+    assert re.fullmatch(r"warning: .* loadings have enough atoms for the target;.*\n.*\n.*\n", warned)
     some = "returns_a_plan or fills_the_target or refuses_wrong_input or order"  # the others take long
     code, out = run_pytest(capsys, "-k", some, "plugins/spiral", "test_mine.py", "labseq-helix/tests")
     assert code == 0, out

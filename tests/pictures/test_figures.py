@@ -36,10 +36,10 @@ from labseq.testing.strategies import grids
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("figure.gif", r"no name of a PNG or SVG or PDF file.*ends in \.png or \.svg or \.pdf"),
+        ("figure.gif", r"not the name of a PNG or SVG or PDF file.*ends in \.png or \.svg or \.pdf"),
         ("nowhere/figure.png", "no such folder"),
         ("a_folder.png", "this is a folder"),
-        ("f" * 300 + ".png", "no name of a file"),
+        ("f" * 300 + ".png", "not the name of a file"),
     ],
 )
 def test_a_file_that_cannot_be_a_picture_is_refused(name: str, message: str, tmp_path: Path) -> None:

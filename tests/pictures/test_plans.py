@@ -242,7 +242,7 @@ def test_arrays_of_all_shapes_can_be_drawn(save: Save, shape: tuple[int, int], g
 
 
 def test_only_png_files_and_arrays_of_a_visible_size_can_be_drawn(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="this is no name of a PNG file"):
+    with pytest.raises(ConfigError, match="this is not the name of a PNG file"):
         check_picture(tmp_path / "plan.svg", (5, 5))
     with pytest.raises(ConfigError, match=f"5 x {MAX_SITES + 1} sites are too many for a picture"):
         check_picture(tmp_path / "plan.png", (5, MAX_SITES + 1))

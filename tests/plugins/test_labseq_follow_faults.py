@@ -72,7 +72,7 @@ def test_a_second_leader_is_turned_away_with_a_line_that_says_so() -> None:
         assert second.hear() == ""
         second.leave()
         assert peer.ask("state?") == "state idle"
-        assert "was turned away" in log(device)
+        assert "was refused" in log(device)
 
 
 def test_after_a_disconnect_the_shot_goes_on_and_its_result_is_sent_to_no_other() -> None:
@@ -127,7 +127,7 @@ def test_one_that_reads_nothing_counts_as_gone() -> None:
 def test_a_fault_of_its_own_is_reported_to_the_step_that_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     with listening() as device:
         monkeypatch.setattr(device._link, "poll", lambda: 1 / 0)
-        with pytest.raises(DeviceError, match=r"it does not listen any more: ZeroDivisionError"):
+        with pytest.raises(DeviceError, match=r"it no longer listens: ZeroDivisionError"):
             device.wait_for("go", 20.0)
 
 

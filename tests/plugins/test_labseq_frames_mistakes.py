@@ -82,7 +82,7 @@ def test_a_path_that_does_not_exist_is_named_with_one_like_it(tmp_path: Path) ->
     assert refusal(tmp_path / "a" / "b").endswith("check `path`; it is relative to the profile")
     assert f"no file in {tmp_path} matches" in refusal(tmp_path / "*.png")
     assert "no file in" in refusal(tmp_path / "nowhere" / "*.png")
-    assert "is no pattern" in refusal(tmp_path / "**x" / "*.png") or sys.version_info >= (3, 13)
+    assert "is not a pattern" in refusal(tmp_path / "**x" / "*.png") or sys.version_info >= (3, 13)
 
 
 def test_folders_and_files_that_hold_no_frames_are_refused(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_folders_and_files_that_hold_no_frames_are_refused(tmp_path: Path) -> No
     assert "x.sif: is neither a TIFF nor a PNG" in refusal(folder / "x.sif")
     (folder / "x.tif").write_text("version https://git-lfs.github.com/spec/v1")
     assert "x.tif: cannot be read as a TIFF: not a TIFF file" in refusal(folder / "x.tif")
-    text = "x.tif: is no run, so that `images: first` has no meaning"
+    text = "x.tif: is not a run, so that `images: first` has no meaning"
     tifffile.imwrite(folder / "x.tif", pixels())
     assert text in refusal(folder / "x.tif", images="first")
     Image.fromarray(pixels()).save(folder / "x.png")
@@ -133,7 +133,7 @@ def test_a_damaged_png_is_named(tmp_path: Path) -> None:
     assert "x1.png: is damaged: " in failure(tmp_path, 1)
     assert "x1.png: is damaged: " in failure(tmp_path, 1, at_end="repeat")
     (tmp_path / "x1.png").write_bytes(b"\x89PNG")
-    assert "x1.png: is not a PNG; take it from a backup" in refusal(tmp_path)
+    assert "x1.png: is not a PNG; restore it from a backup" in refusal(tmp_path)
     (tmp_path / "x1.png").write_bytes(whole[:100])
     assert "x1.png: is damaged: " in refusal(tmp_path / "x1.png")
 
@@ -205,7 +205,7 @@ def test_a_shot_that_is_damaged_or_gone_is_named(tmp_path: Path) -> None:
     second.write_bytes(whole[: len(whole) // 2])
     assert f"{second}: is damaged: " in failure(run, 2)
     second.unlink()
-    assert f"{second}: is missing; take it from a backup" in failure(run, 2)
+    assert f"{second}: is missing; restore it from a backup" in failure(run, 2)
     (run / "run.json").write_text("{}")
     assert f"{run / 'run.json'}: is damaged" in refusal(run)
 

@@ -54,8 +54,12 @@ a:
         ("port: COM3", "usb: {}", "3:8: this fits every adapter; expected vid, pid or serial"),
         ("port: COM3", "timeout: 1 s", "3:3: it has no port; expected 'port' or 'usb'"),
         ("COM3", "COM3\n  usb: {serial: A5}", "4:3: it has both 'port' and 'usb'; expected one of them"),
-        ("COM3", "spy://COM3", "3:9: 'spy://COM3' is no port; expected socket://host:port or rfc2217://host"),
-        ("COM3", "socket://localhost:99999", "3:9: 'socket://localhost:99999' is no port; expected"),
+        (
+            "COM3",
+            "spy://COM3",
+            "3:9: 'spy://COM3' is not a port; expected socket://host:port or rfc2217://host",
+        ),
+        ("COM3", "socket://localhost:99999", "3:9: 'socket://localhost:99999' is not a port; expected"),
         ('"\\r"', "'\\r'", "4:20: '\\r' holds a backslash; expected control characters"),
         ("OUT 0,", "ÖUT 0,", "8:17: 'ÖUT 0' is not ascii; expected another 'encoding', or other characters"),
         ("OUT 0,", '"OUT 0\\r",', "8:17: 'OUT 0\\r' holds what ends a command; expected it without"),
@@ -66,9 +70,9 @@ a:
             "10:13: '{F}' is not an argument; expected one of f, n, wave; did you mean",
         ),
         ("{f:.1f},", "", "12:9: the argument 'f' has no place in 'FREQ {n:02d},{wave}'; expected a placeho"),
-        ("{f:.1f}", "{f:.1q}", "10:13: '{f:.1q}' is no format of a float"),
+        ("{f:.1f}", "{f:.1q}", "10:13: '{f:.1q}' is not a format of a float"),
         ("{n:02d}", "{n:.1f}", "10:13: '0.0' cannot be read back; expected a format of plain numbers"),
-        ("{f:.1f}", "{f", "10:13: 'FREQ {f,{n:02d},{wave}' is no template"),
+        ("{f:.1f}", "{f", "10:13: 'FREQ {f,{n:02d},{wave}' is not a template"),
         ("{f:.1f}", "{f.real}", "10:13: the placeholder '{f.real}' is not the name"),
         (",{n:02d},{wave}", "{n}{wave}", "10:13: the arguments cannot be separated in 'FREQ 200.015SQU'"),
         (
@@ -89,7 +93,7 @@ a:
         ("choices: [SIN, SQU]", "words: [a, b]", "14:28: 'words' does not go with type text; expected type"),
         ("        n:", "        name:", "an argument is called 'name'; expected a word of letters"),
         # replies and effects
-        ("reply: OK", "reply: '(OK'", "8:31: '(OK' is no regular expression: missing ), unterminated"),
+        ("reply: OK", "reply: '(OK'", "8:31: '(OK' is not a regular expression: missing ), unterminated"),
         (
             "reply: OK, ",
             "",

@@ -135,7 +135,7 @@ def test_a_second_user_is_reported_that_the_port_is_taken(
     ("port", "text"),
     [
         ({"port": "/dev/ttyNOSUCH7"}, "cannot open /dev/ttyNOSUCH7: there is no such port; expected"),
-        ({"port": "/dev/null"}, "cannot open /dev/null: it is no serial port; expected"),
+        ({"port": "/dev/null"}, "cannot open /dev/null: it is not a serial port; expected"),
         (
             {"port": None, "usb": {"vid": 0x0403, "serial": "NOSUCH"}},
             "no USB adapter has vid 0x0403, serial_number",

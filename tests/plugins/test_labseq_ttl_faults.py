@@ -239,7 +239,7 @@ def test_garbage_does_no_harm() -> None:
 
 @pytest.mark.parametrize(
     ("says", "text"),
-    [("!off 0000", "told to turn all lines off"), ("!alone 0000", "heard nothing for 0 s")],
+    [("!off 0000", "a command to turn all lines off"), ("!alone 0000", "heard nothing for 0 s")],
 )
 def test_a_box_that_turned_all_lines_off_by_itself_is_an_error(says: str, text: str) -> None:
     with rig() as lab:
@@ -318,7 +318,7 @@ def test_a_real_port_does_the_same_as_a_simulated_box(plugged: SimavrBox) -> Non
 def test_a_port_that_is_not_there_is_named() -> None:
     with pytest.raises(DeviceError, match="cannot open /dev/ttyNONE: there is no such port"):
         make_rig(port="/dev/ttyNONE").lines.open()
-    with pytest.raises(DeviceError, match="cannot open socket://here: it is no network port; expected"):
+    with pytest.raises(DeviceError, match="cannot open socket://here: it is not a network port; expected"):
         make_rig(port="socket://here").lines.open()
 
 

@@ -94,7 +94,7 @@ def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable
         ),
         (lost_file, "the shot's file is missing", "shot_000001.h5"),
         (damaged_line, "line 2 is damaged", "index.jsonl"),
-        (line_of_no_shot, "a line of the index is no shot's", "index.jsonl"),
+        (line_of_no_shot, "a line of the index is not a shot's", "index.jsonl"),
         (damaged_state, "STATE is damaged", "STATE"),
         (shot_of_another_run, "a shot of another run, 2020-01-01/0001_other", "shot_000001.h5"),
         (foreign_skip, "torn last line", "skipped.jsonl"),
@@ -214,7 +214,7 @@ def test_shots_without_a_run_file_are_left(run_dir: Path) -> None:
     os.utime(run_dir, (LONG_AGO, LONG_AGO))
     (found,) = examine(run_dir).findings
     assert (found.what, found.left) == ("run.json is missing", True)
-    assert "take it from a backup" in found.done
+    assert "restore it from a backup" in found.done
     assert len(list((run_dir / "shots").iterdir())) == N_SHOTS + 1
 
 

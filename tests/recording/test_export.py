@@ -196,12 +196,17 @@ def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> No
     ("kind", "name", "options", "message"),
     [
         ("xls", "a.xls", {}, "--to: a run cannot be exported as 'xls'; expected .*archive"),
-        ("csv", "a.txt", {}, r"a\.txt: this is no name of a csv file; expected a file that ends in \.csv"),
+        (
+            "csv",
+            "a.txt",
+            {},
+            r"a\.txt: this is not the name of a csv file; expected a file that ends in \.csv",
+        ),
         (
             "csv",
             "there.csv",
             {},
-            "this file is there already; choose another name, or replace it with --force",
+            "this file already exists; choose another name, or replace it with --force",
         ),
         ("netcdf", "a.nc", {"frames": True}, "--frames: a netcdf file holds no frames; use --to archive"),
         ("archive", "folder.h5", {"replace": True}, "this is not an ordinary file"),

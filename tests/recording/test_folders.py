@@ -108,6 +108,6 @@ def test_a_run_that_lost_its_run_file_is_not_to_be_deleted(tmp_path: Path) -> No
     (run / "run.json").unlink()
     for path in (run, run / "shots" / "shot_000000.h5"):
         with pytest.raises(
-            RecordingError, match=r"holds shots, but its run\.json is gone; take that from a backup"
+            RecordingError, match=r"holds shots, but its run\.json is gone; restore that from a backup"
         ):
             find_run(path)

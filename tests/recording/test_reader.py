@@ -68,7 +68,7 @@ def test_the_index_is_enough_to_open_a_run(run_dir: Path) -> None:
     run = open_run(run_dir)
     assert [shot.index for shot in run.shots] == list(range(1_000))
     assert run.defect_free == 1.0
-    with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing; take it from a backup"):
+    with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing; restore it from a backup"):
         _ = run.shots[17].plans
     with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing"):
         _ = run.shots[17].frames
@@ -149,7 +149,9 @@ def test_a_run_without_a_state_has_failed(run_dir: Path, content: bytes | None) 
 @pytest.mark.parametrize("content", [b"[]", b"\xff", b'{"format": "other"}'])
 def test_a_damaged_run_file_is_explained(run_dir: Path, content: bytes) -> None:
     (run_dir / "run.json").write_bytes(content)
-    with pytest.raises(RecordingError, match=r"run.json: is damaged, or not labseq's; take it from a backup"):
+    with pytest.raises(
+        RecordingError, match=r"run.json: is damaged, or not labseq's; restore it from a backup"
+    ):
         open_run(run_dir)
 
 
@@ -204,7 +206,7 @@ def test_a_damaged_shot_file_is_explained(run_dir: Path, part: float) -> None:
     shot = open_run(run_dir).shots[0]
     data = shot.file.read_bytes()
     shot.file.write_bytes(data[: int(part * len(data))])
-    with pytest.raises(RecordingError, match=r"shot_000000.h5: is damaged: .*; take it from a backup"):
+    with pytest.raises(RecordingError, match=r"shot_000000.h5: is damaged: .*; restore it from a backup"):
         _ = shot.occupancies
     with pytest.raises(RecordingError, match="is damaged"):
         _ = shot.frames
@@ -224,7 +226,7 @@ def test_importing_the_package_is_light() -> None:
 
 @pytest.mark.parametrize("path", [None, b"data"])
 def test_what_is_no_path_is_no_run(path: Any) -> None:
-    with pytest.raises(RecordingError, match="is no path; give a run's folder or a file in it"):
+    with pytest.raises(RecordingError, match="is not a path; give a run's folder or a file in it"):
         open_run(path)
 
 

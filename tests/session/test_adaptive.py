@@ -135,7 +135,7 @@ def test_a_missing_figure_is_one_warning_and_no_score(tmp_path: Path) -> None:
     over = OVER.replace("filling_fraction", "reading.laser.power_w")
     run(tmp_path, f"use: scripted, dops: [3, 5], {over}, points: 2", observer=seen)
     (warning,) = [values["text"] for name, values in seen.events if name == "warning"]
-    assert warning.startswith("shot 0 has no 'reading.laser.power_w' to climb on")
+    assert warning.startswith("shot 0 has no 'reading.laser.power_w' to optimise")
     points = [values for name, values in seen.events if name == "scan_point"]
     assert [(values["value"], values["best"]) for values in points] == [(None, None)] * 2
 
@@ -172,7 +172,7 @@ BOTH = "from: 1, to: 9"
     [
         ("use: climb", "1:7: 'over' is missing"),
         (f"use: clim, {OVER}, points: 3", "1:13: unknown scanner 'clim'; expected one of"),
-        (f"use: climb, {OVER}", "1:7: 'points' is missing from 'scan' (the most points)"),
+        (f"use: climb, {OVER}", "1:7: 'points' is missing from 'scan' (the maximum number of points)"),
         (f"use: climb, {OVER}, points: 3, stop: 0.1", "'stop' is not a setting of scanner 'climb'"),
         (f"use: climb, over: {{{DOP}: {{from: 1}}}}, maximise: success, points: 3", "'to' is missing"),
         (f"use: climb, over: {{{DOP}: [1, 9]}}, maximise: success, points: 3", f"{DOP} is a list"),
@@ -191,16 +191,19 @@ BOTH = "from: 1, to: 9"
         ),
         (
             f"use: climb, over: {{{DOP}: {{{BOTH}, steps: 3}}}}, maximise: success, points: 3",
-            "3 equal steps from 1 to 9 are no whole ones; expected a number of steps that 8 is a multiple of",
+            "3 equal steps from 1 to 9 are not whole numbers; expected a number of steps that 8 is a",
         ),
         (
             f"use: climb, over: {{grid.rows: {{{BOTH}}}}}, maximise: success, points: 3",
             "there is no 'grid' in",
         ),
-        (f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, points: 3", "the scan has no aim"),
+        (
+            f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, points: 3",
+            "the scan has neither 'maximise' nor 'minimise'",
+        ),
         (
             f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: filling, points: 3",
-            "there is no figure 'filling' to climb on; expected",
+            "there is no figure 'filling' to optimise; expected",
         ),
         (f"use: scripted, then: refuse, {OVER}, points: 3", "it does not want to"),
     ],

@@ -55,7 +55,7 @@ def test_a_run_takes_as_long_as_the_check_predicts(tmp_path: Path):
             "shot.2.rearrange={cycles: 2, window: [60 ms, 10 ms]}",
             "a window of 10 ms is over before the first",
         ),
-        ("profile.simulation.loading=0.5", "loadings allow to fill the target"),
+        ("profile.simulation.loading=0.5", "loadings have enough atoms for the target"),
         (
             "shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 3}}]",
             "no image follows the last rearrangement",

@@ -125,5 +125,7 @@ def test_a_folder_without_locks_is_a_warning(monkeypatch: pytest.MonkeyPatch) ->
     assert run(seen).status == "complete"
     texts = [values["text"] for values in seen.of("warning")]
     folder = lock_files(marker_roots(Path("data")), "x")[0].parent
-    assert texts[0].startswith(f"the folder {folder} knows no locks: nothing keeps a run on another")
-    assert texts[-1] == "no lock could be had: nothing keeps another run from the same devices"
+    assert texts[0].startswith(
+        f"the folder {folder} does not support file locks: nothing keeps a run on another"
+    )
+    assert texts[-1] == "no file could be locked: nothing keeps another run from the same devices"

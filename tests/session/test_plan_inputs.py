@@ -50,7 +50,7 @@ def test_targets_as_text(text: str, expected: Any) -> None:
 
 @pytest.mark.parametrize("text", ["", ":3x3", "compact:15", "compact:3x3,4x4", "a b"])
 def test_what_is_no_target_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="this is no target; expected a pattern such as kagome:15x15"):
+    with pytest.raises(ConfigError, match="this is not a target; expected a pattern such as kagome:15x15"):
         parse_target(text)
 
 
@@ -74,7 +74,7 @@ def test_a_target_is_centred_or_at_its_origin() -> None:
         ("compact:15x15", {"origin": "1,x"}, "this is no site"),
         ("nowhere.yaml", {}, "nowhere.yaml: there is no such file"),
         ("compact:3x3", {"planner": "pcsa"}, "--planner pcsa: unknown planner 'pcsa'; expected"),
-        ("compact:3x3", {"planner": "a b"}, "this is no name of a planner"),
+        ("compact:3x3", {"planner": "a b"}, "this is not the name of a planner"),
         (
             "compact:3x3",
             {"degree_of_parallelism": 0},

@@ -240,8 +240,8 @@ def test_a_text_that_was_edited_is_refused(taken, tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "'' is no shot; expected numbers such as 3,5-9"),
-        ("-1", "'-1' is no shot"),
+        ("", "'' is not a shot; expected numbers such as 3,5-9"),
+        ("-1", "'-1' is not a shot"),
         ("4", "there is no shot 4; expected 0 to 3"),
         ("3-1", "3-1 goes backwards; expected 1-3"),
     ],

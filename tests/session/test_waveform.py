@@ -168,7 +168,7 @@ def test_what_cannot_be_played_is_refused(request_: PlanRequest, error: Any, mes
     ("rate", "words"),
     [
         ("200 MHz", "MHz cannot be sampled at 200 MHz; expected more than 211.2 MHz"),
-        ("-625e6", "this is no sample rate"),
+        ("-625e6", "this is not a sample rate"),
         ("5 parsec", "'parsec' in '5 parsec' is not a unit of frequency"),
     ],
 )

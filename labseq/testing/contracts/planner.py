@@ -62,7 +62,7 @@ class PatternContract:
     def test_wants_atoms(self, factory: PatternFactory) -> None:
         """A pattern without atoms would be met without any move."""
         for grid in self.grids:
-            assert _target_of(factory, grid).n_atoms > 0, f"on {_called(grid)} it wants none"
+            assert _target_of(factory, grid).n_atoms > 0, f"on {_called(grid)} it requires none"
 
     @promise("the same grid gives the same target")
     def test_same_grid_same_target(self, factory: PatternFactory) -> None:
