@@ -17,7 +17,7 @@ def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int 
     """Lay out rows in columns two spaces apart.
 
     Where stdout is a terminal that is too narrow for the table, texts are wrapped between words; columns
-    that still do not fit follow in a second table. In a pipe or a file every row stays one line.
+    that still do not fit follow in a second table. A word that is wider than the terminal, a path, stays whole. In a pipe or a file every row stays one line.
 
     Args:
         rows: The cells; all rows have the same number of them.
@@ -77,7 +77,9 @@ def _lines(table: Sequence[Sequence[str]], right: Sequence[int], widths: Sequenc
     lines: list[str] = []
     for row in zip(*table, strict=True):
         cells = [
-            [cell] if len(cell) <= width else textwrap.wrap(_words(cell), width, break_on_hyphens=False)
+            [cell]
+            if len(cell) <= width
+            else textwrap.wrap(_words(cell), width, break_long_words=False, break_on_hyphens=False)
             for cell, width in zip(row, widths, strict=True)
         ]
         for parts in zip_longest(*cells, fillvalue=""):
