@@ -17,7 +17,8 @@ def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int 
     """Lay out rows in columns two spaces apart.
 
     Where stdout is a terminal that is too narrow for the table, texts are wrapped between words; columns
-    that still do not fit follow in a second table. A word that is wider than the terminal, a path, stays whole. In a pipe or a file every row stays one line.
+    that still do not fit follow in a second table. A word that is wider than the terminal, such as a path,
+    stays whole. In a pipe or a file every row stays one line.
 
     Args:
         rows: The cells; all rows have the same number of them.
