@@ -54,7 +54,7 @@ def named_run(name: str, root: Path) -> Path:
         ):
             return folder
     what = f"there is no such folder, and no run of this name or number in {visible(str(root))}"
-    raise ConfigError(Problem(what, clean(name), hint="`labseq runs` lists the runs"))
+    raise ConfigError(Problem(what, visible(name), hint="`labseq runs` lists the runs"))
 
 
 def newest_run(root: Path) -> Path:

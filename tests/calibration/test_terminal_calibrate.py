@@ -91,7 +91,7 @@ def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]
             ("site",),
             "'site' cannot be calibrated; expected one of sites, thresholds, ",
         ),
-        (("sites", "--from", "nowhere"), "--from: "),
+        (("sites", "--from", "nowhere"), "nowhere: there is no such folder, and no run of this name"),
         (("sites", "--shots", "0"), "--shots 0: shots is 0; expected at least 1"),
     ],
 )
