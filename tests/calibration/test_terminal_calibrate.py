@@ -95,10 +95,20 @@ def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]
         (("sites", "--shots", "0"), "--shots 0: shots is 0; expected at least 1"),
     ],
 )
-def test_wrong_usage(arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, err = call(capsys, *arguments)
+def test_wrong_usage(
+    arguments: tuple[str, ...],
+    message: str,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    code, out, err = call(capfd, *arguments)
     assert (code, out) == (2, "")
     assert message in err
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # the command redirects it
+    code, out, _ = call(capfd, *arguments, "--json")
+    answer = json.loads(out)
+    assert (code, answer["kind"], answer["in_use"]) == (2, arguments[0], False)
+    assert message in answer["error"]
 
 
 def test_the_outcome_as_json(

@@ -93,7 +93,7 @@ def test_ctrl_c_outside_of_a_run(monkeypatch: pytest.MonkeyPatch, call: Any) -> 
         raise KeyboardInterrupt
 
     monkeypatch.setattr("labseq.cli.show.show_run", interrupt)
-    assert call("show", "x")[0] == 130
+    assert call("show", "x") == (130, "", "stopped by Ctrl-C\n")
 
 
 def test_wrong_numbers_of_shots_and_seeds_are_reported_as_all_other_settings(call: Any) -> None:

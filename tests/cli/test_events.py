@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -69,3 +70,6 @@ def test_a_shot_as_text(fake: Any, changes: Any, words: str) -> None:
 def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     shot = fake.shot(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
     assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 0  interrupted"
+    scan = {"addresses": ["a.b", "c.d"], "written": [["5 ms", "7"]], "point_of_shot": [0]}
+    text = event_text("shot_finished", {"shot": shot}, replace(fake.run(), scan=scan))
+    assert text == "shot 0  b 5 ms, d 7  interrupted"

@@ -45,6 +45,8 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "shots             3 of 3, 1 attempt kept that did not complete" in lines
     assert "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %" in lines  # one was not judged
     assert "filling           99.6(4) %" in lines
+    folder = write_run(tmp_path / "c d", fake, shots[:1])
+    assert summary_lines(open_run(folder))[-1] == f'resume it with: labseq resume "{folder}"'
 
 
 def test_json(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
