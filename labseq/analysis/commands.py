@@ -112,7 +112,8 @@ def plot(
         str | None,
         typer.Option(
             metavar="PART",
-            help="Only one part of the picture: filling, success, survival, defects, timing, scan or losses.",
+            help="The average image, the loading of each site or the counts (image, loading, counts); "
+            "or one part of the overview: filling, success, survival, defects, timing, scan or losses.",
         ),
     ] = None,
     shot: Annotated[

@@ -26,6 +26,7 @@ from labseq.analysis.charts import (
     draw_trend,
     points_of,
 )
+from labseq.analysis.images import average_panel, loading_panel, signals_panel
 from labseq.analysis.scanned import Axis, Scanned, is_geometric, numbers_of, scanned
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.analysis.survival import Survival, SurvivalCounts, steps_that_load
@@ -454,6 +455,13 @@ def _scan_rows(summary: _Summary) -> list[Row]:
     return [(*filling, *success)] if len(filling) == len(success) == 1 else [filling, success]
 
 
+def _image_rows(summary: _Summary, draw: Callable[[Run, Sequence[Shot]], Panel]) -> list[Row]:
+    """The panel of an image; none if no shot has what it needs."""
+    with suppress(RecordingError):
+        return [(draw(summary.run, evenly(summary.run.shots, PART_SHOTS)),)]
+    return []
+
+
 def _present(*panels: Panel | None) -> Row:
     return tuple(panel for panel in panels if panel is not None)
 
@@ -476,6 +484,21 @@ _IMAGES: Final = "shots with an 'image' step or a rearrangement"
 
 CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] = MappingProxyType(
     {
+        "image": (
+            "the average image",
+            lambda s: _image_rows(s, average_panel),
+            "readable shots whose frames were kept",
+        ),
+        "loading": (
+            "the loading",
+            lambda s: _image_rows(s, partial(loading_panel, grid_of(s.run))),
+            "readable shots with an image",
+        ),
+        "counts": (
+            "the detector's signals",
+            lambda s: _image_rows(s, signals_panel),
+            "a detector that reports its signals",
+        ),
         "filling": ("filling", lambda s: [_measure_row(s, FILLING)], _IMAGES),
         "success": ("defect-free shots", lambda s: [_measure_row(s, SUCCESS)], _IMAGES),
         "survival": (

@@ -89,6 +89,23 @@ class Shot:
         return summary_of(self.row)
 
     @property
+    def signals(self) -> NDArray[np.float64]:
+        """The detector's signals, float64 (n_images, n_rows, n_cols); nan where it reported none."""
+        none = np.full(self._content.target.shape, np.nan)
+        found = [none if image.signal is None else image.signal for image in self.images]
+        return np.array(found, np.float64).reshape(len(found), *none.shape)
+
+    @property
+    def thresholds(self) -> NDArray[np.float64] | None:
+        """The thresholds of the signals, float64 (n_rows, n_cols); None if the detector reported none."""
+        return self._content.record.thresholds
+
+    @property
+    def sites_px(self) -> NDArray[np.float64] | None:
+        """(y, x) of each site on the frames, float64 (n_rows, n_cols, 2); None if it was not reported."""
+        return self._content.record.sites_px
+
+    @property
     def confidences(self) -> NDArray[np.float32]:
         """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
         return self._of_each_image("confidence", np.float32)

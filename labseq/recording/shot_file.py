@@ -203,7 +203,7 @@ def read_content(path: Path) -> ShotContent:
     Raises:
         RecordingError: It is missing, damaged, or of another format.
     """
-    with _opened(path) as entry:
+    with opened(path) as entry:
         run = read_fields(entry["run"], schema.RUN) | read_texts(entry["run"], schema.RUN_TEXTS)
         fill, clear = (entry[f"target/{name}"][()].astype(np.bool_) for name in ("fill", "clear"))
         return ShotContent(_record(entry), run, TargetPattern(fill, clear, run["target.name"]))
@@ -211,7 +211,7 @@ def read_content(path: Path) -> ShotContent:
 
 def read_occupancies(path: Path) -> NDArray[np.uint8]:
     """Read the occupancies of a shot's file and nothing else: uint8 (n_images, n_rows, n_cols)."""
-    with _opened(path) as entry:
+    with opened(path) as entry:
         return entry["detection/occupancy"][()]
 
 
@@ -223,7 +223,7 @@ def read_frames(path: Path) -> dict[int, Frame]:
             and the package for it is missing.
     """
     frames: dict[int, Frame] = {}
-    with _opened(path) as entry:
+    with opened(path) as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
             load_filter(path, group["images"])
             values = schema.FRAMES.arguments(Frame, group["frames"][()])
@@ -241,7 +241,12 @@ def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Generator[Any]:
+def opened(path: Path) -> Generator[Any]:
+    """Open a shot's file to read its group ``/entry``; what fails within reports the file as damaged.
+
+    Raises:
+        RecordingError: It is missing, damaged, or of another format.
+    """
     if not path.is_file():
         raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
     try:

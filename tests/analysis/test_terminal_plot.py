@@ -36,8 +36,8 @@ def test_each_picture_has_a_name_of_its_own(
 @pytest.mark.parametrize(
     ("request_", "output", "printed"),
     [
-        (PlotRequest(what="x"), "a.png", "no picture 'x' of a run; expected one of 'defects', 'filling'"),
-        (PlotRequest(), "a.bmp", "no name of a PNG or SVG or PDF file"),
+        (PlotRequest(what="x"), "a.png", "no picture 'x' of a run; expected one of 'counts', 'defects'"),
+        (PlotRequest(), "a.bmp", "not the name of a PNG or SVG or PDF file"),
         (PlotRequest(what="scan"), "a.png", "nothing to show of the scan; expected a run of a sequence with"),
         (PlotRequest(shot=1, what="scan"), "a.png", "--what and --shot: these are different pictures"),
         (PlotRequest(cycle=1), "a.png", "--cycle: a cycle belongs to a shot; expected --shot as well"),

@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.analysis.overview import overview
+from labseq.analysis.overview import overview, picture_of
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.cli.show import shot_table
 from labseq.cli.summary import summary_lines
+from labseq.recording.images import average_frame, loading_map, signals_of
+
+from .records import make_shot, write
 
 SEQUENCE = """\
 labseq: 1
@@ -121,3 +124,27 @@ def test_a_sequence_without_a_target_is_run_shown_and_drawn(tmp_path: Path) -> N
         labseq.ConfigError, match=r"5:.*'rearrange' needs a target; expected 'target' in the sequence"
     ):
         labseq.Session.open(path)
+
+
+def test_average_image_loading_map_and_counts_of_any_run(
+    run: labseq.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "labseq.pictures.figures.encode_figure", lambda draw, *_, **__: bool(draw()) * b"drawn"
+    )
+    values, n = loading_map(run.shots)
+    np.testing.assert_array_equal(values, np.mean([shot.occupancies[0] for shot in run.shots], axis=0))
+    signals, thresholds, unit = signals_of(run.shots, image=-1)
+    np.testing.assert_array_equal(signals > thresholds, [shot.occupancies[-1] for shot in run.shots])
+    assert (n, unit) == (2, "counts")
+    for what in ("loading", "counts"):
+        picture_of(run, what).save(tmp_path / f"{what}.png")
+    with pytest.raises(
+        labseq.ConfigError, match=r"nothing to show of the average image; expected .* frames were kept"
+    ):
+        picture_of(run, "image")
+
+    kept = write(tmp_path, make_shot(0), make_shot(1))
+    mean, n = average_frame(kept.shots, image=1)
+    np.testing.assert_array_equal(mean, np.mean([shot.frames[1] for shot in kept.shots], axis=0))
+    picture_of(kept, "image").save(tmp_path / "image.png")

@@ -1,0 +1,91 @@
+"""Averages over the shots of a run at one image: frames, occupancies and the detector's signals."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import RecordingError
+from labseq.recording.shot import Shot
+
+Floats = NDArray[np.float64]
+
+
+def average_frame(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
+    """The mean of the frames of an image, float64 (height, width) in adu, and how many there are.
+
+    Args:
+        shots: Those without this frame, or whose frame is of another size than the first, are left out.
+        image: Index of the image in the shot; -1 for the last.
+
+    Raises:
+        RecordingError: No shot has it: frames were not kept, or files are damaged.
+    """
+    total, n = np.empty(0), 0
+    for entry, index in _entries(shots, image):
+        for camera in entry["camera"].values() if "camera" in entry else ():
+            (at,) = np.nonzero(camera["image"][()] == index)
+            if len(at) and (not n or camera["images"].shape[1:] == total.shape):
+                frame = camera["images"][at[0]].astype(np.float64)
+                total, n = (total + frame if n else frame), n + 1
+    if not n:
+        raise _nothing(shots, "frame", image)
+    return total / n, n
+
+
+def loading_map(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
+    """The fraction of the shots with an atom on each site, float64 (n_rows, n_cols), and their number.
+
+    Args:
+        shots: Those without this image are left out.
+        image: Index of the image in the shot; -1 for the last.
+
+    Raises:
+        RecordingError: No shot has it, or files are damaged.
+    """
+    found = [entry["detection/occupancy"][index] for entry, index in _entries(shots, image)]
+    if not found:
+        raise _nothing(shots, "image", image)
+    return np.asarray(np.mean(found, axis=0), np.float64), len(found)
+
+
+def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, str]:
+    """The detector's signals and thresholds, each float64 (n_shots, n_rows, n_cols), and their unit.
+
+    Args:
+        shots: Those without this image, or whose detector reported no signals, are left out.
+        image: Index of the image in the shot; -1 for the last.
+
+    Raises:
+        RecordingError: No shot has them, or files are damaged.
+    """
+    signals, thresholds, unit = list[Any](), list[Any](), ""
+    for entry, index in _entries(shots, image):
+        found = entry["detection"]
+        if "signal" in found and "threshold" in found:
+            signals.append(found["signal"][index])
+            thresholds.append(found["threshold"][()])
+            unit = str(found["signal"].attrs["units"])
+    if not signals:
+        raise _nothing(shots, "signal of the detector", image)
+    return np.array(signals), np.array(thresholds), unit
+
+
+def _entries(shots: Sequence[Shot], image: int) -> Generator[tuple[Any, int]]:
+    """The group ``/entry`` of each shot that has the image, and the image's index."""
+    from labseq.recording.shot_file import opened  # h5py takes 0.1 s to import
+
+    for shot in shots:
+        with suppress(RecordingError), opened(shot.file) as entry:
+            n_images = len(entry["detection/occupancy"])
+            if -n_images <= image < n_images:
+                yield entry, image % n_images
+
+
+def _nothing(shots: Sequence[Shot], what: str, image: int) -> RecordingError:
+    where = shots[0].file.parent.parent if shots else "the run"
+    return RecordingError(where, f"has no {what} of image {image} in its shots")
