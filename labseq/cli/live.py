@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from labseq.cli.arrays import Glyphs, draw_array, glyphs_for, scales
-from labseq.console.events import LASTING, LogLines, best_text, event_text
+from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
 from labseq.console.text import clock_time, count_of, plural
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 from labseq.model.estimate import Estimate, jeffreys, mean
@@ -145,9 +145,8 @@ class Picture:
             lines.insert(1, blank)
         if spare > 3:
             lines.append(blank)
-        n_recent = max(0, height - 1 - len(lines))
-        for text in list(self._recent)[max(0, len(self._recent) - n_recent) :]:
-            lines += lines_of(_line(text, "dim"))
+        recent = [line for text in self._recent for line in lines_of(Text(text, "dim"))]
+        lines += recent[max(0, len(lines) + len(recent) - height + 1) :]
         for line in lines[: height - 1]:
             yield from Segment.adjust_line_length(line, width, pad=False)
             yield Segment.line()
@@ -234,7 +233,7 @@ def _rates(tally: Tally) -> Table:
 def _stages(tally: Tally) -> Table:
     """A row per stage; on real hardware the session's clock is that of this computer."""
     simulated = tally.record is None or tally.record.simulated
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     table.add_column("stage", no_wrap=True)
     for head in (*(("host", "p99", "modelled") if simulated else ("p50", "p99")), "budget", "over"):
         table.add_column(head, justify="right", no_wrap=True)
@@ -415,8 +414,8 @@ class ScanTally:
 
     @property
     def name(self) -> str:
-        """The scanned addresses, as text."""
-        return ", ".join(self._scan.get("addresses", ()))
+        """The scanned settings, as text."""
+        return ", ".join(scanned_names(self._scan))
 
     def add(self, shot: ShotRecord) -> None:
         """Count a shot, unless it was not judged or its point is unknown."""

@@ -118,18 +118,22 @@ def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
 
 
 def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> str:
-    """The scanned values of a shot with their units, named by the end of the address; "" without a scan.
+    """The scanned values of a shot with their names and units; "" without a scan.
 
     Example:
         >>> scan = {"addresses": ["shot.0.load.duration"], "written": [["5 ms"]], "point_of_shot": [0]}
         >>> point_of_shot(scan, 0, {})
         'duration 5 ms'
     """
-    addresses = [str(address) for address in scan.get("addresses", ())]
+    values = scanned_values(scan, shot, parameters)
+    return ", ".join(map(" ".join, zip(scanned_names(scan), values, strict=True)))
+
+
+def scanned_names(scan: Mapping[str, Any]) -> list[str]:
+    """The ends of the scanned addresses: "window"; the addresses themselves if two have the same end."""
+    addresses = [clean(str(address)) for address in scan.get("addresses", ())]
     names = [address.rpartition(".")[2] for address in addresses]
-    if len({*names}) < len(names):
-        names = addresses
-    return ", ".join(map(" ".join, zip(names, scanned_values(scan, shot, parameters), strict=True)))
+    return names if len({*names}) == len(names) else addresses
 
 
 def scanned_values(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> list[str]:

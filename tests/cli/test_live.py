@@ -12,7 +12,7 @@ from rich.console import Console
 from labseq.cli.arrays import ASCII, UNICODE
 from labseq.cli.live import REDRAW_S, LiveView, Picture, ScanTally, Tally, draw_scan, observer_for
 from labseq.console.events import LogLines
-from labseq.model import ShotRecord
+from labseq.model import ShotRecord, StageTiming
 
 
 class Screen(io.TextIOWrapper):
@@ -165,6 +165,18 @@ def test_a_picture_never_exceeds_the_terminal(fake: Any, size: tuple[int, int], 
     assert max(map(len, lines)) <= size[0]
 
 
+def test_80_columns_cut_no_head_and_no_number(fake: Any) -> None:
+    tally = tally_of(fake, fake.run(n_shots=10_000))
+    for _ in range(1000):
+        tally.add("stage", {"timing": StageTiming("read_out", 2, 0, 0.0, 43.1e-3, 12.9e-3, 2.89e-3)})
+    recent = ["shot 3  window 30 ms" + 2 * "  1 defect (defect-free after 3 cycles)"]
+    lines = picture(tally, 80, 40, recent=recent)
+    text = "\n".join(" ".join(line.split()) for line in lines)
+    assert "stage host p99 modelled budget over\n" in text
+    assert "read_out 12.9 ms 12.9 ms 43.1 ms 2.89 ms 1000\n" in text
+    assert text.count("after 3 cycles)") == 2
+
+
 def test_a_wide_terminal_shows_everything(fake: Any) -> None:
     lines = picture(tally_of(fake, fake.run()), 120, 30)
     text = "\n".join(lines)
@@ -251,7 +263,7 @@ def plot(tally: ScanTally, width: int = 40, height: int = 6, glyphs: Any = UNICO
 def test_points_stand_in_the_order_of_their_values() -> None:
     tally = scan_tally([7, 3, 15], [(0, True, 1.0), (1, False, 0.9), (2, True, 1.0), (2, False, 0.9)])
     assert plot(tally) == [
-        "defect-free by planner.dop",
+        "defect-free by dop",
         " 100 %      ████      ",
         "            ████      ",
         "            ████ ████ ",
@@ -262,7 +274,7 @@ def test_points_stand_in_the_order_of_their_values() -> None:
 
 def test_without_a_defect_free_shot_the_filling_is_drawn() -> None:
     drawn = plot(scan_tally([1, 2, 3], [(0, False, 0.98), (2, False, 0.99)]), glyphs=ASCII)
-    assert drawn[0] == "filling by planner.dop"
+    assert drawn[0] == "filling by dop"
     assert (drawn[1][:7], drawn[-2][:7]) == ("  99 % ", "  98 % ")
     assert drawn[-2][7:] == "....      #### "
 
@@ -283,4 +295,4 @@ def test_a_plot_never_exceeds_its_room(
 ) -> None:
     drawn = plot(scan_tally(values, shots), width, height, glyphs)
     assert len(drawn) in (0, height)
-    assert all(len(line) <= max(width, len("defect-free by planner.dop")) for line in drawn)
+    assert all(len(line) <= max(width, len("defect-free by dop")) for line in drawn)
