@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -27,6 +28,17 @@ COLOURS: Final = "cividis"
 """Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
 NO_VALUE: Final = "0.94"
 BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"elinewidth": 0.9, "capthick": 0.9}}
+ERRORS: Final[dict[str, Any]] = {"color": DARK, "capsize": 2, "elinewidth": 0.9, "capthick": 0.9}
+MANY_BARS: Final = 15
+"""Above this number of bars, the line has no marks, and empty bars have no errors."""
+N_LINE: Final = 200
+"""Number of points of a fitted line."""
+CHARACTER: Final = 0.02
+"""Width of a character of a tick's label, relative to the axis."""
+MAX_CHARACTERS: Final = 32
+"""Maximum number of characters below an axis that are not turned."""
+MAX_TURNED: Final = 24
+"""Maximum number of labels below an axis that are turned."""
 MIN_DEFECTS: Final = 4
 """The histogram of defects has at least this range."""
 MANY: Final = 500
@@ -107,7 +119,7 @@ def draw_trend(
     axes.fill_between(x, 100 * low, 100 * high, where=known, color=DARK, alpha=0.2, linewidth=0, zorder=3)
     axes.plot(x, 100 * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
     axes.set(title=title, xlabel="shot", ylabel=label, xlim=(shots[0] - 0.5, shots[-1] + 0.5))
-    axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(values, 0.1, MIN_RANGE_PERCENT)))
+    axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(100 * values, 0.1, MIN_RANGE_PERCENT)))
     whole_numbers(axes.xaxis)
 
 
@@ -122,34 +134,42 @@ def draw_curves(
     whole: bool = False,
     logarithmic: bool = False,
     from_zero: bool = False,
+    scale: float = 100.0,
+    line: Callable[[Floats], Floats] | None = None,
+    line_label: str = "",
 ) -> None:
-    """Draw fractions with error bars.
+    """Draw values with error bars, by default fractions in per cent.
 
     Args:
         curves: Name -> points, see :func:`points_of`; at least one of each.
         ticks: Text at x = 0, 1, 2, ... instead of numbers; the points are then not joined.
+        scale: Factor on the values.
+        line: A function of x that is drawn through the points instead of joining them.
     """
     for (name, (x, y, low, high)), colour, marker in zip(curves.items(), (DARK, ORANGE), "os", strict=False):
-        bars = 100 * np.nan_to_num([y - low, high - y]).clip(min=0.0)
+        bars = scale * np.nan_to_num([y - low, high - y]).clip(min=0.0)
         look: dict[str, Any] = {"markersize": 5, "linewidth": 0.9, "capsize": 2, "capthick": 0.9, "zorder": 3}
-        line = "none" if ticks else "-"
-        axes.errorbar(x, 100 * y, bars, label=name, color=colour, marker=marker, linestyle=line, **look)
+        style = "none" if ticks or line is not None else "-"
+        axes.errorbar(x, scale * y, bars, label=name, color=colour, marker=marker, linestyle=style, **look)
     axes.set(title=title, xlabel=x_label, ylabel=y_label)
     all_x, *ends = np.concatenate([*curves.values()], axis=1)
+    if line is not None:
+        across = np.geomspace if logarithmic else np.linspace
+        x = across(all_x.min(), all_x.max(), N_LINE)
+        axes.plot(x, scale * line(x), color=ORANGE, linewidth=1.2, label=line_label, zorder=2)
     if logarithmic:
         _plain_logarithmic(axes)
     elif ticks:
-        turned = len(ticks) * max(map(len, ticks)) > 32
-        axes.set_xticks(np.arange(len(ticks)), list(ticks), rotation=90 if turned else 0)
+        set_words(axes.xaxis, ticks)
     elif whole:
         whole_numbers(axes.xaxis)
-    elif len(all_x) < 2 or np.diff(np.unique(all_x)).min(initial=np.inf) >= MIN_GAP * np.ptp(all_x) > 0:
+    elif _fit_as_ticks(np.unique(all_x)):
         axes.set_xticks(np.unique(all_x))
     if whole or ticks:
         axes.set_xlim(all_x.min() - 0.5, all_x.max() + 0.5)
-    low, high = _with_room(np.concatenate(ends), 0.12, MIN_RANGE_PERCENT / 2)
+    low, high = _with_room(scale * np.concatenate(ends), 0.12, MIN_RANGE_PERCENT / 2 if scale == 100 else 0.0)
     axes.set_ylim(0.0 if from_zero else low, high)
-    if len(curves) > 1:
+    if len(curves) > 1 or line is not None:
         axes.legend()
 
 
@@ -165,29 +185,28 @@ def draw_map(
     label: str,
     limits: tuple[float, float],
 ) -> None:
-    """Draw a fraction against two scanned values, a cell for each pair.
+    """Draw values against two scanned values, a cell for each pair.
 
     Args:
-        values: float64 (len(y_ticks), len(x_ticks)), fractions; NaN if unknown.
+        values: float64 (len(y_ticks), len(x_ticks)), in the unit of the label; NaN if unknown.
     """
     from matplotlib import colormaps
 
-    low, high = (100 * end for end in limits)
+    low, high = limits
     image = axes.imshow(
-        np.ma.masked_invalid(100 * values),
+        np.ma.masked_invalid(values),
         origin="lower",
         aspect="auto",
         cmap=colormaps[COLOURS].with_extremes(bad=NO_VALUE),
         vmin=low,
-        vmax=max(high, low + 1e-9),
+        vmax=high if high > low else low + 1e-9 * max(1.0, abs(low)),
     )
     axes.set(title=title, xlabel=x_label, ylabel=y_label)
     axes.grid(visible=False)
-    for axis, words in ((axes.xaxis, x_ticks), (axes.yaxis, y_ticks)):
-        at = range(0, len(words), -(-len(words) // MAX_TICKS))
-        axis.set_ticks(at, [words[i] for i in at])
+    set_words(axes.xaxis, x_ticks, room=24, most=MAX_TICKS)
+    set_words(axes.yaxis, y_ticks, room=sys.maxsize, most=MAX_TICKS)
     if max(values.shape) <= MAX_CELLS_WITH_TEXT:
-        for (row, col), value in np.ndenumerate(100 * values):
+        for (row, col), value in np.ndenumerate(values):
             if np.isfinite(value):
                 colour = "white" if value < (low + high) / 2 else "black"
                 axes.text(col, row, f"{value:.3g}", ha="center", va="center", fontsize=8, color=colour)
@@ -229,26 +248,33 @@ def draw_sites(
     axes.figure.colorbar(filled, ax=axes, pad=0.02, shrink=0.85, extend=extend, label=label)
 
 
-def draw_defects(axes: Axes, *, title: str, x_label: str, shares: Floats, expected: Floats) -> None:
+def draw_defects(
+    axes: Axes, *, title: str, x_label: str, shares: Floats, expected: Floats, width: int = 1
+) -> None:
     """Draw the share of the shots with each number of defects.
 
     Args:
-        shares: Share of the shots at 0, 1, 2, ... defects, see :func:`points_of`.
+        shares: Share of the shots at each number of defects, see :func:`points_of`.
         expected: float64 (n,), the shares for independent sites with the same mean filling.
+        width: Number of defects that a bar spans.
     """
     x, y, low, high = shares
     errors = 100 * np.stack([y - low, high - y]).clip(min=0.0)
-    axes.bar(x, 100 * y, width=0.8, color=LIGHT, yerr=errors, label="shots", **BARS)
+    seen = y > 0 if len(x) > MANY_BARS else np.ones(len(x), np.bool_)
+    axes.bar(x, 100 * y, width=0.8 * width, color=LIGHT, label="shots")
+    axes.errorbar(x[seen], 100 * y[seen], errors[:, seen], linestyle="none", **ERRORS)
     points: dict[str, Any] = {
         "marker": "D",
-        "markersize": 4,
+        "markersize": 4 if len(x) <= MANY_BARS else 0,
         "linewidth": 0.9,
         "linestyle": "--",
         "zorder": 3,
     }
-    axes.plot(np.arange(len(expected)), 100 * expected, color=ORANGE, label="independent sites", **points)
+    at = x[0] + width * np.arange(len(expected))
+    axes.plot(at, 100 * expected, color=ORANGE, label="independent sites", **points)
     axes.set(title=title, xlabel=x_label, ylabel="shots (%)")
-    axes.set_xlim(-0.6, max(MIN_DEFECTS, x[-1], len(expected) - 1) + 0.6)
+    least = x[0] - 0.6 * width
+    axes.set_xlim(least, max(least + MIN_DEFECTS + 1.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
     axes.set_ylim(bottom=0.0)
     whole_numbers(axes.xaxis)
     axes.legend()
@@ -315,11 +341,24 @@ def _time_text(time_s: float, _: object) -> str:
     return format_quantity(time_s, "time").replace("us", "µs")
 
 
-def _with_room(fractions: Floats, room: float, min_range: float) -> tuple[float, float]:
-    """Limits of an axis in per cent, with a margin above and below that is relative to the range."""
-    low, high = 100 * float(np.nanmin(fractions)), 100 * float(np.nanmax(fractions))
-    room *= max(high - low, min_range)
+def _with_room(values: Floats, room: float, min_range: float) -> tuple[float, float]:
+    """Limits of an axis, with a margin above and below that is relative to the range."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    room *= max(high - low, min_range) or abs(high) or 1.0
     return low - room, high + room
+
+
+def _fit_as_ticks(values: Floats) -> bool:
+    """Whether each value can have a tick without overlapping labels."""
+    gap = max(MIN_GAP, CHARACTER * (max(len(f"{value:g}") for value in values) + 1.5))
+    return len(values) < 2 or bool(np.diff(values).min() >= gap * np.ptp(values) > 0)
+
+
+def set_words(axis: Axis, words: Sequence[str], room: int = MAX_CHARACTERS, most: int = MAX_TURNED) -> None:
+    """Put words at 0, 1, 2, ..., at most so many, turned if they need more room than so many characters."""
+    turned = len(words) * max(map(len, words)) > room
+    at = range(0, len(words), -(-len(words) // most))
+    axis.set_ticks(at, [words[i] for i in at], rotation=90 if turned else 0)
 
 
 def _vertical_grid(axes: Axes) -> None:

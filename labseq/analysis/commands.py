@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from labseq.console.options import Json, Plugins, RunFolder
+from labseq.console.options import FitModel, FitSettings, Json, Plugins, RunFolder, ScanQuantities, Where
 
 REPLAY_EXAMPLES = """\b
 Examples:
@@ -18,11 +18,13 @@ ANALYSE_EXAMPLES = """\b
 Examples:
   labseq analyse data/2026-01-02/0001_compact-225
   labseq analyse data/2026-01-02/0001_compact-225 --use survival --set atoms=moved
+  labseq analyse --scan analysis.survival.survival
 """
 PLOT_EXAMPLES = """\b
 Examples:
   labseq plot
   labseq plot data/2026-11-21/0004_scan-dop --what scan -o scan.pdf
+  labseq plot --scan survival:before,after --fit exponential
   labseq plot --shot 3
   labseq plot --shot 3 --cycle 1 -o first_cycle.svg
 """
@@ -95,15 +97,21 @@ def analyse(
     again: Annotated[
         bool, typer.Option("--again", help="Analyse all shots again, including those that have a result.")
     ] = False,
+    scan: ScanQuantities = None,
+    where: Where = None,
+    fit: FitModel = None,
+    fit_set: FitSettings = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Analyse the shots of a run that have no result yet.
+    """Analyse the shots of a run that have no result yet; with --scan, then print it.
 
     If the settings differ from those of the existing results, all shots are analysed again.
     """
+    from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import analyse_run
 
-    raise typer.Exit(analyse_run(run, use, overrides or (), again=again))
+    wanted = scan_request(scan, where, fit, fit_set)
+    raise typer.Exit(analyse_run(run, use, overrides or (), wanted, again=again))
 
 
 def plot(
@@ -135,11 +143,20 @@ def plot(
             "--output",
             "-o",
             metavar="FILE",
-            help="A PNG, SVG or PDF file. Default: overview.png, shot-3.png, ... in the current folder.",
+            help="A PNG, SVG or PDF file. Default: overview.png, shot-3.png, ... in the current folder, "
+            "with a number if there is such a file.",
         ),
     ] = None,
+    scan: ScanQuantities = None,
+    where: Where = None,
+    fit: FitModel = None,
+    fit_set: FitSettings = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file of --output.")] = False,
 ) -> None:
-    """Draw a run, finished or not: an overview, one part of it, or a shot."""
+    """Draw a run, finished or not: an overview, one part of it, the points of a scan, or a shot."""
+    from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import PlotRequest, plot_run
 
-    plot_run(run, PlotRequest(what, shot, cycle), output)
+    plot_run(
+        run, PlotRequest(what, shot, cycle, scan_request(scan, where, fit, fit_set)), output, replace=force
+    )

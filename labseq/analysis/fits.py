@@ -24,6 +24,8 @@ RB87_U, ATOMIC_MASS_KG = 86.909180531, 1.66053906660e-27
 """Mass of 87Rb (AME2020), and the unit that it is in (CODATA 2018)."""
 N_ATOMS: Final = 20_000
 """Number of atoms in the model of release and recapture."""
+ROUNDING: Final = 1e-9
+"""Relative error below which a value counts as without error."""
 MAX_ERROR: Final = 10.0
 """Largest error of a parameter, relative to its value or to the range of the points."""
 RELATIVE_STEP: Final = 0.02
@@ -232,6 +234,19 @@ class Fit:
             f"  {'chi-square'.ljust(width)}  {chi2} (reduced, {self.n_points} points)",
         ]
 
+    def short_lines(self) -> list[str]:
+        """The result for the legend of a picture: what was fitted, and the reduced chi-square."""
+        free = [
+            f"{name} {parameter_text(one, self.units[name])}"
+            for name, one in self.values.items()
+            if one.error
+        ]
+        return [
+            self.model,
+            *free,
+            *([] if math.isnan(self.chi2) else [f"reduced chi-square {self.chi2:.2f}"]),
+        ]
+
     def as_dict(self) -> dict[str, Any]:
         """The result, JSON-ready, SI."""
         parameters = {
@@ -304,7 +319,7 @@ def fit_points(
             f"{len(np.unique(at))} points are too few for a fit of {len(free)} parameters ({', '.join(free)})"
         )
         raise _problem(what, f"at least {len(free) + 1} different values with a result")
-    known = np.isfinite(error) & (error > 0)
+    known = np.isfinite(error) & (error > ROUNDING * np.abs(y))
     sigma = np.where(known, error, error[known].max(initial=0.0)) if known.any() else np.ones_like(y)
     start = {**chosen.guess(at, y), **fixed}
     values_of, chi2 = _minimise(chosen, at, y, sigma, start, fixed, is_weighted=bool(known.any()))

@@ -10,7 +10,7 @@ from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numpy as np
 
@@ -26,20 +26,32 @@ from labseq.analysis.charts import (
     draw_trend,
     points_of,
 )
+from labseq.analysis.fits import Fit
 from labseq.analysis.images import average_panel, loading_panel, signals_panel
-from labseq.analysis.scanned import Axis, Scanned, is_geometric, numbers_of, scanned
-from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
+from labseq.analysis.scanned import (
+    DEFAULT,
+    Scanned,
+    ScanRequest,
+    is_geometric,
+    scan_report,
+    scanned,
+    shown_unit,
+    title_of,
+)
+from labseq.analysis.statistics import Statistics, statistics_of
 from labseq.analysis.survival import Survival, SurvivalCounts, steps_that_load
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean
-from labseq.model import CalibrationEntry, SiteGrid, TargetPattern
+from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.pictures.figures import make_figure, save_figure
-from labseq.recording import Run, Shot
+from labseq.recording import Run
+from labseq.recording.quantities import Quantity
 from labseq.roles import Context
+from labseq.units import factor_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,8 +71,12 @@ PART_SHOTS: Final = 500
 """Maximum number of shot files read for one part of the overview, or for a table."""
 MAX_MAPS: Final = 6
 """Maximum number of maps in a row."""
-MIN_FULL: Final = 0.5
-"""Maps are drawn if at least this fraction of their cells has a point."""
+MAX_PANELS: Final = 2
+"""Maximum number of panels of a scan in a row."""
+MIN_SHARE: Final = 1e-3
+"""Numbers of defects that are less probable than this are not drawn unless they occurred."""
+MAX_BARS: Final = 40
+"""Maximum number of bars in the histogram of defects."""
 PANEL_IN: Final = (3.7, 3.1)
 """Width and height of a panel in inches."""
 SINGLE_IN: Final = (6.4, 4.4)
@@ -120,7 +136,7 @@ def overview(run: Run) -> RunPicture:
         RecordingError: It is damaged.
     """
     summary = _Summary(_with_shots(run), OVERVIEW_SHOTS)
-    filling, success = (_measure_row(summary, measure) for measure in (FILLING, SUCCESS))
+    filling, success = (_fraction_row(summary, name) for name in DEFAULT)
     causes, defects = causes_panel(summary.statistics), defects_panel(run, summary.statistics)
     survival, timing = summary.read
     rows = [
@@ -128,7 +144,7 @@ def overview(run: Run) -> RunPicture:
         _present(*success, causes or lost_by_cycle(run, survival)),
         _present(*survival_panels(run, survival), stages_panel(run, timing)),
     ]
-    if summary.scan is not None and len(maps := scan_panels(summary.scan, SUCCESS)) > 1:
+    if summary.scan is not None and len(maps := scan_panels(summary.scan, summary.quantity(DEFAULT[1]))) > 1:
         rows.insert(2, maps)
     return _picture(run, f"run {clean(run.name)}", rows)
 
@@ -153,88 +169,45 @@ def picture_of(run: Run, what: str) -> RunPicture:
     return _picture(run, title, rows)
 
 
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """A result of each shot, and its mean over shots.
-
-    Attributes:
-        name: "filling" or "success".
-        title: Its name in titles.
-        label: Its name on axes.
-    """
-
-    name: Literal["filling", "success"]
-    title: str
-    label: str
-
-    @property
-    def is_rate(self) -> bool:
-        """Whether it is true or false for each shot."""
-        return self.name == "success"
-
-    def of_shot(self, shot: Shot, target: TargetPattern) -> float:
-        """Its value on the image that judges the shot, else on that of the last cycle; NaN without one."""
-        if not math.isnan(shot.filling_fraction):
-            return float(shot.success) if self.is_rate else shot.filling_fraction
-        try:
-            images = shot.summary.images
-        except RecordingError:  # for an old index with a damaged shot file
-            return math.nan
-        if not len(images) or images.cycle[-1] < 0 or not target.n_atoms:
-            return math.nan
-        n_defects, n_surplus = images.n_defects[-1], images.n_surplus[-1]
-        return float(not n_defects and not n_surplus) if self.is_rate else 1.0 - n_defects / target.n_atoms
-
-    def of_many(self, statistics: Statistics | CycleStatistics) -> Estimated:
-        """The mean over the given shots."""
-        return statistics.defect_free if self.is_rate else statistics.filling
-
-    def over(self, values: Sequence[float]) -> Estimated:
-        """The mean of the values of the given shots."""
-        return Rate(round(math.fsum(values)), len(values)) if self.is_rate else mean(values)
-
-
-FILLING: Final = Measure("filling", "filling", "filling (%)")
-SUCCESS: Final = Measure("success", "defect-free", "defect-free (%)")
-
-
-def trend_panel(run: Run, measure: Measure) -> Panel | None:
-    """A measure against the shot, with its running mean; None if no shot has a value."""
-    values = np.array([measure.of_shot(shot, run.target) for shot in run.shots])
+def trend_panel(run: Run, quantity: Quantity) -> Panel | None:
+    """A fraction against the shot, with its running mean; None if no shot has a value."""
+    values = np.array([quantity.of_shot(shot) for shot in run.shots])
     known = np.isfinite(values)
     if not known.any():
         return None
     x, y = np.array([float(shot.index) for shot in run.shots])[known], values[known]
     window = min(len(y), max(MIN_WINDOW, len(y) // N_WINDOWS))
     starts = np.unique(np.linspace(0, len(y) - window, MAX_POINTS).astype(np.int64))
-    means = [measure.over(y[start : start + window].tolist()) for start in starts]
+    parts = [y[start : start + window].tolist() for start in starts]
+    means = [Rate(round(math.fsum(part)), window) if quantity.is_rate else mean(part) for part in parts]
     middles = ((x[starts] + x[starts + window - 1]) / 2).tolist()
     shots = "1 shot" if window == 1 else f"{window} shots"
     return partial(
         draw_trend,
-        title=f"{measure.title} by shot; line: mean of {shots}",
-        label=measure.label,
+        title=f"{title_of(quantity)} by shot; line: mean of {shots}",
+        label=f"{title_of(quantity)} (%)",
         shots=x,
         values=y,
         running=points_of(middles, means),
-        is_rate=measure.is_rate,
+        is_rate=quantity.is_rate,
     )
 
 
-def cycles_panel(measure: Measure, statistics: Statistics) -> Panel | None:
-    """A measure against the cycle, from the image at the end of each cycle; None without cycles."""
+def cycles_panel(quantity: Quantity, statistics: Statistics) -> Panel | None:
+    """A fraction against the cycle, from the image at the end of each cycle; None without cycles."""
     cycles = statistics.cycles
     if not cycles:
         return None
+    means = [one.defect_free if quantity.is_rate else one.filling for one in cycles]
     fewer = cycles[-1].n_shots < cycles[0].n_shots
     return partial(
         draw_curves,
-        title=f"{measure.title} by cycle" + (", of the shots that made it" if fewer else ""),
+        title=f"{title_of(quantity)} by cycle" + (", of the shots that made it" if fewer else ""),
         x_label="cycle",
-        y_label=measure.label,
-        curves={"": points_of([one.cycle for one in cycles], [measure.of_many(one) for one in cycles])},
+        y_label=f"{title_of(quantity)} (%)",
+        curves={"": points_of([one.cycle for one in cycles], means)},
         whole=True,
-        from_zero=measure.is_rate,
+        from_zero=quantity.is_rate,
     )
 
 
@@ -298,12 +271,22 @@ def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
         return None
     number = np.arange(len(counts))
     empty = float(np.dot(counts, number)) / n_shots / n_sites
+    expected = binomial(n_sites, empty, len(counts))
+    padded = np.pad(counts, (0, len(expected) - len(counts)))
+    first = int(np.flatnonzero((padded > 0) | (expected > MIN_SHARE))[0])
+    width = -(-(len(expected) - first) // MAX_BARS)
+    first = 0 if width == 1 and first < MAX_BARS // 2 else first
+    starts = np.arange(first, len(expected), width)
+    seen = np.add.reduceat(padded, starts)[: np.searchsorted(starts, len(counts))]
+    shares = [Rate(int(count), n_shots) for count in seen]
+    each = f", {width} numbers to a bar" if width > 1 else ""
     return partial(
         draw_defects,
         title=f"{mean(np.repeat(number, counts))} defects in a shot, {n_shots} of {len(run.shots)} shots",
-        x_label=f"defects {end}",
-        shares=points_of(number.tolist(), [Rate(count, n_shots) for count in counts]),
-        expected=binomial(n_sites, empty, len(counts)),
+        x_label=f"defects {end}{each}",
+        shares=points_of((starts[: len(shares)] + (width - 1) / 2).tolist(), shares),
+        expected=np.add.reduceat(expected, starts),
+        width=width,
     )
 
 
@@ -319,7 +302,7 @@ def binomial(n: int, p: float, n_least: int) -> np.ndarray[tuple[int], np.dtype[
     from scipy.special import bdtr
 
     terms = np.diff(bdtr(np.arange(n + 1.0), n, p), prepend=0.0)
-    seen = np.flatnonzero(terms > 1e-3)
+    seen = np.flatnonzero(terms > MIN_SHARE)
     return terms[: max(n_least, int(seen[-1]) + 1)]
 
 
@@ -337,75 +320,99 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
     )
 
 
-def scan_panels(found: Scanned, measure: Measure) -> Row:
-    """A measure against the scanned values: a curve for one axis, maps for more; empty if it is unknown."""
-    means = found.means(measure.of_many)
-    if all(math.isnan(one.value) for one in means):
+def scan_panels(found: Scanned, quantity: Quantity, fit: Fit | None = None) -> Row:
+    """A quantity against the scanned values: a curve for one axis, maps for more; empty if it is unknown."""
+    means = found.over(quantity)
+    known = [one.value for one in means if not math.isnan(one.value)]
+    if not known:
         return ()
+    unit, factor = shown_unit(quantity, known)
+    label = f"{title_of(quantity)} ({unit})" if unit else title_of(quantity)
+    if len(found.axes) > 1 and found.is_map:
+        return _scan_maps(found, title_of(quantity), [one.value / factor for one in means], label)
+    from_zero = quantity.is_rate and (fit is None or quantity.name == "defect_free")
+    common: dict[str, Any] = {"y_label": label, "scale": 1 / factor, "from_zero": from_zero}
     if len(found.axes) == 1:
-        return (_scan_curve(found.axes[0], [place[0] for place in found.places], means, measure),)
-    n_cells = math.prod(len(axis.words) for axis in found.axes)
-    if len({*found.places}) >= MIN_FULL * n_cells:
-        return _scan_maps(found, means, measure)
+        return (_scan_curve(found, title_of(quantity), means, fit, common),)
     return (  # few points share a value, for example those of an optimiser
         partial(
             draw_curves,
-            title=f"{measure.title} by point of {len(found.axes)} values",
+            title=f"{title_of(quantity)} by point of {len(found.axes)} values",
             x_label="point of the scan",
-            y_label=measure.label,
             curves={"": points_of(range(len(means)), means)},
             whole=True,
-            from_zero=measure.is_rate,
+            **common,
         ),
     )
 
 
-def _scan_curve(axis: Axis, places: Sequence[int], means: Sequence[Estimated], measure: Measure) -> Panel:
-    common: dict[str, Any] = {
-        "title": f"{measure.title} by scanned value",
-        "y_label": measure.label,
-        "from_zero": measure.is_rate,
-    }
-    numbers = numbers_of(axis.words)
+def _scan_curve(
+    found: Scanned, title: str, means: Sequence[Estimated], fit: Fit | None, common: Mapping[str, Any]
+) -> Panel:
+    axis, numbers = found.axes[0], found.on_axis(0)
+    title = f"{title} by scanned value"
     if numbers is None:
-        curves = {"": points_of(places, means)}
-        return partial(draw_curves, x_label=axis.address, curves=curves, ticks=axis.words, **common)
+        curves = {"": points_of([place[0] for place in found.places], means)}
+        return partial(
+            draw_curves, title=title, x_label=axis.address, curves=curves, ticks=axis.words, **common
+        )
     values, unit = numbers
-    rows = sorted(zip((values[place] for place in places), means, strict=True), key=lambda row: row[0])
+    rows = sorted(zip(values, means, strict=True), key=lambda row: row[0])
     return partial(
         draw_curves,
+        title=title,
         x_label=f"{axis.address} ({unit})" if unit else axis.address,
         curves={"": points_of([x for x, _ in rows], [y for _, y in rows])},
         logarithmic=is_geometric(sorted({*values})),
+        line=None if fit is None else partial(_fitted, fit, factor_of(unit)),
+        line_label="" if fit is None else "\n".join(fit.short_lines()),
         **common,
     )
 
 
-def _scan_maps(found: Scanned, means: Sequence[Estimated], measure: Measure) -> Row:
+def _fitted(fit: Fit, factor: float, x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The fitted function at values in the unit of the axis."""
+    return fit.at(x * factor)
+
+
+def _scan_maps(found: Scanned, title: str, means: Sequence[float], label: str) -> Row:
     """A map against the last two axes for each combination of the others."""
     *others, y, x = found.axes
     values = np.full([len(axis.words) for axis in found.axes], np.nan)
     for place, one in zip(found.places, means, strict=True):
-        values[place] = one.value
+        values[place] = one
     combinations = list(product(*(range(len(axis.words)) for axis in others)))
     panels: list[Panel] = []
-    for number, chosen in enumerate(combinations[:MAX_MAPS], start=1):
+    for index, chosen in enumerate(combinations[:MAX_MAPS]):
         at = ", ".join(f"{axis.address} {axis.words[i]}" for axis, i in zip(others, chosen, strict=True))
-        more = f" ({number} of {len(combinations)})" if len(combinations) > MAX_MAPS else ""
+        more = f" ({index + 1} of {len(combinations)})" if len(combinations) > MAX_MAPS else ""
         panels.append(
             partial(
                 draw_map,
-                title=(at or f"{measure.title} by scanned values") + more,
+                title=(at or f"{title} by scanned values") + more,
                 x_label=x.address,
                 y_label=y.address,
                 x_ticks=x.words,
                 y_ticks=y.words,
                 values=values[chosen],
-                label=measure.label,
+                label=label,
                 limits=(float(np.nanmin(values)), float(np.nanmax(values))),
             )
         )
     return tuple(panels)
+
+
+def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
+    """Quantities at the points of a scan, with their fits.
+
+    Raises:
+        ConfigError: See :func:`labseq.analysis.scanned.scan_report`.
+    """
+    report = scan_report(_with_shots(run), request)
+    fits = report.fits or (None,) * len(report.values)
+    rows = [scan_panels(report.found, one, fit) for (one, _), fit in zip(report.values, fits, strict=True)]
+    shown = [panel for row in rows for panel in row]
+    return _picture(run, "the scan", [tuple(shown)] if len(shown) <= MAX_PANELS else rows)
 
 
 class _Summary:
@@ -429,6 +436,10 @@ class _Summary:
         """The points of the scan, from the index; None without a scan."""
         return scanned(self.run)
 
+    def quantity(self, name: str) -> Quantity:
+        """A quantity of the run."""
+        return self.run.quantity(name)
+
     @cached_property
     def read(self) -> tuple[Survival, RunTiming]:
         """Survival and times, from the files of some shots; unreadable ones are left out."""
@@ -441,18 +452,16 @@ class _Summary:
         return survival, totals.sum_up(self.run)
 
 
-def _measure_row(summary: _Summary, measure: Measure) -> Row:
-    """A measure against shot, cycle and scanned value, where available."""
-    maps = scan_panels(summary.scan, measure) if summary.scan is not None else ()
-    by_cycle = cycles_panel(measure, summary.statistics)
-    return _present(trend_panel(summary.run, measure), by_cycle, *(maps if len(maps) == 1 else ()))
+def _fraction_row(summary: _Summary, name: str) -> Row:
+    """A fraction against shot, cycle and scanned value, where available."""
+    quantity = summary.quantity(name)
+    maps = scan_panels(summary.scan, quantity) if summary.scan is not None else ()
+    by_cycle = cycles_panel(quantity, summary.statistics)
+    return _present(trend_panel(summary.run, quantity), by_cycle, *(maps if len(maps) == 1 else ()))
 
 
 def _scan_rows(summary: _Summary) -> list[Row]:
-    if summary.scan is None:
-        return []
-    filling, success = (scan_panels(summary.scan, measure) for measure in (FILLING, SUCCESS))
-    return [(*filling, *success)] if len(filling) == len(success) == 1 else [filling, success]
+    return [] if summary.scan is None else [*scan_picture(summary.run, ScanRequest()).rows]
 
 
 def _image_rows(summary: _Summary, draw: Callable[[Run, Sequence[Shot]], Panel]) -> list[Row]:
@@ -499,8 +508,8 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
             lambda s: _image_rows(s, signals_panel),
             "a detector that reports its signals",
         ),
-        "filling": ("filling", lambda s: [_measure_row(s, FILLING)], _IMAGES),
-        "success": ("defect-free shots", lambda s: [_measure_row(s, SUCCESS)], _IMAGES),
+        "filling": ("filling", lambda s: [_fraction_row(s, "filling")], _IMAGES),
+        "success": ("defect-free shots", lambda s: [_fraction_row(s, "defect_free")], _IMAGES),
         "survival": (
             "survival by site",
             lambda s: [survival_panels(s.run, s.read[0])],

@@ -1,20 +1,32 @@
-"""The points of a scan: the scanned values, and the statistics at each point."""
+"""The points of a scan, the quantities at each, their tables, and fits of them."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
-from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
+from labseq.analysis.fits import Fit, fit_points
+from labseq.analysis.statistics import as_mapping
+from labseq.console.text import columns, count_of
+from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
-from labseq.model.estimate import Estimated
+from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording import Run
-from labseq.recording.points import scan_points
+from labseq.recording.points import ScanPoint, scan_points
+from labseq.recording.quantities import Quantity, find_quantity, select_shots
+from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of
 
+MIN_FULL: Final = 0.5
+"""Maps are drawn if at least this fraction of their cells has a point."""
+DEFAULT: Final = ("filling", "defect_free")
+"""The quantities at the points of a scan, unless others are named."""
+WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
+"""The same for a run without a target."""
 GEOMETRIC_RATIO: Final = 20.0
 """Minimum ratio of largest to smallest value for a logarithmic axis."""
 EQUAL: Final = 0.25
@@ -44,28 +56,48 @@ class Scanned:
     Attributes:
         axes: Independent addresses, the slowest first.
         places: Index of each point's value on each axis.
-        statistics: Statistics of each point.
+        points: The points, with their shots.
     """
 
     axes: tuple[Axis, ...]
     places: tuple[tuple[int, ...], ...]
-    statistics: tuple[Statistics, ...]
+    points: tuple[ScanPoint, ...]
 
-    def means(self, mean_of: Callable[[Statistics | CycleStatistics], Estimated]) -> list[Estimated]:
-        """A mean at each point; if no shot is judged, over the images at the end of the last cycles."""
-        judged = any(one.defect_free.n_trials for one in self.statistics)
-        of = [one if judged or not one.cycles else one.cycles[-1] for one in self.statistics]
-        return [mean_of(one) for one in of]
+    @property
+    def is_map(self) -> bool:
+        """Whether there are two axes or more, and most combinations of their values have a point."""
+        n_cells = math.prod(len(axis.words) for axis in self.axes)
+        return len(self.axes) > 1 and len({*self.places}) >= MIN_FULL * n_cells
+
+    def over(self, quantity: Quantity) -> list[Estimated]:
+        """The mean of a quantity at each point."""
+        return [quantity.over(point.shots) for point in self.points]
+
+    def on_axis(self, number: int) -> tuple[list[float], str] | None:
+        """Each point's value on an axis, and the unit that it is written in; None if these are no numbers."""
+        numbers = numbers_of(self.axes[number].words)
+        if numbers is None:
+            return None
+        return [numbers[0][place[number]] for place in self.places], numbers[1]
 
 
-def scanned(run: Run) -> Scanned | None:
+def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     """The points of a run's scan that have shots; None without a scan.
+
+    Args:
+        run: The run.
+        conditions: Only shots that meet all of them are kept, see
+            :func:`labseq.recording.quantities.select_shots`.
 
     Raises:
         RecordingError: The scan in run.json is damaged.
+        ConfigError: A condition cannot be read.
     """
     points = scan_points(run)
-    if not points:
+    if conditions:
+        kept = {shot.index for shot in select_shots(run, conditions)}
+        points = [replace(one, shots=tuple(s for s in one.shots if s.index in kept)) for one in points]
+    if not points or not points[0].parameters:  # --set may have replaced every address
         return None
     rows = [tuple(map(clean, row)) for row in run.scan["written"]]
     columns = list(zip(*rows, strict=True))
@@ -82,7 +114,7 @@ def scanned(run: Run) -> Scanned | None:
     places = tuple(
         tuple(axis.words.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
     )
-    return Scanned(axes, places, tuple(statistics_of(point.shots, run.target) for point in points))
+    return Scanned(axes, places, tuple(points))
 
 
 def _follows(values: Sequence[str], others: Sequence[str]) -> bool:
@@ -114,3 +146,231 @@ def is_geometric(values: Sequence[float]) -> bool:
         return False
     steps = np.diff(np.log(values))
     return float(np.ptp(steps)) <= 2 * EQUAL * float(steps.mean())
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRequest:
+    """What to show of the points of a scan.
+
+    Attributes:
+        names: Names of the quantities; none for :data:`DEFAULT`.
+        where: Conditions on the shots: "filling:before == 1".
+        fit: A model of :data:`labseq.analysis.fits.MODELS`, or None.
+        fit_settings: "NAME=VALUE" for parameters of the fit.
+    """
+
+    names: tuple[str, ...] = ()
+    where: tuple[str, ...] = ()
+    fit: str | None = None
+    fit_settings: tuple[str, ...] = ()
+
+
+def scan_request(
+    names: Sequence[str] | None,
+    where: Sequence[str] | None = None,
+    fit: str | None = None,
+    fit_settings: Sequence[str] | None = None,
+) -> ScanRequest | None:
+    """The options of a command as a request; None if there are none.
+
+    Raises:
+        ConfigError: Settings of a fit are given without a fit.
+    """
+    if fit_settings and fit is None:
+        raise ConfigError(Problem("this needs a fit", "--fit-set", expected="--fit MODEL as well"))
+    if names is None and not where and fit is None:
+        return None
+    return ScanRequest(
+        tuple(name for name in names or () if name), tuple(where or ()), fit, tuple(fit_settings or ())
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanReport:
+    """Quantities at the points of a scan.
+
+    Attributes:
+        found: The points.
+        values: Each quantity with its mean at each point.
+        fits: The fit of each quantity; empty without.
+    """
+
+    found: Scanned
+    values: tuple[tuple[Quantity, list[Estimated]], ...]
+    fits: tuple[Fit, ...] = ()
+
+    def lines(self) -> list[str]:
+        """A map for each quantity if all pairs of two values were scanned, else a table; then the fits."""
+        found = self.found
+        if len(found.axes) == 2 and len({*found.places}) == math.prod(len(axis.words) for axis in found.axes):
+            tables = [
+                line for quantity, values in self.values for line in (*self._map(quantity, values), "")
+            ][:-1]
+        else:
+            tables = self.table()
+        return [*tables, *(line for fit in self.fits for line in ("", *fit.lines()))]
+
+    def table(self, most: int = 0) -> list[str]:
+        """A row for each point, at most so many if given."""
+        written = [tuple(map(clean, point.written.values())) for point in self.found.points]
+        header = (*map(clean, self.found.points[0].written), "shots", *(title_of(q) for q, _ in self.values))
+        rows = [
+            (
+                *words,
+                str(len(point.shots)),
+                *(value_text(values[i], quantity) for quantity, values in self.values),
+            )
+            for i, (words, point) in enumerate(zip(written, self.found.points, strict=True))
+        ]
+        return columns([header, *rows], right=range(len(header)), most=most)
+
+    def _map(self, quantity: Quantity, values: Sequence[Estimated]) -> list[str]:
+        down, across = self.found.axes
+        at = {
+            place: value_text(one, quantity, short=True)
+            for place, one in zip(self.found.places, values, strict=True)
+        }
+        rows = [
+            (word, *(at.get((i, j), "-") for j in range(len(across.words))))
+            for i, word in enumerate(down.words)
+        ]
+        header = ("", *across.words)
+        title = f"{title_of(quantity)}; down: {down.address}, across: {across.address}"
+        return [title, *columns([header, *rows], right=range(len(header)))]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The points and fits, SI: points are counted from 0."""
+        points = [
+            {
+                "parameters": dict(point.parameters),
+                "shots": len(point.shots),
+                "values": {quantity.name: as_mapping(values[i]) for quantity, values in self.values},
+            }
+            for i, point in enumerate(self.found.points)
+        ]
+        names = [quantity.name for quantity, _ in self.values]
+        fits = {name: fit.as_dict() for name, fit in zip(names, self.fits, strict=False)}
+        return {"points": points} | ({"fits": fits} if fits else {})
+
+    def csv_rows(self) -> list[list[Any]]:
+        """A header and a row for each point: scanned values, shots, quantities and their intervals."""
+        parts = [f"{quantity.name}{end}" for quantity, _ in self.values for end in ("", " low", " high")]
+        rows: list[list[Any]] = [[*self.found.points[0].parameters, "shots", *parts]]
+        for i, point in enumerate(self.found.points):
+            numbers = [n for _, values in self.values for n in (values[i].value, *values[i].interval)]
+            shown = ["" if math.isnan(n) else n for n in numbers]
+            rows.append([*point.parameters.values(), len(point.shots), *shown])
+        return rows
+
+
+def scan_report(run: Run, request: ScanRequest) -> ScanReport:
+    """Quantities at the points of a run's scan.
+
+    Raises:
+        ConfigError: The run has no scan or no shots, there is no such quantity, or the fit cannot be made.
+        RecordingError: The scan in run.json is damaged.
+    """
+    found = scanned(run, request.where)
+    if found is None:
+        what = "the scan has no shots yet" if run.record.get("scan") else "the run has no scan"
+        raise ConfigError(Problem(what, clean(str(run.path)), expected="a run of a sequence with 'scan:'"))
+    names = request.names or (WITHOUT_TARGET if run.target.is_none else DEFAULT)
+    quantities = [find_quantity(run, name) for name in names]
+    values = tuple((quantity, found.over(quantity)) for quantity in quantities)
+    for quantity, means in values if request.names else ():
+        if all(math.isnan(one.value) for one in means):
+            where = f" that meets {' and '.join(request.where)}" if request.where else ""
+            raise ConfigError(
+                Problem(f"no shot{where} has a value of '{quantity.name}'", clean(run.path.name))
+            )
+    fits = tuple(_fit(run, found, one, means, request) for one, means in values) if request.fit else ()
+    return ScanReport(found, values, fits)
+
+
+def _fit(
+    run: Run, found: Scanned, quantity: Quantity, values: Sequence[Estimated], request: ScanRequest
+) -> Fit:
+    on_axis = found.on_axis(0) if len(found.axes) == 1 else None
+    if on_axis is None:
+        raise ConfigError(
+            Problem("there is no axis to fit along", "--fit", expected="a scan of one numerical value")
+        )
+    x, unit = on_axis
+    given: dict[str, str] = {}
+    for setting in request.fit_settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise ConfigError(Problem(f"'{clean(setting)}' has no value", "--fit-set", expected="NAME=VALUE"))
+        given[name.strip()] = text.strip()
+    profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
+    units = si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit
+    factor = factor_of(unit)
+    assert request.fit is not None
+    return fit_points(
+        request.fit, [factor * one for one in x], values, units, given, profile.get("simulation") or {}
+    )
+
+
+def title_of(quantity: Quantity) -> str:
+    """The name of a quantity in tables and titles."""
+    return "defect-free" if quantity.name == "defect_free" else clean(quantity.name)
+
+
+def value_text(value: Estimated, quantity: Quantity, *, short: bool = False) -> str:
+    """A mean of a quantity with its error, in a readable unit."""
+    if isinstance(value, Rate):
+        return rate_text(value) if short else counted_text(value)
+    if quantity.is_fraction:
+        return share_text(value)
+    unit, factor = shown_unit(quantity, [value.value])
+    text = str(value.scaled(1 / factor))
+    return text if text == "-" else f"{text} {unit}".rstrip()
+
+
+def shown_unit(quantity: Quantity, values: Sequence[float]) -> tuple[str, float]:
+    """A unit in which values of a quantity are readable, and its factor to SI."""
+    if quantity.is_fraction:
+        return "%", 0.01
+    known = [abs(value) for value in values if math.isfinite(value)]
+    dimension = dimension_of(quantity.unit)
+    if not dimension or not known:
+        return quantity.unit, 1.0
+    unit = readable_unit(max(known), dimension)
+    return unit, UNITS[dimension][unit]
+
+
+def rate_text(rate: Rate) -> str:
+    """A rate in per cent, with its interval.
+
+    Example:
+        >>> rate_text(Rate(7, 20)), rate_text(Rate(0, 0))
+        ('35.0 % (25.3 to 46.2)', '-')
+    """
+    if not rate.n_trials:
+        return "-"
+    low, high = rate.interval
+    return f"{100 * rate.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def share_text(fraction: Estimate) -> str:
+    """A mean fraction in per cent.
+
+    Example:
+        >>> share_text(Estimate(0.97664, 0.0004))
+        '97.66(4) %'
+    """
+    text = str(fraction.scaled(100.0))
+    return text if text == "-" else f"{text} %"
+
+
+def counted_text(rate: Rate) -> str:
+    """A count, its total and its rate, with its interval.
+
+    Example:
+        >>> counted_text(Rate(7, 20)), counted_text(Rate(0, 0))
+        ('7 of 20 (35.0 %), 25.3 to 46.2 %', '0 of 0')
+    """
+    if not rate.n_trials:
+        return count_of(0, 0)
+    low, high = rate.interval
+    return f"{count_of(rate.n, rate.n_trials)}, {100 * low:.1f} to {100 * high:.1f} %"

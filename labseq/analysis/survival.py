@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.model import CycleRecord, Occupancy
+from labseq.model import Occupancy
 from labseq.model.estimate import Rate
-from labseq.pictures.plans import on_grid
 from labseq.recording import Run, Shot
+from labseq.recording.quantities import follow_atoms
 
 Counts = NDArray[np.int64]
 
@@ -93,7 +93,7 @@ class Survival:
             start_s, end_s = images.t_start_s[i - 1] if i else -1.0, images.t_start_s[i]
             if not i or any(start_s <= t_s < end_s for t_s in loaded_s):
                 continue
-            moved, kept = expected(occupancies[i - 1], made)
+            moved, kept = follow_atoms(occupancies[i - 1], () if made is None else (made,))
             self._count(moved, kept, occupancies[i], last if made is not None else -1)
         self.n_read += 1
 
@@ -112,24 +112,6 @@ def steps_that_load(run: Run) -> frozenset[int]:
     resolved: Mapping[str, Any] = run.record.get("resolved") or {}
     steps: Sequence[Mapping[str, Any]] = resolved.get("shot", ())
     return frozenset(i for i, step in enumerate(steps) if "load" in step)
-
-
-def expected(before: Occupancy, cycle: CycleRecord | None) -> tuple[Occupancy, Occupancy]:
-    """Sites that hold an atom after a cycle without losses: moved atoms, and atoms that stayed.
-
-    Args:
-        before: bool (n_rows, n_cols), the image that the cycle was planned on.
-        cycle: The cycle; None if nothing was moved.
-
-    Returns:
-        Two arrays, bool (n_rows, n_cols).
-    """
-    atoms, moved = before.copy(), np.zeros_like(before)
-    for batch in () if cycle is None else cycle.plan.batches[: cycle.n_batches_played]:
-        start, end = batch.from_sites, batch.to_sites[on_grid(batch.to_sites, before.shape)]
-        atoms[tuple(start.T)] = moved[tuple(start.T)] = False
-        atoms[tuple(end.T)] = moved[tuple(end.T)] = True
-    return moved, atoms & ~moved
 
 
 def _nothing(shape: tuple[int, ...]) -> SurvivalCounts:

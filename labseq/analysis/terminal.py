@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,8 +12,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.analysis.overview import overview, picture_of
+from labseq.analysis.overview import overview, picture_of, scan_picture
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
+from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.analysis.statistics import as_mapping
 from labseq.config.addresses import split_overrides
@@ -230,8 +232,15 @@ def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
     }
 
 
-def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *, again: bool) -> int:
-    """Analyse the shots of a run that have no result yet, and print how many.
+def analyse_run(
+    path: Path | None,
+    use: str | None,
+    overrides: Sequence[str],
+    request: ScanRequest | None = None,
+    *,
+    again: bool,
+) -> int:
+    """Analyse the shots of a run that have no result yet, and print how many; then the scan.
 
     Returns:
         The exit code: 1 if the analysis of a shot failed.
@@ -242,6 +251,8 @@ def analyse_run(path: Path | None, use: str | None, overrides: Sequence[str], *,
         done = analyse_missing(run, settings, again=again)
         _report(done)
         failed = failed or bool(done.failures)
+    if request is not None:
+        say("", *scan_report(run, request).lines())
     return int(failed)
 
 
@@ -280,17 +291,19 @@ def _report(done: AnalysisOutcome) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """The part or the shot of a run to draw; at most one of ``what`` and ``shot`` is given.
+    """What of a run to draw; at most one of ``what``, ``scan`` and ``shot`` is given.
 
     Attributes:
         what: A part of the overview; None for all of it.
         shot: A shot, counted from 0.
         cycle: A cycle of it, counted from 0.
+        scan: Quantities at the points of the scan.
     """
 
     what: str | None = None
     shot: int | None = None
     cycle: int | None = None
+    scan: ScanRequest | None = None
 
     def check(self) -> None:
         """Check that the options are compatible.
@@ -298,9 +311,11 @@ class PlotRequest:
         Raises:
             ConfigError: Options conflict, or there is no such picture.
         """
-        if self.what is not None and self.shot is not None:
+        chosen = {"--what": self.what, "--shot": self.shot, "--scan": self.scan}
+        options = [option for option, value in chosen.items() if value is not None]
+        if len(options) > 1:
             what = "these are different pictures"
-            raise ConfigError(Problem(what, "--what and --shot", expected="one of them"))
+            raise ConfigError(Problem(what, " and ".join(options), expected="one of them"))
         if self.cycle is not None and self.shot is None:
             raise ConfigError(Problem("a cycle belongs to a shot", "--cycle", expected="--shot as well"))
 
@@ -314,17 +329,30 @@ class PlotRequest:
         """
         if self.shot is not None:
             return f"shot-{self.shot}" + (f"-cycle-{self.cycle}" if self.cycle is not None else "")
-        return self.what or "overview"
+        return "scan" if self.scan is not None else self.what or "overview"
 
 
-def plot_run(run: Path | None, request: PlotRequest, output: Path | None) -> None:
-    """Draw a run."""
+def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, replace: bool = False) -> None:
+    """Draw a run; a file is replaced only on request."""
     request.check()
-    path = Path(f"{request.name}.png") if output is None else output
+    path = _free_name(request.name) if output is None else output
     check_place(path)
+    if path.exists() and not replace:
+        hint = "--force replaces it"
+        raise ConfigError(
+            Problem("this file exists already", clean(str(path)), expected="a new name", hint=hint)
+        )
     chosen = chosen_run(run)
     if request.shot is not None:
         save_shot(path, shot_picture(chosen, request.shot, request.cycle))
+    elif request.scan is not None:
+        scan_picture(chosen, request.scan).save(path)
     else:
         (overview(chosen) if request.what is None else picture_of(chosen, request.what)).save(path)
     say(f"written: {path}")
+
+
+def _free_name(name: str) -> Path:
+    """A PNG file of this name in the current folder, with a number if there is one already."""
+    names = (Path(f"{name}_{i}.png" if i else f"{name}.png") for i in itertools.count())
+    return next(path for path in names if not path.exists())

@@ -19,6 +19,8 @@ from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibrati
 from labseq.cli.plan_commands import PLAN_EXAMPLES, WAVEFORM_EXAMPLES, plan, waveform
 from labseq.console.options import (
     DryRun,
+    FitModel,
+    FitSettings,
     Json,
     Output,
     Overrides,
@@ -27,9 +29,11 @@ from labseq.console.options import (
     ProfileArgument,
     Realtime,
     RunFolder,
+    ScanQuantities,
     Seed,
     SequenceFile,
     Shots,
+    Where,
     dry_run_mode,
     profile_option,
     run_argument,
@@ -261,7 +265,10 @@ def show(
     timing: Annotated[
         bool, typer.Option("--timing", help="Print a row for each stage of a shot: its budget and duration.")
     ] = False,
-    scan: Annotated[bool, typer.Option("--scan", help="Print a row for every point of the scan.")] = False,
+    scan: ScanQuantities = None,
+    where: Where = None,
+    fit: FitModel = None,
+    fit_set: FitSettings = None,
     devices: Annotated[
         bool, typer.Option("--devices", help="Print how each device described itself.")
     ] = False,
@@ -271,9 +278,11 @@ def show(
 
     Shots, attempts, cycles and scan points are counted from 0.
     """
+    from labseq.analysis.scanned import scan_request
     from labseq.cli.show import Tables, show_run
 
-    show_run(run, as_json=as_json, tables=Tables(shots, timing, scan, devices))
+    wanted = scan_request(scan, where, fit, fit_set)
+    show_run(run, as_json=as_json, tables=Tables(shots, timing, wanted, devices))
 
 
 @app.command(short_help="Watch a run that another process takes.")
@@ -311,11 +320,21 @@ def export(
         ),
     ] = None,
     frames: Annotated[bool, typer.Option("--frames", help="Include the frames; for archive only.")] = False,
+    scan: ScanQuantities = None,
+    where: Where = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
 ) -> None:
-    """Export a run to one file that other programs can read."""
-    from labseq.cli.data import export_to
+    """Export a run to one file that other programs can read.
 
+    With --scan a row for each point of the scan, csv only: scanned values, shots, means and their intervals.
+    """
+    from labseq.analysis.scanned import scan_request
+    from labseq.cli.data import export_points, export_to
+
+    wanted = scan_request(scan, where)
+    if wanted is not None:
+        export_points(run, to, output, wanted, replace=force)
+        return
     raise typer.Exit(export_to(run, to, output, frames=frames, replace=force))
 
 

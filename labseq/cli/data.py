@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import sys
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.console.output import as_line, say
 from labseq.console.runs import chosen_run, existing_run
 from labseq.console.text import columns, plural
 from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.files import explained, whole_file
 from labseq.messages import visible
 from labseq.recording import Run, data_root
 from labseq.recording.doctor import Report, examine as find_damage
@@ -105,6 +109,24 @@ def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool,
     for file in files_of(kind, path):
         say(f"written: {file}")
     return RecordingError.exit_code if left_out else 0
+
+
+def export_points(
+    run: Path | None, kind: str, output: Path | None, request: ScanRequest, *, replace: bool
+) -> None:
+    """Write a CSV file with a row for each point of a scan, and print its name."""
+    if kind != "csv":
+        what = f"the points of a scan cannot be exported as '{visible(kind)}'"
+        raise ConfigError(Problem(what, "--to", expected="csv"))
+    opened = chosen_run(run)
+    path = output or Path(f"{opened.path.parent.name}_{opened.path.name}.points.csv")
+    check_export(kind, path, replace=replace)
+    rows = scan_report(opened, request).csv_rows()
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    with explained(path), whole_file(path) as file:
+        file.write(text.getvalue().encode())
+    say(f"written: {path}")
 
 
 def state_lines(run: Run) -> list[str]:

@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def arrange(arguments: Sequence[str]) -> list[str]:
-    """Give ``--dry-run`` its value and move ``--debug`` to the front.
+    """Give ``--dry-run`` and ``--scan`` their values and move ``--debug`` to the front.
 
     typer has no options with an optional value, and accepts global options only before
     the command. Arguments after ``--`` are unchanged.
@@ -61,13 +61,26 @@ def arrange(arguments: Sequence[str]) -> list[str]:
     Example:
         >>> arrange(["run", "--dry-run", "a.yaml", "--debug"])
         ['--debug', 'run', '--dry-run=full', 'a.yaml']
+        >>> arrange(["show", "--scan", "--json"]), arrange(["show", "--scan", "filling"])
+        (['show', '--scan=', '--json'], ['show', '--scan', 'filling'])
     """
     end = arguments.index("--") if "--" in arguments else len(arguments)
     options, rest = arguments[:end], arguments[end:]
     debug = ["--debug"] if "--debug" in options else []
     command = next((option for option in options if not option.startswith("-")), "")
     values = {} if command in _PLAIN_DRY_RUN else {"--dry-run": "--dry-run=full"}
-    return [*debug, *(values.get(option, option) for option in options if option != "--debug"), *rest]
+    follows = [*options[1:], "-"][: len(options)]
+    values_of = (
+        "--scan=" if option == "--scan" and _is_no_quantity(following) else values.get(option, option)
+        for option, following in zip(options, follows, strict=True)
+        if option != "--debug"
+    )
+    return [*debug, *values_of, *rest]
+
+
+def _is_no_quantity(argument: str) -> bool:
+    """Whether an argument after ``--scan`` is another option, or the run: a path or a number."""
+    return argument.startswith("-") or argument.isdecimal() or "/" in argument or os.path.exists(argument)  # noqa: PTH110 - of any text
 
 
 def _report_usage(error: Any, arguments: Sequence[str]) -> int:

@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from labseq.cli.summary import MAX_ROWS, json_points, json_summary, point_table, summary_lines
+from labseq.analysis.scanned import ScanRequest, scan_report
+from labseq.cli.summary import MAX_ROWS, json_summary, summary_lines
 from labseq.console.errors import lines_of
 from labseq.console.events import outcome, scanned_values
 from labseq.console.output import as_line, say
@@ -38,13 +39,13 @@ class Tables:
 
     shots: bool = False
     timing: bool = False
-    scan: bool = False
+    scan: ScanRequest | None = None
     devices: bool = False
 
     @property
     def any(self) -> bool:
         """Whether at least one table is chosen."""
-        return self.shots or self.timing or self.scan or self.devices
+        return self.shots or self.timing or self.scan is not None or self.devices
 
 
 def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) -> None:
@@ -70,7 +71,7 @@ def _table_lines(run: Run, wanted: Tables) -> list[str]:
     choices = (
         (wanted.shots, lambda: shot_table(run, details=True)),
         (wanted.timing, lambda: timing_table(run)),
-        (wanted.scan, lambda: scan_table(run)),
+        (wanted.scan is not None, lambda: scan_table(run, wanted.scan or ScanRequest())),
         (wanted.devices, lambda: devices_table(run)),
     )
     found = [table() for is_wanted, table in choices if is_wanted]
@@ -86,9 +87,8 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
         ]
     if wanted.timing:
         values["timing"] = _json_timing(run)
-    if wanted.scan:
-        scan_table(run)  # raises if there is nothing to show
-        values["points"] = json_points(run)
+    if wanted.scan is not None:
+        values |= {"points": []} if _all_skipped(run) else scan_report(run, wanted.scan).as_dict()
     if wanted.devices:
         values["devices"] = _devices(run)
     return values
@@ -134,20 +134,19 @@ def shot_time_s(shot: Shot) -> float:
     return math.fsum(s for s in steps_s if isinstance(s, float | int))
 
 
-def scan_table(run: Run) -> list[str]:
-    """A row per point of the scan.
+def scan_table(run: Run, request: ScanRequest) -> list[str]:
+    """A row per point of the scan, or a map; and the fits.
 
     Raises:
-        ConfigError: The run has no scan, or no shots yet.
+        ConfigError: The run has no scan, or no shots yet; or the request cannot be met.
     """
-    lines = point_table(run)
-    has_scan = bool(run.record.get("scan"))
-    if not lines and run.skipped and has_scan:
+    if _all_skipped(run):
         return [f"no point of the scan has a shot: {len(run.skipped)} of {run.n_shots} were skipped"]
-    if not lines:
-        what = "the scan has no shots yet" if has_scan else "the run has no scan"
-        raise ConfigError(Problem(what, clean(str(run.path)), expected="a run of a sequence with 'scan:'"))
-    return lines
+    return scan_report(run, request).lines()
+
+
+def _all_skipped(run: Run) -> bool:
+    return bool(run.record.get("scan")) and bool(run.skipped) and not run.shots
 
 
 def timing_table(run: Run) -> list[str]:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, Final
 
+from labseq.analysis.scanned import ScanRequest, counted_text, rate_text, scan_report, scanned, share_text
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.console.text import columns, count_of, plural, quoted
 from labseq.messages import clean
-from labseq.model.estimate import Estimate, Rate, mean
+from labseq.model.estimate import mean
 from labseq.recording import Run
-from labseq.recording.points import scan_points
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40
@@ -27,7 +27,9 @@ NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
 def summary_lines(run: Run) -> list[str]:
     """A table of the run's points or cycles, and its statistics. Shots and cycles are counted from 0."""
     statistics = statistics_of(run.shots, run.target)
-    table = point_table(run, MAX_ROWS) or cycle_table(statistics)
+    table = cycle_table(statistics)
+    if scanned(run) is not None:
+        table = scan_report(run, ScanRequest()).table(MAX_ROWS)
     skipped = f", {len(run.skipped)} skipped" if run.skipped else ""
     kept = f", {plural(len(run.attempts), 'attempt')} kept that did not complete" if run.attempts else ""
     rows = [
@@ -62,47 +64,11 @@ def json_summary(run: Run | None) -> dict[str, Any]:
         nothing = {"defect_free": None, "filling_fraction": None}
         return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
     values = run.summary() | {"statistics": statistics_of(run.shots, run.target).as_dict()}
-    if points := json_points(run):
-        values["points"] = points
+    if scanned(run) is not None:
+        values |= scan_report(run, ScanRequest()).as_dict()
     if run.skipped:
         values["skipped_shots"] = [{"shots": shots, "why": why} for why, shots in _by_reason(run)]
     return values | ({"error": run.error} if run.error else {})
-
-
-def json_points(run: Run) -> list[dict[str, Any]]:
-    """The points of a scan as ``--json`` prints them."""
-    points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
-    return [
-        {
-            "parameters": dict(point.parameters),
-            "shots": len(point.shots),
-            "defect_free": statistics.defect_free.value,
-            "filling_fraction": statistics.filling.value,
-            "statistics": statistics.as_dict(),
-        }
-        for point, statistics in points
-    ]
-
-
-def point_table(run: Run, most: int = 0) -> list[str]:
-    """A row per point of the scan, at most so many if given; empty without a scan.
-
-    If no shot is judged, the images at the end of the last cycles are used.
-    """
-    points = [(point, statistics_of(point.shots, run.target)) for point in scan_points(run)]
-    if not points:
-        return []
-    is_judged = any(statistics.defect_free.n_trials for _, statistics in points)
-    rows: list[tuple[str, ...]] = []
-    for point, statistics in points:
-        shown = statistics if is_judged or not statistics.cycles else statistics.cycles[-1]
-        values = map(clean, point.written.values())
-        rows.append(
-            (*values, str(len(point.shots)), share_text(shown.filling), counted_text(shown.defect_free))
-        )
-    after = "" if is_judged else ", last cycle"
-    header = (*map(clean, points[0][0].written), "shots", f"filling{after}", f"defect-free{after}")
-    return columns([header, *rows], right=range(len(header) - 1), most=most)
 
 
 def cycle_table(statistics: Statistics) -> list[str]:
@@ -155,43 +121,6 @@ def statistics_rows(statistics: Statistics) -> list[tuple[str, str]]:
         damaged = f"{plural(len(one.unreadable), 'shot')} cannot be read and {are} left out"
         rows.append(("warning", f"{damaged} of cycles and defects: {_numbers(one.unreadable)}"))
     return rows
-
-
-def rate_text(rate: Rate) -> str:
-    """A rate in per cent, with its interval.
-
-    Example:
-        >>> rate_text(Rate(7, 20)), rate_text(Rate(0, 0))
-        ('35.0 % (25.3 to 46.2)', '-')
-    """
-    if not rate.n_trials:
-        return "-"
-    low, high = rate.interval
-    return f"{100 * rate.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
-
-
-def counted_text(rate: Rate) -> str:
-    """A count, its total and its rate, with its interval.
-
-    Example:
-        >>> counted_text(Rate(7, 20)), counted_text(Rate(0, 0))
-        ('7 of 20 (35.0 %), 25.3 to 46.2 %', '0 of 0')
-    """
-    if not rate.n_trials:
-        return count_of(0, 0)
-    low, high = rate.interval
-    return f"{count_of(rate.n, rate.n_trials)}, {100 * low:.1f} to {100 * high:.1f} %"
-
-
-def share_text(fraction: Estimate) -> str:
-    """A mean fraction in per cent.
-
-    Example:
-        >>> share_text(Estimate(0.97664, 0.0004))
-        '97.66(4) %'
-    """
-    text = str(fraction.scaled(100.0))
-    return text if text == "-" else f"{text} %"
 
 
 def histogram_text(counts: Sequence[int]) -> str:

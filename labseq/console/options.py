@@ -172,3 +172,38 @@ RunFolder = Annotated[
     Path | None,
     run_argument("The run's folder, or its name or number as in labseq runs; default: the newest run."),
 ]
+ScanQuantities = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--scan",
+        metavar="[QUANTITY]",
+        help="A quantity at each point of the scan: survival:before,after between two images, filling, "
+        "defect_free or loading (also of one image: filling:before), any column of labseq export, or "
+        "analysis.NAME.KEY; default: filling and defect_free. May be given several times.",
+    ),
+]
+Where = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="CONDITION",
+        help="Only shots in which a quantity meets a condition, for example 'filling:before == 1'; may be "
+        "given several times.",
+    ),
+]
+FitModel = Annotated[
+    str | None,
+    typer.Option(
+        "--fit",
+        metavar="MODEL",
+        help="Fit the quantity against the scanned value: exponential, gaussian, lorentzian, linear or "
+        "release_recapture.",
+    ),
+]
+FitSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fit-set",
+        metavar="NAME=VALUE",
+        help="Fix a parameter of the fit (waist='0.98 um'), or free one (offset=free); may be repeated.",
+    ),
+]

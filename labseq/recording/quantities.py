@@ -16,7 +16,7 @@ import numpy as np
 
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
-from labseq.model import CycleRecord, ImageRecord, Occupancy
+from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.recording.columns import FRACTIONS, figures_in
 from labseq.recording.results import result_columns
@@ -27,6 +27,8 @@ from labseq.units import parse_any
 if TYPE_CHECKING:
     from labseq.recording.reader import Run
 
+NOTHING: Final = (math.nan, 0.0)
+"""Events and trials of a shot without a value."""
 MAX_LOOKED_AT: Final = 20
 """Maximum number of shots in which the names of images are looked up."""
 
@@ -66,7 +68,7 @@ class Quantity:
         try:
             return self.events_of(shot)
         except RecordingError:
-            return math.nan, 0
+            return NOTHING
 
 
 def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occupancy, Occupancy]:
@@ -100,40 +102,43 @@ def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
     return next((image for image in images if image.name == name), None)
 
 
-def _survival(shot: Shot, before: str = "", after: str = "") -> tuple[float, float]:
+def _survival(shot: Shot, _: TargetPattern, before: str = "", after: str = "") -> tuple[float, float]:
     first, last = _image(shot, before, 0), _image(shot, after, -1)
     if first is None or last is None or first.t_start_s >= last.t_start_s:
-        return math.nan, 0
-    place = (first.step, first.cycle), (last.step, last.cycle)
-    moved, held = follow_atoms(
-        first.occupancy, (cycle for cycle in shot.cycles if place[0] < (cycle.step, cycle.cycle) <= place[1])
-    )
-    return int(np.sum((moved | held) & last.occupancy)), int(np.sum(moved | held))
+        return NOTHING
+    start, end = (first.step, first.cycle), (last.step, last.cycle)
+    cycles = (cycle for cycle in shot.cycles if start < (cycle.step, cycle.cycle) <= end)
+    expected = np.logical_or(*follow_atoms(first.occupancy, cycles))
+    return int(np.sum(expected & last.occupancy)), int(np.sum(expected))
 
 
-def _loading(shot: Shot, name: str = "") -> tuple[float, float]:
+def _loading(shot: Shot, _: TargetPattern, name: str = "") -> tuple[float, float]:
     image = _image(shot, name, 0)
-    return (math.nan, 0) if image is None else (float(image.occupancy.mean()), 1)
+    return NOTHING if image is None else (float(image.occupancy.mean()), 1)
 
 
-def _filling(shot: Shot, name: str = "") -> tuple[float, float]:
-    if not name:
-        if not math.isnan(shot.filling_fraction):
-            return shot.filling_fraction, 1
-        if not len(shot.summary.images):
-            return math.nan, 0
-    image = _image(shot, name, -1)
-    return (math.nan, 0) if image is None else (shot.target.filling_fraction(image.occupancy), 1)
+def _filling(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
+    if name:
+        image = _image(shot, name, -1)
+        return NOTHING if image is None or target.is_none else (target.filling_fraction(image.occupancy), 1)
+    if not math.isnan(shot.filling_fraction):
+        return shot.filling_fraction, 1
+    n_defects = shot.summary.images.n_defects  # from the index
+    return (1 - n_defects[-1] / target.n_atoms, 1) if n_defects and target.n_atoms else NOTHING
 
 
-def _defect_free(shot: Shot, name: str = "") -> tuple[float, float]:
-    if not name:
-        images = shot.summary.images
-        if not math.isnan(shot.filling_fraction):
-            return shot.success, 1
-        return (not images.n_defects[-1] and not images.n_surplus[-1], 1) if len(images) else (math.nan, 0)
-    image = _image(shot, name, -1)
-    return (math.nan, 0) if image is None else (shot.target.is_met_by(image.occupancy), 1)
+def _defect_free(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
+    if name:
+        image = _image(shot, name, -1)
+        return NOTHING if image is None or target.is_none else (target.is_met_by(image.occupancy), 1)
+    if not math.isnan(shot.filling_fraction):
+        return shot.success, 1
+    images = shot.summary.images
+    return (
+        (not images.n_defects[-1] and not images.n_surplus[-1], 1)
+        if len(images) and not target.is_none
+        else NOTHING
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +149,7 @@ class ImageQuantity:
         about: Its description.
         n_images: Number of images that its name may give.
         is_rate: See :class:`Quantity`.
-        events_of: Its value, see :class:`Quantity`; takes a shot and the names of the images.
+        events_of: Its value, see :class:`Quantity`; takes a shot, the target and the names of the images.
     """
 
     about: str
@@ -179,23 +184,26 @@ def split_name(name: str) -> tuple[str, tuple[str, ...]]:
     return (kind, tuple(image.strip() for image in images.split(","))) if colon else (name, ())
 
 
-def make_quantity(name: str, results: Mapping[str, Mapping[int, Any]] | None = None) -> Quantity:
+def make_quantity(
+    name: str, target: TargetPattern, results: Mapping[str, Mapping[int, Any]] | None = None
+) -> Quantity:
     """A quantity of a name that has been checked.
 
     Args:
         name: Its name.
+        target: The target of the run.
         results: The results of analyses: name -> shot -> value.
     """
     kind, images = split_name(name)
     if kind in OF_IMAGES:
         one = OF_IMAGES[kind]
-        return Quantity(name, "", one.is_rate, True, lambda shot: one.events_of(shot, *images))
+        return Quantity(name, "", one.is_rate, True, lambda shot: one.events_of(shot, target, *images))
     of_shots = (results or {}).get(name)
     is_rate = name == "success" or (of_shots is not None and {*map(type, of_shots.values())} == {bool})
 
     def events_of(shot: Shot) -> tuple[float, float]:
         found = figures_in(shot.row).get(name) if of_shots is None else of_shots.get(shot.index)
-        return (math.nan, 0) if found is None else (float(found), 1)
+        return NOTHING if found is None else (float(found), 1)
 
     return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
 
@@ -270,7 +278,7 @@ def find_quantity(run: Run, name: str) -> Quantity:
         what, expected, hint = problem
         raise ConfigError(Problem(what, clean(run.path.name), expected=expected, hint=hint))
     _check_no_load(run, name)
-    return make_quantity(name, _numbers(run))
+    return make_quantity(name, run.target, _numbers(run))
 
 
 def _check_no_load(run: Run, name: str) -> None:

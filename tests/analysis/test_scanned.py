@@ -78,7 +78,7 @@ def test_two_values_make_a_map(write: Write) -> None:
     (filling, success), *_ = charts(taken(write, of))
     assert filling.func is draw_map
     assert (filling.y_label, filling.x_label, filling.values.shape) == ("dop", "window", (3, 2))
-    assert filling.values.ravel() == pytest.approx([1, 5 / 6, 4 / 6] * 2)
+    assert filling.values.ravel() == pytest.approx([100, 500 / 6, 400 / 6] * 2)
     assert success.label == "defect-free (%)"
 
 

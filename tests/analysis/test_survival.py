@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from labseq.analysis.survival import Survival, expected, steps_that_load
+from labseq.analysis.survival import Survival, steps_that_load
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.model.estimate import Rate
 from labseq.recording import Run
+from labseq.recording.quantities import follow_atoms
 
 from .records import make_shot
 
@@ -35,7 +36,7 @@ def test_atoms_that_go_on_in_later_batches_are_counted_where_they_end() -> None:
     before = np.array([[True, True, True, False], [True, False, False, False]])
     chain = ([(0, 0), (0, 1), (0, 2)], [(0, 1), (0, 2), (0, 3)])
     plan = Plan.from_batches([chain, ([(0, 3)], [(1, 3)]), ([(1, 0)], [(1, -1)])])
-    moved, kept = expected(before, cycle(plan, 3))
+    moved, kept = follow_atoms(before, [cycle(plan, 3)])
     assert np.argwhere(moved).tolist() == [[0, 1], [0, 2], [1, 3]]
     assert not kept.any()  # the last one was ejected
 
@@ -43,7 +44,7 @@ def test_atoms_that_go_on_in_later_batches_are_counted_where_they_end() -> None:
 def test_batches_that_were_not_played_move_nothing() -> None:
     before = np.array([[True, False, False, False], [True, False, False, False]])
     plan = Plan.from_batches([([(0, 0)], [(0, 1)]), ([(1, 0)], [(1, 1)])])
-    moved, kept = expected(before, cycle(plan, 1))
+    moved, kept = follow_atoms(before, [cycle(plan, 1)])
     assert np.argwhere(moved).tolist() == [[0, 1]]
     assert np.argwhere(kept).tolist() == [[1, 0]]
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from labseq.analysis.scanned import ScanRequest
 from labseq.cli.show import Tables, show_run
 from labseq.cli.summary import MAX_ROWS, summary_lines
 from labseq.console.runs import newest_run
@@ -158,9 +159,9 @@ def test_what_was_skipped_is_reported_with_the_reasons(
 def test_a_scan_whose_points_were_all_skipped_is_no_error(
     skipped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    show_run(skipped, as_json=False, tables=Tables(scan=True))
+    show_run(skipped, as_json=False, tables=Tables(scan=ScanRequest()))
     assert capsys.readouterr().out == "no point of the scan has a shot: 8 of 8 were skipped\n"
-    show_run(skipped, as_json=True, tables=Tables(scan=True))
+    show_run(skipped, as_json=True, tables=Tables(scan=ScanRequest()))
     assert json.loads(capsys.readouterr().out)["points"] == []
 
 
@@ -188,12 +189,12 @@ def folder(tmp_path: Path, fake: Any) -> Path:
     return writer.run_dir
 
 
-def shown(folder: Path, capsys: pytest.CaptureFixture[str], **tables: bool) -> list[str]:
+def shown(folder: Path, capsys: pytest.CaptureFixture[str], **tables: Any) -> list[str]:
     show_run(folder, as_json=False, tables=Tables(**tables))
     return capsys.readouterr().out.splitlines()
 
 
-def as_json(folder: Path, capsys: pytest.CaptureFixture[str], **tables: bool) -> dict[str, Any]:
+def as_json(folder: Path, capsys: pytest.CaptureFixture[str], **tables: Any) -> dict[str, Any]:
     show_run(folder, as_json=True, tables=Tables(**tables))
     return json.loads(capsys.readouterr().out)
 
@@ -216,7 +217,7 @@ def test_each_stage_has_a_row(folder: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_each_point_has_a_row(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = shown(folder, capsys, scan=True)
+    lines = shown(folder, capsys, scan=ScanRequest())
     assert [line.split()[:3] for line in lines[1:]] == [["60", "ms", "1"], ["100", "ms", "1"]]
 
 
@@ -229,7 +230,7 @@ def test_devices_tell_of_themselves(folder: Path, capsys: pytest.CaptureFixture[
 
 
 def test_json_holds_the_same(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    answer = as_json(folder, capsys, shots=True, timing=True, scan=True, devices=True)
+    answer = as_json(folder, capsys, shots=True, timing=True, scan=ScanRequest(), devices=True)
     assert (answer["run_dir"], answer["status"]) == (str(folder), "stopped")
     assert [(shot["index"], shot["status"]) for shot in answer["shot_list"]] == [
         (0, "complete"),
@@ -247,13 +248,21 @@ def test_json_holds_the_same(folder: Path, capsys: pytest.CaptureFixture[str]) -
 
 @pytest.mark.parametrize(
     ("table", "printed", "json_wanted"),
-    [("scan", "the run has no scan", True), ("timing", "no shots yet whose files can be read", False)],
+    [
+        (Tables(scan=ScanRequest()), "the run has no scan", True),
+        (Tables(timing=True), "no shots yet whose files can be read", False),
+    ],
 )
 def test_a_table_without_data_is_reported(
-    tmp_path: Path, fake: Any, capsys: pytest.CaptureFixture[str], table: str, printed: str, json_wanted: bool
+    tmp_path: Path,
+    fake: Any,
+    capsys: pytest.CaptureFixture[str],
+    table: Tables,
+    printed: str,
+    json_wanted: bool,
 ) -> None:
     run_dir = RunWriter.create(tmp_path, fake.run()).run_dir
     with pytest.raises(ConfigError, match=printed):
-        show_run(run_dir, as_json=json_wanted, tables=Tables(**{table: True}))
+        show_run(run_dir, as_json=json_wanted, tables=table)
     out = capsys.readouterr().out
     assert not json_wanted or printed in json.loads(out)["error"]

@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 import labseq
+from labseq.analysis.scanned import ScanRequest
 from labseq.cli.arrays import UNICODE
 from labseq.cli.live import Picture, Tally, draw_scan
 from labseq.cli.show import Tables, show_run
@@ -62,7 +63,7 @@ def test_each_point_is_reported_with_the_best_so_far(printed: tuple[labseq.Run, 
 def test_the_table_has_the_points_in_the_order_in_which_they_were_chosen(
     printed: tuple[labseq.Run, list[str]], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    show_run(printed[0].path, as_json=False, tables=Tables(scan=True))
+    show_run(printed[0].path, as_json=False, tables=Tables(scan=ScanRequest()))
     header, first, *rest = capfd.readouterr().out.splitlines()
     assert header.split()[:3] == [DOP, "shot.2.rearrange.window", "shots"]
     assert first.split()[:4] == ["2", "60", "ms", "2"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import labseq
+from labseq.analysis.scanned import ScanRequest
 from labseq.cli.check import check_sequence
 from labseq.cli.show import Tables, show_run
 from labseq.recording.points import scan_points
@@ -43,7 +44,7 @@ def test_the_climb_of_the_page(tmp_path: Path, capfd: pytest.CaptureFixture[str]
         "profile.mobile_tweezers.pick_up": "60 us",
     }
     assert max(filling[1:]) > filling[0]
-    show_run(run.path, as_json=False, tables=Tables(scan=True))
+    show_run(run.path, as_json=False, tables=Tables(scan=ScanRequest()))
     lines = capfd.readouterr().out.splitlines()
     assert lines[1].split()[:3] == ["15", "60", "us"]
     assert len(lines) == 1 + len(points)
