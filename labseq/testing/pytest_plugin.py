@@ -6,6 +6,8 @@ the fixtures.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Generator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -16,6 +18,19 @@ if TYPE_CHECKING:
     from labseq.testing.fakes import FakeClock
 
 pytest.register_assert_rewrite("labseq.testing.contracts")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    call: pytest.CallInfo[None],
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Print a broken promise without the code of the suite."""
+    report = yield
+    contracts = sys.modules.get("labseq.testing.contracts.promises")
+    error = None if call.excinfo is None else call.excinfo.value
+    if report.failed and contracts is not None and isinstance(error, contracts.ContractViolation):
+        report.longrepr = contracts.failure_text(error)
+    return report
 
 
 @pytest.fixture

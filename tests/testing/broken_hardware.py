@@ -1,6 +1,7 @@
 """Cameras that break one promise each of those that all hardware makes."""
 
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,6 +15,17 @@ from labseq.testing import CameraContract
 from labseq.testing.fakes import RecordingCamera
 
 from .planted import Planted
+
+
+class CannotBeTriggered(RecordingCamera):
+    def trigger(self) -> None:
+        raise OSError("no answer")
+
+
+class Sleeps(RecordingCamera):
+    def read(self, timeout_s: float) -> Frame:
+        time.sleep(1e-9)
+        return super().read(timeout_s)
 
 
 class ReadsAFile(RecordingCamera):
@@ -232,6 +244,8 @@ PLANTED = Planted(
     Suite(),
     RecordingCamera,
     (
+        (CannotBeTriggered, "test_works"),
+        (Sleeps, "test_keeps_timeouts"),
         (ReadsAFile, "test_constructor_does_no_io"),
         (OpensOnce, "test_opens_and_closes_twice"),
         (ClosesOnce, "test_opens_and_closes_twice"),

@@ -27,6 +27,16 @@ class Right:
         shot.take_image(0.045)
 
 
+class RunsWithoutAShot(Right):
+    def run(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Its signature is wrong."""
+
+
+class GivesTuples(Right):
+    def plan_timeline(self, context: StepContext) -> Sequence[Any]:
+        return [("wait", 0.1)]
+
+
 class UsuallyTakesLonger(Right):
     def plan_timeline(self, context: StepContext) -> Sequence[Any]:
         return [TimelineEntry("wait", 0.15, 0.2, n_images=1)]
@@ -87,6 +97,8 @@ PLANTED = Planted(
     StepContract(),
     Right,
     (
+        (RunsWithoutAShot, "test_runs"),
+        (GivesTuples, "test_lays_out_its_timeline"),
         (UsuallyTakesLonger, "test_lays_out_its_timeline"),
         (ReadsAFile, "test_timeline_is_pure"),
         (KnowsItsImagesLater, "test_declares_its_images"),

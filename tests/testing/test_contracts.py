@@ -19,6 +19,7 @@ from labseq.registry import KINDS
 from labseq.roles import Context
 from labseq.testing import SUITES, CameraContract, ContractViolation, MobileTweezersContract, PlannerContract
 from labseq.testing.contracts import HardwareContract
+from labseq.testing.contracts.promises import failure_text
 from labseq.testing.fakes import OneByOnePlanner, RecordingCamera, RecordingMobileTweezers
 
 from . import (
@@ -70,7 +71,73 @@ def test_the_broken_promise_is_named_and_no_other(
     promise = getattr(planted.suite, tests[0]).promise
     for error in failed.values():
         assert error.promise == promise
-        assert str(error) == f"promise: {promise}; but {error.detail}"
+        assert str(error).startswith(f"promise: {promise}; but {error.detail}")
+
+
+class NoTargets(Suite):
+    fills_any_target: ClassVar[bool] = False
+
+
+@pytest.mark.parametrize(
+    ("suite", "plugin", "words"),
+    [
+        (
+            Suite(),
+            broken_planners.ReturnsBatches,
+            "returned a list\nto do: 'return Plan.from_batches(batches)'",
+        ),
+        (Suite(), broken_planners.TakesTheOccupancyAlone, "write it as 'def plan(self, occupancy, target)'"),
+        (
+            Suite(),
+            object,
+            "its constructor raised TypeError: object() takes no arguments\nto do: the fixture",
+        ),
+        (Suite(), broken_planners.Hangs, "plan() has not returned after 0.1 s for\n"),
+        (Suite(), broken_planners.Prints, "it printed 'planning\\n'; use logging.getLogger(__name__)"),
+        (
+            Suite(),
+            broken_planners.CountsFromOne,
+            "takes an atom from (1, 1); there is none for the loading\n#\n",
+        ),
+        (Suite(), broken_planners.ChecksNothing, "begin plan() with 'occupancy = as_occupancy("),
+        (
+            NoTargets(),
+            OneByOnePlanner,
+            "and no targets\nto do: list some that the planner always fills: targets =",
+        ),
+        (
+            broken_hardware.Suite(),
+            broken_hardware.Sleeps,
+            "called time.sleep(1e-09)\nto do: wait with context.clock",
+        ),
+        (
+            broken_steps.PLANTED.suite,
+            broken_steps.GivesTuples,
+            "gave a tuple\nto do: return a list of Timeline",
+        ),
+        (broken_steps.PLANTED.suite, broken_steps.RunsWithoutAShot, "write it as 'def run(self, shot)'"),
+    ],
+)
+def test_the_author_is_told_once_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, suite: object, plugin: Factory, words: str
+) -> None:
+    if plugin is broken_planners.Hangs:
+        monkeypatch.setattr("labseq.testing.contracts.planner.MAX_WAIT_S", 0.1)
+    is_planner = isinstance(suite, PlannerContract) and plugin is not object
+    failed = failed_tests(suite, partial(plugin, None) if is_planner else plugin)
+    assert len(failed) == 1
+    assert words in str(*failed.values())
+
+
+def test_pytest_prints_the_lines_of_the_plugin_only() -> None:
+    with pytest.raises(ContractViolation) as caught:
+        Suite().test_returns_a_plan(partial(broken_planners.Raises, None))
+    text = failure_text(caught.value)
+    line = broken_planners.Raises.plan.__code__.co_firstlineno + 1
+    assert text.startswith("promise: plan() returns a Plan, ")
+    assert [line for line in text.splitlines() if line.startswith("  File ")] == [
+        f'  File "{broken_planners.__file__}", line {line}, in plan'
+    ]
 
 
 @pytest.mark.parametrize("kind", ALL)

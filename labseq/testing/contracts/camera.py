@@ -26,6 +26,10 @@ class CameraContract(HardwareContract[Camera]):
     """
 
     role: ClassVar[str] = "camera"
+    how_it_works: ClassVar[str] = (
+        "after arm(n) each trigger() exposes a frame, which read() returns; _take of a CameraDriver returns "
+        "ExposureResult(number, image): numbers from 0 in each series, the image uint16 (height, width)"
+    )
     exposure_s: ClassVar[float] = 0.01
     exposure_tolerance: ClassVar[float] = 0.01
     timeout_s: ClassVar[float] = 2.0
@@ -98,7 +102,10 @@ class CameraContract(HardwareContract[Camera]):
             frames.append(camera.read(self.exposure_s + self.timeout_s))
         return frames
 
-    @promise("arm, trigger, read gives a Frame: uint16 (height, width), with the requested exposure")
+    @promise(
+        "arm, trigger, read gives a Frame: uint16 (height, width), with the requested exposure",
+        "return labseq.plugin.Frame(image, exposure_s, t_start_s, device, number), times in seconds",
+    )
     def test_gives_a_frame(self, factory: Factory[Camera]) -> None:
         """One image, as the ``image`` step takes it."""
         with self.opened(factory) as (camera, _):
@@ -108,7 +115,7 @@ class CameraContract(HardwareContract[Camera]):
             assert frame.image.ndim == 2, f"the image has shape {frame.image.shape}"
             assert frame.image.size > 0, f"the image has shape {frame.image.shape}"
             deviation = abs(frame.exposure_s / self.exposure_s - 1.0)
-            text = f"the frame's exposure is {frame.exposure_s} s; expected {self.exposure_s} s"
+            text = f"the frame's exposure is {frame.exposure_s:g} s; expected {self.exposure_s:g} s"
             assert deviation <= self.exposure_tolerance, text
 
     @promise("after arm(n) come n frames, the oldest first, and no more")
@@ -124,7 +131,10 @@ class CameraContract(HardwareContract[Camera]):
             self.take(camera)
             refusal(DeviceError, "a second trigger after arm(1)", camera.trigger)
 
-    @promise("frames are numbered from 0 in each series, and later ones have later time stamps")
+    @promise(
+        "frames are numbered from 0 in each series, and later ones have later time stamps",
+        "subtract the library's number of the first frame of the series",
+    )
     def test_numbers_its_frames(self, factory: Factory[Camera]) -> None:
         """A gap shows that a frame was lost; time stamps are the camera's own, and optional."""
         with self.opened(factory) as (camera, _):
@@ -161,7 +171,10 @@ class CameraContract(HardwareContract[Camera]):
             assert apart >= self.exposure_s * (1 - self.exposure_tolerance), f"they start at {starts} s"
             self.take(camera)
 
-    @promise("t_start_s is the start of the exposure on the session's clock")
+    @promise(
+        "t_start_s is the start of the exposure on the session's clock",
+        "take context.clock.now() at the trigger, not time.time() or time.monotonic()",
+    )
     def test_tells_when_it_exposed(self, factory: Factory[Camera]) -> None:
         """Later frames start later, each between its trigger and its read()."""
         with self.opened(factory) as (camera, context):
@@ -180,7 +193,7 @@ class CameraContract(HardwareContract[Camera]):
                 assert t_start_s > last_s, f"t_start_s {t_start_s} s comes after {last_s} s"
                 last_s = t_start_s
 
-    @promise("a frame does not change after it was read")
+    @promise("a frame does not change after it was read", "return a copy of the library's buffer")
     def test_frames_do_not_change(self, factory: Factory[Camera]) -> None:
         """A driver that returns its own buffer would overwrite the last image with the next."""
         with self.opened(factory) as (camera, _):

@@ -15,7 +15,10 @@ from labseq.model import SiteGrid
 from labseq.roles import Context, Hardware
 from labseq.testing.contracts.promises import (
     CallHungError,
+    ContractViolation,
+    calls_of_sleep,
     doing,
+    format_error,
     in_time,
     no_factory,
     promise,
@@ -45,6 +48,7 @@ class Wait(Generic[D]):
     wait: Action[D]
 
 
+WORKS: Final = "factory(context) makes the device, and it can be opened, used as in a shot, and closed"
 ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
 
 
@@ -56,10 +60,13 @@ class HardwareContract(Generic[D]):
 
     Attributes:
         role: Name that the device has in the profile.
+        how_it_works: What its methods must do, for the message of a device that fails at its work.
         max_wait_s: Real time after which a call counts as hung, in seconds.
     """
 
+    basis: ClassVar[str] = WORKS
     role: ClassVar[str] = "device"
+    how_it_works: ClassVar[str] = ""
     max_wait_s: ClassVar[float] = 10.0
 
     @pytest.fixture
@@ -157,6 +164,23 @@ class HardwareContract(Generic[D]):
                 context.clock.stop.request()
             raise
 
+    @promise(WORKS)
+    def test_works(self, factory: Factory[D]) -> None:
+        """Nothing else can be tested without it."""
+        try:
+            close_quietly(factory(self.context()))
+        except TypeError as error:
+            advice = "the fixture 'factory' takes the context alone, as in partial(MyDriver, MySettings())"
+            about_arguments = "argument" in str(error)
+            detail = f"its constructor {format_error(error)}"
+            raise ContractViolation(WORKS, detail, advice if about_arguments else "") from error
+        with self.opened(factory) as (device, context):
+            try:
+                self.call_in_time(context, "its work", self.work, device)
+            except Exception as error:
+                raise ContractViolation(WORKS, f"it {format_error(error)}", self.how_it_works) from error
+            device.close()
+
     @promise("the constructor does no I/O and changes no shared state")
     def test_constructor_does_no_io(self, factory: Factory[D]) -> None:
         """Nothing is opened, connected or started before open()."""
@@ -225,7 +249,10 @@ class HardwareContract(Generic[D]):
                     with doing(f"close() after {what}"):
                         device.close()
 
-    @promise("describe() gives values that JSON can hold")
+    @promise(
+        "describe() gives values that JSON can hold",
+        "give a dict of text, bool, int, float, None and lists of them; float(...) of numbers of numpy",
+    )
     def test_describes_itself(self, factory: Factory[D]) -> None:
         """It is written into every run."""
         with self.opened(factory) as (device, _):
@@ -233,7 +260,10 @@ class HardwareContract(Generic[D]):
             assert isinstance(described, Mapping), f"it gave a {type(described).__name__}"
             json.dumps(dict(described), allow_nan=False)
 
-    @promise("calls before open() and after close() raise DeviceError")
+    @promise(
+        "calls before open() and after close() raise DeviceError",
+        "begin each of them with: if not open, raise DeviceError(context.name, 'it is not open')",
+    )
     def test_refuses_calls_while_closed(self, factory: Factory[D]) -> None:
         """Every call of the role that needs the device."""
         for what, use in self.uses().items():
@@ -244,7 +274,10 @@ class HardwareContract(Generic[D]):
             for what, use in self.uses().items():
                 refusal(DeviceError, f"{what} after close()", use, device)
 
-    @promise("what exceeds a limit is refused with LimitError before anything moves")
+    @promise(
+        "what exceeds a limit is refused with LimitError before anything moves",
+        "check the arguments first, all in SI units, and raise LimitError(what, value, limit)",
+    )
     def test_refuses_what_exceeds_limits(self, factory: Factory[D]) -> None:
         """Neither does time pass nor does the simulation see anything, and the device goes on working."""
         with self.opened(factory) as (device, context):
@@ -257,18 +290,27 @@ class HardwareContract(Generic[D]):
                 with doing(f"work after {what} was refused"):
                     self.work(device)
 
-    @promise("timeouts are kept, and end with DeviceTimeoutError")
+    @promise(
+        "timeouts are kept, and end with DeviceTimeoutError",
+        "wait with context.clock.sleep or labseq.plugin.wait_for, which a stop request ends, then raise "
+        "DeviceTimeoutError(context.name, ...)",
+    )
     def test_keeps_timeouts(self, factory: Factory[D]) -> None:
         """On the virtual clock, so that it costs no time."""
         for what, wait in self.waits().items():
             with self.opened(factory) as (device, context):
                 wait.enter(device)
                 before_s = context.clock.now()
-                self.call_in_time(context, what, refusal, DeviceTimeoutError, what, wait.wait, device)
+                with calls_of_sleep(type(device).__module__) as slept_s:
+                    self.call_in_time(context, what, refusal, DeviceTimeoutError, what, wait.wait, device)
+                assert not slept_s, f"{what} called time.sleep({slept_s[0]:g})"
                 passed_s = context.clock.now() - before_s
                 assert passed_s <= 1.1 * wait.timeout_s + 1e-3, f"{what} took {passed_s:g} s"
 
-    @promise("a DeviceError names the device as the profile does")
+    @promise(
+        "a DeviceError names the device as the profile does",
+        "raise DeviceError(context.name, ...), with the name that the constructor received",
+    )
     def test_errors_name_the_device(self, factory: Factory[D]) -> None:
         """So that the message shows which instrument failed."""
         for what, use in self.uses().items():

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from itertools import product
 from typing import Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
-from hypothesis.strategies import SearchStrategy
 from numpy.typing import NDArray
 
-from labseq.errors import LabseqError
+from labseq.errors import InvalidPlanError, LabseqError
 from labseq.kernel import load_kernels
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
-from labseq.motion import check_plan
+from labseq.motion import RULES, check_plan
 from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.testing.contracts.promises import (
+    CallHungError,
     ContractViolation,
     as_this_promise,
     doing,
@@ -25,11 +25,10 @@ from labseq.testing.contracts.promises import (
     in_time,
     no_factory,
     promise,
-    promised,
     quietly,
     refusal,
 )
-from labseq.testing.strategies import cases, drawn, occupancies
+from labseq.testing.strategies import drawn
 
 PatternFactory: TypeAlias = Callable[[SiteGrid], TargetPattern]
 
@@ -109,9 +108,37 @@ def _called(grid: SiteGrid) -> str:
 Case: TypeAlias = tuple[TargetPattern, Occupancy]
 
 
-def cases_of(targets: Sequence[TargetPattern]) -> SearchStrategy[Case]:
-    """One of the targets, with any occupancy."""
-    return st.sampled_from(targets).flatmap(lambda t: st.tuples(st.just(t), occupancies(t.shape)))
+def examples(n_random: int, targets: Sequence[TargetPattern] = ()) -> list[Case]:
+    """Random cases, always the same ones and the smallest first, so that a failure is shown on a small one.
+
+    Args:
+        n_random: Number of random cases.
+        targets: Targets of the cases; without any, random ones on up to 6 x 6 sites, after all cases of one
+            or two sites.
+    """
+    random = np.random.default_rng(225)
+    made: list[Case] = []
+    for _ in range(n_random):
+        if targets:
+            target = targets[int(random.integers(len(targets)))]
+        else:
+            shape = tuple(random.integers(1, 7, 2).tolist())
+            fill = random.random(shape) < random.random()
+            target = TargetPattern(fill, ~fill & (random.random(shape) < random.random()))
+        made.append((target, random.random(target.shape) < random.random()))
+    made.sort(key=lambda case: (case[1].size, np.count_nonzero(case[1])))
+    return made if targets else _of_two_sites() + made
+
+
+def _of_two_sites() -> list[Case]:
+    """All cases of one site and of two: to be filled, to be empty or neither, with or without an atom."""
+    states = [(wish == 1, wish == 2, atom) for wish in range(3) for atom in (False, True)]
+    made: list[Case] = []
+    for shape in ((1, 1), (1, 2), (2, 1)):
+        for sites in product(states, repeat=shape[0] * shape[1]):
+            fill, clear, atoms = np.array(sites, np.bool_).T.reshape(3, *shape)
+            made.append((TargetPattern(fill, clear), atoms.copy()))
+    return made
 
 
 def paper_cases() -> list[Case]:
@@ -167,21 +194,46 @@ RETURNS_A_PLAN: Final = "plan() returns a Plan, whatever the grid, the loading a
 NO_ATOM_CREATED: Final = "no atom is created: every move takes an atom that is there"
 
 
-def plan_of(planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan:
+MAX_WAIT_S: Final = 60.0
+"""Real time after which plan() counts as hung; the first call may compile."""
+_SIGNATURE: Final = "def plan(self, occupancy, target)"
+_COPY: Final = "begin plan() with 'occupancy = as_occupancy(occupancy, target.shape)' of labseq.plugin"
+
+
+_HANGING: Final[dict[type, str]] = {}
+"""Class of a planner that hangs -> for which case, so that each is waited for only once."""
+
+
+def plan_of(
+    planner: Planner, target: TargetPattern, atoms: Occupancy, max_wait_s: float | None = None
+) -> Plan:
     """The plan of a planner.
 
     Raises:
-        ContractViolation: It is not a Plan, or the planner raises anything but a LabseqError.
+        ContractViolation: It is not a Plan, or the planner hangs or raises anything but a LabseqError.
+        CallHungError: It has not returned after ``max_wait_s``.
     """
+    case = f"for\n{drawn(target, atoms)}"
+    if type(planner) in _HANGING:
+        raise ContractViolation(RETURNS_A_PLAN, _HANGING[type(planner)])
     try:
-        plan: Any = planner.plan(atoms, target)
+        plan: Any = in_time(max_wait_s or MAX_WAIT_S, "plan()", planner.plan, atoms, target)
     except LabseqError:
         raise
+    except CallHungError as error:
+        if max_wait_s is not None:
+            raise
+        _HANGING[type(planner)] = f"{error} {case}"
+        raise ContractViolation(
+            RETURNS_A_PLAN, f"{error} {case}", "end every loop; wait for nothing"
+        ) from None
     except Exception as error:
-        detail = f"it {format_error(error)} for\n{drawn(target, atoms)}"
-        raise ContractViolation(RETURNS_A_PLAN, detail) from error
+        is_signature = isinstance(error, TypeError) and "argument" in str(error)
+        advice = f"write it as '{_SIGNATURE}'" if is_signature else "plan for this case, or raise PlanError"
+        raise ContractViolation(RETURNS_A_PLAN, f"it {format_error(error)} {case}", advice) from error
     if not isinstance(plan, Plan):
-        raise ContractViolation(RETURNS_A_PLAN, f"it returned a {type(plan).__name__}")
+        advice = "'return Plan.from_batches(batches)'; a batch is two lists of (row, column): from, to"
+        raise ContractViolation(RETURNS_A_PLAN, f"it returned a {type(plan).__name__}", advice)
     return plan
 
 
@@ -198,8 +250,9 @@ def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
     for index, batch in enumerate(plan.batches):
         for row, col in batch.from_sites.tolist():
             if (row, col) not in held:
-                detail = f"batch {index} takes an atom from ({row}, {col}); there is none"
-                raise ContractViolation(NO_ATOM_CREATED, detail)
+                what = f"batch {index} takes an atom from ({row}, {col}); there is none for the loading"
+                advice = "follow every atom from batch to batch; rows and columns count from 0"
+                raise ContractViolation(NO_ATOM_CREATED, f"{what}\n{_sites(atoms)}", advice)
             held.remove((row, col))
         held.update((row, col) for row, col in batch.to_sites.tolist())
     end = np.zeros_like(atoms, order="C")
@@ -207,6 +260,11 @@ def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
         if 0 <= row < end.shape[0] and 0 <= col < end.shape[1]:
             end[row, col] = True
     return end
+
+
+def _sites(atoms: Occupancy) -> str:
+    """Draw an occupancy, one line per row."""
+    return "\n".join("".join(".#"[atom] for atom in row) for row in atoms.tolist())
 
 
 def equal(plan: Plan, other: Plan) -> bool:
@@ -233,7 +291,7 @@ class PlannerContract:
         fills_any_target: Whether it fills every target that the atoms suffice for.
             If not, it fills ``targets``; for any other target its plan is
             legal, or it raises a LabseqError.
-        targets: Targets that it fills; only needed without ``fills_any_target``.
+        targets: Some targets that it fills; needed without ``fills_any_target``.
         time_limit_s: Longest time for one plan of the paper's size (15 x 15 out of
             20 x 20 sites at 75 % filling) or the largest of ``targets``, in seconds.
         n_examples: Number of random cases per promise.
@@ -253,17 +311,15 @@ class PlannerContract:
         """The context that the planner is constructed with; override it for other limits of motion."""
         return Context("planner", SiteGrid(*shape))
 
-    def trials(self) -> settings:
-        """Settings of hypothesis: always the same random cases, without a deadline."""
-        return settings(max_examples=self.n_examples, deadline=None, database=None, derandomize=True)
-
     def stopwatch(self) -> float:
         """The clock that times plans, in seconds."""
         return time.perf_counter()
 
     @promise(RETURNS_A_PLAN)
     def test_returns_a_plan(self, factory: PlannerFactory) -> None:
-        """Not a list of batches, not None."""
+        """Not a list, not None; for single sites and lines, empty and full loadings, and full size."""
+        for case in self.extreme_cases():
+            self.checked(factory, *case)
         for target, atoms in self.large_cases():
             self.planned(factory, target, atoms)
 
@@ -272,7 +328,7 @@ class PlannerContract:
         """Random small arrays, on any target."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
-            plan = self.answered(factory(self.context(target.shape)), target, atoms)
+            plan = self.answered(self.made(factory, self.context(target.shape)), target, atoms)
             if plan is not None:
                 replay(plan, atoms)
 
@@ -289,7 +345,10 @@ class PlannerContract:
         for case in self.large_cases():
             check(*case)
 
-    @promise("the target is filled, and clear sites are emptied, when there are enough atoms")
+    @promise(
+        "the target is filled, and clear sites are emptied, when there are enough atoms",
+        "if it fills only certain targets, set fills_any_target = False and list some of those in targets",
+    )
     def test_fills_the_target(self, factory: PlannerFactory) -> None:
         """Random small arrays with enough atoms, and one of full size."""
 
@@ -317,26 +376,23 @@ class PlannerContract:
 
         self.on_examples(check, served=True)
 
-    @promise(RETURNS_A_PLAN)
-    def test_plans_for_extremes(self, factory: PlannerFactory) -> None:
-        """Single sites and lines, empty and full loadings, targets without atoms."""
-        for case in self.extreme_cases():
-            self.checked(factory, *case)
-
-    @promise("the same input gives the same plan")
+    @promise(
+        "the same input gives the same plan",
+        "keep nothing between calls; decide nothing by the order of a set or by a random number",
+    )
     def test_same_input_same_plan(self, factory: PlannerFactory) -> None:
         """A second time, after other calls, and from a new instance."""
         for target, atoms in self.large_cases():
-            planner = factory(self.context(target.shape))
-            first = planner.plan(atoms.copy(), same(target))
-            again = {"the second time": planner.plan(atoms.copy(), same(target))}
-            planner.plan(~atoms, same(target))
-            again["after another input"] = planner.plan(atoms.copy(), same(target))
+            planner = self.made(factory, self.context(target.shape))
+            first = plan_of(planner, same(target), atoms.copy())
+            again = {"the second time": plan_of(planner, same(target), atoms.copy())}
+            self.answered(planner, same(target), ~atoms)
+            again["after another input"] = plan_of(planner, same(target), atoms.copy())
             again["from a fresh instance"] = self.planned(factory, same(target), atoms.copy())
             for when, plan in again.items():
                 assert equal(first, plan), f"the plan is another {when}"
 
-    @promise("the input is left untouched")
+    @promise("the input is left untouched", f"{_COPY}, and change only a copy of it: occupancy.copy()")
     def test_leaves_the_input_untouched(self, factory: PlannerFactory) -> None:
         """The occupancy belongs to the shot's record."""
         for target, atoms in self.large_cases():
@@ -347,7 +403,7 @@ class PlannerContract:
             assert np.array_equal(target.fill, fill), "plan() changed the target's fill"
             assert np.array_equal(target.clear, clear), "plan() changed the target's clear"
 
-    @promise("read-only and non-contiguous occupancies are planned like others")
+    @promise("read-only and non-contiguous occupancies are planned like others", _COPY)
     def test_takes_any_memory_layout(self, factory: PlannerFactory) -> None:
         """Recorded occupancies are read-only; a view of a larger array is not contiguous."""
         for target, atoms in self.large_cases():
@@ -358,16 +414,19 @@ class PlannerContract:
             layouts = {"read-only": read_only, "Fortran": np.asfortranarray(atoms), "strided": strided}
             for layout, same_atoms in layouts.items():
                 with doing(f"a {layout} occupancy"):
-                    plan = factory(self.context(target.shape)).plan(same_atoms, target)
+                    plan = self.planned(factory, target, same_atoms)
                     with as_this_promise():
                         left = target.n_defects(replay(plan, atoms))
                     assert left == expected, f"the plan leaves {left} defects, not {expected}"
 
-    @promise("an array that is not an occupancy of the target's shape raises LabseqError or ValueError")
+    @promise(
+        "an array that is not an occupancy of the target's shape raises LabseqError or ValueError", _COPY
+    )
     def test_refuses_wrong_input(self, factory: PlannerFactory) -> None:
         """Not a wrong plan, and not an error from deep inside."""
         target, atoms = self.large_cases()[0]
-        planner = factory(self.context(target.shape))
+        planner = self.made(factory, self.context(target.shape))
+        plan_of(planner, target, atoms.copy())
         wrong: dict[str, NDArray[Any]] = {
             "an occupancy of one row too few": atoms[:-1],
             "an occupancy of one column too many": np.pad(atoms, ((0, 0), (0, 1))),
@@ -379,7 +438,10 @@ class PlannerContract:
         for what, values in wrong.items():
             refusal((LabseqError, ValueError), what, planner.plan, values, target)
 
-    @promise("a plan is made within the time limit")
+    @promise(
+        "a plan is made within the time limit",
+        "write the loops as kernels (labseq.plugin.kernel); or raise time_limit_s, and timeouts.plan",
+    )
     def test_plans_in_time(self, factory: PlannerFactory) -> None:
         """The best of three, after compiling."""
         for target, atoms in self.large_cases():
@@ -387,7 +449,7 @@ class PlannerContract:
             taken_s: list[float] = []
             for _ in range(3):
                 start_s = self.stopwatch()
-                in_time(2 * self.time_limit_s, "plan()", planner.plan, atoms.copy(), target)
+                plan_of(planner, target, atoms.copy(), 2 * self.time_limit_s)
                 taken_s.append(self.stopwatch() - start_s)
                 if taken_s[-1] <= self.time_limit_s:
                     break
@@ -399,13 +461,26 @@ class PlannerContract:
         """Other plugins draw from the global random numbers too."""
         for target, atoms in self.large_cases():
             planner = self.warmed(factory, target)
-            planner.plan(atoms.copy(), target)
+            plan_of(planner, target, atoms.copy())
             with quietly():
                 planner.plan(atoms.copy(), target)
 
+    def made(self, factory: PlannerFactory, context: Context) -> Planner:
+        """A new planner."""
+        try:
+            planner = factory(context)
+        except TypeError as error:
+            advice = "the fixture 'factory' takes the context alone, as in partial(MyPlanner, MySettings())"
+            detail = f"its constructor {format_error(error)}"
+            raise ContractViolation(RETURNS_A_PLAN, detail, advice) from error
+        if not callable(getattr(planner, "plan", None)):
+            detail = f"factory(context) made a {type(planner).__name__}, which has no method plan"
+            raise ContractViolation(RETURNS_A_PLAN, detail, f"write '{_SIGNATURE}'")
+        return planner
+
     def planned(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> Plan:
         """The plan of a new planner; it receives the array itself, not a copy."""
-        return plan_of(factory(self.context(target.shape)), target, atoms)
+        return plan_of(self.made(factory, self.context(target.shape)), target, atoms)
 
     def answered(self, planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan | None:
         """The plan of a planner; None if it refuses a target that it need not fill."""
@@ -420,43 +495,51 @@ class PlannerContract:
     def checked(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
         """The check's report on a new planner's plan; None if it refuses a target that it need not fill."""
         context = self.context(target.shape)
-        planner = factory(context)
+        planner = self.made(factory, context)
         plan = self.answered(planner, target, atoms)
         if plan is None:
             return None
         replay(plan, atoms)
         dop = getattr(planner, "degree_of_parallelism", context.motion.max_tweezers)
-        with promised(PASSES_THE_CHECK):
+        try:
             return check_plan(plan, atoms, target, dop, grid=context.grid, motion=context.motion)
+        except InvalidPlanError as error:
+            detail = f"{error}; for\n{drawn(target, atoms)}"
+            advice = f"rule '{error.rule}': {RULES[error.rule]}; 'labseq plan --png' draws such a plan"
+            raise ContractViolation(PASSES_THE_CHECK, detail, advice) from None
 
     def warmed(self, factory: PlannerFactory, target: TargetPattern) -> Planner:
         """A new planner, with its kernels compiled."""
-        planner = factory(self.context(target.shape))
+        planner = self.made(factory, self.context(target.shape))
         if isinstance(planner, NeedsWarmUp):
             planner.warm()
             load_kernels()
         return planner
 
     def on_examples(self, check: Check, *, served: bool = False) -> None:
-        """Check random cases; the smallest failing one is reported.
+        """Check all cases of one or two sites, and random ones, the smallest first.
 
         Args:
             check: Given a target and an occupancy.
             served: Whether the planner must be able to fill the target.
         """
-        of_any = cases() if self.fills_any_target or not served else cases_of(self.targets)
+        for target, atoms in examples(self.n_examples, self.served_targets() if served else ()):
+            check(target, atoms)
 
-        @self.trials()
-        @given(of_any)
-        def run(case: Case) -> None:
-            check(*case)
-
-        run()
+    def served_targets(self) -> Sequence[TargetPattern]:
+        """The targets that it fills; empty if it fills any."""
+        if self.fills_any_target or self.targets:
+            return () if self.fills_any_target else self.targets
+        example = "targets = (labseq.make_target('compact', rows=4, cols=4, grid=(8, 8)),)"
+        what = f"{type(self).__name__} has fills_any_target = False and no targets"
+        raise ContractViolation(RETURNS_A_PLAN, what, f"list some that the planner always fills: {example}")
 
     def large_cases(self) -> list[Case]:
         """Cases of full size with enough atoms."""
-        return paper_cases() if self.fills_any_target else [loaded(target) for target in self.targets]
+        return (
+            paper_cases() if self.fills_any_target else [loaded(target) for target in self.served_targets()]
+        )
 
     def extreme_cases(self) -> list[Case]:
         """Cases at the extremes of size and loading."""
-        return extreme_cases(self.targets if not self.fills_any_target else small_targets())
+        return extreme_cases(small_targets() if self.fills_any_target else self.served_targets())

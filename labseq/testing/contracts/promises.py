@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import io
 import os
 import random
 import sys
 import threading
+import time
+import traceback
 import warnings
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from functools import wraps
+from pathlib import Path
 from typing import Any, Final, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
@@ -29,12 +33,14 @@ class ContractViolation(AssertionError):  # noqa: N818 - reads as what it is in 
     Attributes:
         promise: The promise, as a sentence.
         detail: What happened instead.
+        advice: What to do, or "".
     """
 
-    def __init__(self, promise: str, detail: str) -> None:
+    def __init__(self, promise: str, detail: str, advice: str = "") -> None:
         self.promise = promise
         self.detail = detail
-        super().__init__(f"promise: {promise}; but {detail}")
+        self.advice = advice
+        super().__init__(f"promise: {promise}; but {detail}" + (f"\nto do: {advice}" if advice else ""))
 
 
 class CallHungError(AssertionError):
@@ -50,14 +56,34 @@ def promised(promise: str) -> Generator[None]:
     except ContractViolation:
         raise
     except _FAILURES as error:
-        raise ContractViolation(promise, format_error(error)) from error
+        raise ContractViolation(promise, format_error(error)) from _of_the_plugin(error)
 
 
-def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Decorate a test of a contract with the promise that it tests.
+def _of_the_plugin(error: BaseException) -> BaseException | None:
+    """The error whose traceback the author needs: one of the plugin's code, not of the suite's."""
+    cause: BaseException | None = error
+    while cause is not None and isinstance(cause, AssertionError):
+        cause = cause.__cause__
+    return cause
+
+
+def failure_text(error: ContractViolation) -> str:
+    """What pytest prints: the promise, what happened, what to do, and the lines of the plugin's own code."""
+    frames = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ is not None else []
+    here = Path(__file__).parent
+    first = next((i for i, one in enumerate(frames) if here not in Path(one.filename).parents), len(frames))
+    while first < len(frames) and any(here in Path(one.filename).parents for one in frames[first:]):
+        first += 1
+    own = [one for one in frames[first:] if Path(one.filename).name not in ("contextlib.py", "threading.py")]
+    return str(error) + "".join(["\n\n", *traceback.format_list(own)] if own else []).rstrip()
+
+
+def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Decorate a test of a contract with the promise that it tests, and what to do if it is broken.
 
     The sentence is kept as the test's attribute ``promise``. A test that cannot continue because
     another promise is broken is skipped if a test of that promise fails, so that a fault is reported once.
+    So is every test of a suite whose ``basis`` is broken: the promise that all others need.
     """
 
     def decorate(test: Callable[P, None]) -> Callable[P, None]:
@@ -71,7 +97,10 @@ def promise(text: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
                     pytest.skip(f"cannot continue: {error}")
                 raise
             except _FAILURES as error:
-                raise ContractViolation(text, format_error(error)) from error
+                basis = getattr(args[0], "basis", text)
+                if basis != text and _is_reported_elsewhere(basis, *args, *kwargs.values()):
+                    pytest.skip(f"cannot continue: promise: {basis}")
+                raise ContractViolation(text, format_error(error), advice) from _of_the_plugin(error)
 
         run.__dict__["promise"] = text
         return run
@@ -161,6 +190,29 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
     if not results:
         raise CallHungError(f"{what} has not returned after {limit_s:g} s")
     return results[0]
+
+
+@contextmanager
+def calls_of_sleep(module: str) -> Generator[list[float]]:
+    """The times that code of a module passes to ``time.sleep``, which nothing can interrupt."""
+    seen: list[float] = []
+    sleep = time.sleep
+
+    def watched(duration_s: float) -> None:
+        frame = inspect.currentframe()
+        if (
+            frame is not None
+            and frame.f_back is not None
+            and frame.f_back.f_globals.get("__name__") == module
+        ):
+            seen.append(duration_s)
+        sleep(duration_s)
+
+    time.sleep = watched
+    try:
+        yield seen
+    finally:
+        time.sleep = sleep
 
 
 def no_factory(suite: object, signature: str) -> NoReturn:
@@ -288,8 +340,10 @@ def quietly(advice: str = "") -> Generator[None]:
     random.random()  # so that the state is not what a fixed seed leaves behind
     np.random.random()  # noqa: NPY002 - the global one is what is watched
     before = process_state()
-    with watch_io() as seen:
+    with redirect_stdout(io.StringIO()) as printed, watch_io() as seen:
         yield
     did = [f"it did {', '.join(seen)}"] if seen else []
+    if text := printed.getvalue():
+        did += [f"it printed {text[:40]!r}; use logging.getLogger(__name__)"]
     did += changes_since(before)
     assert not did, "; ".join([*did, advice] if advice else did)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
-from typing import Any, Final, TypeAlias
+from typing import Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 import pytest
@@ -14,14 +14,24 @@ from labseq.guard import Guard
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.roles import Step, StepContext
 from labseq.sequencer.shot import RunningShot
-from labseq.testing.contracts.promises import ContractViolation, doing, no_factory, promise, quietly, refusal
+from labseq.testing.contracts.promises import (
+    ContractViolation,
+    calls_of_sleep,
+    doing,
+    no_factory,
+    promise,
+    quietly,
+    refusal,
+)
 from labseq.testing.fakes import FakeLab, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
 
+_BARS: Final = "return a list of TimelineEntry(label, min_duration_s, duration_s)"
 TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= min_duration_s <= duration_s"
 
 
+RUNS: Final = "run(shot) works on the devices of a shot that has taken an image"
 _MOVE_ATOMS: Final = frozenset(
     {"mobile_tweezers.play", "static_tweezers.load", "static_tweezers.ramp", "simulation.load"}
 )
@@ -34,6 +44,8 @@ class StepContract:
     Devices are fakes. The detector sees 4 x 4 sites full of atoms but for one that
     the target wants filled, image after image.
     """
+
+    basis: ClassVar[str] = RUNS
 
     @pytest.fixture
     def factory(self) -> Factory:
@@ -48,7 +60,14 @@ class StepContract:
         fill[1:3, 1:3] = True
         return fake_lab([seen], fill=fill, simulated=True)
 
-    @promise(TIMELINE)
+    @promise(RUNS, "write it as 'def run(self, shot)'; every duration is in seconds, every length in metres")
+    def test_runs(self, factory: Factory) -> None:
+        """Nothing else can be tested without it."""
+        step = factory()
+        with self.shot() as (shot, _):
+            step.run(shot)
+
+    @promise(TIMELINE, _BARS)
     def test_lays_out_its_timeline(self, factory: Factory) -> None:
         """``labseq check`` prints it and adds it up."""
         for entry in self._timeline(factory()):
@@ -72,14 +91,20 @@ class StepContract:
             value: Any = getattr(step, name)
             assert isinstance(value, bool), f"{name} is {value!r}"
 
-    @promise("it takes no longer, and no more images, than its timeline says")
+    @promise(
+        "it takes no longer, and no more images, than its timeline says",
+        "plan_timeline() returns a TimelineEntry for each part of run(): duration in seconds, readout of the "
+        "camera (context.camera.readout_s) included, and the number of images",
+    )
     def test_keeps_its_timeline(self, factory: Factory) -> None:
         """Measured on the virtual clock; a timeline without lengths promises none."""
         step = factory()
         bars = self._timeline(step)
         with self.shot() as (shot, _):
             start_s, n_before = shot.elapsed_s, len(shot.record.images)
-            step.run(shot)
+            with calls_of_sleep(type(step).__module__) as slept_s:
+                step.run(shot)
+            assert not slept_s, f"it called time.sleep({slept_s[0]:g}); wait with shot.clock.sleep"
             taken_s, n_taken = shot.elapsed_s - start_s, len(shot.record.images) - n_before
         planned_s, n_planned = sum(bar.duration_s for bar in bars), sum(bar.n_images for bar in bars)
         assert taken_s <= planned_s + 1e-6 or not planned_s, f"it took {taken_s} s; planned {planned_s} s"
@@ -101,7 +126,10 @@ class StepContract:
             done = [name for name in lab.calls.names()[before:] if name in _MOVE_ATOMS]
             assert not done, f"it is repeatable, and called {', '.join(dict.fromkeys(done))}"
 
-    @promise("a stop request ends it with StopRequested")
+    @promise(
+        "a stop request ends it with StopRequested",
+        "wait with shot.clock.sleep and call devices with shot.call; time.sleep ignores a stop request",
+    )
     def test_hears_a_stop_request(self, factory: Factory) -> None:
         """It waits and calls devices through the shot, which checks for stop requests."""
         step = factory()
@@ -126,8 +154,11 @@ class StepContract:
 
     def _timeline(self, step: Step) -> list[TimelineEntry]:
         lab = self.lab()
-        entries: list[Any] = list(step.plan_timeline(StepContext(lab.grid, lab.motion, lab.target)))
+        given: Any = step.plan_timeline(StepContext(lab.grid, lab.motion, lab.target))
+        if not isinstance(given, Iterable):
+            raise ContractViolation(TIMELINE, f"plan_timeline() gave a {type(given).__name__}", _BARS)
+        entries: list[Any] = list(given)
         for entry in entries:
             if not isinstance(entry, TimelineEntry):
-                raise ContractViolation(TIMELINE, f"plan_timeline() gave a {type(entry).__name__}")
+                raise ContractViolation(TIMELINE, f"plan_timeline() gave a {type(entry).__name__}", _BARS)
         return entries
