@@ -10,6 +10,8 @@ import pytest
 from labseq_soapy_sim import build_module
 
 import labseq
+from labseq.analysis.fits import fit_points
+from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 from tests.plugins.needs import need_library
@@ -112,28 +114,21 @@ def recaptured(path: Path, folder: Path, *overrides: str) -> tuple[float, labseq
     return 1 - lost / before, run
 
 
-def harmonic(temperature_k: float, dark_s: float) -> float:
-    """Recaptured fraction of atoms that start in a harmonic well of the virtual lab."""
-    rng, n = np.random.default_rng(7), 40_000
-    waist, wavelength, mass, boltzmann = 0.98e-6, 808e-9, 1.443160e-25, 1.380649e-23
-    depth, kt = boltzmann * 300e-6, boltzmann * temperature_k
-    rayleigh = np.pi * waist**2 / wavelength
-    size = np.array([waist / 2, waist / 2, rayleigh / np.sqrt(2)]) * np.sqrt(kt / depth)
-    v = rng.standard_normal((n, 3)) * np.sqrt(kt / mass)
-    x, y, z = (rng.standard_normal((n, 3)) * size + v * dark_s).T
-    width = 1 + (z / rayleigh) ** 2
-    well = depth / width * np.exp(-2 * (x**2 + y**2) / waist**2 / width)
-    return float(np.mean(0.5 * mass * (v**2).sum(axis=1) < well))
-
-
-def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(tmp_path: Path) -> None:
-    path = written(tmp_path, BY_HARDWARE)
-    for kelvin, dark_s in ((15e-6, 10e-6), (15e-6, 20e-6), (15e-6, 40e-6), (30e-6, 20e-6)):
-        set_ = f"shot.2.release.duration={dark_s} s", f"profile.simulation.temperature={kelvin} K"
-        kept, _ = recaptured(path, tmp_path, *set_)
-        low, high = (harmonic(factor * kelvin, dark_s) for factor in (1.1, 0.9))
-        error = 3 * (kept * (1 - kept) / 1200) ** 0.5
-        assert low - error < kept < high + error, (kelvin, dark_s)
+@pytest.mark.parametrize("temperature_k", [15e-6, 30e-6])
+def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(
+    temperature_k: float, tmp_path: Path
+) -> None:
+    overrides = [f"profile.simulation.temperature={temperature_k} K", "repeats=1", "record_frames=none"]
+    sequence = ROOT / "sequences" / "release_recapture.yaml"
+    with labseq.Session.open(sequence, output=tmp_path, seed=2, overrides=overrides) as session:
+        run = session.run()
+    survival, points = run.quantity("survival:before,after"), scan_points(run)
+    x = [point.parameters["shot.recapture.duration"] for point in points]
+    y = [survival.over(point.shots) for point in points]
+    light = {"static_depth": 300e-6, "static_waist": 0.98e-6, "static_wavelength": 808e-9}
+    found = fit_points("release_recapture", x, y, ("s", "%"), settings=light).values["temperature"]
+    assert abs(found.value - temperature_k) < 3 * found.error
+    assert found.error < 0.06 * temperature_k
 
 
 def test_the_box_and_the_radio_release_as_the_virtual_tweezers_do(tmp_path: Path) -> None:
