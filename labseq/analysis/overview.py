@@ -48,7 +48,7 @@ from labseq.messages import clean
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.pictures.figures import make_figure, save_figure
-from labseq.recording import Run
+from labseq.recording import Run, Shot
 from labseq.recording.quantities import Quantity
 from labseq.roles import Context
 from labseq.units import factor_of
