@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.config.document import Document
-from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem
+from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, one_of
 from labseq.guard import Guard
-from labseq.model import COMPUTER, Occupancy, Plan, PlanReport, TimelineEntry
+from labseq.model import COMPUTER, Frame, Occupancy, Plan, PlanReport, TimelineEntry
 from labseq.motion import check_plan, fitting_batches, tone_program
-from labseq.roles import Step, StepContext, find_leader, offers
+from labseq.roles import Detector, Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.lines import line_program, own_duration_s, spans_on
+from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timelines
 from labseq.session.assembly import Assembly
 from labseq.session.lab import WARM_S
@@ -56,6 +56,7 @@ class _Points:
     warnings: dict[str, Problem] = field(default_factory=dict[str, Problem])
     _labs: dict[tuple[int, int], tuple[Point, Lab]] = field(default_factory=dict[Any, Any])
     _timelines: dict[tuple[int, ...], tuple[Point, Timeline]] = field(default_factory=dict[Any, Any])
+    _detectors: list[Detector] = field(default_factory=list[Detector])
 
     def lab(self, point: Point) -> Lab:
         """The devices of a point; none is open."""
@@ -126,7 +127,27 @@ class _Points:
                         self._ask_lines(lab, bar.kind, own_duration_s(lab.line_specs, bar))
                 except LabseqError as error:
                     self.add(point.document, (*spec.loc, key), str(error))
-        self._ask_timeouts(point, lab)
+        if any(bar.exposure_s for _, bars in self.timeline(point) for bar in bars):
+            self._ask_images(point, lab)
+            self._ask_timeouts(point, lab)
+
+    def _ask_images(self, point: Point, lab: Lab) -> None:
+        """The camera must have what triggers it, and the detector must take its frames."""
+        document, facts = point.hardware.document, lab.step_context.camera
+        if "software" not in facts.triggers and trigger_line(lab.line_specs, "camera") is None:
+            what = (
+                f"the camera has no software trigger, only {one_of(facts.triggers)}, and no line triggers it"
+            )
+            self.add(document, ("camera", "use"), what, "a line with `triggers: camera`")
+        if facts.frame_shape is None or lab.detector in self._detectors:
+            return
+        self._detectors.append(lab.detector)
+        image = np.random.default_rng(0).integers(100, 1000, facts.frame_shape, np.uint16)
+        try:
+            self.guard.call("detector", WARM_S, lab.detector.detect, Frame(image, 1.0, 0.0))
+        except LabseqError as error:
+            if error.__cause__ is None:  # it refuses the frame; a failure may be due to the noise on it
+                self.add(document, ("detector", "use"), str(error))
 
     def _ask_lines(self, lab: Lab, kind: str, duration_s: float) -> None:
         if lab.lines is not None and offers(lab.lines, "check_program"):

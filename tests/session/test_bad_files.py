@@ -122,6 +122,13 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         ],
     ),
     (
+        "frames that the detector does not take",
+        {"frame: [512, 512]": "frame: [600, 600]"},
+        [
+            "p.yaml:67:8: detector: the frame is uint16 (512, 512); according to the detector's settings, the sites are on uint16 frames of (600, 600); calibrate the sites, or check `centre_px`, `pixel_size`, `angle` and `frame` of the detector"
+        ],
+    ),
+    (
         "edges too close for the lines",
         {
             "- load: {duration: 500 ms}": "- wait: {duration: 1 us}\n  - load: {duration: 2 us}",
