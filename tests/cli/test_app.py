@@ -11,15 +11,30 @@ import labseq
 from labseq.errors import ConfigError, DeviceError, PlanError, Problem, StopRequested
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
+COMPILER = "numba.misc.cffiimpl"  # comes with all that numba needs to compile
 HEAVY = ("numpy", "pydantic", "yaml", "rich", "h5py", "numba", "scipy", "pluggy")
 
 
-def test_help_imports_nothing_heavy() -> None:
-    command = [sys.executable, "-X", "importtime", "-m", "labseq", "--help"]
+def imported_by(*arguments: str) -> set[str]:
+    command = [sys.executable, "-X", "importtime", "-m", "labseq", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    imported = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
+    return {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+
+
+def test_help_imports_nothing_heavy() -> None:
+    imported = imported_by("--help")
     assert "typer" in imported
     assert imported.isdisjoint(HEAVY)
+
+
+def test_a_check_imports_only_what_it_needs() -> None:
+    imported = imported_by("check", str(SEQUENCE))
+    if COMPILER in imported:  # the first time, kernels are compiled
+        imported = imported_by("check", str(SEQUENCE))
+    assert "numba" in imported
+    assert imported.isdisjoint(
+        {COMPILER, "h5py", "lmfit", "matplotlib", "pandas", "rich", "scipy.linalg", "scipy.special", "xarray"}
+    )
 
 
 def test_version(call: Any) -> None:
