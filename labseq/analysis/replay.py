@@ -246,6 +246,7 @@ def replay_plans(
         except LabseqError as error:
             failure = str(error)
         found.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))
+    guard.end()
     return found
 
 

@@ -382,8 +382,12 @@ def call_planner(
     Raises:
         PlanError: The planner raised, or did not return in time; names the planner.
     """
-    guard = guard or Guard()
-    call = guard.run("planner", MAX_PLAN_S, partial(planner.plan, occupancy.copy(), target))
+    own = guard or Guard()
+    try:
+        call = own.run("planner", MAX_PLAN_S, partial(planner.plan, occupancy.copy(), target))
+    finally:
+        if guard is None:
+            own.end()
     if call is None:
         text = f"plan() did not return within {MAX_PLAN_S:.3g} s and was abandoned"
         in_a_run = "a run waits for 'timeouts: {plan: ...}' of its profile, 5 s by default"
