@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -68,7 +68,8 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
         if run is not None:
             _report(run)
         if answer is not None:
-            _answer(answer, json_result(session, run, failure), failure)
+            with nullcontext() if failure is None else suppress(RecordingError):  # the failure is reported
+                answer(json_result(session, run, failure))
 
 
 def json_result(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
@@ -90,15 +91,6 @@ def _report(run: Run) -> None:
     except RecordingError as error:
         with suppress(RecordingError):
             say(f"warning: {error}; the run is not affected", *lines, stream=sys.stderr)
-
-
-def _answer(answer: Callable[[str], None], line: str, failure: BaseException | None) -> None:
-    """Print the result; if that fails, the error that ended the run is still reported."""
-    try:
-        answer(line)
-    except RecordingError:
-        if failure is None:
-            raise
 
 
 def _read_back(session: Session | None) -> Run | None:
