@@ -274,7 +274,7 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     if found is None:
         what = "the scan has no shots yet" if run.record.get("scan") else "the run has no scan"
         raise ConfigError(Problem(what, clean(str(run.path)), expected="a run of a sequence with 'scan:'"))
-    names = request.names or (WITHOUT_TARGET if run.target.is_none else DEFAULT)
+    names = request.names or (*_aim(run), *(WITHOUT_TARGET if run.target.is_none else DEFAULT))
     quantities = [find_quantity(run, name) for name in names]
     values = tuple((quantity, found.over(quantity)) for quantity in quantities)
     for quantity, means in values if request.names else ():
@@ -285,6 +285,12 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
             )
     fits = tuple(_fit(run, found, one, means, request) for one, means in values) if request.fit else ()
     return ScanReport(found, values, fits)
+
+
+def _aim(run: Run) -> tuple[str, ...]:
+    """What an adaptive scan optimises, unless it is shown anyway."""
+    figure = str(run.scan.get("figure") or "")
+    return (figure,) if figure and figure not in {*DEFAULT, "filling_fraction", "success"} else ()
 
 
 def _fit(

@@ -10,6 +10,7 @@ import operator
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -206,6 +207,21 @@ def make_quantity(
         return NOTHING if found is None else (float(found), 1)
 
     return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
+
+
+def figures_with_images(
+    row: Mapping[str, Any], names: Iterable[str], run_dir: Path, target: TargetPattern
+) -> dict[str, float]:
+    """The figures in a line of the index, and those of these quantities that follow from images.
+
+    The shot's file is read for the latter only.
+    """
+    figures, shot = figures_in(row), Shot(run_dir / row["file"], dict(row))
+    for name in names:
+        if split_name(name)[0] in OF_IMAGES:
+            value = make_quantity(name, target).of_shot(shot)
+            figures |= {} if math.isnan(value) else {name: value}
+    return figures
 
 
 def quantity_problem(

@@ -16,8 +16,10 @@ from labseq.config.document import Document
 from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettings, StepSpec
 from labseq.errors import CheckFailedError, Loc, ProblemCollector, StopRequested
 from labseq.messages import clean, did_you_mean, listing
+from labseq.model.records import unique_names
 from labseq.recording.columns import FIGURES, figures_in
 from labseq.recording.folders import STOP_FILE
+from labseq.recording.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.recording.writer import RunWriter
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
@@ -33,7 +35,9 @@ _UNFORESEEN: Final = ("reading.", "stage.")
 def check_figure(
     document: Document, place: Loc, figure: str, purpose: str, steps: Sequence[tuple[str, Step]] | None
 ) -> None:
-    """Check that the shots of a sequence can have a figure (a numerical result of a shot).
+    """Check that the shots of a sequence can have a quantity when the next shot begins.
+
+    Results of analyses may come later than that.
 
     Args:
         document: The sequence.
@@ -45,11 +49,17 @@ def check_figure(
     Raises:
         ConfigError: No shot can have it.
     """
-    if figure not in FIGURES and not figure.startswith(_UNFORESEEN):
-        what = f"there is no figure '{clean(figure)}' {purpose}"
-        known = [*FIGURES, "reading.<name>", "stage.<name>_s"]
-        raise document.error(place, what, listing(known), did_you_mean(figure, FIGURES))
-    if figure in _JUDGED and steps is not None and not any(step.takes_image for _, step in steps):
+    names = unique_names([name for name, _ in steps or ()])
+    images = [name for name, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
+    problem = quantity_problem(figure, FIGURES, images, _UNFORESEEN)
+    if problem is not None:
+        what, expected, hint = problem
+        raise document.error(place, f"{what} {purpose}", expected, hint)
+    if (
+        (figure in _JUDGED or split_name(figure)[0] in OF_IMAGES)
+        and steps is not None
+        and not any(step.takes_image for _, step in steps)
+    ):
         what = f"no shot has a {figure}: it takes no image"
         raise document.error(place, what, "an 'image' step in the shot, or another figure")
 
@@ -148,6 +158,7 @@ class Checks:
         checks: The checks of the sequence.
         rows: The index's lines of earlier shots of a resumed run, in order.
         warn: Receives the warnings.
+        figures_of: A line of the index -> the values of the quantities of its shot.
 
     Attributes:
         left_open: The last of the earlier shots, and why a check would skip the rest of its point, or "".
@@ -158,7 +169,9 @@ class Checks:
         checks: Sequence[CheckSettings],
         rows: Iterable[Mapping[str, Any]],
         warn: Callable[[str], None],
+        figures_of: Callable[[Mapping[str, Any]], Mapping[str, float]] = figures_in,
     ) -> None:
+        self._figures_of = figures_of
         self._checks = [(check, deque[float](maxlen=check.shots)) for check in checks]
         self._warn = warn
         self._unseen = {check.value for check in checks}
@@ -193,7 +206,7 @@ class Checks:
 
     def _warn_unchecked(self, row: Mapping[str, Any]) -> None:
         """Warn, after the first shot, of figures that it does not have: their names may be misspelt."""
-        figures = figures_in(row) if self._unseen else {}
+        figures = self._figures_of(row) if self._unseen else {}
         for value in sorted(self._unseen.difference(figures)):
             self._warn(missing_figure(row["shot"], value, _CHECKED, figures))
         self._unseen.clear()
@@ -201,7 +214,7 @@ class Checks:
     def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
         """The checks that fail after a shot, each with a message."""
         broken: list[tuple[CheckSettings, str]] = []
-        figures = figures_in(row) if self._checks else {}
+        figures = self._figures_of(row) if self._checks else {}
         for check, values in self._checks:
             values.append(figures.get(check.value, math.nan))
             if message := _failure(check, values):

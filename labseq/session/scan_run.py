@@ -18,6 +18,7 @@ from labseq.model import ScanRange, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.columns import figures_in
+from labseq.recording.quantities import Quantity, make_quantity
 from labseq.roles import RunObserver, Scanner
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.run import Sequencer
@@ -221,7 +222,11 @@ class AdaptiveScanRun(ScanRun):
         self._search = search
         super().__init__(assembly, seed, done)
         self._scanner = ScannerCall(search, seed, stop)
-        self._results = Results(search, {} if run is None else {shot.index: shot for shot in run.shots})
+        self._results = Results(
+            search,
+            {} if run is None else {shot.index: shot for shot in run.shots},
+            make_quantity(search.adaptive.figure, assembly.target),
+        )
         for attempt in () if run is None else run.attempts:
             if run is not None and attempt.index in run.skipped:
                 self._results.add_skipped(attempt.index, attempt.row["parameters"])
@@ -358,10 +363,12 @@ class Results:
     Attributes:
         search: The scanner and its ranges.
         shots: The shots that count: index -> shot.
+        quantity: What is optimised.
     """
 
     search: Search
     shots: dict[int, Shot]
+    quantity: Quantity
     _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
     _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
     _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
@@ -398,11 +405,10 @@ class Results:
 
     def missing_figure(self, shot: int) -> str:
         """A warning, given once, that a shot lacks the figure that the scan optimises; else ""."""
-        figure, figures = self.search.adaptive.figure, figures_in(self.shots[shot].row)
-        if self._warned or figure in figures:
+        if self._warned or not math.isnan(self.quantity.of_shot(self.shots[shot])):
             return ""
         self._warned = True
-        return missing_figure(shot, figure, CLIMBED, figures)
+        return missing_figure(shot, self.quantity.name, CLIMBED, figures_in(self.shots[shot].row))
 
     def progress(self, visit: int) -> dict[str, Any]:
         """The score of a point and the best one so far, JSON-ready, for the run's events."""
@@ -438,10 +444,9 @@ class Results:
         return [self.shots[index] for index in indices if index in self.shots]
 
     def _visit(self, visit: int) -> VisitedPoint:
-        figures = [MappingProxyType(figures_in(shot.row)) for shot in self._shots_of(visit)]
-        name, sign = self.search.adaptive.figure, 1.0 if self.search.adaptive.maximise else -1.0
-        known = [sign * one[name] for one in figures if name in one]
-        score = math.fsum(known) / len(known) if known else math.nan
+        shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
+        figures = [MappingProxyType(figures_in(shot.row)) for shot in shots]
+        score = sign * self.quantity.over(shots).value
         return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))
 
 

@@ -7,6 +7,7 @@ import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, Self
@@ -15,6 +16,7 @@ from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
+from labseq.recording.quantities import figures_with_images
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, plan_timelines
@@ -257,7 +259,10 @@ class Session:
         self._observers.analyse(writer.run_dir, self.assembly.resolved["analysis"])
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
-        checks = Checks(self.assembly.sequence.policy.checks, before, self._warn)
+        settings, target = self.assembly.sequence.policy.checks, self.assembly.target
+        names = [check.value for check in settings]
+        figures_of = partial(figures_with_images, names=names, run_dir=writer.run_dir, target=target)
+        checks = Checks(settings, before, self._warn, figures_of)
         self.scan_run.follow(writer, self._observers)
         self.scan_run.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
 

@@ -202,8 +202,8 @@ BOTH = "from: 1, to: 9"
             "the scan has neither 'maximise' nor 'minimise'",
         ),
         (
-            f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: filling, points: 3",
-            "there is no figure 'filling' to optimise; expected",
+            f"use: climb, over: {{{DOP}: {{{BOTH}}}}}, maximise: filling:aft, points: 3",
+            "there is no image 'aft' for 'filling:aft' to optimise; expected",
         ),
         (f"use: scripted, then: refuse, {OVER}, points: 3", "it does not want to"),
     ],

@@ -187,7 +187,7 @@ def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
         (
             "{}",
             {"policy": {"checks": [{"value": "filing_fraction", "at_least": 0.5}]}},
-            "there is no figure 'filing_fraction' to check; expected ",
+            "there is no quantity 'filing_fraction' to check; expected ",
         ),
         (
             "{}",
