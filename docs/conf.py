@@ -1,5 +1,7 @@
 """Sphinx configuration."""
 
+import re
+
 import labseq
 
 project = "labseq"
@@ -15,3 +17,15 @@ html_theme = "alabaster"
 html_static_path = ["_static"]
 html_css_files = ["labseq.css"]
 html_theme_options = {"description": release, "page_width": "1100px"}
+
+
+def add_contents(_app: object, page: str, source: list[str]) -> None:
+    """Make the links of an index page its table of contents."""
+    if page.rpartition("/")[2] == "index":
+        pages = dict.fromkeys(re.findall(r"\]\(([\w-]+(?:/index)?)\.md\)", source[0]))
+        source[0] += "\n```{toctree}\n:hidden:\n\n" + "\n".join(pages) + "\n```\n"
+
+
+def setup(app: object) -> None:
+    """Connect what this file defines."""
+    app.connect("source-read", add_contents)  # pyright: ignore[reportAttributeAccessIssue]
