@@ -61,6 +61,7 @@ NOT_RUN = {
         "changes the settings of the shell",
     ],
     "docs/how-to/export.md": ["installs packages"],
+    "docs/how-to/fit.md": ["needs a run with releases"],
     "docs/how-to/follow.md": [
         "a drawing",
         "waits for the leader below; tests/plugins/test_labseq_follow_session.py runs both",
