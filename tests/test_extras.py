@@ -31,7 +31,7 @@ EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text
 
 def compressed() -> h5py.Dataset:
     file = h5py.File("a.h5", "w", driver="core", backing_store=False)
-    return file.create_dataset("images", data=[0], chunks=True, compression="gzip")
+    return file.create_dataset("frames", data=[0], chunks=True, compression="gzip")
 
 
 NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {

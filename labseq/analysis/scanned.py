@@ -19,7 +19,7 @@ from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording import Run
 from labseq.recording.points import ScanPoint, scan_points
 from labseq.recording.quantities import Quantity, find_quantity, select_shots
-from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of
+from labseq.units import UNITS, dimension_of, factor_of, readable_unit, scaled, si_unit_of, split_quantity
 
 MIN_FULL: Final = 0.5
 """Maps are drawn if at least this fraction of their cells has a point."""
@@ -32,7 +32,6 @@ GEOMETRIC_RATIO: Final = 20.0
 EQUAL: Final = 0.25
 """Maximum relative difference of ratios that count as equal, as those of "1, 2, 5, 10" do."""
 
-_NUMBER: Final = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S*)\Z")
 _MICRO: Final = re.compile(r"\bu(?=[msVWK]\b)")
 
 
@@ -132,12 +131,21 @@ def _follows(values: Sequence[str], others: Sequence[str]) -> bool:
 
 
 def numbers_of(words: Sequence[str]) -> tuple[list[float], str] | None:
-    """Values as numbers and their common unit; None if they are not numbers of one unit."""
-    found = [match for word in words if (match := _NUMBER.match(word.strip()))]
-    units = {match[2] for match in found}
-    if len(found) < len(words) or len(units) != 1:
+    """Values as numbers in one unit, that of the largest; None if they are not numbers of one dimension."""
+    found = [split_quantity(word) for word in words]
+    units = {unit for _, unit in found}
+    if any(math.isnan(number) for number, _ in found) or not units:
         return None
-    return [float(match[1]) for match in found], _MICRO.sub("µ", units.pop())
+    if len(units) == 1:
+        numbers, unit = [number for number, _ in found], units.pop()
+    else:
+        dimensions = {dimension_of(unit) for unit in units}
+        if len(dimensions) > 1 or "" in dimensions:
+            return None
+        in_si = [scaled(number, factor_of(unit)) for number, unit in found]
+        unit = found[int(np.argmax(np.abs(in_si)))][1]
+        numbers = [value / factor_of(unit) for value in in_si]
+    return numbers, _MICRO.sub("µ", unit)
 
 
 def is_geometric(values: Sequence[float]) -> bool:

@@ -117,7 +117,7 @@ class _Shots:
         with h5py.File(shot.file, "r", locking=False) as source:
             entry: Any = source["entry"]
             for camera in entry.get("camera", {}).values() if self._frames else ():
-                load_filter(shot.file, camera["images"])
+                load_filter(shot.file, camera["frames"])
             made = self._group.create_group(shot.file.stem)
             made.attrs.update(entry.attrs)
             for name in entry:
@@ -154,7 +154,7 @@ def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
         for inner in node.keys():  # noqa: SIM118 - the names in this group, all text
             _copy(node, group, inner, frames=frames)
         return
-    is_image = name == "images" and node.ndim == 3
+    is_image = name == "frames" and node.ndim == 3
     if is_image and not frames:
         return
     is_compressed = node.id.get_create_plist().get_nfilters() > 0

@@ -29,8 +29,8 @@ def average_frame(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
     for entry, index in _entries(shots, image):
         for camera in entry["camera"].values() if "camera" in entry else ():
             (at,) = np.nonzero(camera["image"][()] == index)
-            if len(at) and (not n or camera["images"].shape[1:] == total.shape):
-                frame = camera["images"][at[0]].astype(np.float64)
+            if len(at) and (not n or camera["frames"].shape[1:] == total.shape):
+                frame = camera["frames"][at[0]].astype(np.float64)
                 total, n = (total + frame if n else frame), n + 1
     if not n:
         raise _nothing(shots, "frame", image)

@@ -248,8 +248,8 @@ IMAGES: Final = Table(
 )
 """Of :class:`ImageRecord`."""
 
-FRAMES: Final = Table(
-    "camera/<name>/frames",
+EXPOSURES: Final = Table(
+    "camera/<name>/exposures",
     "frame",
     "when and how each frame was taken",
     (
@@ -411,7 +411,7 @@ STEPS: Final = Table(
 )
 """Of :class:`StepTiming`."""
 
-TABLES: Final = (IMAGES, FRAMES, MOVES, BATCHES, CYCLES, STEPS, TIMING)
+TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, CYCLES, STEPS, TIMING)
 
 
 def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> list[CycleRecord]:
@@ -469,7 +469,7 @@ ARRAYS: Final[Mapping[str, Dataset]] = {
         Dataset("target/fill", "uint8", "row, col", "1 where the target must hold an atom"),
         Dataset("target/clear", "uint8", "row, col", "1 where the target must be empty"),
         Dataset(
-            "camera/<name>/images", "uint16", "frame, y, x", "frames as the camera delivered them", "adu"
+            "camera/<name>/frames", "uint16", "frame, y, x", "frames as the camera delivered them", "adu"
         ),
         Dataset(
             "camera/<name>/t_s", "float64", "frame", "start of the exposure, from the start of the shot", "s"
@@ -559,7 +559,7 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
     nexus = {
         "/entry": ("NX_class", "default"),
         "/entry/camera/<name>": ("NX_class",),
-        "/entry/camera/<name>/images": ("interpretation", "long_name"),
+        "/entry/camera/<name>/frames": ("interpretation", "long_name"),
         "/entry/images_view": ("NX_class", "signal", "axes"),
         "/entry/detection": ("NX_class", "signal", "auxiliary_signals", "axes"),
         "/entry/detection/occupancy": ("interpretation",),

@@ -101,8 +101,8 @@ class ShotEncoder:
             names.append(link_name(camera, names))
             self._write_series(cameras.create_group(names[-1]), camera, images, indices)
         view = entry.create_group("images_view")
-        set_attributes(view, {"NX_class": "NXdata", "signal": "images", "axes": _AXES})
-        for dataset in ("images", "t_s"):
+        set_attributes(view, {"NX_class": "NXdata", "signal": "frames", "axes": _AXES})
+        for dataset in ("frames", "t_s"):
             view[dataset] = h5py.SoftLink(f"/entry/camera/{names[0]}/{dataset}")
 
     @staticmethod
@@ -110,18 +110,18 @@ class ShotEncoder:
         frames = [cast("Frame", images[i].frame) for i in indices]
         shape = frames[0].image.shape
         options: dict[str, Any] = {"chunks": (1, *shape)} if all(shape) else {}
-        stack = group.create_dataset("images", (len(frames), *shape), np.uint16, **options)
+        stack = group.create_dataset("frames", (len(frames), *shape), np.uint16, **options)
         for i, frame in enumerate(frames):
             if options:  # a quarter less time than through HDF5's chunk cache
                 stack.id.write_direct_chunk((i, 0, 0), frame.image)
             else:
                 stack[i] = frame.image
         set_attributes(group, {"NX_class": "NXdetector", "name": camera})
-        describe(stack, schema.ARRAYS["camera/<name>/images"])
+        describe(stack, schema.ARRAYS["camera/<name>/frames"])
         set_attributes(stack, {"interpretation": "image", "long_name": f"{camera} (ADU)"})
         write_array(group, "camera/<name>/t_s", [images[i].t_start_s for i in indices])
         write_array(group, "camera/<name>/image", indices)
-        write_table(group, schema.FRAMES, schema.FRAMES.rows(frames))
+        write_table(group, schema.EXPOSURES, schema.EXPOSURES.rows(frames))
 
 
 def _encode_common(run: RunRecord, run_id: str) -> bytes:
@@ -225,10 +225,10 @@ def read_frames(path: Path) -> dict[int, Frame]:
     frames: dict[int, Frame] = {}
     with opened(path) as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
-            load_filter(path, group["images"])
-            values = schema.FRAMES.arguments(Frame, group["frames"][()])
+            load_filter(path, group["frames"])
+            values = schema.EXPOSURES.arguments(Frame, group["exposures"][()])
             camera = str(group.attrs["name"])
-            for index, image, known in zip(group["image"][()], group["images"][()], values, strict=True):
+            for index, image, known in zip(group["image"][()], group["frames"][()], values, strict=True):
                 image.flags.writeable = False
                 frames[int(index)] = Frame(image, camera=camera, **known)
     return dict(sorted(frames.items()))

@@ -65,7 +65,7 @@ def rewrite_state(run_dir: Path, **changes: Any) -> None:
 def flipped_bit(run_dir: Path) -> None:
     path = run_dir / "shots" / "shot_000001.h5"
     with h5py.File(path) as file:
-        dataset: Any = file["entry/camera/camera/images"]
+        dataset: Any = file["entry/camera/camera/frames"]
         offset = dataset.id.get_chunk_info(0).byte_offset
     data = bytearray(path.read_bytes())
     data[offset] ^= 1

@@ -120,14 +120,14 @@ def test_an_archive_holds_what_the_files_hold(run: Run, tmp_path: Path, frames: 
             with h5py.File(shot.file) as file:
                 entry: Any = file["entry"]
                 expected, found = everything(entry), everything(copy)
-                left_out = set[str]() if frames else {"camera/camera/images"}
+                left_out = set[str]() if frames else {"camera/camera/frames"}
                 assert {*found} == {*expected} - left_out
                 for name, dataset in found.items():
                     assert values_in(dataset) == values_in(expected[name]), name
                     assert {*dataset.attrs} == {*expected[name].attrs}, name
                 assert copy.attrs["shot"] == entry.attrs["shot"]
                 if frames:
-                    np.testing.assert_array_equal(copy["images_view/images"], entry["images_view/images"])
+                    np.testing.assert_array_equal(copy["images_view/frames"], entry["images_view/frames"])
                 else:
                     assert "images_view" not in copy
                     assert copy.attrs["default"] == "detection"

@@ -201,9 +201,9 @@ def test_frames_that_were_compressed_later_come_back(tmp_path: Path, monkeypatch
     (found,) = write(tmp_path, shot).shots
     with h5py.File(found.file, "r+") as file:
         camera: Any = file["entry/camera/camera"]
-        frames = camera["images"][()]
-        del camera["images"]
-        camera.create_dataset("images", data=frames, **filters.Bitshuffle(cname="lz4"))
+        frames = camera["frames"][()]
+        del camera["frames"]
+        camera.create_dataset("frames", data=frames, **filters.Bitshuffle(cname="lz4"))
     assert_same(found.record(), shot)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     with pytest.raises(RecordingError, match=r"hdf5plugin is needed; pip install 'labseq\[compress\]'"):

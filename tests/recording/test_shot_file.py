@@ -109,7 +109,7 @@ def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own() -> None:
             "日": [3],
         }
         assert cameras["a_b_2"].attrs["name"] == "a/b"
-        assert default_plot(file)["images"].shape == (2, 6, 8)
+        assert default_plot(file)["frames"].shape == (2, 6, 8)
 
 
 def test_a_file_of_an_older_minor_format_reads_with_defaults(
