@@ -10,7 +10,7 @@ import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import LineProgram, LineSpec
-from labseq.roles import Context, Device, Lines
+from labseq.roles import Context, Device, Lines, offers
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import doing, promise, refusal
@@ -149,9 +149,17 @@ class LinesContract(HardwareContract[Lines]):
 
     def excesses(self) -> Mapping[str, Action[Lines]]:
         """More edges, and edges closer to one another, than any box can play."""
+
+        def check(lines: Lines) -> None:
+            if offers(lines, "check_program"):
+                lines.check_program(self._many(3, 1e-12))
+            else:
+                lines.compile(self._many(3, 1e-12))
+
         return {
             "a program of 1 000 000 edges": lambda lines: lines.compile(self._many(1_000_000, 1e-3)),
             "edges a picosecond apart": lambda lines: lines.compile(self._many(3, 1e-12)),
+            "check_program() of edges a picosecond apart": check,
         }
 
     def waits(self) -> Mapping[str, Wait[Lines]]:

@@ -216,9 +216,17 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         def prepare(excessive: ToneProgram) -> Action[MobileTweezers]:
             return lambda tweezers: tweezers.prepare(excessive)
 
+        def check(tweezers: MobileTweezers) -> None:
+            if offers(tweezers, "check_program"):
+                tweezers.check_program(too_far)
+            else:
+                tweezers.prepare(too_far)
+
         far, loud = np.full_like(row.end_hz, 1e11), np.full_like(column.start_amplitude, 3.0)
+        too_far = replace(program, row=replace(row, end_hz=far))
         return {
-            "prepare() of tones at 100 GHz": prepare(replace(program, row=replace(row, end_hz=far))),
+            "prepare() of tones at 100 GHz": prepare(too_far),
+            "check_program() of tones at 100 GHz": check,
             "prepare() of tones at a frequency of nan": prepare(
                 replace(program, column=replace(column, start_hz=column.start_hz * math.nan))
             ),
