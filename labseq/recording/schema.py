@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from operator import attrgetter
 from typing import Any, Final
 
@@ -48,6 +49,9 @@ _UNITS: Final = {
     **{unit.lower(): unit for unit in ("K", "Hz", "V", "W", "A")},
 }
 """Suffix of a name (after the last "_") -> unit."""
+
+
+_getter: Final = cache(attrgetter)
 
 
 def unit_of(name: str) -> str:
@@ -91,7 +95,7 @@ class Field:
 
     def value(self, record: Any) -> Any:
         """The value in a record."""
-        return self.source(record) if callable(self.source) else attrgetter(self.attribute)(record)
+        return self.source(record) if callable(self.source) else _getter(self.attribute)(record)
 
 
 @dataclass(frozen=True, slots=True)

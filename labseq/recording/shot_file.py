@@ -47,7 +47,9 @@ class ShotEncoder:
 
     def __init__(self, run: RunRecord, run_id: str) -> None:
         self._run = run
-        self._common = _encode_common(run, run_id)
+        self._run_id = run_id
+        self._detector: tuple[Any, ...] = ()
+        self._common = b""
 
     def encode(self, shot: ShotRecord) -> memoryview:
         """The bytes of the shot's file.
@@ -55,8 +57,11 @@ class ShotEncoder:
         Raises:
             RecordingError: The record contradicts itself, for example occupancies of different shapes.
         """
-        buffer = io.BytesIO(self._common)
         try:
+            arrays = [None if one is None else one.tobytes() for one in (shot.thresholds, shot.sites_px)]
+            if (detector := (*arrays, shot.signal_unit)) != self._detector:  # they rarely change in a run
+                self._common, self._detector = _encode_common(self._run, self._run_id, shot), detector
+            buffer = io.BytesIO(self._common)
             with h5py.File(buffer, "r+", libver=schema.LIBRARY_VERSIONS) as file:
                 self._write_shot(file["entry"], shot)
         except Exception as error:  # a plugin's camera or step may put anything into the record
@@ -75,7 +80,7 @@ class ShotEncoder:
         )
         if kept:
             self._write_frames(entry, shot.images, kept)
-        _write_detection(entry.create_group("detection"), shot, self._run.target.shape)
+        _write_detection(entry["detection"], shot, self._run.target.shape)
         _write_cycles(entry.create_group("rearrangement"), shot, self._run.target.shape)
         write_table(entry, schema.STEPS, schema.STEPS.rows(shot.steps))
         write_table(entry, schema.TIMING, schema.TIMING.rows(shot.timing))
@@ -124,8 +129,8 @@ class ShotEncoder:
         write_table(group, schema.EXPOSURES, schema.EXPOSURES.rows(frames))
 
 
-def _encode_common(run: RunRecord, run_id: str) -> bytes:
-    """A file with the values that all shots share; completing it takes half the time of writing it all."""
+def _encode_common(run: RunRecord, run_id: str, shot: ShotRecord) -> bytes:
+    """A file with what shots share, the detector's values among it; completing it takes half the time."""
     buffer = io.BytesIO()
     values = {field.name: getattr(run, field.name) for field in fields(run)}
     hashes = {f"{name}_sha256": sha256_of_text(values[f"{name}_text"]) for name in ("sequence", "profile")}
@@ -142,6 +147,11 @@ def _encode_common(run: RunRecord, run_id: str) -> bytes:
         target = entry.create_group("target")
         write_array(target, "target/fill", run.target.fill)
         write_array(target, "target/clear", run.target.clear)
+        detection = entry.create_group("detection")
+        if shot.thresholds is not None:
+            write_array(detection, "detection/threshold", shot.thresholds, shot.signal_unit)
+        if shot.sites_px is not None:
+            write_array(detection, "detection/sites_px", shot.sites_px)
     return buffer.getvalue()
 
 
@@ -158,10 +168,6 @@ def _write_detection(group: Any, shot: ShotRecord, grid_shape: tuple[int, int]) 
         stack = np.array(values, schema.ARRAYS[f"detection/{name}"].dtype).reshape(len(values), *grid_shape)
         units = shot.signal_unit if name == "signal" else None
         set_attributes(write_array(group, f"detection/{name}", stack, units), {"interpretation": "image"})
-    if shot.thresholds is not None:
-        write_array(group, "detection/threshold", shot.thresholds, shot.signal_unit)
-    if shot.sites_px is not None:
-        write_array(group, "detection/sites_px", shot.sites_px)
     write_array(group, "detection/t_s", [image.t_start_s for image in shot.images])
     write_table(group, schema.IMAGES, schema.IMAGES.rows(shot.images))
 

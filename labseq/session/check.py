@@ -40,7 +40,9 @@ SURVIVAL: Final = 0.98
 N_PROGRAMS: Final = 20
 """Number of plans whose tones are computed."""
 SHOT_OVERHEAD_BYTES: Final = 60_000
-"""Approximate size of a shot file without frames, in bytes."""
+"""Approximate size of a shot file without images, in bytes."""
+BYTES_PER_SITE: Final = 13
+"""What the file holds of each site on an image: occupancy, confidence, signal."""
 
 Timeline: TypeAlias = Sequence[tuple[str, Sequence[TimelineEntry]]]
 """Name and bars of each step."""
@@ -525,4 +527,5 @@ def _shot_bytes(session: Session, lab: Lab, timeline: Timeline) -> int | None:
     kept = {"all": n_images, "last": min(1, n_images), "none": 0}[session.assembly.sequence.record_frames]
     if shape is None and kept:
         return None
-    return SHOT_OVERHEAD_BYTES + kept * 2 * math.prod(shape or (0,))
+    per_image = BYTES_PER_SITE * lab.grid.n_rows * lab.grid.n_cols
+    return SHOT_OVERHEAD_BYTES + n_images * per_image + kept * 2 * math.prod(shape or (0,))

@@ -314,6 +314,14 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
             names; with their place.
     """
     entry = named(hardware.host, document, "step", spec.kind, spec.loc, key=True)
+    known = entry.settings_model.model_fields if entry.settings_model is not None else {}
+    for key in {"name", "policy"}.difference(known):
+        if document.root.at((*spec.loc, key)) is not None:
+            what, hint = (
+                f"'{key}' is in the settings of '{spec.kind}'",
+                f"write '{key}' on a line of its own below",
+            )
+            raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
     settings = validate(document, entry, spec.loc)
     try:
         step, dumped = construct_role(entry, settings), dump(entry, settings)
