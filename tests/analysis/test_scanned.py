@@ -65,11 +65,17 @@ def test_values_at_equal_ratios_are_on_a_logarithmic_axis(
     assert chart.logarithmic is logarithmic
 
 
-@pytest.mark.parametrize("words", [["psca", "other"], ["10 ms", "1 s"], ["1", "true"]])
+@pytest.mark.parametrize("words", [["psca", "other"], ["10 ms", "1 um"], ["1", "true"]])
 def test_what_is_no_number_is_written_below_the_axis(write: Write, words: list[str]) -> None:
     ((chart, _),) = charts(taken(write, scan(("planner", words))))
     assert tuple(chart.ticks) == tuple(words)
     assert chart.curves[""][0].tolist() == [0, 1]
+
+
+def test_values_in_several_units_of_a_dimension_are_on_one_axis(write: Write) -> None:
+    ((chart, _),) = charts(taken(write, scan(("a", ["10 ms", "1 s"]))))
+    assert chart.curves[""][0].tolist() == [0.01, 1.0]
+    assert "(s)" in chart.x_label
 
 
 def test_two_values_make_a_map(write: Write) -> None:
