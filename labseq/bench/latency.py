@@ -355,16 +355,11 @@ def _report(
         device=str(device.get("model", "")),
         mode=str(device.get("mode", "")),
         readout_s=lab.step_context.camera.readout_s,
-        prepare=_both("prepare", times["prepare"]),
-        start=_both("start", times["start"]),
+        prepare=Stage.of("prepare", *times["prepare"]),
+        start=Stage.of("start", *times["start"]),
         trigger_s=float(device.get("trigger_delay_s", 0.0)),
         planned=Stage.of("frame to tone program", total_s - rendered_s),
         n_cores=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         warnings=session.assembly.hardware.warnings,
     )
-
-
-def _both(name: str, times: NDArray[np.float64]) -> Stage:
-    """A stage with its time on this computer's clock and on the session's clock."""
-    return Stage.of(name, times[0], times[1])

@@ -13,9 +13,7 @@ from multiprocessing.process import BaseProcess
 from types import FrameType
 from typing import Any, Final, cast
 
-from labseq.bench.comparison import (
-    Comparison,
-)
+from labseq.bench.comparison import Comparison
 from labseq.bench.report import Report, Tally
 from labseq.bench.work import Done, Job, prepare, set_up, warm
 from labseq.errors import LabseqError, StopRequested
@@ -41,9 +39,7 @@ def run_jobs(comparison: Comparison, jobs: Iterable[Job], n_workers: int) -> Gen
         return
     workers: dict[Connection, BaseProcess] = {}
     try:
-        with _signals(
-            signal.SIG_IGN, signal.SIGINT
-        ):  # a process begins with the signals that its parent ignores
+        with _signals(signal.SIG_IGN, signal.SIGINT):  # which the processes then ignore, too
             for _ in range(n_workers):
                 connection, process = _start(comparison)
                 workers[connection] = process

@@ -6,9 +6,9 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,21 +36,6 @@ def ratio_of_means(numerator: ArrayLike, denominator: ArrayLike) -> Estimate:
         return Estimate(math.nan, math.nan)
     ratio = float(above.mean() / below.mean())
     return Estimate(ratio, mean(above - ratio * below).error / float(below.mean()))
-
-
-ESTIMATES: Final = (
-    "n_batches",
-    "n_atoms_moved",
-    "distance_m",
-    "motion_s",
-    "n_scans",
-    "scan_s",
-    "filling_fraction",
-    "target_met",
-    "bound",
-    "ratio_to_bound",
-)
-"""The means of a :class:`Row`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,9 +111,9 @@ class Row:
             "n_short": self.n_short,
             "n_failed": self.n_failed,
         }
-        for name in ESTIMATES:
-            estimate: Estimate = getattr(self, name)
-            values[name] = {"mean": _known(estimate.value), "error": _known(estimate.error)}
+        for name in (field.name for field in fields(self)):
+            if isinstance(estimate := getattr(self, name), Estimate):
+                values[name] = {"mean": _known(estimate.value), "error": _known(estimate.error)}
         values["planning_s"] = {"median": _known(self.planning_median_s), "p99": _known(self.planning_p99_s)}
         return values
 
@@ -230,6 +215,8 @@ class Tally:
         filled = good["n_defects"] == 0
         planning_s = good["planning_s"] if len(good) else np.array([math.nan])
         runner = condition.runners[planner_entry]
+        names = ("n_batches", "n_atoms_moved", "distance_m", "motion_s", "n_scans", "scan_s")
+        means = {name: mean(good[name]) for name in names}
         return Row(
             planner_entry=self._comparison.planner_entries[planner_entry],
             condition=self._comparison.conditions[i],
@@ -240,19 +227,14 @@ class Tally:
             n_short=int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
             n_failed=int(np.count_nonzero(~right)),
             first_failure=self._failures.get((i, planner_entry)),
-            n_batches=mean(good["n_batches"]),
-            n_atoms_moved=mean(good["n_atoms_moved"]),
-            distance_m=mean(good["distance_m"]),
-            motion_s=mean(good["motion_s"]),
-            n_scans=mean(good["n_scans"]),
-            scan_s=mean(good["scan_s"]),
             planning_median_s=float(np.median(planning_s)),
             planning_p99_s=float(np.quantile(planning_s, 0.99)),
             filling_fraction=mean(1.0 - good["n_defects"] / max(1, n_atoms)),
-            target_met=mean((good["n_defects"] == 0) & (good["n_surplus"] == 0)),
+            target_met=mean(filled & (good["n_surplus"] == 0)),
             bound=mean(loadings["n_lines"]),
             ratio_to_bound=ratio_of_means(good["n_batches"][filled], loadings["n_lines"][right][filled]),
             counts=np.bincount(good["n_batches"]),
+            **means,
         )
 
 

@@ -21,6 +21,7 @@ from labseq.kernel import load_kernels
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
+from labseq.plugins.calls import format_error
 from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
 from labseq.session.lab import construct
@@ -70,7 +71,7 @@ def warm(prepared: list[PreparedCondition]) -> None:
             try:
                 runner.planner.warm()
             except Exception as error:
-                raise PlanError(f"warm() raised {type(error).__name__}: {error}", runner.name) from error
+                raise PlanError(f"warm() raised {format_error(error)}", runner.name) from error
     load_kernels()
 
 
@@ -94,7 +95,7 @@ def _motion(condition: Condition) -> MotionSpec:
         Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
         for key, value in condition.motion
     ]
-    document = _document(overrides, "motion")
+    document = Document.parse("{}", _MOTION_ADDRESS).override_all(overrides, may_add=("motion",))
     motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
     n = condition.degree_of_parallelism
     limit, what = min(
@@ -135,11 +136,8 @@ def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option:
     """Resolve a plugin that was named in an option."""
     kind = "pattern" if choice.key == "pattern" else "planner"
     named = Override(f"{kind}.{choice.key}", choice.use, option)
-    return resolve(host, _document([named, *overrides], kind), kind, choice.placed(kind))
-
-
-def _document(overrides: list[Override], top: str) -> Document:
-    return Document.parse("{}", "the command line").override_all(overrides, may_add=(top,))
+    document = Document.parse("{}", option).override_all([named, *overrides], may_add=(kind,))
+    return resolve(host, document, kind, choice.placed(kind))
 
 
 def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
@@ -302,7 +300,10 @@ def work(prepared: list[PreparedCondition], seed: int, job: Job) -> Done:
                 rows.append(_run(condition, runner, occupancy))
             except Exception as error:  # noqa: BLE001 - a planner may raise anything; it is counted
                 if not any(failure.planner_entry == i for failure in failures):
-                    failures.append(Failure(i, job.condition, index, _format_error(error)))
+                    message = (
+                        str(error) if isinstance(error, PlanError) else f"plan() raised {format_error(error)}"
+                    )
+                    failures.append(Failure(i, job.condition, index, message))
                 rows.append(_FAILED)
         results[i] = rows
     return Done(job, results, loadings, tuple(failures))
@@ -346,10 +347,3 @@ def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> 
         report.n_surplus,
         False,
     )
-
-
-def _format_error(error: Exception) -> str:
-    if isinstance(error, PlanError):
-        return str(error)
-    text = str(error)
-    return f"plan() raised {type(error).__name__}" + (f": {text}" if text else "")
