@@ -1,10 +1,10 @@
 """Compiled functions: a numba decorator that takes explicit signatures, and a cache keyed by the source.
 
 Because every kernel has explicit signatures, no new dtype or layout can cost a compile
-in the middle of a shot. A kernel is compiled, or its machine code loaded from the user's
-cache, at the end of the :func:`warming` block in which its module is imported, otherwise
-at its first call. Several processes share what is missing from the cache. A helper, which
-only kernels call, is compiled with them and is part of their machine code: it is not loaded.
+in the middle of a shot. After its module was imported, :func:`load_kernels` compiles a
+kernel or loads its machine code from the user's cache; otherwise its first call does.
+Several processes compile what the cache lacks. A helper, which only kernels call, is part
+of their machine code and is not loaded.
 
 numba's own cache notices an edit of a kernel's file, but not of a kernel or constant
 imported from another file: it would continue to use the old machine code. So each

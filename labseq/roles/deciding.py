@@ -167,7 +167,7 @@ class NeedsWarmUp(Protocol):
     """A planner or detector with kernels to compile before the first shot."""
 
     def warm(self) -> None:
-        """Compile, or load from the cache, every kernel that a shot will need."""
+        """Import every kernel that a shot will need; labseq then compiles or loads them."""
         ...
 
 

@@ -41,7 +41,7 @@ class Hardware(ABC):
         """Model, serial number, firmware, current settings: JSON-ready values."""
 
     def warm(self) -> None:
-        """Compile, or load from the cache, every kernel that a shot will need; called before ``open()``."""
+        """Import every kernel that a shot needs, before ``open()``; labseq then compiles or loads them."""
 
     @property
     def settling_timeout_s(self) -> float:
