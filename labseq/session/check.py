@@ -208,7 +208,7 @@ def _badly_timed(
             hint += "; to pulse a light, use a line that is on in `wait` alone"
             yield number, Problem(what, expected=f"at least {least}", hint=hint), True
         elif late_s > ROUGH * own_s:
-            what = f"the computer keeps {wanted} only roughly: up to about {late} longer"
+            what = f"the computer cannot time {wanted} exactly: it may last about {late} longer"
             if after.latency_s:
                 what += f", because '{after.label}' begins late at the outputs of '{after.timed_by.name}'"
             yield number, Problem(what), False
