@@ -19,7 +19,7 @@ shots: 3
 seed: 1
 target: {pattern: compact, rows: 2, cols: 2}
 shot:
-  - load: {duration: 1 ms}
+  - load: {duration: 100 ms}
   - image: {}
 """
 PROFILE = """

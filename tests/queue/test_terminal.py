@@ -94,7 +94,7 @@ def test_a_queue_that_keeps_going_ends_with_the_first_failure(
         (("queue", "remove", "5"), "error: the queue has no entry 5; expected nothing: the queue is empty\n"),
         (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml\n"),
         (("stop", "--queue"), "error: no process runs the queue; 'labseq stop' without --queue ends a run\n"),
-        (("stop", "nowhere"), "nowhere: no such file or folder"),
+        (("stop", "nowhere"), "nowhere: there is no such folder"),
     ],
 )
 def test_what_is_not_there_is_said(
