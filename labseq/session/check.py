@@ -37,7 +37,7 @@ PAPERS_LOADING: Final = 0.75
 """Loading probability if the profile has no simulation that reports it."""
 SURVIVAL: Final = 0.98
 """Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
-N_PROGRAMS: Final = 20
+N_PROGRAMS: Final = 5
 """Number of plans whose tones are computed."""
 SHOT_OVERHEAD_BYTES: Final = 60_000
 """Approximate size of a shot file without images, in bytes."""
