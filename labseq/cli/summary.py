@@ -7,12 +7,23 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, Final
 
-from labseq.analysis.scanned import ScanRequest, counted_text, rate_text, scan_report, scanned, share_text
+from labseq.analysis.scanned import (
+    ScanRequest,
+    counted_text,
+    rate_text,
+    scan_report,
+    scanned,
+    share_text,
+    title_of,
+    value_text,
+)
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.console.text import columns, count_of, plural, quoted
 from labseq.messages import clean
 from labseq.model.estimate import mean
+from labseq.plain import to_plain
 from labseq.recording import Run
+from labseq.recording.best import best_point
 from labseq.units import format_quantity
 
 MAX_ROWS: Final = 40
@@ -37,6 +48,7 @@ def summary_lines(run: Run) -> list[str]:
         ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
         ("shots", f"{len(run.shots)} of {run.n_shots}{skipped}{kept}"),
         *_skipped_rows(run),
+        *_best_rows(run),
         *(_atom_rows(run) if run.target.is_none else statistics_rows(statistics)),
         ("duration", _duration(run)),
     ]
@@ -46,6 +58,18 @@ def summary_lines(run: Run) -> list[str]:
         [f"resume it with: labseq resume {quoted(run.path)}"] if run.status in ("stopped", "failed") else []
     )
     return [*table, *([""] if table else []), *columns(rows), *resume]
+
+
+def _best_rows(run: Run) -> list[tuple[str, str]]:
+    """The best point of an adaptive scan, with its value and the suggested one."""
+    best = best_point(run)
+    if best is None:
+        return []
+    at = ", ".join(f"{clean(address)} {value}" for address, value in best.point.written.items())
+    value = f"{title_of(best.quantity)} {value_text(best.value, best.quantity)}"
+    suggested = ", ".join(f"{clean(address)} {value}" for address, value in best.suggested.items())
+    source = "a parabola through the points near it" if best.is_fitted else "no parabola fits: the best point"
+    return [("best point", f"{at}: {value}"), ("suggested", f"{suggested} ({source})")]
 
 
 def _atom_rows(run: Run) -> list[tuple[str, str]]:
@@ -66,6 +90,8 @@ def json_summary(run: Run | None) -> dict[str, Any]:
     values = run.summary() | {"statistics": statistics_of(run.shots, run.target).as_dict()}
     if scanned(run) is not None:
         values |= scan_report(run, ScanRequest()).as_dict()
+    if (best := best_point(run)) is not None:
+        values["best"] = to_plain(best.as_dict())
     if run.skipped:
         values["skipped_shots"] = [{"shots": shots, "why": why} for why, shots in _by_reason(run)]
     return values | ({"error": run.error} if run.error else {})

@@ -16,6 +16,7 @@ from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
+from labseq.recording.best import best_point
 from labseq.recording.quantities import figures_with_images
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
@@ -227,6 +228,8 @@ class Session:
             error = failure
         unsafe = self._shut_down()
         self._observers.finish_analyses()
+        if error is None and self.scan_run.is_adaptive:
+            self._try(self._report_best, writer.run_dir)
         if error is None and unsafe:
             reasons = "; ".join(str(failure) for failure in unsafe.values())
             error = DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
@@ -278,6 +281,12 @@ class Session:
         self._observers.log = writer.event
         self._hold(f"the run {writer.run_dir}")
         return record, writer
+
+    def _report_best(self, run_dir: Path) -> None:
+        """Record the best point of an adaptive scan, with its value and the suggested one."""
+        best = best_point(open_run(run_dir))
+        if best is not None:
+            self._observers.event("scan_result", best.as_dict())
 
     def _warn(self, text: str) -> None:
         self._observers.event("warning", {"text": text})

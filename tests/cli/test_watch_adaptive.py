@@ -15,6 +15,7 @@ from labseq.cli.live import Picture, Tally, draw_scan
 from labseq.cli.show import Tables, show_run
 from labseq.cli.watch import EventReader
 from labseq.console.events import LogLines, event_text
+from labseq.recording.points import scan_points
 from tests.session.small_runs import PROFILE
 
 DOP = "planner.degree_of_parallelism"
@@ -72,6 +73,20 @@ def test_the_table_has_the_points_in_the_order_in_which_they_were_chosen(
     points = json.loads(capfd.readouterr().out)["points"]
     assert points[0]["parameters"] == {DOP: 2, "shot.2.rearrange.window": 0.06}
     assert sum(point["shots"] for point in points) == 10
+
+
+def test_the_run_ends_with_the_best_point_and_a_suggested_one(
+    printed: tuple[labseq.Run, list[str]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    run = printed[0]
+    (result,) = [event["values"] for event in run.events if event["event"] == "scan_result"]
+    fillings = {p.written[DOP]: run.quantity("filling").over(p.shots).value for p in scan_points(run)}
+    assert result["value"] == pytest.approx(max(fillings.values()))
+    assert set(result["suggested"]) == set(result["best"]) == {DOP, "shot.2.rearrange.window"}
+    show_run(run.path, as_json=False)
+    shown = " ".join(capfd.readouterr().out.split())
+    assert f"best point {DOP} {result['best'][DOP]}, " in shown
+    assert f"suggested {DOP} {result['suggested'][DOP]}, " in shown
 
 
 def test_a_view_in_another_process_learns_the_points_and_the_best(
