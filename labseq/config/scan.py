@@ -581,10 +581,7 @@ def _number(node: Node, name: str) -> Number:
 _VALUES: Final = "a list such as [3, 5, 7], {linspace: [50 um/ms, 200 um/ms, 4]} or {range: [0, 20, 5]}"
 
 
-_FORMS: Final = {
-    "linspace": "[first, last, number of values]",
-    "range": "[start, stop, step]",
-}
+_FORMS: Final = {"linspace": "[first, last, number of values]", "range": "[start, stop, step]"}
 
 
 _TOLERANCE: Final = 1e-9  # of a step: rounding must not drop the last value of a range

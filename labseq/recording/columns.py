@@ -26,10 +26,7 @@ _Row: TypeAlias = Mapping[str, Any]
 _DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
     "n_loaded": ("atoms on the first image", lambda row: _of_image(row, "n_atoms", 0)),
     "n_atoms": ("atoms on the last image", lambda row: _of_image(row, "n_atoms", -1)),
-    "n_defects": (
-        "empty target sites on the last image",
-        lambda row: _of_image(row, "n_defects", -1),
-    ),
+    "n_defects": ("empty target sites on the last image", lambda row: _of_image(row, "n_defects", -1)),
     "n_surplus": (
         "atoms on the last image on sites that must be empty",
         lambda row: _of_image(row, "n_surplus", -1),
