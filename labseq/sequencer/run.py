@@ -210,7 +210,7 @@ class Sequencer:
         self._parameters = dict(parameters or {})
         self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
         self._unsafe: dict[str, LabseqError] = {}
-        self._budgets = self._lay_out()
+        self._timelines = plan_timelines(self.lab, self.guard, self._steps)
 
     @property
     def state(self) -> State:
@@ -249,18 +249,7 @@ class Sequencer:
         if reopened:
             open_devices(lab, self.guard, self._stop, self._emit, reopened)
             self._states.to(State.IDLE)
-        self._budgets = self._lay_out()
-
-    def _lay_out(self) -> list[float]:
-        """Budget of each step in seconds: the length of its timeline; nan for one without a length."""
-        detect_s = self.lab.budgets.get("detect", 0.0)  # a timeline leaves out the detection
-        budgets: list[float] = []
         self._timelines = plan_timelines(self.lab, self.guard, self._steps)
-        for entries in self._timelines:
-            planned_s = sum(entry.duration_s for entry in entries)
-            detection_s = detect_s * sum(entry.n_images for entry in entries)
-            budgets.append(planned_s + detection_s if planned_s else math.nan)
-        return budgets
 
     def run(self, shot_indices: Sequence[int]) -> dict[int, str]:
         """Take the shots, and repeat those that fail, as the policy says.
@@ -362,14 +351,9 @@ class Sequencer:
         shot.poll()
         shot.check_interlocks()
         images = unique_names([name for name, _ in self._steps])
-        for number, (name, step) in enumerate(self._steps):
+        for number, ((name, step), entries) in enumerate(zip(self._steps, self._timelines, strict=True)):
             self._stop.check()
-            policy, budget_s, entries = (
-                self._policy.of_step(number),
-                self._budgets[number],
-                self._timelines[number],
-            )
-            with shot.of_step(number, name, policy, budget_s, images[number], entries):
+            with shot.of_step(number, name, self._policy.of_step(number), entries, images[number]):
                 self._run_step(shot, number, name, step)
         shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
         shot.record_truth()

@@ -186,9 +186,8 @@ class RunningShot:
         number: int,
         name: str,
         policy: StepPolicy,
-        budget_s: float,
-        images: str = "",
         entries: Sequence[TimelineEntry] = (),
+        images: str = "",
     ) -> Generator[None]:
         """Context manager around a step: the stages, images and failures within belong to it.
 
@@ -196,7 +195,7 @@ class RunningShot:
             number: Its index.
             name: Its name.
             policy: Its policy.
-            budget_s: What it may take.
+            entries: Its timeline, whose length is its budget; without a length it has none.
             images: Beginning of the names of its images; by default its name.
 
         Raises:
@@ -205,9 +204,11 @@ class RunningShot:
         self.in_step, self._image_name, self._kept = True, images or name, None
         self.stages.begin_step(number, name, policy)
         start_s, host_start_s = self.elapsed_s, time.perf_counter()
-        with self.stage(f"{STEP}{number}_{name}", budget_s):
+        planned_s = sum(entry.duration_s for entry in entries)
+        # a timeline leaves out the detection
+        detection_s = self.lab.budgets.get("detect", 0.0) * sum(entry.n_images for entry in entries)
+        with self.stage(f"{STEP}{number}_{name}", planned_s + detection_s if planned_s else math.nan):
             yield
-            planned_s = sum(entry.duration_s for entry in entries)
             durations = self._kept or (planned_s, self.elapsed_s - start_s)
             timed_by = ", ".join(dict.fromkeys(entry.timed_by.name for entry in entries))
             host_s = time.perf_counter() - host_start_s
