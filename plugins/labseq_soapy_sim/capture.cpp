@@ -30,7 +30,7 @@
 
 namespace {
 
-constexpr uint64_t MAGIC = 0x3170616371657362ull;  // changes with the layout below
+constexpr uint64_t MAGIC = 0x3270616371657362ull;  // changes with the layout below
 constexpr size_t RING = 1u << 18;                  // samples of each channel
 constexpr size_t CHANNELS = 2;
 constexpr size_t MTU = 16384;
@@ -39,6 +39,7 @@ enum Fault : uint64_t { UNDERFLOW_ONCE = 1, STREAM_ERROR = 2, MUTE_0 = 4, MUTE_1
 
 struct Header {
     uint64_t magic, ring, sent, underflows, is_active, fault;
+    uint64_t silent, silence;  // samples of silence up to now, and those of the last silence that is over
     double rate_hz, speed, patience_s, t0_s;  // sample n is played at t0 + n / (rate speed), CLOCK_MONOTONIC
     double frequency_hz[CHANNELS], gain_db[CHANNELS];
 };
@@ -157,7 +158,14 @@ public:
         const size_t buffer = size_t(std::max(1.0, buffer_s_ * header_->rate_hz));
         const size_t room = wait_for_room(std::min(std::min(n, MTU), buffer), 1e-6 * double(timeout_us));
         if (room == 0) return SOAPY_SDR_TIMEOUT;
-        for (size_t i = 0; i < channels_.size(); i++) keep(i, static_cast<const Sample *>(buffers[i]), room);
+        bool silent = true;
+        for (size_t i = 0; i < channels_.size(); i++) {
+            const Sample *samples = static_cast<const Sample *>(buffers[i]);
+            silent = silent && std::all_of(samples, samples + room, [](Sample sample) { return sample == 0; });
+            keep(i, samples, room);
+        }
+        if (!silent && header_->silent) header_->silence = header_->silent;
+        header_->silent = silent ? header_->silent + room : 0;
         __atomic_store_n(&header_->sent, header_->sent + room, __ATOMIC_RELEASE);
         return int(room);
     }

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import DeviceError, TweezerAmplitudes
+from labseq.plugin import TweezerAmplitudes
 from labseq_soapy_sim.ring import Ring
 
 DECIMALS: Final = 6
@@ -46,18 +46,9 @@ class CapturedOutputs:
             self._record(tuple(np.zeros_like(values) for values in self._last))
         self._record(self._now())
 
-    def find_silence(self) -> None:
-        """Record for how long the samples were 0 last, as far as the ring goes back.
-
-        Raises:
-            DeviceError: The ring does not hold the silence any more.
-        """
-        is_on = self._ring.latest(self._ring.n_kept).any(axis=0)
-        edges = np.flatnonzero(np.diff(np.concatenate([[True], is_on, [True]]).astype(np.int8)))
-        starts, ends = edges[::2], edges[1::2]
-        if not len(starts):
-            raise DeviceError("simulated radio", "the samples of a release are overwritten: lower 'buffer'")
-        self._record(self._now(), float(ends[-1] - starts[-1]) / float(self._ring["rate_hz"]))
+    def end_silence(self) -> None:
+        """Record the amplitudes after a silence, and how long it was in samples that the radio was sent."""
+        self._record(self._now(), float(self._ring["silence"]) / float(self._ring["rate_hz"]))
 
     def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:  # noqa: ARG002 - all changes are in the past
         """The amplitudes since the last call, in time's order; empty if unchanged."""

@@ -124,9 +124,9 @@ class SimulatedRadio:
             self._outputs.measure()
 
     def released(self) -> None:
-        """The driver has released the atoms: find the silence in the samples."""
+        """The driver has released the atoms: the silence in the samples is over."""
         if self._outputs is not None:
-            self._outputs.find_silence()
+            self._outputs.end_silence()
 
     def disconnect(self) -> None:
         """Remove its files, unless the profile names their folder; no effect if it is not connected."""

@@ -10,12 +10,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-MAGIC: Final = 0x3170616371657362
+MAGIC: Final = 0x3270616371657362
 CHANNELS: Final = 2
 
+_COUNTS: Final = ("magic", "ring", "sent", "underflows", "is_active", "fault", "silent", "silence")
 _HEADER: Final = np.dtype(
     [
-        *((name, np.uint64) for name in ("magic", "ring", "sent", "underflows", "is_active", "fault")),
+        *((name, np.uint64) for name in _COUNTS),
         *((name, np.float64) for name in ("rate_hz", "speed", "max_wait_s", "t0_s")),
         *((name, np.float64, CHANNELS) for name in ("frequency_hz", "gain_db")),
     ]
@@ -65,11 +66,6 @@ class Ring:
             return False
         late_s = time.monotonic() - header["t0_s"] - header["sent"] / (header["rate_hz"] * header["speed"])
         return bool(late_s <= header["max_wait_s"])
-
-    @property
-    def n_kept(self) -> int:
-        """The most of the latest samples that can be read while the radio runs."""
-        return self._samples.shape[1] - (1 << 17)
 
     def latest(self, n: int) -> NDArray[np.complex64]:
         """The latest samples that it received, complex64 (2, n); fewer if there were fewer."""
