@@ -31,6 +31,8 @@ BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"eline
 ERRORS: Final[dict[str, Any]] = {"color": DARK, "capsize": 2, "elinewidth": 0.9, "capthick": 0.9}
 MANY_BARS: Final = 15
 """Above this number of bars, the line has no marks, and empty bars have no errors."""
+LEGEND: Final = 0.2
+"""Room for the legend above the histogram of defects, relative to its height."""
 N_LINE: Final = 200
 """Number of points of a fitted line."""
 CHARACTER: Final = 0.02
@@ -165,6 +167,8 @@ def draw_curves(
         whole_numbers(axes.xaxis)
     elif _fit_as_ticks(np.unique(all_x)):
         axes.set_xticks(np.unique(all_x))
+    else:
+        axes.ticklabel_format(axis="x", scilimits=(-3, 5))
     if whole or ticks:
         axes.set_xlim(all_x.min() - 0.5, all_x.max() + 0.5)
     low, high = _with_room(scale * np.concatenate(ends), 0.12, MIN_RANGE_PERCENT / 2 if scale == 100 else 0.0)
@@ -275,7 +279,7 @@ def draw_defects(
     axes.set(title=title, xlabel=x_label, ylabel="shots (%)")
     least = x[0] - 0.6 * width
     axes.set_xlim(least, max(least + MIN_DEFECTS + 1.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, (1.0 + LEGEND) * 100 * float(max(np.nanmax(high), expected.max())))
     whole_numbers(axes.xaxis)
     axes.legend()
 

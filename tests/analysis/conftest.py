@@ -73,11 +73,40 @@ shot:
 """
 
 
+RECAPTURE = """
+labseq: 1
+name: recapture
+profile: virtual
+scan:
+  shot.drop.duration: [1 us, 10 us, 15 us, 20 us, 30 us, 50 us]
+repeats: 2
+record_frames: none
+shot:
+  - load: {duration: 500 ms}
+  - name: before
+    image: {exposure: 45 ms}
+  - name: drop
+    release: {duration: 10 us}
+  - name: after
+    image: {exposure: 45 ms}
+"""
+
+
+def run_text(text: str, root: Path, seed: int) -> Run:
+    """Run a sequence in the virtual lab."""
+    (root / "sequence.yaml").write_text(text, "utf-8")
+    profile = str(ROOT / "hardware_profiles" / "virtual.yaml")
+    with labseq.Session.open(root / "sequence.yaml", profile=profile, seed=seed, output=root) as session:
+        return session.run()
+
+
+@pytest.fixture(scope="session")
+def recapture(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A scan of the duration of a release, without a target."""
+    return run_text(RECAPTURE, tmp_path_factory.mktemp("recapture"), seed=1)
+
+
 @pytest.fixture(scope="session")
 def lifetime(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A lifetime scan of 12 shots in the virtual lab."""
-    root = tmp_path_factory.mktemp("lifetime")
-    (root / "lifetime.yaml").write_text(LIFETIME, "utf-8")
-    profile = ROOT / "hardware_profiles" / "virtual.yaml"
-    with labseq.Session.open(root / "lifetime.yaml", profile=str(profile), seed=2, output=root) as session:
-        return session.run()
+    return run_text(LIFETIME, tmp_path_factory.mktemp("lifetime"), seed=2)

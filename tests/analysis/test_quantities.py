@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import labseq
 from labseq.analysis.fits import MODELS, Fit, fit_points
+from labseq.analysis.scanned import ScanRequest, scan_report
+from labseq.cli import main
 from labseq.errors import ConfigError
 from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.model.estimate import Estimate, Estimated, Rate
@@ -104,6 +108,47 @@ def test_a_lifetime_scan_gives_the_lifetime_of_the_profile(lifetime: labseq.Run)
     assert abs(fit.values["decay"].value - 33.0) < fit.values["decay"].error < 1.5
     assert 0.2 < fit.chi2 < 2
     assert "  decay       33(1) s" in fit.lines()
+
+
+def test_release_and_recapture_gives_the_temperature_of_the_profile(recapture: labseq.Run) -> None:
+    (fit,) = scan_report(recapture, ScanRequest(("survival:before,after",), fit="release_recapture")).fits
+    temperature = fit.values["temperature"]
+    assert abs(temperature.value - 15e-6) < 2.5 * temperature.error < 2e-6
+    assert 0.2 < fit.chi2 < 3
+
+
+def test_the_commands_show_write_and_draw_the_same_points(
+    lifetime: labseq.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run, scan = str(lifetime.path), ["--scan", "survival:before,after"]
+
+    def printed(*arguments: str) -> str:
+        with pytest.raises(SystemExit) as leaving:
+            main([*arguments])
+        assert leaving.value.code in (0, 2)
+        captured = capsys.readouterr()
+        return captured.out + captured.err
+
+    shown = printed("show", run, *scan, "--fit", "exponential")
+    rate = at_points(lifetime, "survival:before,after")[0]
+    assert isinstance(rate, Rate)
+    assert f"1 s      2  {rate.n} of {rate.n_trials} (" in shown
+    assert "decay       33(1) s" in shown
+    answer = json.loads(printed("show", run, *scan, "--json", "--where", "loading > 0.74"))
+    shots = select_shots(lifetime, ["loading > 0.74"])
+    assert sum(point["shots"] for point in answer["points"]) == len(shots) < 12
+    assert printed("export", run, *scan, "-o", "points.csv") == "written: points.csv\n"
+    header, first, *rest = (tmp_path / "points.csv").read_text().splitlines()
+    assert header.startswith('shot.hold.duration,shots,"survival:before,after","survival:before,after low"')
+    assert float(first.split(",")[2]) == rate.value
+    assert len(rest) == 5
+    for name in ("scan.png", "scan_1.png"):
+        assert printed("plot", run, *scan, "--fit", "exponential") == f"written: {name}\n"
+    assert "this file exists already; expected a new name; --force replaces it" in printed(
+        "plot", run, *scan, "-o", "scan.png"
+    )
+    assert printed("plot", run, "--scan", "-o", "scan.png", "--force") == "written: scan.png\n"
 
 
 TRAP = {"static_depth": 300e-6, "static_waist": 0.98e-6, "static_wavelength": 808e-9}
