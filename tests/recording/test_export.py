@@ -164,7 +164,7 @@ def test_an_archive_holds_the_files_of_the_run(run: Run, tmp_path: Path) -> None
 
 def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_path: Path) -> None:
     path = exported(run, "archive", tmp_path)
-    assert path.stat().st_size < 0.7 * sum(shot.file.stat().st_size for shot in run.shots)
+    assert path.stat().st_size < 0.75 * sum(shot.file.stat().st_size for shot in run.shots)
     with h5py.File(path) as archive:
         first, last = (archive[f"shots/shot_{i:06d}/run"] for i in (0, 11))
         assert first == last
