@@ -31,7 +31,7 @@ BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"eline
 ERRORS: Final[dict[str, Any]] = {"color": DARK, "capsize": 2, "elinewidth": 0.9, "capthick": 0.9}
 MANY_BARS: Final = 15
 """Above this number of bars, the line has no marks, and empty bars have no errors."""
-LEGEND: Final = 0.2
+LEGEND: Final = 0.35
 """Room for the legend above the histogram of defects, relative to its height."""
 N_LINE: Final = 200
 """Number of points of a fitted line."""
