@@ -446,6 +446,7 @@ EVENTS: Final = {
     "shot_finished": "a shot is on disk, complete or not",
     "shots_skipped": "a policy skipped shots, with the reason",
     "scan_point": "a shot of an adaptive scan is on disk: the point so far, and the best one",
+    "scan_result": "an adaptive scan is over: its best point, with the value and the suggested one",
     "scan_ended": "the scanner chose no further point",
     "warning": "something that the user should know; the run continues",
     "safe_state": "a device was brought to its safe state, or could not be",
