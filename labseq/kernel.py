@@ -226,7 +226,8 @@ def _defer(one: _Kernel) -> None:
         _load(one)
         return type(dispatcher).get_call_template(dispatcher, args, kws)
 
-    # attributes of the object go before those of its class, and are deleted once it is loaded
+    # Attributes of the object go before those of its class. They stay once it is loaded: a thread whose
+    # call began before that would otherwise ask numba to compile, which is disabled by then.
     dispatcher._compile_for_args = callable_for  # noqa: SLF001
     dispatcher.get_call_template = get_call_template
     _PENDING[id(dispatcher)] = one
@@ -256,7 +257,6 @@ def _load(one: _Kernel) -> None:
             one.is_begun = False
             _PENDING[id(dispatcher)] = one
             raise
-        del dispatcher._compile_for_args, dispatcher.get_call_template  # noqa: SLF001
 
 
 def _build(one: _Kernel) -> None:
