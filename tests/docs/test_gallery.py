@@ -55,7 +55,7 @@ def test_every_pattern_has_a_picture_and_a_section(name: str) -> None:
     assert name in {example.pattern for example in EXAMPLES}
     assert f"\n## {name}\n" in PAGE
     assert f"| [{name}](#{name.replace('_', '-')}) |" in PAGE
-    assert f"```{{settings}} pattern {name}\n" in PAGE
+    assert re.search(rf"^<!-- reference: .*\bpattern {name}\b.* -->$", PAGE, re.MULTILINE)
 
 
 def test_every_picture_on_the_page_belongs_to_a_snippet_and_no_other_is_kept() -> None:

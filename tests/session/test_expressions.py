@@ -84,7 +84,8 @@ def test_the_record_has_the_values_and_the_texts(tmp_path: Path) -> None:
         "profile.mobile_tweezers.pick_up": "= variables.ramp",
         "profile.mobile_tweezers.drop_off": "= 2 * variables.ramp",
     }
-    assert record["overrides"] == {"shot.1.image.exposure": "= 2 * variables.hold"}
+    exposure = {"value": 0.04, "unit": "s", "written": "= 2 * variables.hold"}
+    assert record["overrides"] == {"shot.1.image.exposure": exposure}
     assert record["resolved"]["shot"][1]["image"]["exposure"] == 0.04
     assert record["resolved"]["variables"] == {"hold": 0.02, "dop": 2}
 

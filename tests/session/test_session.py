@@ -65,7 +65,7 @@ def test_a_run_reads_back(tmp_path):
     assert 0.9 < shot.filling_fraction <= 1.0
     assert {t.stage for t in shot.timing} >= {"expose", "detect", "plan", "check", "prepare", "play", "move"}
     assert [t for shot in done.shots for t in shot.timing if t.over_budget] == []
-    assert shot.parameters == {"shots": "2", "seed": "3"}
+    assert shot.parameters == {"shots": 2, "seed": 3}
     planner = done.record["resolved"]["planner"]
     assert (planner["use"], planner["degree_of_parallelism"], planner["variant"]) == ("psca", 7, "fewest")
     assert done.record["devices"]["camera"]
@@ -92,7 +92,8 @@ def test_values_can_be_set(tmp_path):
     assert shot.cycles[0].window_s == 0.2
     assert done.record["resolved"]["profile"]["mobile_tweezers"]["speed"] == pytest.approx(0.1)
     assert len(shot.frames) == 1
-    assert shot.parameters == {**changes, "shots": "1", "seed": "1"}
+    values = [3, 0.2, pytest.approx(0.1), "last", 1, 1]
+    assert shot.parameters == dict(zip((*changes, "shots", "seed"), values, strict=True))
 
 
 @pytest.mark.parametrize(
