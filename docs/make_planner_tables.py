@@ -72,18 +72,18 @@ def planners(n_loadings: int) -> list[str]:
 
 
 def planner_cells(row: Row) -> list[str]:
-    batches, motion_s = row.n_batches, row.motion_s
-    scans = f" ({row.n_scans} scans)" if row.scans else ""
-    scan_s = f" ({row.scan_s.scaled(1e3)} ms)" if row.scans else ""
+    batches, motion_s = row["n_batches"], row["motion_s"]
+    scans = f" ({row['n_scans']} scans)" if row.scans else ""
+    scan_s = f" ({row['scan_s'].scaled(1e3)} ms)" if row.scans else ""
     return [
         f"`{row.planner_entry.label}`",
         f"{batches}{scans}",
-        str(row.n_atoms_moved),
-        f"{row.distance_m.scaled(1e3)} mm",
+        str(row["n_atoms_moved"]),
+        f"{row['distance_m'].scaled(1e3)} mm",
         f"{motion_s.scaled(1e3)} ms{scan_s}",
-        format_quantity(row.planning_median_s, "time"),
-        f"{100 * row.target_met.value:.4g} %",
-        str(row.ratio_to_bound),
+        format_quantity(row["planning_s"]["median"], "time"),
+        f"{100 * row['target_met'].value:.4g} %",
+        str(row["ratio_to_bound"]),
     ]
 
 
@@ -94,8 +94,8 @@ def sizes(n_loadings: int) -> list[str]:
         target = f"compact:{side}x{side}"
         request = BenchRequest(grid=f"{grid}x{grid}", target=target, dop=15, loadings=n_loadings)
         (row,) = compare(read_request(request), 1).rows
-        times = [format_quantity(s, "time") for s in (row.planning_median_s, row.planning_p99_s)]
-        rows.append([f"{grid} x {grid} to {side} x {side}", str(row.n_batches), *times])
+        times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
+        rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])
     command = "labseq bench planners --dop 15 --grid 64x64 --target compact:48x48"
     return [
         *shown(f"{command} --loadings {n_loadings} --workers 1"),
@@ -302,7 +302,7 @@ def points_of(report: Report, figure: Figure) -> list[Points]:
         found.append(_points(label, rows, figure, [_y(row, figure.y) for row in rows]))
     if figure.y == "n_batches":
         rows = report.rows_of(report.comparison.planner_entries[0])
-        found.append(_points(BOUND, rows, figure, [row.bound for row in rows]))
+        found.append(_points(BOUND, rows, figure, [row["bound"] for row in rows]))
     return found
 
 
@@ -314,26 +314,26 @@ def _points(label: str, rows: list[Row], figure: Figure, y: list[Estimate]) -> P
 
 
 def _x(row: Row, quantity: Quantity) -> float:
-    return row.n_target_atoms if quantity == "n_target_atoms" else row.degree_of_parallelism
+    return row["n_target_atoms"] if quantity == "n_target_atoms" else row["degree_of_parallelism"]
 
 
 def _y(row: Row, quantity: Quantity) -> Estimate:
     """As the planner's paper counts it."""
     if quantity == "motion_s":
-        return row.scan_s if row.scans else row.motion_s
-    return row.n_scans if row.scans else row.n_batches
+        return row["scan_s"] if row.scans else row["motion_s"]
+    return row["n_scans"] if row.scans else row["n_batches"]
 
 
 def draw_figure(path: Path, report: Report, figure: Figure) -> None:
     """Draw a figure: histograms on the left if it has any, curves with their power laws on the right."""
     first = report.comparison.planner_entries[0]
-    rows = [row for row in report.rows_of(first) if row.degree_of_parallelism in figure.histograms_at]
+    rows = [row for row in report.rows_of(first) if row["degree_of_parallelism"] in figure.histograms_at]
     n_panels = 2 if rows else 1
     drawing, panels = plt.subplots(
         1, n_panels, figsize=(5.4 * n_panels, 4.2), layout="constrained", squeeze=False
     )
     for i, row in enumerate(rows):
-        draw_histogram(panels[0, 0], row.counts, f"C{i}", f"DOP {row.degree_of_parallelism}")
+        draw_histogram(panels[0, 0], row.counts, f"C{i}", f"DOP {row['degree_of_parallelism']}")
     if rows:
         panels[0, 0].set(xlabel=f"batches of {first.label}", ylabel="share of the loadings")
         panels[0, 0].legend(frameon=False, fontsize=8)

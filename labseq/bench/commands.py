@@ -1,11 +1,19 @@
 """The commands of `labseq bench`."""
 
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from labseq.console.options import JsonFile, Plugins, profile_names
+
+if TYPE_CHECKING:
+    from labseq.bench.report import Report
 
 bench = typer.Typer(
     name="bench",
@@ -29,6 +37,35 @@ Examples:
   labseq bench latency sequences/compact_225.yaml --set planner.degree_of_parallelism=15 --json latency.json
   labseq bench latency sequences/compact_225.yaml --profile bench_awg --set profile.mobile_tweezers.mode=fifo
 """
+
+
+_STEPS: Final = 10
+"""Number of progress lines without a terminal."""
+
+
+@contextmanager
+def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
+    """A progress bar on stderr if that is a terminal, else a line for every tenth; ``what`` is counted."""
+    from labseq.console.output import say
+
+    if not sys.stderr.isatty():
+        reported = 0
+
+        def report_progress(done: int, wanted: int) -> None:
+            nonlocal reported
+            if done * _STEPS // wanted > reported:
+                reported = done * _STEPS // wanted
+                say(f"{done} of {wanted} {what}", stream=sys.stderr)
+
+        yield report_progress
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    parts = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, wanted: bar.update(task, completed=done, total=wanted)
 
 
 @bench.command(epilog=PLANNERS_EXAMPLES, short_help="Compare planners on the same random loadings.")
@@ -84,11 +121,52 @@ def planners(
     _plugins: Plugins = None,
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
-    from labseq.bench.comparison import BenchRequest
-    from labseq.bench.terminal import bench_planners
+    from labseq.bench.comparison import BenchRequest, read_request
+    from labseq.bench.planners import compare
+    from labseq.bench.report import notes, table
+    from labseq.console import output
+    from labseq.pictures.plans import check_picture
 
     request = BenchRequest(planners, grid, target, loading, dop, loadings, seed, tuple(overrides or ()))
-    bench_planners(request, workers, json=json, csv=csv, png=png)
+    comparison = read_request(request)
+    output.check_different(json, csv, png)
+    if png is not None:
+        check_picture(png, (1, 1))
+    for path in filter(None, (csv, png)):
+        output.check_writable(path)
+    write = output.json_writer(json)
+    with progress_of("loadings") as progress:
+        report = compare(comparison, workers, announce=output.report_compiling, progress=progress)
+    output.say(*table(report), *notes(report))
+    if report.rows:
+        _write_files(report, csv, png, json)
+    write(report.as_dict())
+    _raise_failures(report)
+
+
+def _write_files(report: Report, csv: Path | None, png: Path | None, json: str | None) -> None:
+    """Write table and picture, and name all files."""
+    from labseq.bench.report import save_histogram
+    from labseq.console.output import STDOUT, say, write_text
+
+    if csv is not None:
+        write_text(csv, report.as_csv())
+    if png is not None:
+        save_histogram(png, report)
+    if files := [str(name) for name in (csv, png, json) if name not in (None, STDOUT)]:
+        say(f"written: {', '.join(files)}")
+
+
+def _raise_failures(report: Report) -> None:
+    """Raise what ended the comparison, or a ``PlanError`` if plans are wrong."""
+    from labseq.errors import PlanError
+
+    if report.ended_by is not None:
+        raise report.ended_by
+    if failed := [row for row in report.rows if row["n_failed"]]:
+        n, of = sum(row["n_failed"] for row in failed), sum(row["n_loadings"] for row in failed)
+        names = ", ".join(dict.fromkeys(f"'{row['planner']}'" for row in failed))
+        raise PlanError(f"{n} of {of} plans of {names} are wrong; they are not counted in the table")
 
 
 @bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the first light.")
@@ -124,10 +202,16 @@ def latency(
 
     Shots are taken in a dry run up to the first image, and continued to the start of the moves.
     """
-    from labseq.bench.latency import LatencyRequest
-    from labseq.bench.terminal import bench_latency
+    from labseq.bench.latency import LatencyRequest, measure_latency, report_text
+    from labseq.console.output import json_writer, report_compiling, say
 
-    bench_latency(LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed), json)
+    write = json_writer(json)
+    request = LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed)
+    with progress_of("loadings") as progress:
+        report = measure_latency(request, announce=report_compiling, progress=progress)
+    say(*report_text(report))
+    say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
+    write(report.as_dict())
 
 
 @bench.command(short_help="Measure the speed of rendering.")
@@ -138,6 +222,10 @@ def waveform(
     json: JsonFile = None,
 ) -> None:
     """Measure rendering: by kind of segment, for a plan, and compared with stored waveforms and numpy."""
-    from labseq.bench.terminal import bench_rendering
+    from labseq.bench.rendering import bench_waveform, report_text
+    from labseq.console.output import json_writer, report_compiling, say
 
-    bench_rendering(repeats, json)
+    write = json_writer(json)
+    report = bench_waveform(repeats, announce=report_compiling)
+    say(*report_text(report))
+    write(report.as_dict())

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.console.text import columns, percent, plural
 from labseq.errors import ConfigError, LimitError, Problem
 from labseq.guard import stop_on_signals
 from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
@@ -22,6 +23,7 @@ from labseq.sequencer.lab import Lab
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
 from labseq.session.session import Session
+from labseq.units import format_quantity
 
 HOST_STAGES: Final = ("detect", "plan", "check", "tone program", "renderer", "first chunk")
 """The stages between a frame in memory and the first chunk of samples."""
@@ -363,3 +365,53 @@ def _report(
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         warnings=session.assembly.hardware.warnings,
     )
+
+
+def report_text(report: LatencyReport) -> list[str]:
+    """The two tables and the notes that are printed."""
+    return [*_chunk_table(report), "", *_light_table(report), "", *_notes(report)]
+
+
+def _time(duration_s: float) -> str:
+    return format_quantity(duration_s, "time") if duration_s else "-"
+
+
+def _chunk_table(report: LatencyReport) -> list[str]:
+    """From a frame in memory to the first chunk of samples."""
+    rows = [("stage", "median", "99 %", "share")]
+    for stage in (*report.stages, report.total):
+        share = percent(stage.median_s / report.total.median_s, 0)
+        rows.append((stage.name, _time(stage.median_s), _time(stage.p99_s), share))
+    return columns(rows, right=(1, 2, 3))
+
+
+def _light_table(report: LatencyReport) -> list[str]:
+    """From the end of the exposure to the output; the times of the hardware are modelled."""
+    parts = (
+        Stage("camera read-out", 0.0, 0.0, report.readout_s),
+        report.planned,
+        report.prepare,
+        report.start,
+        Stage("trigger", 0.0, 0.0, report.trigger_s),
+    )
+    rows = [("to the light", "this computer", "99 %", "modelled")]
+    rows += [(s.name, _time(s.median_s), _time(s.p99_s), _time(s.modelled_s)) for s in parts]
+    here_s = sum(stage.median_s for stage in parts)
+    rows.append(("end of exposure to light", _time(here_s), "-", _time(report.to_light_s - here_s)))
+    return columns(rows, right=(1, 2, 3))
+
+
+def _notes(report: LatencyReport) -> list[str]:
+    """Notes below the tables: the measured stages, and the computer."""
+    device = f"{report.device}, mode {report.mode}" if report.mode else report.device
+    load = "" if report.load is None else f", load {report.load:.2g}"
+    playing, rate = format_quantity(report.playing_s, "time"), report.sample_rate_hz
+    planner = f"{report.planner}, degree of parallelism {report.degree_of_parallelism}"
+    median, goal = (format_quantity(s, "time") for s in (report.total.median_s, GOAL_S))
+    return [
+        f"frame to first chunk: {median}; the goal is {goal}",
+        f"{plural(report.n_loadings, 'loading')}, seed {report.seed}; {plural(report.n_cores, 'core')}{load}",
+        f"{planner}: {report.n_batches:g} batches, played in {playing}",
+        f"profile {report.profile}: {device}; first chunk at {format_quantity(rate, 'frequency')}",
+        "prepare includes the driver's own rendering and the work of a simulated device",
+    ]

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any, Final, cast
 
 from labseq.bench.comparison import Comparison
-from labseq.bench.report import Report, Tally
+from labseq.bench.report import Report, make_rows
 from labseq.bench.work import Done, Job, prepare, set_up, warm
 from labseq.errors import LabseqError, StopRequested
 from labseq.kernel import announcing, n_cores
@@ -146,7 +146,8 @@ def compare(
     """
     start_s = time.perf_counter()
     prepared = set_up(comparison)
-    tally = Tally(comparison, prepared)
+    all_done: list[Done] = []
+    n_done = 0
     wanted = comparison.n_loadings * len(prepared)
     ended_by: LabseqError | None = None
     received: list[int] = []
@@ -162,14 +163,16 @@ def compare(
             progress(0, wanted)
             with closing(_results(comparison, n_workers)) as results:
                 for done in results:
-                    tally.add(done)
-                    progress(tally.n_done, wanted)
+                    all_done.append(done)
+                    n_done += len(done.loadings)
+                    progress(n_done, wanted)
     except KeyboardInterrupt:
         ended_by = StopRequested(received[0] if received else signal.SIGINT)
     except LabseqError as error:
         ended_by = error
     duration_s = time.perf_counter() - start_s
-    return Report(comparison, tally.rows(), tally.n_done, duration_s, ended_by)
+    rows = make_rows(comparison, prepared, all_done)
+    return Report(comparison, rows, n_done, duration_s, ended_by)
 
 
 def _results(comparison: Comparison, n_workers: int | None) -> Generator[Done]:

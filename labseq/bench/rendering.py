@@ -12,10 +12,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.console.text import columns
 from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
 from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
 from labseq.motion.render_reference import render_reference
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
+from labseq.units import format_quantity
 
 N_CHANNELS: Final = 2
 CHUNK: Final = 1 << 18
@@ -214,3 +216,18 @@ def _best(call: Callable[[], object], repeats: int) -> float:
 
 def _row(name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None) -> Row:
     return Row(name, N_CHANNELS * n_samples / taken_s / 1e9, n_samples / sample_rate_hz / taken_s, goal)
+
+
+def report_text(report: WaveformReport) -> list[str]:
+    """A table of the measurements, a table of the ratios of rendering times, and their extent."""
+    rows = [("two channels", "Gsample/s", "playing/rendering", "goal")]
+    for row in report.rows:
+        goal = "-" if row.goal is None else f">= {row.goal:g}"
+        rows.append((row.name, f"{row.gigasamples_per_s:.3g}", f"{row.playing_over_rendering:.3g}", goal))
+    ratios = [("rendering times", "ratio", "goal")]
+    for ratio in report.ratios:
+        sign = "<=" if ratio.at_most else ">="
+        ratios.append((ratio.name, f"{ratio.value:.3g}", f"{sign} {ratio.goal:g}"))
+    rate = format_quantity(report.sample_rate_hz, "frequency")
+    extent = f"{rate}, two threads; the best of {report.repeats}"
+    return [*columns(rows, right=(1, 2, 3)), "", *columns(ratios, right=(1, 2)), "", extent]

@@ -1,23 +1,26 @@
-"""The results of a comparison of planners: a row per condition and planner, and a histogram."""
+"""The results of a comparison of planners: a row per condition and planner; text, CSV, JSON, histogram."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.bench.comparison import Comparison, Condition, PlannerEntry
-from labseq.bench.work import LOADING, RESULT, Done, Failure, PreparedCondition
+from labseq.bench.comparison import BARE_MOTION, Comparison, Condition, PlannerEntry
+from labseq.bench.work import Done, Failure, PreparedCondition, loading_seed
+from labseq.console.text import columns, percent, plural
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import make_figure, save_figure
+from labseq.units import format_quantity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,82 +43,57 @@ def ratio_of_means(numerator: ArrayLike, denominator: ArrayLike) -> Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """Results of one planner under one condition; the means are over the loadings with a valid plan.
+    """Results of one planner under one condition.
 
     Attributes:
-        settings: All settings of the planner, JSON-ready.
-        degree_of_parallelism: Maximum number of tweezers on at once for which its plans were checked.
-        n_short: Number of loadings with fewer atoms than the target.
-        n_failed: Loadings for which the planner failed or its plan broke a rule.
-        first_failure: The first of these, or None.
-        n_batches: Mean number of batches, linked ones counted as one.
-        n_atoms_moved: Mean number of atoms moved; one that is picked up again counts again.
-        distance_m: Mean total distance of all atom moves, in metres.
-        motion_s: Mean time of ramps and transport, in seconds, with the overheads
-            that the condition names.
-        n_scans: Mean number of scans, which the papers of some planners count
-            instead of batches; NaN for all others.
-        scan_s: Mean time of the scans, in seconds.
-        planning_median_s: Median time of a call of ``plan()``, in seconds.
-        planning_p99_s: The time within which 99 % of the calls return, in seconds.
-        filling_fraction: Mean fraction of the target's sites that hold an atom after the plan.
-        target_met: Fraction of the loadings whose plan ends with the target exactly met.
-        bound: Mean number of lines that cover the vacancies, see
-            :func:`labseq.bench.work.lines_to_cover`.
-        ratio_to_bound: Mean number of batches over mean bound, both over the loadings
-            whose target was filled.
+        values: What is exported, see :func:`summarise`; also by ``row[name]``.
+        first_failure: The first loading for which the planner failed or its plan broke a rule, or None.
         counts: int64 (n,), number of plans with 0, 1, 2, ... batches.
     """
 
     planner_entry: PlannerEntry
     condition: Condition
-    settings: Mapping[str, Any]
-    degree_of_parallelism: int
-    n_target_atoms: int
-    n_loadings: int
-    n_short: int
-    n_failed: int
+    values: Mapping[str, Any]
     first_failure: Failure | None
-    n_batches: Estimate
-    n_atoms_moved: Estimate
-    distance_m: Estimate
-    motion_s: Estimate
-    n_scans: Estimate
-    scan_s: Estimate
-    planning_median_s: float
-    planning_p99_s: float
-    filling_fraction: Estimate
-    target_met: Estimate
-    bound: Estimate
-    ratio_to_bound: Estimate
     counts: NDArray[np.int64]
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
 
     @property
     def scans(self) -> bool:
         """Whether the planner's paper counts scans."""
-        return not math.isnan(self.n_scans.value)
+        return not math.isnan(self["n_scans"].value)
 
-    def as_dict(self) -> dict[str, Any]:
-        """All values except the failure's message, JSON-ready, SI; None for unknown ones."""
-        rows, cols = self.condition.shape
-        values: dict[str, Any] = {
-            "planner": self.planner_entry.planner,
-            "label": self.planner_entry.label,
-            "settings": dict(self.settings),
-            "degree_of_parallelism": self.degree_of_parallelism,
-            "grid": {"rows": rows, "cols": cols},
-            "target": self.condition.target,
-            "n_target_atoms": self.n_target_atoms,
-            "loading": self.condition.loading,
-            "n_loadings": self.n_loadings,
-            "n_short": self.n_short,
-            "n_failed": self.n_failed,
-        }
-        for name in (field.name for field in fields(self)):
-            if isinstance(estimate := getattr(self, name), Estimate):
-                values[name] = {"mean": _known(estimate.value), "error": _known(estimate.error)}
-        values["planning_s"] = {"median": _known(self.planning_median_s), "p99": _known(self.planning_p99_s)}
-        return values
+
+def _milli(value: Estimate) -> str:
+    return str(value.scaled(1e3))
+
+
+def _percent(value: Estimate) -> str:
+    return percent(value.value, 2)
+
+
+def _time(duration_s: float) -> str:
+    return "-" if math.isnan(duration_s) else format_quantity(duration_s, "time")
+
+
+PRINTED: Final[Sequence[tuple[str, str, Callable[[Any], str]]]] = (
+    ("planner", "label", str),
+    ("DOP", "degree_of_parallelism", str),
+    ("batches", "n_batches", str),
+    ("atoms moved", "n_atoms_moved", str),
+    ("distance/mm", "distance_m", _milli),
+    ("motion/ms", "motion_s", _milli),
+    ("scans", "n_scans", str),
+    ("scans/ms", "scan_s", _milli),
+    ("planning", "planning_s", lambda times: _time(times["median"])),
+    ("99 %", "planning_s", lambda times: _time(times["p99"])),
+    ("filled", "filling_fraction", _percent),
+    ("met", "target_met", _percent),
+    ("/bound", "ratio_to_bound", str),
+)
+"""Heading, value and format of the printed columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,14 +113,14 @@ class Report:
     duration_s: float
     ended_by: LabseqError | None
 
+    def rows_of(self, planner_entry: PlannerEntry) -> list[Row]:
+        """The rows of one planner, in the order of the conditions."""
+        return [row for row in self.rows if row.planner_entry == planner_entry]
+
     @property
     def n_wanted(self) -> int:
         """Requested loadings, over all conditions."""
         return self.comparison.n_loadings * len(self.comparison.conditions)
-
-    def rows_of(self, planner_entry: PlannerEntry) -> list[Row]:
-        """The rows of one planner, in the order of the conditions."""
-        return [row for row in self.rows if row.planner_entry == planner_entry]
 
     @property
     def extent_text(self) -> str:
@@ -157,12 +135,12 @@ class Report:
             "seed": self.comparison.seed,
             "n_loadings": self.comparison.n_loadings,
             "duration_s": self.duration_s,
-            "rows": [row.as_dict() for row in self.rows],
+            "rows": [_known(row.values) for row in self.rows],
         }
 
     def as_csv(self) -> str:
         """The rows as CSV, SI, a line per row."""
-        flat = [_flat(row.as_dict()) for row in self.rows]
+        flat = [_flat(row) for row in self.as_dict()["rows"]]
         text = io.StringIO()
         writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
         writer.writeheader()
@@ -170,76 +148,13 @@ class Report:
         return text.getvalue()
 
 
-class Tally:
-    """Collects the results of the jobs of a comparison."""
-
-    def __init__(self, comparison: Comparison, prepared: Sequence[PreparedCondition]) -> None:
-        n_planners, n_loadings = len(comparison.planner_entries), comparison.n_loadings
-        self._comparison = comparison
-        self._prepared = prepared
-        self._results = [np.empty((n_planners, n_loadings), RESULT) for _ in prepared]
-        self._loadings = [np.empty(n_loadings, LOADING) for _ in prepared]
-        self._is_done = [np.zeros(n_loadings, np.bool_) for _ in prepared]
-        self._failures: dict[tuple[int, int], Failure] = {}
-
-    @property
-    def n_done(self) -> int:
-        """Loadings that are done, over all conditions."""
-        return sum(int(np.count_nonzero(done)) for done in self._is_done)
-
-    def add(self, done: Done) -> None:
-        """Add the results of a job."""
-        i, span = done.job.condition, slice(done.job.start, done.job.stop)
-        self._results[i][:, span] = done.results
-        self._loadings[i][span] = done.loadings
-        self._is_done[i][span] = True
-        for failure in done.failures:
-            key = (i, failure.planner_entry)
-            if key not in self._failures or failure.loading < self._failures[key].loading:
-                self._failures[key] = failure
-
-    def rows(self) -> tuple[Row, ...]:
-        """A row per condition and planner, of the loadings that are done."""
-        return tuple(
-            self._row(i, planner_entry)
-            for i, done in enumerate(self._is_done)
-            if done.any()
-            for planner_entry in range(len(self._comparison.planner_entries))
-        )
-
-    def _row(self, i: int, planner_entry: int) -> Row:
-        condition, done = self._prepared[i], self._is_done[i]
-        results, loadings = self._results[i][planner_entry, done], self._loadings[i][done]
-        right = ~results["failed"]
-        good, n_atoms = results[right], condition.target.n_atoms
-        filled = good["n_defects"] == 0
-        planning_s = good["planning_s"] if len(good) else np.array([math.nan])
-        runner = condition.runners[planner_entry]
-        names = ("n_batches", "n_atoms_moved", "distance_m", "motion_s", "n_scans", "scan_s")
-        means = {name: mean(good[name]) for name in names}
-        return Row(
-            planner_entry=self._comparison.planner_entries[planner_entry],
-            condition=self._comparison.conditions[i],
-            settings=runner.settings,
-            degree_of_parallelism=runner.degree_of_parallelism,
-            n_target_atoms=n_atoms,
-            n_loadings=len(results),
-            n_short=int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
-            n_failed=int(np.count_nonzero(~right)),
-            first_failure=self._failures.get((i, planner_entry)),
-            planning_median_s=float(np.median(planning_s)),
-            planning_p99_s=float(np.quantile(planning_s, 0.99)),
-            filling_fraction=mean(1.0 - good["n_defects"] / max(1, n_atoms)),
-            target_met=mean(filled & (good["n_surplus"] == 0)),
-            bound=mean(loadings["n_lines"]),
-            ratio_to_bound=ratio_of_means(good["n_batches"][filled], loadings["n_lines"][right][filled]),
-            counts=np.bincount(good["n_batches"]),
-            **means,
-        )
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _known(value: Any) -> Any:
+    """JSON-ready; None for what is not known."""
+    if isinstance(value, Estimate):
+        return _known({"mean": value.value, "error": value.error})
+    if isinstance(value, Mapping):
+        return {name: _known(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -255,6 +170,137 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
+def make_rows(
+    comparison: Comparison, prepared: Sequence[PreparedCondition], jobs_done: Sequence[Done]
+) -> tuple[Row, ...]:
+    """A row per condition and planner, of the jobs that are done, in any order."""
+    rows: list[Row] = []
+    for i, condition in enumerate(comparison.conditions):
+        parts = sorted((d for d in jobs_done if d.job.condition == i), key=lambda d: d.job.start)
+        if not parts:
+            continue
+        results = np.concatenate([part.results for part in parts], axis=1)
+        loadings = np.concatenate([part.loadings for part in parts])
+        failures = [failure for part in parts for failure in part.failures]
+        for k, entry in enumerate(comparison.planner_entries):
+            values = _identity(entry, condition, prepared[i], k)
+            values |= summarise(results[k], loadings, prepared[i].target.n_atoms)
+            first = next((failure for failure in failures if failure.planner_entry == k), None)
+            counts = np.bincount(results[k]["n_batches"][~results[k]["failed"]])
+            rows.append(Row(entry, condition, values, first, counts))
+    return tuple(rows)
+
+
+def _identity(
+    entry: PlannerEntry, condition: Condition, prepared: PreparedCondition, k: int
+) -> dict[str, Any]:
+    """What was measured: planner ``k`` with all its settings, and the condition."""
+    runner = prepared.runners[k]
+    return {
+        "planner": entry.planner,
+        "label": entry.label,
+        "settings": dict(runner.settings),
+        "degree_of_parallelism": runner.degree_of_parallelism,
+        "grid": dict(zip(("rows", "cols"), condition.shape, strict=True)),
+        "target": condition.target,
+        "n_target_atoms": prepared.target.n_atoms,
+        "loading": condition.loading,
+    }
+
+
+def summarise(results: NDArray[Any], loadings: NDArray[Any], n_atoms: int) -> dict[str, Any]:
+    """Numbers of loadings, and means with errors over the loadings with a valid plan, in SI.
+
+    Args:
+        results: :data:`labseq.bench.work.RESULT` (n,), of one planner.
+        loadings: :data:`labseq.bench.work.LOADING` (n,).
+        n_atoms: Number of sites of the target.
+
+    Returns:
+        ``n_short`` loadings have fewer atoms than the target, ``n_failed`` no valid plan. Linked batches
+        count as one; an atom that is picked up again counts again. ``n_scans`` and ``scan_s`` are NaN for
+        a planner whose paper counts batches. ``bound`` is the number of lines that cover the vacancies,
+        see :func:`labseq.bench.work.lines_to_cover`, and ``ratio_to_bound`` the mean number of batches over
+        the mean bound, both over the loadings whose target was filled.
+    """
+    right = ~results["failed"]
+    good = results[right]
+    filled = good["n_defects"] == 0
+    planning_s = good["planning_s"] if len(good) else np.array([math.nan])
+    means = ("n_batches", "n_atoms_moved", "distance_m", "motion_s", "n_scans", "scan_s")
+    return {
+        "n_loadings": len(results),
+        "n_short": int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
+        "n_failed": int(np.count_nonzero(~right)),
+        **{name: mean(good[name]) for name in means},
+        "filling_fraction": mean(1.0 - good["n_defects"] / max(1, n_atoms)),
+        "target_met": mean(filled & (good["n_surplus"] == 0)),
+        "bound": mean(loadings["n_lines"]),
+        "ratio_to_bound": ratio_of_means(good["n_batches"][filled], loadings["n_lines"][right][filled]),
+        "planning_s": {
+            "median": float(np.median(planning_s)),
+            "p99": float(np.quantile(planning_s, 0.99)),
+        },
+    }
+
+
+def table(report: Report) -> list[str]:
+    """The printed table of a comparison with one condition: a line per planner."""
+    if not report.rows:
+        return ["no plan was made"]
+    scans = any(row.scans for row in report.rows)
+    printed = [column for column in PRINTED if scans or column[1] not in ("n_scans", "scan_s")]
+    lines = [[text(row[name]) for _, name, text in printed] for row in report.rows]
+    return columns([[heading for heading, *_ in printed], *lines], range(1, len(printed)))
+
+
+def notes(report: Report) -> list[str]:
+    """Notes below the table: number of loadings, missing atoms, wrong plans."""
+    comparison = report.comparison
+    extent = plural(comparison.n_loadings, "loading")
+    if report.ended_by is not None:
+        extent = f"INCOMPLETE: {report.n_done} of {report.n_wanted} loadings"
+    if report.rows:
+        extent += f"; bound {report.rows[0]['bound']} batches"
+    lines = ["", f"{extent}; seed {comparison.seed}; {format_quantity(report.duration_s, 'time')}"]
+    if any(row.scans for row in report.rows):
+        lines.append("scans: what the paper of the planner counts instead of batches, and their duration")
+    for row in report.rows[:1]:
+        if row["n_short"]:
+            few = f"{row['n_short']} of {row['n_loadings']} loadings hold fewer atoms"
+            lines.append(f"{few} than {row['target']} has sites")
+    for row in report.rows:
+        if row.first_failure is not None:
+            lines += _failure(comparison, row, row.first_failure)
+    return lines
+
+
+def _failure(comparison: Comparison, row: Row, failure: Failure) -> list[str]:
+    what = (
+        f"{row['n_failed']} of {row['n_loadings']} plans are wrong; the first, of loading {failure.loading}"
+    )
+    return [
+        f"{row['label']}: {what}: {failure.message}",
+        f"  see it with: {_again(comparison, row, failure.loading)}",
+    ]
+
+
+def _again(comparison: Comparison, row: Row, loading: int) -> str:
+    """The command that plans one loading again."""
+    condition = row.condition
+    rows, cols = condition.shape
+    seed = loading_seed(comparison.seed, loading)
+    if condition.motion != BARE_MOTION:  # which takes a profile
+        return f"numpy.random.default_rng({seed}).random(({rows}, {cols})) < {condition.loading:g}"
+    words = ["labseq", "plan", f"random:{rows}x{cols}@{condition.loading:g}", "--seed", str(seed)]
+    words += ["--target", condition.target, "--planner", row.planner_entry.planner]
+    if "degree_of_parallelism" in row["settings"] and condition.degree_of_parallelism is not None:
+        words += ["--dop", str(condition.degree_of_parallelism)]
+    for key, value in (*comparison.settings, *row.planner_entry.settings):
+        words += ["--set", f"{key}={value}"]
+    return shlex.join(words)
+
+
 def save_histogram(path: Path, report: Report) -> None:
     """Draw how many batches the planners need, for a comparison with one condition, as a PNG.
 
@@ -267,7 +313,7 @@ def save_histogram(path: Path, report: Report) -> None:
         figure = make_figure(5.4, 4.2, layout="constrained")
         axes = figure.add_subplot()
         for i, row in enumerate(report.rows):
-            label = f"{row.planner_entry.label}: {row.n_batches}"
+            label = f"{row['label']}: {row['n_batches']}"
             draw_histogram(axes, row.counts, f"C{i % 10}", label)
         axes.set_xlabel("batches")
         axes.set_ylabel("share of the loadings")
