@@ -29,11 +29,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from labseq.bench.comparison import (
     BARE_MOTION,
-    BenchRequest,
     Comparison,
     Condition,
     PlannerEntry,
-    read_request,
+    read_comparison,
 )
 from labseq.bench.planners import compare
 from labseq.bench.report import Report, Row, draw_histogram
@@ -55,8 +54,8 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def planners(n_loadings: int) -> list[str]:
     """All planners side by side, one after the other so that times are true."""
-    request = BenchRequest(planners=PLANNERS, dop=15, loadings=n_loadings)
-    report = compare(read_request(request), 1)
+    comparison = read_comparison(planners=PLANNERS, dop=15, loadings=n_loadings)
+    report = compare(comparison, 1)
     header = (
         "planner",
         "batches",
@@ -92,8 +91,8 @@ def sizes(n_loadings: int) -> list[str]:
     rows: list[list[str]] = []
     for grid, side in SIZES:
         target = f"compact:{side}x{side}"
-        request = BenchRequest(grid=f"{grid}x{grid}", target=target, dop=15, loadings=n_loadings)
-        (row,) = compare(read_request(request), 1).rows
+        comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop=15, loadings=n_loadings)
+        (row,) = compare(comparison, 1).rows
         times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
         rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])
     command = "labseq bench planners --dop 15 --grid 64x64 --target compact:48x48"

@@ -121,14 +121,13 @@ def planners(
     _plugins: Plugins = None,
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
-    from labseq.bench.comparison import BenchRequest, read_request
+    from labseq.bench.comparison import read_comparison
     from labseq.bench.planners import compare
     from labseq.bench.report import notes, table
     from labseq.console import output
     from labseq.pictures.plans import check_picture
 
-    request = BenchRequest(planners, grid, target, loading, dop, loadings, seed, tuple(overrides or ()))
-    comparison = read_request(request)
+    comparison = read_comparison(planners, grid, target, loading, dop, loadings, seed, overrides or ())
     output.check_different(json, csv, png)
     if png is not None:
         check_picture(png, (1, 1))

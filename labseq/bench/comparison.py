@@ -170,26 +170,18 @@ def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
     return tuple(planner), tuple(motion)
 
 
-@dataclass(frozen=True, slots=True)
-class BenchRequest:
-    """The options of ``labseq bench planners`` that say what is compared, as text."""
-
-    planners: str = "psca"
-    grid: str = "20x20"
-    target: str = "compact:15x15"
-    loading: str = "75 %"
-    dop: int | None = None
-    loadings: int = 1000
-    seed: int = 1
-    overrides: Sequence[str] = ()
-
-
-def read_request(request: BenchRequest) -> Comparison:
-    """Convert a request to a comparison; raises ``ConfigError`` if it has an error."""
-    settings, motion = parse_overrides(request.overrides)
-    shape, loading = parse_grid(request.grid), parse_loading(request.loading)
-    condition = Condition(shape, request.target, loading, request.dop, (*BARE_MOTION, *motion))
-    called = f"--planners {request.planners}"
-    return Comparison(
-        parse_planners(request.planners), (condition,), request.loadings, request.seed, settings, called
-    )
+def read_comparison(
+    planners: str = "psca",
+    grid: str = "20x20",
+    target: str = "compact:15x15",
+    loading: str = "75 %",
+    dop: int | None = None,
+    loadings: int = 1000,
+    seed: int = 1,
+    overrides: Sequence[str] = (),
+) -> Comparison:
+    """Read the options of ``labseq bench planners``; raises ``ConfigError`` if one has an error."""
+    settings, motion = parse_overrides(overrides)
+    condition = Condition(parse_grid(grid), target, parse_loading(loading), dop, (*BARE_MOTION, *motion))
+    entries = parse_planners(planners)
+    return Comparison(entries, (condition,), loadings, seed, settings, f"--planners {planners}")

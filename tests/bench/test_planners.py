@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from labseq.bench import planners as bench
-from labseq.bench.comparison import BenchRequest, Comparison, Condition, PlannerEntry, read_request
+from labseq.bench.comparison import Comparison, Condition, PlannerEntry, read_comparison
 from labseq.bench.planners import compare
 from labseq.bench.report import Report
 from labseq.bench.work import draw, set_up
@@ -149,26 +149,24 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
 @pytest.mark.parametrize(
     ("request_", "words"),
     [
-        (BenchRequest(planners="psac"), "unknown planner 'psac'; expected .*; did you mean 'psca'?"),
-        (BenchRequest(target="compact:30x30"), "--target compact:30x30: the size of the target is 30 rows"),
-        (BenchRequest(dop=21), "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
+        ({"planners": "psac"}, "unknown planner 'psac'; expected .*; did you mean 'psca'?"),
+        ({"target": "compact:30x30"}, "--target compact:30x30: the size of the target is 30 rows"),
+        ({"dop": 21}, "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
         (
-            BenchRequest(
-                dop=6, overrides=[f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")]
-            ),
+            {"dop": 6, "overrides": [f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")]},
             "--dop 6: .*; expected 1 to 5, the most tones of an axis",
         ),
-        (BenchRequest(planners="psca:dop=3"), "psca:dop=3: 'dop' is not a setting of planner 'psca'"),
-        (BenchRequest(overrides=["planner.dop=3"]), "--set planner.dop=3: 'dop' is not a setting"),
-        (BenchRequest(overrides=["profile.mobile_tweezers.speed=3 ms"]), "'3 ms' is a time, not a speed"),
+        ({"planners": "psca:dop=3"}, "psca:dop=3: 'dop' is not a setting of planner 'psca'"),
+        ({"overrides": ["planner.dop=3"]}, "--set planner.dop=3: 'dop' is not a setting"),
+        ({"overrides": ["profile.mobile_tweezers.speed=3 ms"]}, "'3 ms' is a time, not a speed"),
     ],
 )
-def test_wrong_requests_are_refused(request_: BenchRequest, words: str) -> None:
+def test_wrong_requests_are_refused(request_: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        compare(read_request(request_), 1)
+        compare(read_comparison(**request_), 1)
 
 
 def test_the_tweezers_speed_can_be_set() -> None:
-    request = BenchRequest(target="compact:2x2", overrides=["profile.mobile_tweezers.speed=130 um/ms"])
-    (course,) = set_up(read_request(request))
+    speed = "profile.mobile_tweezers.speed=130 um/ms"
+    (course,) = set_up(read_comparison(target="compact:2x2", overrides=[speed]))
     assert course.motion.speed_m_s == 0.13
