@@ -227,4 +227,4 @@ def waveform(
     write = json_writer(json)
     report = bench_waveform(repeats, announce=report_compiling)
     say(*report_text(report))
-    write(report.as_dict())
+    write(report)

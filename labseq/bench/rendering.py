@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import timeit
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -41,52 +41,17 @@ PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1
 """A typical plan: 225 atoms in 20 x 20 sites, moved seven at a time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One measurement: samples of both channels per second, in 1e9, and the goal for the other ratio."""
-
-    name: str
-    gigasamples_per_s: float
-    playing_over_rendering: float
-    goal: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Ratio:
-    """The ratio of two rendering times; the goal is a minimum, or a maximum if ``at_most``."""
-
-    name: str
-    value: float
-    goal: float
-    at_most: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class WaveformReport:
-    """The results of the measurement.
-
-    Attributes:
-        rows: A row for each kind of segment and for a plan; stored waveforms and numpy last.
-        sample_rate_hz: Sample rate of all rows.
-        repeats: Number of repetitions; the fastest one counts.
-    """
-
-    rows: tuple[Row, ...]
-    ratios: tuple[Ratio, ...]
-    sample_rate_hz: float
-    repeats: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, JSON-ready."""
-        return asdict(self)
-
-
-def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lambda _: None) -> WaveformReport:
+def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lambda _: None) -> dict[str, Any]:
     """Measure rendering in two threads into reused buffers; the fastest of several repetitions counts.
 
     Args:
         repeats: Number of repetitions.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
+
+    Returns:
+        JSON-ready: ``rows``, one for each kind of segment and for a plan, stored waveforms and numpy last,
+        with samples of both channels per second, in 1e9; ``ratios`` of rendering times, whose goal is a
+        minimum, or a maximum if ``at_most``.
     """
     from labseq.kernel import announcing, load_kernels
 
@@ -96,17 +61,23 @@ def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lamb
         warm_rendering()
         load_kernels()
         rows = [*_comb_rows(moves, rate_hz, repeats), *_other_ways(grid, rate_hz, repeats)]
-    time_of = {row.name: 1.0 / row.gigasamples_per_s for row in rows}
+    time_of = {row["name"]: 1.0 / row["gigasamples_per_s"] for row in rows}
     fast, stored, numpy = (time_of[name] for name in ("1 group, 20 tones", STORED_20, NUMPY_20))
     ratios = (
-        Ratio("20 tones over 5 tones", fast / time_of["1 group, 5 tones"], 1.3, at_most=True),
-        Ratio("stored waveforms over comb, 20 tones", stored / fast, 5.0),
-        Ratio("numpy over comb, 20 tones", numpy / fast, 100.0),
+        ("20 tones over 5 tones", fast / time_of["1 group, 5 tones"], 1.3, True),
+        ("stored waveforms over comb, 20 tones", stored / fast, 5.0, False),
+        ("numpy over comb, 20 tones", numpy / fast, 100.0, False),
     )
-    return WaveformReport(tuple(rows), ratios, rate_hz, repeats)
+    names = ("name", "value", "goal", "at_most")
+    return {
+        "rows": rows,
+        "ratios": [dict(zip(names, ratio, strict=True)) for ratio in ratios],
+        "sample_rate_hz": rate_hz,
+        "repeats": repeats,
+    }
 
 
-def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Row]:
+def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[dict[str, Any]]:
     grid = moves.grid
     bare = replace(moves.motion, overhead_per_batch_s=0.0)
     plan = tone_program(moves.plan, grid, bare)
@@ -124,7 +95,7 @@ def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[R
         yield _row(name, renderer.n_samples, rate_hz, taken_s, goal)
 
 
-def _other_ways(grid: SiteGrid, rate_hz: float, repeats: int) -> Generator[Row]:
+def _other_ways(grid: SiteGrid, rate_hz: float, repeats: int) -> Generator[dict[str, Any]]:
     stored = stored_waveforms(grid, rate_hz)
     for name, n_tones in ((STORED_5, 5), (STORED_20, 20)):
         yield _row(name, STORED, rate_hz, _best(partial(sum_all_stored, stored, n_tones), repeats))
@@ -214,20 +185,28 @@ def _best(call: Callable[[], object], repeats: int) -> float:
     return min(timeit.repeat(call, number=1, repeat=repeats))
 
 
-def _row(name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None) -> Row:
-    return Row(name, N_CHANNELS * n_samples / taken_s / 1e9, n_samples / sample_rate_hz / taken_s, goal)
+def _row(
+    name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "gigasamples_per_s": N_CHANNELS * n_samples / taken_s / 1e9,
+        "playing_over_rendering": n_samples / sample_rate_hz / taken_s,
+        "goal": goal,
+    }
 
 
-def report_text(report: WaveformReport) -> list[str]:
+def report_text(report: Mapping[str, Any]) -> list[str]:
     """A table of the measurements, a table of the ratios of rendering times, and their extent."""
     rows = [("two channels", "Gsample/s", "playing/rendering", "goal")]
-    for row in report.rows:
-        goal = "-" if row.goal is None else f">= {row.goal:g}"
-        rows.append((row.name, f"{row.gigasamples_per_s:.3g}", f"{row.playing_over_rendering:.3g}", goal))
+    for row in report["rows"]:
+        goal = "-" if row["goal"] is None else f">= {row['goal']:g}"
+        speed, ratio = row["gigasamples_per_s"], row["playing_over_rendering"]
+        rows.append((row["name"], f"{speed:.3g}", f"{ratio:.3g}", goal))
     ratios = [("rendering times", "ratio", "goal")]
-    for ratio in report.ratios:
-        sign = "<=" if ratio.at_most else ">="
-        ratios.append((ratio.name, f"{ratio.value:.3g}", f"{sign} {ratio.goal:g}"))
-    rate = format_quantity(report.sample_rate_hz, "frequency")
-    extent = f"{rate}, two threads; the best of {report.repeats}"
+    for ratio in report["ratios"]:
+        sign = "<=" if ratio["at_most"] else ">="
+        ratios.append((ratio["name"], f"{ratio['value']:.3g}", f"{sign} {ratio['goal']:g}"))
+    rate = format_quantity(report["sample_rate_hz"], "frequency")
+    extent = f"{rate}, two threads; the best of {report['repeats']}"
     return [*columns(rows, right=(1, 2, 3)), "", *columns(ratios, right=(1, 2)), "", extent]
