@@ -139,8 +139,8 @@ def test_a_morning_of_calibration_finds_all_that_the_practice_lab_hides(tmp_path
     assert lab.mobile_off_m().mean() > 200e-9
     for kind, shots in SHOTS.items():
         lab.calibrate(kind, shots)
-    amplitudes = (lab.found["tweezers"].values[f"{axis}_amplitudes"] for axis in ("row", "column"))
-    lab.world.play("static_tweezers", TweezerAmplitudes(*amplitudes), 0.0)
+    rows, columns = (lab.found["tweezers"].values[f"{axis}_amplitudes"] for axis in ("row", "column"))
+    lab.world.play("static_tweezers", TweezerAmplitudes(rows, columns), 0.0)
     assert lab.separable_spread() < 0.006
     assert lab.sites_off_px().max() < 0.1
     assert lab.mobile_off_m().mean() < 50e-9

@@ -46,6 +46,7 @@ def test_everything_in_it() -> None:
     assert spec.seed == 7
     assert spec.record_frames == "last"
     assert spec.attempts == 2
+    assert spec.target is not None
     assert (spec.target.use, spec.target.loc, spec.target.key) == ("compact", ("target",), "pattern")
     assert (spec.planner.use, spec.planner.loc, spec.planner.key) == ("psca", ("planner",), "use")
     assert spec.shot == (
