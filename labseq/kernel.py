@@ -82,9 +82,11 @@ class _Kernel:
         return getattr(sys.modules.get(self.module), "__dict__", None) is self.dispatcher.py_func.__globals__
 
     def is_cached(self) -> bool:
-        code = self.dispatcher.py_func.__code__
-        pattern = f"*{code.co_name}-{code.co_firstlineno}.*.nbi"
-        return self.folder is not None and any(self.folder.rglob(pattern))
+        if self.folder is None:
+            return False
+        code, cache = self.dispatcher.py_func.__code__, self.dispatcher._cache  # noqa: SLF001
+        # a copy of labseq in another place has a folder of its own below that of the digest
+        return any(Path(cache.cache_path).glob(f"*{code.co_name}-{code.co_firstlineno}.*.nbi"))
 
 
 def const(dtype: str, ndim: int) -> str:

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 from typing import Any, Final
 
 _MAX_LENGTH: Final = 60
+
+
+def install_hint(extra: str) -> str:
+    """The command that installs an extra here; environments that uv made have no pip of their own."""
+    return f"{'pip' if find_spec('pip') else 'uv pip'} install 'labseq[{extra}]'"
 
 
 def visible(text: str) -> str:

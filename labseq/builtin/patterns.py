@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from labseq.geometry import DrawingError, read_bitmap
+from labseq.messages import install_hint
 from labseq.plugin import (
     ConfigError,
     FilePath,
@@ -66,7 +67,7 @@ def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
     try:
         from PIL import Image
     except ImportError:
-        hint = 'pip install "labseq[plot]", or draw it as text'
+        hint = f"{install_hint('plot')}, or draw it as text"
         raise ConfigError(
             Problem("reading a PNG needs Pillow, which is not installed", name, hint=hint)
         ) from None

@@ -27,7 +27,7 @@ from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.console.runs import existing_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
-from labseq.messages import clean
+from labseq.messages import clean, install_hint
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid
 from labseq.pictures.figures import can_draw, encode_figure
 from labseq.recording import Run, open_run
@@ -264,7 +264,7 @@ def _picture(result: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
     if result.draw is None:
         return None, ()
     if not can_draw():
-        return None, ("there is no picture: matplotlib is not installed (pip install 'labseq[plot]')",)
+        return None, (f"there is no picture: matplotlib is not installed ({install_hint('plot')})",)
     return encode_figure(result.draw, dpi=PICTURE_DPI), ()
 
 

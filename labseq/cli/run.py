@@ -20,7 +20,7 @@ from labseq.console.runs import existing_run
 from labseq.console.text import plural, quoted
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
-from labseq.messages import visible
+from labseq.messages import install_hint, visible
 from labseq.queue.queue import Queue
 from labseq.recording import Run, data_root, open_run
 from labseq.roles import RunObserver
@@ -167,7 +167,7 @@ def ending(run_dir: Path) -> list[str]:
     """The commands suggested after the run."""
     run = quoted(run_dir)
     has_matplotlib = importlib.util.find_spec("matplotlib") is not None
-    needs = "" if has_matplotlib else '; first: pip install "labseq[plot]"'
+    needs = "" if has_matplotlib else f"; first: {install_hint('plot')}"
     rows = [
         (f"  labseq show {run}", "these numbers again; --shots and --timing print more"),
         (f"  labseq plot {run}", f"the run as a picture{needs}"),

@@ -86,7 +86,7 @@ def report_compiling(about_s: float) -> None:
 
 def compiling_text(about_s: float) -> str:
     """What to say before kernels are compiled."""
-    return f"compiling kernels, about {about_s:.0f} s; later runs find them in the cache"
+    return f"compiling kernels, about {max(1.0, about_s):.0f} s; later runs find them in the cache"
 
 
 def as_line(values: Any) -> str:

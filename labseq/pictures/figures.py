@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import ConfigError, Problem
 from labseq.files import whole_file
+from labseq.messages import install_hint
 from labseq.model import SiteGrid
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
         raise ConfigError(Problem(what, name, expected=wanted))
     if not can_draw():
         what = "drawing a picture needs matplotlib, which is not installed"
-        raise ConfigError(Problem(what, hint="pip install 'labseq[plot]'"))
+        raise ConfigError(Problem(what, hint=install_hint("plot")))
 
 
 def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:

@@ -14,6 +14,7 @@ from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - 
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
+from labseq.messages import install_hint
 from labseq.plain import dumps, plain_text, to_plain
 from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
 
@@ -191,7 +192,5 @@ def load_filter(path: Path, dataset: Any) -> None:
     try:
         import hdf5plugin  # noqa: F401  # pyright: ignore[reportUnusedImport] - importing it registers the filter
     except ImportError as error:
-        text = (
-            "holds compressed frames, and to read them hdf5plugin is needed; pip install 'labseq[compress]'"
-        )
+        text = f"holds compressed frames, and to read them hdf5plugin is needed; {install_hint('compress')}"
         raise RecordingError(path, text) from error

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import ConfigError, Problem
+from labseq.messages import install_hint
 from labseq.plain import dumps
 from labseq.recording.columns import columns_of
 from labseq.recording.points import reporting_damage
@@ -35,7 +36,7 @@ def check_installed(*packages: str) -> None:
     for package in packages:
         if find_spec(package) is None:
             what = f"this needs {package}, which is not installed"
-            raise ConfigError(Problem(what, hint="pip install 'labseq[analysis]'"))
+            raise ConfigError(Problem(what, hint=install_hint("analysis")))
 
 
 def facts_of(run: Run) -> dict[str, Any]:

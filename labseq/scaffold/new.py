@@ -24,7 +24,7 @@ from labseq import __version__
 from labseq.config.find import find_profile
 from labseq.errors import ConfigError, Problem
 from labseq.files import PLUGINS, packaged_profiles_dir
-from labseq.messages import clean, visible
+from labseq.messages import clean, install_hint, visible
 from labseq.plugins import PluginHost
 from labseq.registry import Registry
 from labseq.scaffold.schemas import KINDS as FILE_KINDS, FileKind, schema_path, write_schema
@@ -118,7 +118,7 @@ def _needed(commands: list[str], folder: Path) -> tuple[str, ...]:
     """The commands without the one that makes the sequence, if it exists, and with what tests still need."""
     has_sequence = (folder / f"{FIRST}.yaml").exists()
     can_test = all(find_spec(module) is not None for module in ("pytest", "hypothesis"))
-    install = () if can_test else ('pip install "labseq[testing]"',)
+    install = () if can_test else (install_hint("testing"),)
     return (*install, *(c for c in commands if not (has_sequence and c == f"labseq new sequence {FIRST}")))
 
 

@@ -131,19 +131,22 @@ def plan_timelines(
     Raises:
         LabseqError: A step fails; the error names it.
     """
-    context = context or lab.step_context
+    return [plan_timeline(lab, guard, number, *step, context) for number, step in enumerate(steps)]
 
-    def entries(number: int, name: str, step: Step) -> list[TimelineEntry]:
+
+def plan_timeline(
+    lab: Lab, guard: Guard, number: int, name: str, step: Step, context: StepContext | None = None
+) -> list[TimelineEntry]:
+    """The timeline of one step, see :func:`plan_timelines`; ``number`` is its index in the shot."""
+
+    def entries() -> list[TimelineEntry]:
         with _named(number, name):
-            found = list(step.plan_timeline(context))
+            found = list(step.plan_timeline(context or lab.step_context))
             if other := [one for one in found if not isinstance(one, TimelineEntry)]:  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(f"plan_timeline() gave {other[0]!r}; expected TimelineEntry objects")
             return found
 
-    return [
-        guard.call("step", lab.timeouts.call_s, entries, number, name, step)
-        for number, (name, step) in enumerate(steps)
-    ]
+    return guard.call("step", lab.timeouts.call_s, entries)
 
 
 def _run_step(step: Step, number: int, name: str, shot: RunningShot) -> None:

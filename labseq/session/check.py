@@ -19,7 +19,7 @@ from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.roles import Detector, Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
-from labseq.sequencer.run import plan_timelines
+from labseq.sequencer.run import plan_timeline
 from labseq.session.assembly import Assembly
 from labseq.session.lab import WARM_S
 from labseq.session.scan import Point
@@ -76,8 +76,13 @@ class _Points:
         lab = self.lab(point)
         key = (id(lab), *(id(step) for _, step in point.steps))
         if key not in self._timelines:
-            bars = plan_timelines(lab, self.guard, point.steps)
-            named = [(name, own) for (name, _), own in zip(point.steps, bars, strict=True)]
+            named: list[tuple[str, list[TimelineEntry]]] = []
+            for number, (name, step) in enumerate(point.steps):
+                try:
+                    named.append((name, plan_timeline(lab, self.guard, number, name, step)))
+                except LimitError as error:
+                    self.add(point.document, self.session.assembly.sequence.shot[number].loc, str(error))
+            self.raise_problems()
             self._timelines[key] = point, named
         return self._timelines[key][1]
 

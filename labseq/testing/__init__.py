@@ -26,6 +26,8 @@ import importlib
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
+from labseq.messages import install_hint
+
 if TYPE_CHECKING:
     from labseq.testing import fakes as fakes, strategies as strategies
     from labseq.testing.contracts import (
@@ -69,7 +71,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'labseq.testing' has no attribute '{name}'")
     for package in ("pytest", "hypothesis"):
         if find_spec(package) is None:
-            text = f'labseq.testing needs {package}; install it with: pip install "labseq[testing]"'
+            text = f"labseq.testing needs {package}; install it with: {install_hint('testing')}"
             raise ModuleNotFoundError(text, name=package)
     if name in _MODULES:
         return importlib.import_module(f"labseq.testing.{name}")

@@ -140,6 +140,14 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         ],
     ),
     (
+        "a tone of a step outside the AOD's band",
+        {"- image: {exposure: 45 ms}": "- image: {exposure: 45 ms}\n  - probe: {offset: [40 um, 0 um]}"},
+        [
+            "s.yaml:13:12: the frequency of the tone of column 12 at an offset of 40 um is 118.254 MHz; "  # noqa: ISC004 - one message
+            "the limit is the band of 82 to 118 MHz; choose a smaller offset, or sites further from the edge",
+        ],
+    ),
+    (
         "values of a scan's other points",
         {
             "shots: 20": "scan: {shot.1.image.exposure: [45 ms, 9 s], profile.camera.max_exposure: [10 s, 5 s]}",

@@ -64,4 +64,4 @@ for option in ("--json=-", "--png=a.png"):
     done = call("-c", code, cwd=tmp_path)
     assert json.loads(done.stdout)["degree_of_parallelism"] == 7
     assert [line for line in done.stderr.splitlines() if line.startswith("code")] == ["code 0", "code 2"]
-    assert "needs matplotlib, which is not installed; pip install 'labseq[plot]'" in done.stderr
+    assert "needs matplotlib, which is not installed; " in done.stderr
