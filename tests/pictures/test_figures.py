@@ -52,7 +52,7 @@ def test_without_matplotlib_there_is_a_hint(tmp_path: Path, monkeypatch: pytest.
     check_place(tmp_path / "a.PNG")
     monkeypatch.setattr("labseq.pictures.figures.find_spec", lambda _: None)
     with pytest.raises(
-        ConfigError, match=r"needs matplotlib, which is not installed; pip install 'labseq\[plot\]'"
+        ConfigError, match=r"needs matplotlib, which is not installed; (uv )?pip install 'labseq\[plot\]'"
     ):
         check_place(tmp_path / "a.png")
 

@@ -206,7 +206,7 @@ def test_frames_that_were_compressed_later_come_back(tmp_path: Path, monkeypatch
         camera.create_dataset("frames", data=frames, **filters.Bitshuffle(cname="lz4"))
     assert_same(found.record(), shot)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(RecordingError, match=r"hdf5plugin is needed; pip install 'labseq\[compress\]'"):
+    with pytest.raises(RecordingError, match=r"hdf5plugin is needed; (uv )?pip install 'labseq\[compress\]'"):
         _ = found.frames
 
 

@@ -169,7 +169,7 @@ def test_a_missing_package_is_explained(run: Run, monkeypatch: pytest.MonkeyPatc
     found = importlib.util.find_spec
     monkeypatch.setattr("labseq.recording.tables.find_spec", without)
     with pytest.raises(
-        ConfigError, match=rf"{package}, which is not installed; pip install 'labseq\[analysis\]'"
+        ConfigError, match=rf"{package}, which is not installed; (uv )?pip install 'labseq\[analysis\]'"
     ):
         run.to_dataframe() if package == "pandas" else run.to_xarray()
 
