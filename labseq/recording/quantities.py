@@ -22,7 +22,7 @@ from labseq.model.estimate import Estimated, Rate, mean
 from labseq.recording.columns import FRACTIONS, figures_in
 from labseq.recording.results import result_columns
 from labseq.recording.schema import unit_of
-from labseq.recording.shot import Shot
+from labseq.recording.shot import Shot, caching_loader
 from labseq.units import parse_any
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def figures_with_images(
 
     The shot's file is read for the latter only.
     """
-    figures, shot = figures_in(row), Shot(run_dir / row["file"], dict(row))
+    figures, shot = figures_in(row), Shot(run_dir / row["file"], dict(row), caching_loader())
     for name in names:
         if split_name(name)[0] in OF_IMAGES:
             value = make_quantity(name, target).of_shot(shot)

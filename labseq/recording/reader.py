@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from labseq.recording import folders
 from labseq.recording.points import SCANNER, completed, reporting_damage
 from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
-from labseq.recording.shot import Shot, load_content
+from labseq.recording.shot import Shot, caching_loader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +47,7 @@ def open_run(path: str | Path) -> Run:
     status, error = read_state(folder)
     rows, damaged = read_lines(folder / folders.INDEX_FILE)
     usable = [row for row in rows if is_index_row(row)]
-    load = lru_cache(maxsize=8)(load_content)  # several values of a shot read its file once
+    load = caching_loader()
     counted = {
         row["shot"]: row for row in usable if row["counts"]
     }  # the last line counts if a shot was written twice

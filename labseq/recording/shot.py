@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,11 @@ def load_content(path: Path) -> ShotContent:
     from labseq.recording.shot_file import read_content  # h5py takes 0.1 s to import
 
     return read_content(path)
+
+
+def caching_loader() -> Callable[[Path], ShotContent]:
+    """A loader that keeps the last eight shots: several values of a shot then read its file once."""
+    return lru_cache(maxsize=8)(load_content)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -19,6 +19,7 @@ from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.columns import figures_in
 from labseq.recording.quantities import Quantity, make_quantity
+from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver, Scanner
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.run import Sequencer
@@ -230,6 +231,7 @@ class AdaptiveScanRun(ScanRun):
         for attempt in () if run is None else run.attempts:
             if run is not None and attempt.index in run.skipped:
                 self._results.add_skipped(attempt.index, attempt.row["parameters"])
+        self._load = caching_loader()
         self._writer: RunWriter | None = None
         self._observer: RunObserver | None = None
 
@@ -290,7 +292,7 @@ class AdaptiveScanRun(ScanRun):
         if not row["counts"]:
             self._results.add_skipped(shot, row["parameters"])
             return
-        self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row))))
+        self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), self._load))
         if warning := self._results.missing_figure(shot):
             self._log_event("warning", {"text": warning})
 
@@ -369,7 +371,7 @@ class Results:
     search: Search
     shots: dict[int, Shot]
     quantity: Quantity
-    _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
+    _visited: dict[int, VisitedPoint] = field(default_factory=dict[int, VisitedPoint])
     _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
     _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
     _n_counted: int = 0
@@ -399,9 +401,7 @@ class Results:
 
     def before(self, visit: int) -> list[VisitedPoint]:
         """The results of all points before the given one, as the scanner receives them."""
-        while len(self._visited) < visit:
-            self._visited.append(self._visit(len(self._visited)))
-        return [one for one in self._visited[:visit] if one.values]
+        return [one for one in map(self._visit, range(visit)) if one.values]
 
     def missing_figure(self, shot: int) -> str:
         """A warning, given once, that a shot lacks the figure that the scan optimises; else ""."""
@@ -444,6 +444,12 @@ class Results:
         return [self.shots[index] for index in indices if index in self.shots]
 
     def _visit(self, visit: int) -> VisitedPoint:
+        """The result of a point whose shots have all been taken or skipped; worked out once."""
+        if visit not in self._visited:
+            self._visited[visit] = self._result(visit)
+        return self._visited[visit]
+
+    def _result(self, visit: int) -> VisitedPoint:
         shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
         figures = [MappingProxyType(figures_in(shot.row)) for shot in shots]
         score = sign * self.quantity.over(shots).value

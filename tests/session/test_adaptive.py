@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError, DeviceError
+from labseq.recording import shot_file
 from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
@@ -64,6 +66,21 @@ def test_quantities_are_recorded_in_their_unit_and_chosen_in_si(tmp_path: Path) 
     assert all(
         shot.cycles[0].window_s == window for shot, (_, window) in zip(done.shots, parameters, strict=True)
     )
+
+
+def test_a_scan_of_images_reads_each_shot_once_and_again_for_its_best_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, read_content = list[str](), shot_file.read_content
+
+    def noting(path: Path) -> shot_file.ShotContent:
+        read.append(path.name)
+        return read_content(path)
+
+    monkeypatch.setattr(shot_file, "read_content", noting)
+    scan = f"use: scripted, dops: [3, 5, 3], {OVER}, points: 3".replace("filling_fraction", "survival")
+    done = run(tmp_path, scan, "repeats: 2\n")
+    assert Counter(read) == {shot.file.name: 2 for shot in done.shots}
 
 
 def test_a_scanner_may_end_the_run_and_then_it_is_complete(tmp_path: Path) -> None:
