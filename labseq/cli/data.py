@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
 from pathlib import Path
 from typing import Any, Final
@@ -13,11 +11,11 @@ from labseq.console.output import as_line, say
 from labseq.console.runs import chosen_run, existing_run
 from labseq.console.text import columns, plural
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import explained, whole_file
+from labseq.files import explained
 from labseq.messages import visible
 from labseq.recording import Run, data_root
 from labseq.recording.doctor import Report, examine as find_damage
-from labseq.recording.export import ENDINGS, check_export, export_run, files_of
+from labseq.recording.export import ENDINGS, check_export, export_run, files_of, write_rows
 
 MAX_ROWS: Final = 200
 """Maximum number of findings that are printed."""
@@ -122,10 +120,8 @@ def export_points(
     path = output or Path(f"{opened.path.parent.name}_{opened.path.name}.points.csv")
     check_export(kind, path, replace=replace)
     rows = scan_report(opened, request).csv_rows()
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    with explained(path), whole_file(path) as file:
-        file.write(text.getvalue().encode())
+    with explained(path):
+        write_rows(path, rows)
     say(f"written: {path}")
 
 

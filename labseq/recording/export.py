@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -87,11 +87,12 @@ def _write_csv(run: Run, path: Path) -> None:
     rows = zip(*(map(_cell, column.values.tolist()) for column in columns), strict=True)
     about = [(column.name, column.units, column.description) for column in columns]
     table, units = files_of("csv", path)
-    _write_rows(units, [("column", "units", "description"), *about])
-    _write_rows(table, [[column.name for column in columns], *rows])
+    write_rows(units, [("column", "units", "description"), *about])
+    write_rows(table, [[column.name for column in columns], *rows])
 
 
-def _write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
+def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Write a CSV file, which appears only when it is complete."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(rows)
     with whole_file(path) as file:
