@@ -16,6 +16,7 @@ from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylon.library import load_pypylon
 
 import labseq.testing
+from labseq import messages
 from labseq.builtin.patterns import read_drawing
 from labseq.errors import LabseqError
 from labseq.model import ScanSpace
@@ -72,3 +73,11 @@ def test_every_package_of_every_extra_is_tried() -> None:
 
     listed = {(extra, name(package)) for extra, packages in EXTRAS.items() for package in packages}
     assert {case[:2] for case in NEEDS} == listed
+
+
+@pytest.mark.parametrize(("pip", "command"), [(object(), "pip"), (None, "uv pip")])
+def test_the_hint_names_a_tool_that_installs_into_this_environment(
+    monkeypatch: pytest.MonkeyPatch, pip: object, command: str
+) -> None:
+    monkeypatch.setattr(messages, "find_spec", lambda _: pip)
+    assert messages.install_hint("plot") == f"{command} install 'labseq[plot]'"

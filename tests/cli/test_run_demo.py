@@ -12,6 +12,7 @@ import labseq
 from labseq.cli import main, run as demo
 from labseq.errors import ConfigError
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
+from labseq.messages import install_hint
 from labseq.session.session import Session
 
 
@@ -57,7 +58,7 @@ def test_first_look(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_to_install_before_plot(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "pip install" not in "".join(demo.ending(Path("r")))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert "the run as a picture; first: " in "".join(demo.ending(Path("r")))
+    assert f"the run as a picture; first: {install_hint('plot')}" in "".join(demo.ending(Path("r")))
 
 
 def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.cli.waveform import WaveformOutput, note, report, show_waveform, title
+from labseq.messages import install_hint
 from labseq.session.planning import PlanRequest
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
@@ -138,4 +139,4 @@ def test_a_picture_without_matplotlib_is_refused_before_anything_is_done(
     monkeypatch.setattr("labseq.pictures.figures.find_spec", lambda _: None)
     code, _, err = call("waveform", *WORDS, "--png", str(tmp_path / "a.png"))
     assert code == 2
-    assert "needs matplotlib, which is not installed; " in err
+    assert f"needs matplotlib, which is not installed; {install_hint('plot')}" in err

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -15,6 +16,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from labseq.errors import ConfigError
+from labseq.messages import install_hint
 from labseq.model import Plan, SiteGrid
 from labseq.pictures.figures import (
     HEAD_IN,
@@ -52,7 +54,7 @@ def test_without_matplotlib_there_is_a_hint(tmp_path: Path, monkeypatch: pytest.
     check_place(tmp_path / "a.PNG")
     monkeypatch.setattr("labseq.pictures.figures.find_spec", lambda _: None)
     with pytest.raises(
-        ConfigError, match=r"needs matplotlib, which is not installed; (uv )?pip install 'labseq\[plot\]'"
+        ConfigError, match=re.escape(f"needs matplotlib, which is not installed; {install_hint('plot')}")
     ):
         check_place(tmp_path / "a.png")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from labseq.errors import RecordingError
+from labseq.messages import install_hint
 from labseq.model import (
     CALIBRATION_KINDS,
     CycleRecord,
@@ -206,7 +208,7 @@ def test_frames_that_were_compressed_later_come_back(tmp_path: Path, monkeypatch
         camera.create_dataset("frames", data=frames, **filters.Bitshuffle(cname="lz4"))
     assert_same(found.record(), shot)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(RecordingError, match=r"hdf5plugin is needed; (uv )?pip install 'labseq\[compress\]'"):
+    with pytest.raises(RecordingError, match=re.escape(f"hdf5plugin is needed; {install_hint('compress')}")):
         _ = found.frames
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError, RecordingError
+from labseq.messages import install_hint
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.columns import columns_of
 
@@ -169,7 +171,7 @@ def test_a_missing_package_is_explained(run: Run, monkeypatch: pytest.MonkeyPatc
     found = importlib.util.find_spec
     monkeypatch.setattr("labseq.recording.tables.find_spec", without)
     with pytest.raises(
-        ConfigError, match=rf"{package}, which is not installed; (uv )?pip install 'labseq\[analysis\]'"
+        ConfigError, match=re.escape(f"{package}, which is not installed; {install_hint('analysis')}")
     ):
         run.to_dataframe() if package == "pandas" else run.to_xarray()
 

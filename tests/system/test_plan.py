@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from labseq.messages import install_hint
 from labseq.session.planning import PlanRequest, plan_moves
 
 pytestmark = pytest.mark.system
@@ -64,4 +65,4 @@ for option in ("--json=-", "--png=a.png"):
     done = call("-c", code, cwd=tmp_path)
     assert json.loads(done.stdout)["degree_of_parallelism"] == 7
     assert [line for line in done.stderr.splitlines() if line.startswith("code")] == ["code 0", "code 2"]
-    assert "needs matplotlib, which is not installed; " in done.stderr
+    assert f"needs matplotlib, which is not installed; {install_hint('plot')}" in done.stderr
