@@ -74,8 +74,8 @@ def _cache_bytecode(
 
 def _skip_if_something_is_missing(report: pytest.CollectReport | pytest.TestReport) -> None:
     """A test that fails for want of an optional package is skipped, as `uv run pytest` installs none."""
-    told = [str(report.longrepr), *(text for _, text in report.sections)]
-    if _MISSING and report.failed and any(_NEEDS_MISSING.search(text) for text in told):
+    texts = [str(report.longrepr), *(text for _, text in report.sections)]
+    if _MISSING and report.failed and any(_NEEDS_MISSING.search(text) for text in texts):
         report.outcome = "skipped"
         path, line, _ = getattr(report, "location", None) or (report.nodeid, 0, "")
         report.longrepr = (path, line or 0, "Skipped: needs a package of `uv sync --all-extras --all-groups`")

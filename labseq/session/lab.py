@@ -263,7 +263,7 @@ def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool 
     Args:
         lab: The lab whose objects need kernels.
         stop_flag: Checked all the time.
-        observer: Told before kernels are compiled, and how long that took.
+        observer: Receives an event before kernels are compiled, and how long that took.
         devices: Whether to compile the kernels of devices as well as those of planner and detector.
 
     Raises:
