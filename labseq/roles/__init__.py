@@ -25,6 +25,7 @@ from labseq.roles.deciding import (
 from labseq.roles.hardware import (
     Camera,
     Device,
+    Emergency,
     Hardware,
     LeaderLink,
     Lines,
@@ -56,6 +57,7 @@ __all__ = [
     "Detection",
     "Detector",
     "Device",
+    "Emergency",
     "Hardware",
     "LeaderLink",
     "Lines",

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,6 +21,23 @@ from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgra
 
 Trigger = Literal["software", "internal", "external"]
 """The trigger that starts an exposure."""
+
+
+@dataclass(frozen=True, slots=True)
+class Emergency:
+    """How another process brings a device to its safe state after the run has died or hangs.
+
+    The script is loaded by its path and may import the standard library and pyserial only. It defines
+    ``off(**arguments) -> str``, which is idempotent, raises with the reason, and returns in a few words what was
+    done. It may also define ``prepare(**arguments)``, which loads libraries and does not touch the device.
+
+    Attributes:
+        script: A Python file beside the driver.
+        arguments: JSON values: port, card, bytes, register values, known once the device is open.
+    """
+
+    script: Path
+    arguments: Mapping[str, Any]
 
 
 class Hardware(ABC):
@@ -35,6 +54,13 @@ class Hardware(ABC):
     @abstractmethod
     def safe_state(self) -> None:
         """Make all outputs harmless; idempotent and legal in any state."""
+
+    def emergency(self) -> Emergency | None:
+        """How another process brings this device to its safe state; called right after ``open()``.
+
+        None if it has no output to switch off.
+        """
+        return None
 
     @abstractmethod
     def describe(self) -> Mapping[str, Any]:
