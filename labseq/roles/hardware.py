@@ -28,8 +28,8 @@ class Emergency:
     """How another process brings a device to its safe state after the run has died or hangs.
 
     The script is loaded by its path and may import the standard library and pyserial only. It defines
-    ``off(**arguments) -> str``, which is idempotent, raises with the reason, and returns in a few words what was
-    done. It may also define ``prepare(**arguments)``, which loads libraries and does not touch the device.
+    ``off(**arguments) -> str``, which is idempotent, raises with the reason, and returns in a few words what
+    was done. It may also define ``prepare(**arguments)``, which loads libraries and leaves the device alone.
 
     Attributes:
         script: A Python file beside the driver.

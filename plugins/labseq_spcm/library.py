@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from labseq.plugin import Context, DeviceError
+from labseq.plugin import Context, DeviceError, Emergency
 from labseq_spcm.settings import SpcmSettings
 
 if TYPE_CHECKING:
@@ -15,6 +18,7 @@ if TYPE_CHECKING:
 
 SIMULATED: Final = "simulated"
 """Device names that begin like this belong to simulated cards; the vendor's never do."""
+LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
 WITHOUT_A_CARD: Final = "to try things without a card, set `card: simulated`"
 
 
@@ -41,6 +45,10 @@ class VendorLibrary:
 
     def disconnect(self) -> None:
         """Release the card; no effect if it is not connected."""
+
+    def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
+        """How another process switches the card off: the driver's script, with the vendor's library."""
+        return Emergency(script, {**arguments, "library": LIBRARY, "card": self._device_name})
 
 
 Library: TypeAlias = "VendorLibrary | SimulatedLibrary"

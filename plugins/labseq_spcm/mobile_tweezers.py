@@ -12,12 +12,14 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 from labseq.plugin import (
     Context,
     DeviceError,
     DeviceTimeoutError,
+    Emergency,
     LabseqError,
     MobileTweezers,
     ToneProgram,
@@ -284,11 +286,17 @@ class SpcmMobileTweezers(MobileTweezers):
             card.stop,
             partial(switch_output, card, 0, on=False),
             partial(switch_output, card, 1, on=False),
+            partial(card.command, card.spcm.M2CMD_CARD_WRITESETUP, "writing the set-up to open the relays"),
             partial(set_amplitude, card, self._amplitude_mv),
         ]
         failures = [failure for step in steps if (failure := _attempt_twice(step)) is not None]
         if failures:
             raise failures[0]
+
+    def emergency(self) -> Emergency | None:
+        """The card is stopped, and its outputs are disabled, by the vendor's library alone."""
+        script = Path(__file__).with_name("emergency.py")
+        return None if self._card is None else self.library.emergency(script, {"mode": self._settings.mode})
 
     def _ramp_down(self, card: AwgCard) -> None:
         """Lower the amplitude in steps, within the amplifier's present path."""

@@ -107,6 +107,6 @@ def set_amplitude(card: AwgCard, amplitude_mv: int) -> None:
 
 
 def switch_output(card: AwgCard, channel: int, *, on: bool) -> None:
-    """Close or open the relay of an output."""
+    """Close or open the relay of an output, with the next WRITESETUP or start."""
     register = card.spcm.SPC_ENABLEOUT1 if channel else card.spcm.SPC_ENABLEOUT0
     card.set(register, int(on), f"output {channel}")

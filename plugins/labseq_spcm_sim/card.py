@@ -86,6 +86,7 @@ class SimulatedCard:
         self._lock = threading.RLock()
         self._machine = Machine(model)
         self._error = ErrorInfo()
+        self._is_open = False
         self._identity: dict[int, int] = {
             r.SPC_PCISERIALNO: serial_number,
             r.SPC_GETDRVVERSION: DRIVER_VERSION,
@@ -137,7 +138,25 @@ class SimulatedCard:
         with self._lock:
             return self._machine.amplifiers[0].enabled, self._machine.amplifiers[1].enabled
 
-    # Functions of the driver library; each returns the vendor's error code
+    @property
+    def streams(self) -> bool:
+        """Whether the transfer buffer is one of the FIFO mode."""
+        return self._machine.fifo is not None
+
+    # Functions of the driver library; most return the vendor's error code
+
+    def acquire(self) -> bool:
+        """Open it for its only owner; False if it has one."""
+        with self._lock:
+            is_free, self._is_open = not self._is_open, True
+            return is_free
+
+    def release(self) -> None:
+        """Close it: transfers end, everything else goes on."""
+        with self._lock:
+            self._machine.stop_dma(self._advance())
+            self._machine.buffer = None
+            self._is_open = False
 
     def _advance(self) -> float:
         now_s = self._clock.now()

@@ -15,20 +15,32 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from functools import partialmethod
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from labseq.plugin import Clock, DeviceError, ReceivesOutput, RfSamples, RfSpan, RfTones, Simulation
+from labseq.plugin import (
+    Clock,
+    DeviceError,
+    Emergency,
+    ReceivesOutput,
+    RfSamples,
+    RfSpan,
+    RfTones,
+    Simulation,
+)
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
+from labseq_spcm_sim.emergency import PREFIX as SHARED
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import FULL_SCALE, SampleSpan, Span
 from labseq_spcm_sim.setup import ErrorInfo, Number
+from labseq_spcm_sim.shared import SharedCard
 
 Slot = ctypes.c_int32 | ctypes.c_uint32 | ctypes.c_int64 | ctypes.c_double
 
@@ -73,6 +85,7 @@ def typed(library: Any, name: str) -> Any:
 LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
 
 Function = Callable[..., Any]
+Card: TypeAlias = SimulatedCard | SharedCard
 
 
 class Library:
@@ -87,8 +100,8 @@ class Library:
     """
 
     def __init__(self, vendor: Any) -> None:
-        self.cards: dict[str, SimulatedCard] = {}
-        self._open: dict[int, SimulatedCard] = {}
+        self.cards: dict[str, Card] = {}
+        self._open: dict[int, Card] = {}
         self._handles: dict[int, ctypes.Array[ctypes.c_char]] = {}
         self._open_error = ErrorInfo()
         self._vendor = {} if vendor is None else {name: typed(vendor, name) for name in SIGNATURES}
@@ -133,7 +146,7 @@ class Library:
 
     def _hopen(self, name: bytes | None) -> int | None:
         card = self.cards.get((name or b"").decode(errors="replace"))
-        if card is None or card in self._open.values():
+        if card is None or not card.acquire():
             code = r.ERR_BOARDNOTFOUND if card is None else r.ERR_BOARDINUSE
             self._open_error = ErrorInfo(code, text=self._why_not((name or b"").decode(), card))
             return None
@@ -143,7 +156,7 @@ class Library:
         self._open[address] = card
         return address
 
-    def _why_not(self, name: str, card: SimulatedCard | None) -> str:
+    def _why_not(self, name: str, card: Card | None) -> str:
         if card is not None:
             return f"{name!r} is in use"
         if name.startswith(PREFIX) or self.has_vendor:
@@ -152,7 +165,9 @@ class Library:
         return f"there is no driver library for real cards; {hint}"
 
     def _vclose(self, handle: int | None) -> None:
-        self._open.pop(handle or 0, None)
+        card = self._open.pop(handle or 0, None)
+        if card is not None:
+            card.release()
 
     def _write(self, handle: int | None, register: int, value: Number) -> int:
         card = self._open.get(handle or 0)
@@ -264,14 +279,14 @@ class SimulatedLibrary:
     """What the driver of the AWG opens instead of the vendor's library: ``spcm`` with a simulated card.
 
     Args:
-        name: "simulated" for a new card at each ``connect``; another name for a card that
-            :func:`install` made available.
+        name: "simulated" for a new card at each ``connect``; "simulated@" and a path for one in a process of
+            its own; another name for a card that :func:`install` made available.
         clock: The session's time.
         simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
         row_channel: Channel that drives the row axis; the other drives the columns.
 
     Attributes:
-        card: The new card, while connected.
+        card: The new card in this process, while connected.
     """
 
     def __init__(self, name: str, clock: Clock, simulation: Simulation | None, row_channel: int) -> None:
@@ -279,6 +294,7 @@ class SimulatedLibrary:
         self._clock = clock
         self._simulation = simulation
         self._row_channel = row_channel
+        self._shared: SharedCard | None = None
         self.card: SimulatedCard | None = None
 
     def load(self) -> Any:
@@ -294,20 +310,35 @@ class SimulatedLibrary:
 
     def connect(self) -> str:
         """Make the card available; returns its device name."""
-        if self._name != PREFIX:
+        if self._name.startswith(SHARED):
+            self._shared = card = SharedCard(self._name.removeprefix(SHARED))
+            name = self._name
+        elif self._name == PREFIX:
+            received = isinstance(self._simulation, ReceivesOutput)
+            self.card = card = SimulatedCard(self._clock, keep_history=received)
+            name = ""
+        else:
             return self._name
-        received = isinstance(self._simulation, ReceivesOutput)
-        self.card = SimulatedCard(self._clock, keep_history=received)
         if isinstance(self._simulation, ReceivesOutput):
-            self._simulation.connect_outputs("mobile_tweezers", CardOutputs(self.card, self._row_channel))
-        return install(self.card)
+            self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))
+        return install(card, name)
 
     def disconnect(self) -> None:
-        """Remove the card."""
-        if self.card is not None:
+        """Remove the card; one in a process of its own goes on."""
+        for mine in (self.card, self._shared):
             for library in _LIBRARIES:
-                library.cards = {name: card for name, card in library.cards.items() if card is not self.card}
-            self.card = None
+                library.cards = {name: card for name, card in library.cards.items() if card is not mine}
+        if self._shared is not None:
+            self._shared.disconnect()
+        self.card = self._shared = None
+
+    def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
+        """The driver's script, for a card in a process of its own; one in this process dies with it."""
+        if not self._name.startswith(SHARED):
+            return None
+        path = str(Path(self._name.removeprefix(SHARED)).absolute())
+        own = {"script": str(script), "library": "of the simulator", "card": path}
+        return Emergency(Path(__file__).with_name("emergency.py"), {**arguments, **own})
 
 
 class CardOutputs:
@@ -320,7 +351,7 @@ class CardOutputs:
         row_channel: Channel that drives the row axis; the other drives the columns.
     """
 
-    def __init__(self, card: SimulatedCard, row_channel: int) -> None:
+    def __init__(self, card: Card, row_channel: int) -> None:
         self._card = card
         self._channels = row_channel, 1 - row_channel
         self._reported_s = -math.inf
@@ -357,7 +388,7 @@ def _rf_span(span: Span) -> RfSpan:
     return RfTones(span.start_s, span.end_s, *np.array(values, np.float64).reshape(-1, 5).T)
 
 
-def install(card: SimulatedCard, name: str = "") -> str:
+def install(card: Card, name: str = "") -> str:
     """Make a simulated card available to ``spcm`` under a device name.
 
     Args:
@@ -384,7 +415,7 @@ def install(card: SimulatedCard, name: str = "") -> str:
 
 
 @contextmanager
-def installed(card: SimulatedCard, name: str = "") -> Generator[str]:
+def installed(card: Card, name: str = "") -> Generator[str]:
     """Within the block the card is available to ``spcm``; gives its device name."""
     name = install(card, name)
     try:

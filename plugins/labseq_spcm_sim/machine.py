@@ -128,8 +128,6 @@ class Machine:
             self.setup.write(register, value, running=self.running)
             if register in AMPLITUDES:
                 self.amplifiers[AMPLITUDES[register]].set_amplitude(self.setup[register], now_s)
-            elif register in OUTPUTS:
-                self.amplifiers[OUTPUTS[register]].enable(bool(self.setup[register]), now_s)
 
     def read(self, register: int) -> Number:
         """Read a register."""
@@ -170,18 +168,26 @@ class Machine:
             self._reset(now_s)
         if command & r.M2CMD_CARD_STOP and self.running:
             self._end_run(now_s)
+        if command & r.M2CMD_CARD_WRITESETUP:
+            self._switch_outputs(now_s)
         if command & r.M2CMD_DATA_STOPDMA:
-            self._stop_dma(now_s)
+            self.stop_dma(now_s)
         if command & r.M2CMD_DATA_STARTDMA:
             self._start_dma(now_s)
         if command & r.M2CMD_CARD_START:
             self._start()
+            self._switch_outputs(now_s)
         if command & r.M2CMD_CARD_ENABLETRIGGER:
             self.trigger_enabled = self.running
         if command & r.M2CMD_CARD_FORCETRIGGER:
             self._fire(now_s)
         if command & r.M2CMD_CARD_DISABLETRIGGER:
             self.trigger_enabled = False
+
+    def _switch_outputs(self, now_s: float) -> None:
+        """The set-up is written to the card: its relays follow the registers."""
+        for register, channel in OUTPUTS.items():
+            self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
 
     def _reset(self, now_s: float) -> None:
         """Everything as after power-on, outputs off."""
@@ -259,7 +265,7 @@ class Machine:
         self.memory.send(now_s, self.buffer.fetch(0, self.buffer.n_bytes))
         self.buffer = None  # it is used only once
 
-    def _stop_dma(self, now_s: float) -> None:
+    def stop_dma(self, now_s: float) -> None:
         """What has not arrived is lost."""
         self.memory.uploads.clear()
         if self.fifo is not None:

@@ -158,8 +158,8 @@ def test_kinds_of_refusals_are_told_apart() -> None:
 
 def test_a_reset_puts_everything_back_and_the_outputs_off() -> None:
     card = Card()
-    assert card.outputs_on == (True, True)
     card.command(r.M2CMD_CARD_START)
+    assert card.outputs_on == (True, True)
     card.command(r.M2CMD_CARD_RESET)
     assert not card.running
     assert card.outputs_on == (False, False)
@@ -303,17 +303,25 @@ def test_a_pulse_triggers_only_if_it_crosses_the_level(voltage_v: float, accepte
     assert bool(card.status() & r.M2STAT_CARD_TRIGGER) is accepted
 
 
-def test_an_output_that_is_off_plays_nothing_and_its_relay_acts_at_once() -> None:
-    card = endless()
-    card.clock.sleep(10e-6)
+def test_a_relay_changes_only_when_the_set_up_is_written_or_the_card_starts() -> None:
+    card = Card(SPC_LOOPS=0, SPC_ENABLEOUT0=1)
+    assert card.outputs_on == (False, False), "not written yet"
+    card.upload(sines(6400))
+    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
     card.set(SPC_ENABLEOUT0=0)
-    off_s = card.clock.now()
     card.clock.sleep(10e-6)
-    assert [span.end_s for span in card.spans(0)] == pytest.approx([off_s], abs=2 / RATE_HZ)
-    assert card.spans(1)[0].end_s == pytest.approx(card.clock.now(), abs=2 / RATE_HZ)
+    assert card.outputs_on == (True, True), "the register reads 0, and the output is on"
+    assert card.spans(0)[0].end_s == pytest.approx(card.clock.now(), abs=2 / RATE_HZ)
+    assert card.refusal(r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP) == r.ERR_RUNNING
     card.command(r.M2CMD_CARD_STOP)
+    assert card.outputs_on == (True, True)
+    card.command(r.M2CMD_CARD_WRITESETUP)
+    assert card.outputs_on == (False, True)
+    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
     card.forget(card.clock.now())
-    assert not card.spans(1)
+    card.clock.sleep(10e-6)
+    assert not card.spans(0)
+    assert card.spans(1)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,156 @@
+"""Switches a Spectrum card off from another process, with the vendor's library alone.
+
+labseq's watchdog loads this file by its path after the run that used the card has died. It needs nothing
+but Python's standard library. The order: stop, so that the outputs go to their stop level of 0 V; lowest
+amplitude; output relays open, which takes effect with WRITESETUP only; DDS reset. A reset of the whole card
+follows where a step was refused.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import time
+from functools import cache
+from typing import Any
+
+SPC_M2CMD, SPC_M2STATUS = 100, 110
+SPC_AMP0, SPC_AMP1 = 30010, 30110
+SPC_ENABLEOUT0, SPC_ENABLEOUT1 = 30091, 30191
+SPC_DDS_CMD, SPCM_DDS_CMD_RESET = 608003, 1
+M2CMD_CARD_RESET, M2CMD_CARD_WRITESETUP = 0x1, 0x2
+M2CMD_CARD_STOP, M2CMD_DATA_STOPDMA = 0x40, 0x40000
+M2STAT_CARD_READY = 0x4
+
+LOWEST_MV = 80
+HELD_S = 2.0
+"""How long another process may still hold the card: one that dies gives it back within that time."""
+PAUSE_S = 1e-3
+TEXT_LENGTH = 200
+"""Longest error text of the driver library."""
+
+
+class EmergencyError(Exception):
+    """The card could not be switched off; the text says why."""
+
+
+def prepare(library: str, card: str, mode: str) -> None:  # noqa: ARG001 - the arguments are those of off()
+    """Load the driver library; does not touch the card.
+
+    Raises:
+        EmergencyError: Wrong arguments, or there is no such library.
+    """
+    if not card or type(card) is not str:
+        raise EmergencyError(f"the card's device name is {card!r}; expected a text such as '/dev/spcm0'")
+    load(library)
+
+
+def off(library: str, card: str, mode: str) -> str:
+    """Stop the card, disable both outputs, and close it; a card that is off stays off.
+
+    Args:
+        library: The driver library.
+        card: The card's device name.
+        mode: "dds" for a card that makes the tones itself.
+
+    Returns:
+        What was done.
+
+    Raises:
+        EmergencyError: The card cannot be opened, or refuses; the text is the driver library's.
+    """
+    prepare(library, card, mode)
+    device = _Card(load(library), card)
+    try:
+        return device.switch_off(is_dds=mode == "dds")
+    finally:
+        device.close()
+
+
+@cache
+def load(library: str) -> Any:
+    """The driver library, its functions with their signatures."""
+    try:
+        found: Any = ctypes.WinDLL(library) if sys.platform == "win32" else ctypes.CDLL(library)
+    except (OSError, TypeError) as error:
+        raise EmergencyError(f"the driver library {library!r} cannot be loaded: {error}") from error
+    return signed(found)
+
+
+def signed(library: Any) -> Any:
+    """The functions that are used here, with their signatures."""
+    handle, number = ctypes.c_void_p, ctypes.c_int32
+    library.spcm_hOpen.restype, library.spcm_hOpen.argtypes = handle, [ctypes.c_char_p]
+    library.spcm_vClose.restype, library.spcm_vClose.argtypes = None, [handle]
+    for name, value in (("Set", number), ("Get", handle)):
+        function = getattr(library, f"spcm_dw{name}Param_i32")
+        function.restype, function.argtypes = ctypes.c_uint32, [handle, number, value]
+    library.spcm_dwGetErrorInfo_i32.restype = ctypes.c_uint32
+    library.spcm_dwGetErrorInfo_i32.argtypes = [handle] * 4
+    return library
+
+
+class _Card:
+    """The open card."""
+
+    def __init__(self, library: Any, name: str) -> None:
+        self._library = library
+        deadline_s = time.monotonic() + HELD_S
+        while not (handle := library.spcm_hOpen(name.encode())):
+            reason = _error(library, None)
+            if time.monotonic() > deadline_s:
+                raise EmergencyError(f"the card {name!r} cannot be opened for {HELD_S:g} s: {reason}")
+            time.sleep(PAUSE_S)
+        self._handle = handle
+
+    def switch_off(self, *, is_dds: bool) -> str:
+        """All steps, also after one that was refused; then check that the card took them."""
+        refused: list[str] = []
+        steps: list[tuple[int, int, str]] = [
+            (SPC_M2CMD, M2CMD_CARD_STOP | M2CMD_DATA_STOPDMA, "stop"),
+            (SPC_AMP0, LOWEST_MV, "lowest amplitude of output 0"),
+            (SPC_AMP1, LOWEST_MV, "lowest amplitude of output 1"),
+            (SPC_ENABLEOUT0, 0, "disabling output 0"),
+            (SPC_ENABLEOUT1, 0, "disabling output 1"),
+            (SPC_M2CMD, M2CMD_CARD_WRITESETUP, "writing the set-up"),
+            *([(SPC_DDS_CMD, SPCM_DDS_CMD_RESET, "resetting the DDS")] if is_dds else []),
+        ]
+        for register, value, what in steps:
+            # once more after an error: it may be one from before, which blocks the library until it is read
+            if self._write(register, value) and (reason := self._write(register, value)):
+                refused.append(f"{what}: {reason}")
+        done = "card stopped, outputs 0 and 1 disabled"
+        if refused:
+            if reason := self._write(SPC_M2CMD, M2CMD_CARD_RESET):
+                raise EmergencyError(f"{'; '.join(refused)}; reset of the card: {reason}")
+            done = f"card reset, which disables its outputs; refused before: {'; '.join(refused)}"
+        status = self._read(SPC_M2STATUS)
+        enabled = [n for n, register in enumerate((SPC_ENABLEOUT0, SPC_ENABLEOUT1)) if self._read(register)]
+        if enabled or not status & M2STAT_CARD_READY:
+            raise EmergencyError(
+                f"the card reads status {status:#x} and enabled outputs {enabled} after: {done}"
+            )
+        return done
+
+    def close(self) -> None:
+        """Give the card back."""
+        self._library.spcm_vClose(self._handle)
+
+    def _write(self, register: int, value: int) -> str:
+        """Write a register; returns the reason for which it was refused."""
+        if self._library.spcm_dwSetParam_i32(self._handle, register, value):
+            return _error(self._library, self._handle)
+        return ""
+
+    def _read(self, register: int) -> int:
+        value = ctypes.c_int32()
+        if self._library.spcm_dwGetParam_i32(self._handle, register, ctypes.addressof(value)):
+            raise EmergencyError(f"reading register {register}: {_error(self._library, self._handle)}")
+        return value.value
+
+
+def _error(library: Any, handle: int | None) -> str:
+    """The pending error's text; reading it unlocks the library."""
+    text = ctypes.create_string_buffer(TEXT_LENGTH + 56)
+    code = library.spcm_dwGetErrorInfo_i32(handle, None, None, ctypes.addressof(text))
+    return (text.value.decode(errors="replace").strip().splitlines() or [f"error {code:#x}"])[0]

@@ -1,0 +1,273 @@
+"""A simulated card outlives the process that dies, and a plain Python process switches it off."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from labseq_spcm import emergency as script
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+from labseq_spcm_sim import M4I6631, SimulatedCard, Span, installed, registers as r
+from labseq_spcm_sim.emergency import Connection
+from labseq_spcm_sim.library import _library
+from labseq_spcm_sim.setup import Refusal
+
+from labseq.plugin import Context, DeviceError
+from labseq.testing.fakes import FakeClock
+
+from .emergency import Done, outsider
+
+LABSEQ = """
+import json, sys, threading
+import numpy as np
+from labseq.motion import tone_program
+from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+
+tones = np.linspace(12e6, 18e6, 5)
+grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
+band = (10e6, 20e6)
+plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 50)
+
+def tweezers(state, mode, speed_m_s, n_batches, trigger="software"):
+    rf = RfSpec(row_band_hz=band, column_band_hz=band)
+    motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=speed_m_s, rf=rf)
+    card = f"simulated@{sys.argv[1]}/{state}"
+    settings = SpcmSettings(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=0.1)
+    device = SpcmMobileTweezers(settings, Context("mobile_tweezers", grid, motion=motion))
+    device.open()
+    device.prepare(tone_program(plan, grid, motion, n_batches))
+    return device
+
+devices = {
+    "armed": tweezers("armed", "replay", 0.130, 2, "external"),
+    "played": tweezers("played", "replay", 0.130, 1),
+    "locked": tweezers("locked", "dds", 1e-5, 50),
+    "dds": tweezers("dds", "dds", 1e-5, 50),
+    "replay": tweezers("replay", "replay", 1.5e-5, 1),
+    "fifo": tweezers("fifo", "fifo", 1e-5, 50),
+}
+prepared = tweezers("prepared", "replay", 0.130, 1)
+jobs = {
+    state: (str(found.script), dict(found.arguments))
+    for state, device in {**devices, "prepared": prepared}.items()
+    if (found := device.emergency())
+}
+print(json.dumps(jobs), flush=True)
+sys.stdin.readline()
+for device in devices.values():
+    device.play()
+threading.Thread(target=devices["fifo"].wait, args=(1e3,), daemon=True).start()
+devices["played"].wait(10.0)
+card = devices["locked"]._card
+assert card.spcm.spcm_dwSetParam_i64(card._card.handle(), 30010, 9000) == 0x101  # blocks the driver library
+print("on", flush=True)
+sys.stdin.read()
+"""
+STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "dds"}
+
+
+class Scope:
+    """The cards after the process that used them was killed, and after ``off`` from outside, twice."""
+
+    def __init__(self, folder: Path) -> None:
+        command = [sys.executable, "-c", LABSEQ, str(folder)]
+        labseq = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert labseq.stdin is not None
+        assert labseq.stdout is not None
+        jobs = json.loads(labseq.stdout.readline())
+        self.cards = {state: Connection(str(folder / state)) for state in jobs}
+        with outsider(jobs) as outside:
+            self.heavy_modules = outside.heavy_modules
+            labseq.stdin.write("play\n")
+            labseq.stdin.flush()
+            assert labseq.stdout.readline() == "on\n"
+            labseq.kill()
+            labseq.communicate()
+            self.after_death = {state: card("state") for state, card in self.cards.items()}
+            self.off: dict[str, Done] = outside.off()
+            self.writes = {state: card("log") for state, card in self.cards.items()}
+            self.again: dict[str, Done] = outside.off()
+
+    def end_s(self, state: str, channel: int) -> float:
+        """When the output of a channel ended; before the kill if it was silent then."""
+        spans: list[Span] = self.cards[state]("played", channel)
+        return max((span.end_s for span in spans), default=0.0)
+
+
+@pytest.fixture(scope="module")
+def scope(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scope]:
+    scope = Scope(tmp_path_factory.mktemp("computer"))
+    yield scope
+    scope.cards["dds"]("power_off")
+
+
+def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
+    """The reason for all of this: outputs on, and in the mode dds for ever."""
+    assert set(scope.after_death) == STATES
+    assert scope.after_death["dds"] == scope.after_death["locked"] == (True, (True, True))
+    assert scope.after_death["replay"] == (True, (True, True))
+    assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
+    assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"
+    assert scope.after_death["prepared"] == (False, (False, False))
+
+
+@pytest.mark.parametrize("state", sorted(STATES))
+def test_a_plain_process_brings_its_outputs_to_zero(scope: Scope, state: str) -> None:
+    done = scope.off[state]
+    assert done.text == "card stopped, outputs 0 and 1 disabled"
+    assert scope.cards[state]("state") == (False, (False, False))
+    assert not scope.cards[state]("trigger", 3.3), "an edge at Ext0 starts nothing any more"
+    for channel in (0, 1):
+        end_s = scope.end_s(state, channel)
+        assert end_s <= done.end_s
+        if state in ("dds", "locked"):
+            assert end_s > done.start_s, "it played until then"
+    assert scope.again[state].text == done.text, "it can be repeated"
+    assert not scope.heavy_modules
+
+
+def test_the_script_stops_the_card_first_and_writes_the_set_up_to_open_the_relays(scope: Scope) -> None:
+    mine = [
+        (entry.register, entry.value)
+        for entry in scope.writes["dds"]
+        if scope.off["dds"].start_s <= entry.time_s <= scope.off["dds"].end_s
+    ]
+    assert mine == [
+        (r.SPC_M2CMD, r.M2CMD_CARD_STOP | r.M2CMD_DATA_STOPDMA),
+        (r.SPC_AMP0, M4I6631.amplitude_mv[0]),
+        (r.SPC_AMP1, M4I6631.amplitude_mv[0]),
+        (r.SPC_ENABLEOUT0, 0),
+        (r.SPC_ENABLEOUT1, 0),
+        (r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP),
+        (r.SPC_DDS_CMD, r.SPCM_DDS_CMD_RESET),
+    ]
+
+
+def test_its_numbers_are_those_of_the_vendor() -> None:
+    names = [name for name in vars(script) if name.startswith(("SPC", "M2"))]
+    assert len(names) == 13
+    assert {name: getattr(script, name) for name in names} == {name: getattr(r, name) for name in names}
+
+
+CARD = "simulated card"
+LIBRARY = "libspcm_that_is_not_installed.so"
+
+
+def test_a_missing_library_and_wrong_arguments_give_one_clear_line() -> None:
+    path = str(Path(script.__file__))
+    jobs = {
+        "library": (path, {"library": LIBRARY, "card": "/dev/spcm0", "mode": "dds"}),
+        "name": (path, {"library": LIBRARY, "card": 0, "mode": "dds"}),
+        "argument": (path, {"crad": "/dev/spcm0"}),
+    }
+    with outsider(jobs) as outside:
+        done = outside.off()
+    assert outside.prepared == {name: one.text for name, one in done.items() if name != "argument"} | {
+        "argument": "TypeError: prepare() got an unexpected keyword argument 'crad'"
+    }
+    assert done["library"].text == (
+        f"EmergencyError: the driver library {LIBRARY!r} cannot be loaded: {LIBRARY}: cannot open shared "
+        "object file: No such file or directory"
+    )
+    assert done["name"].text == (
+        "EmergencyError: the card's device name is 0; expected a text such as '/dev/spcm0'"
+    )
+
+
+class Stubborn(SimulatedCard):
+    """A card that does not let its output 0 be disabled, and perhaps not be reset."""
+
+    refused: tuple[tuple[int, int], ...] = ()
+
+    def write_all(self, writes: Iterable[tuple[int, int | float]]) -> int:
+        ((register, value),) = writes
+        if (register, value) in self.refused:
+            return self._refused(Refusal(r.ERR_FNCNOTSUPPORTED, "not now"), register, value)
+        return super().write_all([(register, value)])
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stubborn]:
+    """A card in this process, which the script finds as ``simulated``; it plays, with its outputs on."""
+    card = Stubborn(FakeClock())
+    for register, value in (
+        (r.SPC_CARDMODE, r.SPC_REP_STD_DDS),
+        (r.SPC_ENABLEOUT0, 1),
+        (r.SPC_ENABLEOUT1, 1),
+        (r.SPC_M2CMD, r.M2CMD_CARD_START),
+    ):
+        assert card.write(register, value) == 0
+    with installed(card, CARD):
+        functions = {
+            name: ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.cast(function, ctypes.c_void_p).value or 0)
+            for name, function in _library().functions.items()
+        }
+        library = script.signed(SimpleNamespace(**functions))
+        monkeypatch.setattr(script, "load", lambda _library: library)
+        yield card
+
+
+def test_a_card_that_a_dying_process_still_holds_is_waited_for(
+    card: Stubborn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, gives_back_s = 0.0, 0.5
+
+    def sleep(duration_s: float) -> None:
+        nonlocal now_s
+        now_s += duration_s
+        if now_s > gives_back_s:
+            card.release()
+
+    monkeypatch.setattr(script, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=sleep))
+    assert card.acquire()
+    assert script.off("", CARD, "dds") == "card stopped, outputs 0 and 1 disabled"
+    assert 0.5 < now_s < 0.51
+    assert card.acquire(), "the script has closed it"
+    now_s, gives_back_s = 0.0, 1e9
+    with pytest.raises(script.EmergencyError) as error:
+        script.off("", CARD, "dds")
+    assert str(error.value) == f"the card '{CARD}' cannot be opened for 2 s: '{CARD}' is in use"
+
+
+def test_a_card_that_refuses_a_step_is_reset(card: Stubborn) -> None:
+    card.refused = ((r.SPC_ENABLEOUT0, 0),)
+    reason = "disabling output 0: SPC_ENABLEOUT0 (30091): not now"
+    assert script.off("", CARD, "dds") == (
+        f"card reset, which disables its outputs; refused before: {reason}"
+    )
+    assert (card.running, card.outputs_on) == (False, (False, False))
+    card.refused += ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
+    with pytest.raises(script.EmergencyError) as error:
+        script.off("", CARD, "dds")
+    assert str(error.value) == f"{reason}; reset of the card: SPC_M2CMD (100): not now"
+
+
+def test_a_card_in_use_elsewhere_is_refused_and_one_that_dies_with_labseq_needs_no_script(
+    tmp_path: Path,
+) -> None:
+    name = f"simulated@{tmp_path / 'card'}"
+    shared = SpcmMobileTweezers(SpcmSettings(card=name), Context("mobile_tweezers"))
+    assert shared.emergency() is None, "it is not open"
+    shared.open()
+    other = Connection(str(tmp_path / "card"))
+    try:
+        assert not other("acquire"), "one owner"
+        shared.close()
+        assert other("acquire")
+        with pytest.raises(DeviceError, match="is in use"):
+            shared.open()
+    finally:
+        other("power_off")
+    inside = SpcmMobileTweezers(SpcmSettings(card="simulated"), Context("mobile_tweezers"))
+    inside.open()
+    assert inside.emergency() is None
+    inside.close()
