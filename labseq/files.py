@@ -206,6 +206,36 @@ def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
     return rows, [number for number, row in enumerate(found, start=1) if row is None]
 
 
+class NewLines:
+    """Reads the lines that are appended to a file of JSON lines.
+
+    Args:
+        path: The file; it need not exist yet.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._at = 0
+
+    def read(self) -> list[dict[str, Any]]:
+        """The lines since the last call, without damaged ones.
+
+        Raises:
+            RecordingError: The file cannot be read.
+        """
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._at)
+                data = whole_lines(file.read())
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise RecordingError(self._path, f"cannot be read: {error.strerror}; check the disk") from error
+        self._at += len(data)
+        rows = (parse_object(line) for line in data.splitlines())
+        return [row for row in rows if row is not None]
+
+
 PROFILES: Final = "hardware_profiles"
 """Name of the folders of hardware profiles."""
 PLUGINS: Final = "plugins"

@@ -29,6 +29,8 @@ class SurvivalAnalysis:
     detection gets wrong is part of it.
     """
 
+    results = ("survival",)
+
     def __init__(self, settings: SurvivalSettings, context: Context) -> None:  # noqa: ARG002 - as every factory
         self.atoms = settings.atoms
 

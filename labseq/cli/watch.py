@@ -17,9 +17,8 @@ from labseq.cli.summary import summary_lines
 from labseq.console.output import say
 from labseq.console.runs import chosen_run
 from labseq.errors import RecordingError
-from labseq.files import whole_lines
+from labseq.files import NewLines
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
-from labseq.plain import parse_object
 from labseq.recording import Run, Shot, open_run
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
 from labseq.recording.run_file import is_index_row, read_state
@@ -120,36 +119,6 @@ class EventReader:
             yield name, {"shot": _shot_record(logged, shot)}
         else:
             yield name, values
-
-
-class NewLines:
-    """The complete lines that are appended to a file of JSON lines.
-
-    Args:
-        path: The file; it need not exist yet.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._at = 0
-
-    def read(self) -> list[dict[str, Any]]:
-        """The lines since the last call, without damaged ones.
-
-        Raises:
-            RecordingError: The file cannot be read.
-        """
-        try:
-            with self._path.open("rb") as file:
-                file.seek(self._at)
-                data = whole_lines(file.read())
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise RecordingError(self._path, f"cannot be read: {error.strerror}; check the disk") from error
-        self._at += len(data)
-        rows = (parse_object(line) for line in data.splitlines())
-        return [row for row in rows if row is not None]
 
 
 def record_of(run: Run) -> RunRecord:

@@ -217,8 +217,8 @@ class AdaptiveChoice(Choice):
     over: dict[str, EndsSettings] = Field(
         min_length=1, max_length=MAX_RANGES, description="addresses and their ranges"
     )
-    maximise: Text | None = Field(default=None, description="figure of the run's index to maximise")
-    minimise: Text | None = Field(default=None, description="figure of the run's index to minimise")
+    maximise: Text | None = Field(default=None, description="quantity to maximise")
+    minimise: Text | None = Field(default=None, description="quantity to minimise")
     points: Points | None = Field(default=None, description="maximum number of points")
 
     @model_validator(mode="after")

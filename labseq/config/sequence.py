@@ -60,8 +60,8 @@ class CheckSettings(Settings):
     """A check of a figure of the last shots, between two shots."""
 
     value: Text = Field(
-        description="name of the value, as `labseq export` calls it: `filling_fraction`, `n_missing_atoms`, "
-        "`stage.plan_s`, `reading.laser.power_w`"
+        description="name of a quantity: `filling_fraction`, `survival:before,after`, `stage.plan_s`, "
+        "`reading.laser.power_w`, `analysis.survival.survival`"
     )
     at_least: float | None = Field(default=None, description="smallest allowed mean, SI")
     at_most: float | None = Field(default=None, description="largest allowed mean, SI")
@@ -96,7 +96,7 @@ class PolicySettings(Settings):
         default="record", description="reaction to a stage that takes longer than its budget"
     )
     checks: Annotated[tuple[CheckSettings, ...], empty_is(())] = Field(
-        default=(), description="figures that are checked between the shots"
+        default=(), description="quantities that are checked between the shots"
     )
 
 
@@ -105,7 +105,8 @@ class AnalysisChoice(Choice):
 
     finish_within: Duration = Field(
         default=10.0,
-        description="how long it may continue after the run, for shots that it has not analysed yet",
+        description="how long it may continue after the run, for shots that it has not analysed yet; "
+        "and how long a run waits for a result that a check or an adaptive scan needs",
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from labseq.model import ScanRange
 from labseq.model.estimate import Estimated
 from labseq.recording.points import SCANNER, ScanPoint, reporting_damage, scan_points
-from labseq.recording.quantities import Quantity, make_quantity
+from labseq.recording.quantities import Quantity, quantity_of
 from labseq.recording.reader import Run
 from labseq.units import written
 
@@ -59,7 +59,7 @@ def best_point(run: Run) -> BestPoint | None:
     if SCANNER not in scan:
         return None
     with reporting_damage(run.path):
-        quantity = make_quantity(str(scan["figure"]), run.target)
+        quantity = quantity_of(run, str(scan["figure"]))
         ranges = [ScanRange(**one) for one in scan["ranges"]]
         units, sign = [str(unit) for unit in scan["written_units"]], 1.0 if scan["maximise"] else -1.0
     pairs = [(point, quantity.over(point.shots)) for point in scan_points(run)]

@@ -20,7 +20,7 @@ from labseq.messages import clean, closest
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.recording.columns import FRACTIONS, figures_in
-from labseq.recording.results import result_columns
+from labseq.recording.results import PREFIX, result_columns
 from labseq.recording.schema import unit_of
 from labseq.recording.shot import Shot, caching_loader
 from labseq.units import parse_any
@@ -294,7 +294,12 @@ def find_quantity(run: Run, name: str) -> Quantity:
         what, expected, hint = problem
         raise ConfigError(Problem(what, clean(run.path.name), expected=expected, hint=hint))
     _check_no_load(run, name)
-    return make_quantity(name, run.target, _numbers(run))
+    return quantity_of(run, name)
+
+
+def quantity_of(run: Run, name: str) -> Quantity:
+    """A quantity of a run whose name has been checked."""
+    return make_quantity(name, run.target, _numbers(run) if name.startswith(PREFIX) else None)
 
 
 def _check_no_load(run: Run, name: str) -> None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.errors import RecordingError
-from labseq.files import read_lines
+from labseq.files import NewLines, read_lines
 from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
-from labseq.plain import parse_object, to_plain
+from labseq.plain import to_plain
 from labseq.recording import folders
 from labseq.recording.points import SCANNER, completed, reporting_damage
 from labseq.recording.results import rows_of
@@ -250,26 +250,13 @@ class Follower:
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
-        self._offset = 0
+        self._lines = NewLines(run_dir / folders.INDEX_FILE)
 
-    def new(self) -> Generator[Shot]:
+    def new(self) -> list[Shot]:
         """The shots that were added since the last call.
 
         Raises:
             RecordingError: The index cannot be read.
         """
-        path = self._run_dir / folders.INDEX_FILE
-        try:
-            with path.open("rb") as index:
-                index.seek(self._offset)
-                for line in index:
-                    if not line.endswith(b"\n"):
-                        return
-                    self._offset += len(line)
-                    row = parse_object(line)
-                    if row is not None and is_index_row(row) and row["counts"]:
-                        yield Shot(self._run_dir / row["file"], row)
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error
+        rows = [row for row in self._lines.read() if is_index_row(row) and row["counts"]]
+        return [Shot(self._run_dir / row["file"], row) for row in rows]

@@ -12,13 +12,15 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from labseq.errors import RecordingError
-from labseq.files import LineLog, explained, read_lines
+from labseq.files import LineLog, NewLines, explained
 from labseq.recording import folders
 
 SHOT: Final = "shot"
 ERROR: Final = "error"
 AGAIN: Final = "again"
 _SUFFIX: Final = ".jsonl"
+PREFIX: Final = "analysis."
+"""Prefix of the names of results: "analysis.NAME.KEY"."""
 
 
 def results_file(run_dir: Path, name: str) -> Path:
@@ -68,6 +70,34 @@ class ResultsLog:
         self._log.append({SHOT: shot, ERROR: f"{type(error).__name__}: {error}"}, sync=True)
 
 
+class Results:
+    """The results in the file of an analysis, which may grow.
+
+    Attributes:
+        rows: Shot -> its row.
+        about: Plugin, version and settings of the last one; {} if unknown.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._lines = NewLines(path)
+        self.rows: dict[int, dict[str, Any]] = {}
+        self.about: dict[str, Any] = {}
+
+    def read(self) -> None:
+        """Read the lines that were added since the last call.
+
+        Raises:
+            RecordingError: The file exists but cannot be read.
+        """
+        for row in self._lines.read():
+            if type(row.get(SHOT)) is int:
+                self.rows[row[SHOT]] = row
+            else:
+                self.about = row
+                if row.get(AGAIN):
+                    self.rows.clear()
+
+
 def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Read the file of an analysis, even if it is incomplete or damaged.
 
@@ -77,16 +107,9 @@ def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     Raises:
         RecordingError: The file exists but cannot be read.
     """
-    rows: dict[int, dict[str, Any]] = {}
-    about: dict[str, Any] = {}
-    for row in read_lines(path)[0]:
-        if type(row.get(SHOT)) is int:
-            rows[row[SHOT]] = row
-        else:
-            about = row
-            if row.get(AGAIN):
-                rows.clear()
-    return [rows[shot] for shot in sorted(rows)], about
+    results = Results(path)
+    results.read()
+    return [results.rows[shot] for shot in sorted(results.rows)], results.about
 
 
 def done(rows: Iterable[Mapping[str, Any]]) -> set[int]:
@@ -121,7 +144,6 @@ def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
         for row in rows:
             for key, value in row.items():
                 if key not in (SHOT, ERROR) and isinstance(value, bool | int | float | str):
-                    found.setdefault(f"analysis.{about.get('analysis', path.stem)}.{key}", {})[row[SHOT]] = (
-                        value
-                    )
+                    name = f"{PREFIX}{about.get('analysis', path.stem)}.{key}"
+                    found.setdefault(name, {})[row[SHOT]] = value
     return found

@@ -147,7 +147,11 @@ class RecordedShot(Protocol):
 
 
 class Analysis(Protocol):
-    """Computes results from each shot, in a separate process next to the run."""
+    """Computes results from each shot, in a separate process next to the run.
+
+    It may have an attribute ``results``, the names of its results that are single values: ``labseq check``
+    then refuses a check or an adaptive scan that needs another one.
+    """
 
     def shot(self, shot: RecordedShot) -> Mapping[str, Any]:
         """Analyse a shot.

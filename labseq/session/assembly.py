@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -21,6 +21,7 @@ from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, TargetPattern
 from labseq.plugins import PluginHost
 from labseq.recording.points import SCANNER
+from labseq.recording.results import PREFIX
 from labseq.roles import Context, Step
 from labseq.sequencer.policies import RunPolicy
 from labseq.session.chosen import (
@@ -222,8 +223,8 @@ def _assembled(
     with found:
         made["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, found)
-    policy = make_policy(document, sequence, steps, found)
-    analyses = make_analyses(hardware, document, sequence, found)
+    analyses, results = make_analyses(hardware, document, sequence, found)
+    policy = make_policy(document, sequence, steps, results, found)
     scanned: ScanPoints | None = None
     search: Search | None = None
     try:
@@ -232,7 +233,7 @@ def _assembled(
             scanned = ScanPoints(bound, document, sequence, hardware, dry_run, planner, tuple(steps))
             scanned.check(found)
             if not found.problems:
-                search = make_search(scanned, steps, found)
+                search = make_search(scanned, steps, results, found)
         found.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
@@ -347,8 +348,8 @@ def make_steps(
 
 def make_analyses(
     hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
-) -> list[dict[str, Any]]:
-    """The settings of each analysis of the sequence, for the record.
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """The settings of each analysis of the sequence, for the record, and the names of its results.
 
     Each is constructed once, to check that it can be; during the run they have their own processes.
 
@@ -359,15 +360,18 @@ def make_analyses(
         found: Receives the problems.
     """
     dumps: list[dict[str, Any]] = []
+    results: list[str] = []
     for choice in sequence.analysis:
+        prefix, made = f"{PREFIX}{choice.use}.", None
         with found:
             chosen = resolve(hardware.host, document, "analysis", choice)
             context = Context(
                 choice.use, hardware.grid, hardware.profile.motion, calibrations=hardware.calibrations
             )
-            construct_one(chosen, context)
+            made = construct_one(chosen, context)
             dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
-    return dumps
+        results += [f"{prefix}{name}" for name in getattr(made, "results", ("",))]
+    return dumps, results
 
 
 def _grid_note(hardware: ResolvedProfile) -> str:
@@ -444,7 +448,9 @@ class Search:
         }
 
 
-def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> Search | None:
+def make_search(
+    scanned: ScanPoints, steps: Steps, results: Collection[str], found: ProblemCollector
+) -> Search | None:
     """Make and check the scanner of a scan; None if the scan is not adaptive, or if there is a problem.
 
     The scanner is constructed once, to check that its constructor accepts the settings.
@@ -452,6 +458,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
     Args:
         scanned: The scan, its ends checked.
         steps: Name and step, in order.
+        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_figure`.
         found: Receives the problems.
     """
     adaptive = scanned.scan.adaptive
@@ -459,7 +466,7 @@ def make_search(scanned: ScanPoints, steps: Steps, found: ProblemCollector) -> S
         return None
     n_before, document = len(found.problems), scanned.document
     with found:
-        check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps)
+        check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps, results)
     chosen: ChosenPlugin | None = None
     with found:
         chosen = resolve(scanned.hardware.host, document, "scanner", adaptive.choice)

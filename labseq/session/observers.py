@@ -5,17 +5,17 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import DeviceTimeoutError, LabseqError
-from labseq.guard import Guard
+from labseq.guard import Guard, StopFlag
 from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.recording import open_run
-from labseq.recording.results import ERROR, done, read_results, results_file
+from labseq.recording.results import ERROR, Results, done, read_results, results_file
 from labseq.roles import RunObserver
 from labseq.units import format_quantity
 
@@ -58,11 +58,14 @@ class Observers:
         if name == "shot_finished" and self._analyses is not None:
             self._analyses.look()
 
-    def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> None:
+    def warn(self, text: str) -> None:
+        """Report a warning."""
+        self.event("warning", {"text": text})
+
+    def analyse(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]]) -> AnalysisProcesses:
         """Start the analyses of the run's shots, each in its own process."""
-        self._analyses = AnalysisProcesses(
-            run_dir, analyses, lambda text: self.event("warning", {"text": text})
-        )
+        self._analyses = AnalysisProcesses(run_dir, analyses, self.warn)
+        return self._analyses
 
     def finish_analyses(self) -> None:
         """Wait for the analyses to finish, after the devices are safe."""
@@ -126,6 +129,10 @@ def _plain(value: Any) -> Any:
 
 GRACE_S: Final = 2.0
 """Extra time for a process to exit before it is killed, in seconds."""
+MAX_START_S: Final = 60.0
+"""Time for the process of an analysis to start, before it counts as late, in seconds."""
+LOOK_S: Final = 0.02
+"""Interval between two readings of results that the run waits for, in seconds."""
 MAX_READ: Final = 1 << 16
 """Number of bytes that are read from the end of a log."""
 _MODULE: Final = "labseq.session.analysis_process"
@@ -145,28 +152,43 @@ class AnalysisProcesses:
     def __init__(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]], warn: Warn) -> None:
         self._run_dir = run_dir
         self._report = warn
-        self._processes: list[_AnalysisProcess] = []
+        self._processes: dict[str, _AnalysisProcess] = {}
         for analysis in analyses:
             name = str(analysis[USE])
             try:
-                self._processes.append(_AnalysisProcess(run_dir, name, float(analysis[FINISH_WITHIN])))
+                self._processes[name] = _AnalysisProcess(run_dir, name, float(analysis[FINISH_WITHIN]))
             except OSError as error:
                 warn(f"the process of analysis '{name}' could not be started: {error.strerror}")
 
     def look(self) -> None:
         """Warn once about each analysis that has failed; fast enough to call between shots."""
-        for one in self._processes:
+        for one in self._processes.values():
             one.look(self._report)
+
+    def wait_for(
+        self, name: str, shots: Collection[int], stop: StopFlag
+    ) -> tuple[Mapping[int, Mapping[str, Any]], bool]:
+        """Wait until an analysis has results of shots, at most its time ``finish_within``.
+
+        Returns:
+            Shot -> its row, without those that did not come in time; and whether more can come.
+
+        Raises:
+            RecordingError: The results cannot be read.
+            StopRequested: The run was asked to stop.
+        """
+        one = self._processes.get(name)
+        return ({}, False) if one is None else one.wait_for(shots, stop)
 
     def finish(self) -> None:
         """After the run: give each analysis time for the remaining shots, then report missing results."""
-        for one in self._processes:
+        for one in self._processes.values():
             one.end_of_run()
         end_s = time.monotonic()
-        for one in self._processes:
+        for one in self._processes.values():
             one.wait(end_s, self._report)
             self._report_missing(one.name)
-        self._processes = []
+        self._processes = {}
 
     def _report_missing(self, name: str) -> None:
         with suppress(LabseqError):
@@ -188,6 +210,10 @@ class _AnalysisProcess:
         self._has_warned = False
         self._log = results_file(run_dir, name).with_suffix(".log")
         self._log.parent.mkdir(exist_ok=True)
+        self._results_file = results_file(run_dir, name)
+        self._results = Results(self._results_file)
+        self._size_before = self._size()
+        self._start_s = time.monotonic()
         with self._log.open("ab") as log:
             self._seen = log.tell()
             self._process = subprocess.Popen(  # noqa: S603 - our own module, no shell
@@ -212,6 +238,24 @@ class _AnalysisProcess:
             if failed:
                 warn(f"analysis '{self.name}' failed: {failed[0]}; see {self._log}")
                 self._has_warned = True
+
+    def wait_for(
+        self, shots: Collection[int], stop: StopFlag
+    ) -> tuple[Mapping[int, Mapping[str, Any]], bool]:
+        """See :meth:`AnalysisProcesses.wait_for`; the time that the process takes to start does not count."""
+        asked_s = time.monotonic()
+        while True:
+            is_running, now_s = self._process.poll() is None, time.monotonic()
+            self._results.read()
+            if self._size() == self._size_before and now_s < self._start_s + MAX_START_S:
+                asked_s = now_s
+            found = {shot: self._results.rows[shot] for shot in shots if shot in self._results.rows}
+            if len(found) == len(shots) or not is_running or now_s > asked_s + self._finish_within_s:
+                return found, is_running
+            stop.wait(LOOK_S)
+
+    def _size(self) -> int:
+        return self._results_file.stat().st_size if self._results_file.exists() else 0
 
     def end_of_run(self) -> None:
         """Tell the process that no more shots follow."""

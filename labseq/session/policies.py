@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +20,7 @@ from labseq.model.records import unique_names
 from labseq.recording.columns import FIGURES, figures_in
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.quantities import OF_IMAGES, quantity_problem, split_name
+from labseq.recording.results import PREFIX
 from labseq.recording.writer import RunWriter
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
@@ -33,11 +34,14 @@ _UNFORESEEN: Final = ("reading.", "stage.")
 
 
 def check_figure(
-    document: Document, place: Loc, figure: str, purpose: str, steps: Sequence[tuple[str, Step]] | None
+    document: Document,
+    place: Loc,
+    figure: str,
+    purpose: str,
+    steps: Sequence[tuple[str, Step]] | None,
+    results: Collection[str],
 ) -> None:
-    """Check that the shots of a sequence can have a quantity when the next shot begins.
-
-    Results of analyses may come later than that.
+    """Check that the shots of a sequence can have a quantity.
 
     Args:
         document: The sequence.
@@ -45,15 +49,22 @@ def check_figure(
         figure: Its name.
         purpose: Its use: "to optimise".
         steps: The steps of a shot, or None if some have errors.
+        results: Names of the results of its analyses, "analysis.NAME.KEY"; "analysis.NAME." if its keys are
+            not known.
 
     Raises:
         ConfigError: No shot can have it.
     """
     names = unique_names([name for name, _ in steps or ()])
     images = [name for name, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
-    problem = quantity_problem(figure, FIGURES, images, _UNFORESEEN)
+    known = [*FIGURES, *(name for name in results if not name.endswith("."))]
+    unforeseen = (*_UNFORESEEN, *(name for name in results if name.endswith(".")))
+    problem = quantity_problem(figure, known, images, unforeseen)
     if problem is not None:
         what, expected, hint = problem
+        name = figure.removeprefix(PREFIX).split(".")[0]
+        if figure.startswith(PREFIX) and not any(one.startswith(f"{PREFIX}{name}.") for one in results):
+            hint = f"the sequence must list the analysis: 'analysis: [{{use: {clean(name)}}}]'"
         raise document.error(place, f"{what} {purpose}", expected, hint)
     if (
         (figure in _JUDGED or split_name(figure)[0] in OF_IMAGES)
@@ -82,7 +93,11 @@ _CHECKED: Final = "to check"
 
 
 def make_policy(
-    document: Document, sequence: SequenceSpec, steps: Sequence[tuple[str, Step]], found: ProblemCollector
+    document: Document,
+    sequence: SequenceSpec,
+    steps: Sequence[tuple[str, Step]],
+    results: Collection[str],
+    found: ProblemCollector,
 ) -> RunPolicy:
     """The policies of a run and its steps.
 
@@ -90,6 +105,7 @@ def make_policy(
         document: The sequence's file.
         sequence: Its content.
         steps: The steps without errors.
+        results: Names of the results of its analyses, see :func:`check_figure`.
         found: Receives the problems.
     """
     own = sequence.policy
@@ -107,7 +123,8 @@ def make_policy(
     for number, check in enumerate(own.checks):
         place = "policy", "checks", number
         with found:
-            check_figure(document, (*place, "value"), check.value, _CHECKED, steps if is_whole else None)
+            checked = steps if is_whole else None
+            check_figure(document, (*place, "value"), check.value, _CHECKED, checked, results)
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
             found.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
@@ -174,7 +191,7 @@ class Checks:
         self._figures_of = figures_of
         self._checks = [(check, deque[float](maxlen=check.shots)) for check in checks]
         self._warn = warn
-        self._unseen = {check.value for check in checks}
+        self._unseen = {check.value for check in checks if not check.value.startswith(PREFIX)}
         self.left_open = -1, ""
         for row in rows:
             skipping = [message for check, message in self._look(row) if check.then == "skip_point"]

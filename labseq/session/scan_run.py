@@ -19,11 +19,13 @@ from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.columns import figures_in
 from labseq.recording.quantities import Quantity, make_quantity
+from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver, Scanner
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.run import Sequencer
 from labseq.session.assembly import CLIMBED, Assembly, Search
+from labseq.session.awaited import AwaitedResults
 from labseq.session.chosen import construct_one
 from labseq.session.lab import rebuild_lab
 from labseq.session.policies import ShotHooks, missing_figure
@@ -207,6 +209,7 @@ class AdaptiveScanRun(ScanRun):
         stop: The request to stop.
         run: The run so far, if it is resumed.
         done: Shots that were taken before.
+        awaited: The results of analyses that the scan needs.
     """
 
     is_adaptive = True
@@ -219,6 +222,7 @@ class AdaptiveScanRun(ScanRun):
         stop: StopFlag,
         run: Run | None = None,
         done: Collection[int] = (),
+        awaited: AwaitedResults | None = None,
     ) -> None:
         self._search = search
         super().__init__(assembly, seed, done)
@@ -226,7 +230,8 @@ class AdaptiveScanRun(ScanRun):
         self._results = Results(
             search,
             {} if run is None else {shot.index: shot for shot in run.shots},
-            make_quantity(search.adaptive.figure, assembly.target),
+            make_quantity(search.adaptive.figure, assembly.target, awaited.values if awaited else None),
+            awaited,
         )
         for attempt in () if run is None else run.attempts:
             if run is not None and attempt.index in run.skipped:
@@ -306,7 +311,12 @@ class AdaptiveScanRun(ScanRun):
 
 
 def scan_run_of(
-    assembly: Assembly, seed: int, stop: StopFlag, run: Run | None = None, done: Collection[int] = ()
+    assembly: Assembly,
+    seed: int,
+    stop: StopFlag,
+    run: Run | None = None,
+    done: Collection[int] = (),
+    awaited: AwaitedResults | None = None,
 ) -> ScanRun:
     """The shots of a run and their points.
 
@@ -316,10 +326,11 @@ def scan_run_of(
         stop: The request to stop.
         run: The run so far, if it is resumed.
         done: Shots that need not be taken.
+        awaited: The results of analyses that the run needs.
     """
     if assembly.search is None:
         return ScanRun(assembly, seed, done)
-    return AdaptiveScanRun(assembly, assembly.search, seed, stop, run, done)
+    return AdaptiveScanRun(assembly, assembly.search, seed, stop, run, done, awaited)
 
 
 def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
@@ -366,11 +377,13 @@ class Results:
         search: The scanner and its ranges.
         shots: The shots that count: index -> shot.
         quantity: What is optimised.
+        awaited: The results of analyses that this needs.
     """
 
     search: Search
     shots: dict[int, Shot]
     quantity: Quantity
+    awaited: AwaitedResults | None = None
     _visited: dict[int, VisitedPoint] = field(default_factory=dict[int, VisitedPoint])
     _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
     _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
@@ -405,10 +418,11 @@ class Results:
 
     def missing_figure(self, shot: int) -> str:
         """A warning, given once, that a shot lacks the figure that the scan optimises; else ""."""
-        if self._warned or not math.isnan(self.quantity.of_shot(self.shots[shot])):
+        name = self.quantity.name
+        if self._warned or name.startswith(PREFIX) or not math.isnan(self.quantity.of_shot(self.shots[shot])):
             return ""
         self._warned = True
-        return missing_figure(shot, self.quantity.name, CLIMBED, figures_in(self.shots[shot].row))
+        return missing_figure(shot, name, CLIMBED, figures_in(self.shots[shot].row))
 
     def progress(self, visit: int) -> dict[str, Any]:
         """The score of a point and the best one so far, JSON-ready, for the run's events."""
@@ -451,9 +465,15 @@ class Results:
 
     def _result(self, visit: int) -> VisitedPoint:
         shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
-        figures = [MappingProxyType(figures_in(shot.row)) for shot in shots]
+        if self.awaited is not None:
+            self.awaited.await_shots(self.quantity.name, [shot.index for shot in shots])
+        figures = [MappingProxyType(self._figures(shot)) for shot in shots]
         score = sign * self.quantity.over(shots).value
         return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))
+
+    def _figures(self, shot: Shot) -> dict[str, float]:
+        results = self.awaited.figures([self.quantity.name], shot.index) if self.awaited else {}
+        return figures_in(shot.row) | results
 
 
 class ScannerCall:

@@ -7,10 +7,9 @@ import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, ParamSpec, Self
+from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.guard import Guard, StopFlag, stop_on_signals
@@ -22,6 +21,7 @@ from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, plan_timelines
 from labseq.session.assembly import Assembly, assemble
+from labseq.session.awaited import AwaitedResults
 from labseq.session.check import check
 from labseq.session.chosen import DryRun
 from labseq.session.lab import build_lab, clock_for, warm
@@ -68,8 +68,9 @@ class Session:
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
-        self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done)
         self._observers = Observers(assembly.hardware.host, observer)
+        self._awaited = self._awaited_results(before)
+        self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._awaited)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
 
@@ -259,15 +260,29 @@ class Session:
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))
-        self._observers.analyse(writer.run_dir, self.assembly.resolved["analysis"])
+        self._awaited.follow(self._observers.analyse(writer.run_dir, self.assembly.resolved["analysis"]))
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
         names = [check.value for check in settings]
-        figures_of = partial(figures_with_images, names=names, run_dir=writer.run_dir, target=target)
+
+        def figures_of(row: Mapping[str, Any]) -> dict[str, float]:
+            figures = figures_with_images(row, names, writer.run_dir, target)
+            return figures | self._awaited.figures(names, row["shot"])
+
         checks = Checks(settings, before, self._warn, figures_of)
         self.scan_run.follow(writer, self._observers)
         self.scan_run.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
+
+    def _awaited_results(self, run: Run | None) -> AwaitedResults:
+        """The results of analyses without which the run cannot be continued, or a check cannot be made."""
+        checks, search = self.assembly.sequence.policy.checks, self.assembly.search
+        needed = {check.value: "" for check in checks}
+        needed |= {check.value: "for a check that stops it" for check in checks if check.then == "stop"}
+        if search is not None:
+            needed[search.adaptive.figure] = "to choose the next point"
+        analyses = self.assembly.resolved["analysis"]
+        return AwaitedResults(needed, analyses, self._observers, self.stop_flag, run)
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
         """Create the run's folder, or reopen that of a resumed run."""
