@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.config.document import Document
-from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, one_of
+from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, StopRequested, one_of
 from labseq.guard import Guard
-from labseq.model import COMPUTER, Frame, Occupancy, Plan, PlanReport, TimelineEntry
+from labseq.model import COMPUTER, Frame, Plan, PlanReport, TimelineEntry
 from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.roles import Detector, Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
@@ -22,6 +24,7 @@ from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigg
 from labseq.sequencer.run import plan_timeline
 from labseq.session.assembly import Assembly
 from labseq.session.lab import WARM_S
+from labseq.session.planning import changed_settings
 from labseq.session.scan import Point
 from labseq.units import format_quantity
 
@@ -381,58 +384,76 @@ def _rehearsed(points: _Points, runs: bool) -> tuple[dict[int, Rehearsal], list[
         session.warm(lab, devices=runs and n == 0)
         found, plans, failure = _rehearse(points.guard, lab, [*windows.values()], 1 if n else N_LOADINGS)
         points.ask_tweezers(point, lab, plans)
-        if failure:
-            loc = (*session.assembly.sequence.planner.loc, "use")
-            warnings.append(point.document.problem(loc, failure))
+        if failure is not None:
+            what, hint = failure.what, failure.hint and f"{failure.hint} {_plan_options(session, point)}"
+            points.add(point.document, (*session.assembly.sequence.planner.loc, "use"), what, hint=hint)
         elif n == 0:
             rehearsals = dict(zip(windows, found, strict=True))
             warnings += _window_warnings(session, windows, rehearsals)
     return rehearsals, list(dict.fromkeys(warnings))
 
 
+def _plan_options(session: Session, point: Point) -> str:
+    """The options by which `labseq plan` plans as a run does at a point."""
+    assembly, settings = session.assembly, changed_settings(point.planner.settings)
+    options = ["--target", str(assembly.document.path), "--planner", point.planner.entry.name]
+    options += ["--profile", str(assembly.hardware.document.path)]
+    for key, value in settings.items():
+        options += ["--set", f"{key}={json.dumps(value)}"]
+    return shlex.join(options)
+
+
 def _rehearse(
     guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int
-) -> tuple[list[Rehearsal], list[Plan], str]:
-    """Plan for random loadings.
+) -> tuple[list[Rehearsal], list[Plan], Problem | None]:
+    """Plan for random loadings; the seed of each is its number, as in `labseq plan random:... --seed N`.
 
     Returns:
-        The results of each rearrangement, some of the plans, and the planner's failure as text.
+        The results of each rearrangement, some of the plans, and the planner's failure.
     """
     loading = None
     if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
         loading = lab.simulation.loading_probability
     if loading is None:
         loading = PAPERS_LOADING
-    rng, deadline = np.random.default_rng(0), time.monotonic() + MAX_WAIT_S
+    deadline = time.monotonic() + MAX_WAIT_S
     shots: list[list[tuple[Plan, PlanReport]]] = []
-    failure = ""
-    while len(shots) < n_loadings and time.monotonic() < deadline and not failure:
-        occupancy = rng.random(lab.grid.shape) < loading
+    failure: Problem | None = None
+    while len(shots) < n_loadings and time.monotonic() < deadline and failure is None:
+        seed, cycles = len(shots), list[tuple[Plan, PlanReport]]()
         try:
-            shots.append(_rehearse_shot(guard, lab, windows, occupancy, rng))
+            for cycle in _first_cycles(guard, lab, windows, loading, seed):
+                cycles.append(cycle)  # those before a failure are kept
+            shots.append(cycles)
+        except StopRequested:
+            raise
         except LabseqError as error:
-            failure = f"on a random loading of {loading:.0%} of the sites: {error}"
+            drawn = f"random:{lab.grid.n_rows}x{lab.grid.n_cols}@{loading:g}"
+            what = f"it fails on a random loading of {100 * loading:.0f} % of the sites (seed {seed}): {error}"
+            # only the first plan is made for the loading itself
+            failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
     plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
     found = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
     return found, plans, failure
 
 
-def _rehearse_shot(
-    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], occupancy: Occupancy, rng: np.random.Generator
-) -> list[tuple[Plan, PlanReport]]:
+def _first_cycles(
+    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
+) -> Iterator[tuple[Plan, PlanReport]]:
     """Plan and report of the first cycle of each rearrangement, which begins where the one before ends."""
+    rng = np.random.default_rng(seed)
+    occupancy = rng.random(lab.grid.shape) < loading
 
     def checked(plan: Plan) -> PlanReport:
         dop, name = lab.degree_of_parallelism, lab.planner_name
         return check_plan(plan, occupancy, lab.target, dop, lab.grid, lab.motion, name)
 
-    first_cycles: list[tuple[Plan, PlanReport]] = []
     for number, windows_s in enumerate(windows):
         for cycle, window_s in enumerate(windows_s):
             plan = guard.call("planner", lab.timeouts.plan_s, lab.planner.plan, occupancy.copy(), lab.target)
             report = checked(plan)
             if cycle == 0:
-                first_cycles.append((plan, report))
+                yield plan, report
             if number == len(windows) - 1:
                 break
             n_played = fitting_batches(report, plan, window_s)
@@ -440,7 +461,6 @@ def _rehearse_shot(
             occupancy = after.predicted & (rng.random(lab.grid.shape) < SURVIVAL)
             if lab.target.is_met_by(occupancy):
                 break
-    return first_cycles
 
 
 def _summary(reports: Sequence[PlanReport]) -> Rehearsal:

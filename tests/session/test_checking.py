@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.errors import Problem
+from labseq.errors import ConfigError, Problem
 from labseq.session.check import N_LOADINGS, CheckReport, check
 
 ROOT = Path(__file__).parents[2]
@@ -108,14 +108,21 @@ def test_the_disk_space_follows_the_frames_that_are_kept(frames: str):
     assert size < (700_000 if frames == "last" else 150_000)
 
 
-def test_a_planner_that_fails_is_a_warning(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("plan", "why"),
+    [
+        ("raise KeyError('typo')", "raised KeyError: 'typo'"),
+        ("return Plan.from_batches([([(0, 0)], [(0, 99)])])", "batch 0"),
+    ],
+)
+def test_a_planner_that_fails_is_an_error_that_can_be_seen(tmp_path: Path, plan: str, why: str):
     folder = tmp_path / "plugins"
     folder.mkdir()
     (folder / "broken.py").write_text(
-        "import labseq\nLABSEQ_API = 1\n"
+        "import labseq\nfrom labseq.plugin import Plan\nLABSEQ_API = 1\n"
         "class Broken:\n"
         "    def __init__(self, settings, context): pass\n"
-        "    def plan(self, occupancy, target): raise KeyError('typo')\n"
+        f"    def plan(self, occupancy, target): {plan}\n"
         "@labseq.plugin.hookimpl\n"
         "def labseq_register(registry): registry.planner('broken', Broken)\n",
         encoding="utf-8",
@@ -124,9 +131,12 @@ def test_a_planner_that_fails_is_a_warning(tmp_path: Path):
     text = text.replace("{use: psca, degree_of_parallelism: 7}", "{use: broken}")
     path = tmp_path / "broken.yaml"
     path.write_text(text + "plugin_folders: [plugins]\n", encoding="utf-8")
-    (warning,) = check(labseq.Session.open(path)).warnings
-    assert "raised KeyError: 'typo'" in warning.what
-    assert warning.line == next(i for i, line in enumerate(text.splitlines(), 1) if "broken" in line)
+    with pytest.raises(ConfigError) as refused:
+        check(labseq.Session.open(path))
+    (problem,) = refused.value.problems
+    assert why in problem.what
+    assert problem.line == next(i for i, line in enumerate(text.splitlines(), 1) if "broken" in line)
+    assert "labseq plan random:20x20@0.75 --seed 0 --target" in problem.hint
 
 
 STEPS = """
