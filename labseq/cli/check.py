@@ -277,11 +277,11 @@ def _limits(assembly: Assembly) -> list[tuple[str, str]]:
     motion, timeouts = profile.motion, profile.timeouts
     tones = f"{motion.max_row_tones} x {motion.max_column_tones} tones"
     dop = assembly.planner.dump().get("degree_of_parallelism")
-    at_once = f"{motion.max_tweezers} on at once, {tones}" + (f"; the planner uses {dop}" if dop else "")
+    uses = f"; the planner uses {min(dop, motion.max_tweezers)}" if dop else ""
     waits = (("device call", timeouts.call), ("safe state", timeouts.safe_state), ("plan", timeouts.plan))
     return [
         *(("window", text) for text in _windows(assembly.resolved)),
-        ("mobile tweezers", at_once),
+        ("mobile tweezers", f"{motion.max_tweezers} on at once, {tones}{uses}"),
         ("attempts", f"at most {spec.attempts} per shot"),
         *(("policy", text) for text in policy_texts(assembly)),
         ("timeouts", ", ".join(f"{what} {format_quantity(value, 'time')}" for what, value in waits)),

@@ -429,7 +429,7 @@ def _rehearse(
             raise
         except LabseqError as error:
             drawn = f"random:{lab.grid.n_rows}x{lab.grid.n_cols}@{loading:g}"
-            what = f"it fails on a random loading of {100 * loading:.0f} % of the sites (seed {seed}): {error}"
+            what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
             # only the first plan is made for the loading itself
             failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
     plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
@@ -518,7 +518,7 @@ def _parallelism_warnings(session: Session, points: Iterable[Point]) -> list[Pro
         if isinstance(asked, int) and asked > limit:
             loc = (*session.assembly.sequence.planner.loc, "degree_of_parallelism")
             what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
-            problems.setdefault(what, point.document.problem(loc, what, f"at most {limit}"))
+            problems.setdefault(what, point.document.problem(loc, f"{what}; at most {limit} are used"))
     return [*problems.values()]
 
 
