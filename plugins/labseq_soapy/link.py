@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 import tempfile
@@ -18,6 +19,7 @@ from labseq_soapy_stream.messages import Facts, Setup, received, send
 from labseq_soapy_stream.output import Samples
 
 from labseq.plugin import Clock, DeviceError, wait_for
+from labseq_soapy.emergency import start_of
 
 OPEN_S: Final = 60.0
 """How long a radio may take to open: some load their firmware."""
@@ -58,6 +60,7 @@ class Link:
         self._received_s = time.monotonic()
         self._closing = threading.Event()
         self.facts: Facts | None = None
+        self._environment = {key: value for key, value in environment.items() if os.environ.get(key) != value}
         with log.open("wb") as file:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "labseq_soapy_stream.streamer"],
@@ -86,6 +89,20 @@ class Link:
         """Whether the process runs but is silent; while the radio is being opened it always is."""
         is_open = self.facts is not None and not self._ended
         return is_open and time.monotonic() - self._received_s > SILENT_S
+
+    def emergency_arguments(self) -> dict[str, Any]:
+        """The arguments with which the emergency script ends this process and switches off its radio."""
+        facts = self.facts
+        buffered_s = facts.buffered / facts.rate_hz if facts else 0.0
+        return {
+            "pid": self.pid,
+            "started": start_of(self.pid),
+            "opened": str(Path(self._setup.marker).with_suffix(".opened")),
+            "ramp_s": self._setup.ramp_s + buffered_s,
+            "device": self._setup.device,
+            "channels": list(self._setup.channels),
+            "environment": self._environment,
+        }
 
     def wait_open(self) -> Facts:
         """Wait until the radio is open and streams silence; returns what it reports.

@@ -5,12 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from labseq_soapy_stream.messages import Facts, Setup
 
-from labseq.plugin import Context, DeviceError, LimitError, StaticTweezers, TransientError, TweezersFacts
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    Emergency,
+    LimitError,
+    StaticTweezers,
+    TransientError,
+    TweezersFacts,
+)
 from labseq_soapy.access import choose_radio, end_stale_process, marker_of
 from labseq_soapy.link import Link
 from labseq_soapy.settings import SoapySettings
@@ -178,6 +187,12 @@ class SoapyStaticTweezers(StaticTweezers):
                 self._disconnect()
                 raise
             self._depth = 0.0
+
+    def emergency(self) -> Emergency | None:
+        """The streaming process is ended, and closes the radio; None if the light is to be held."""
+        if self._link is None or self._settings.on_exit == "hold":
+            return None
+        return Emergency(Path(__file__).with_name("emergency.py"), self._link.emergency_arguments())
 
     def check_interlocks(self) -> None:
         """Check that the stream is alive; called at the start of each shot and before each pick-up.

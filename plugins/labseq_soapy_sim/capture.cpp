@@ -6,6 +6,9 @@
 //
 // Arguments: folder (where its files are), channels, buffer (s), patience (s: how long its clock waits for
 // samples that are late), speed (of its clock), coerce_rate (Hz), record (samples kept in files), fault=absent.
+//
+// With record, the file "trace" gets a line for each change of the transmitters, also by later processes:
+// time in s (CLOCK_MONOTONIC), name, two numbers. A process that is killed leaves them as they are.
 
 #include <SoapySDR/Device.hpp>
 #include <SoapySDR/Errors.hpp>
@@ -86,10 +89,15 @@ public:
         header_->speed = number(args, "speed", 1.0);
         header_->patience_s = number(args, "patience", 0.0);
         header_->magic = MAGIC;
+        if (n_record_ > 0) trace_ = std::fopen((folder_ + "/trace").c_str(), "a");
+        if (trace_) std::setvbuf(trace_, nullptr, _IOLBF, 4096);
+        trace("open");
     }
 
     ~Capture() override {
         header_->is_active = 0;
+        trace("close");
+        if (trace_) std::fclose(trace_);
         munmap(header_, sizeof(Header) + CHANNELS * RING * sizeof(Sample));
         close(file_);
     }
@@ -116,6 +124,7 @@ public:
     void setGain(const int, const size_t channel, const double gain) override {
         const SoapySDR::Range range = getGainRange(SOAPY_SDR_TX, channel);
         header_->gain_db[channel] = std::min(std::max(gain, range.minimum()), range.maximum());
+        trace("gain", double(channel), header_->gain_db[channel]);
     }
     double getGain(const int, const size_t channel) const override { return header_->gain_db[channel]; }
     SoapySDR::Range getGainRange(const int, const size_t) const override { return SoapySDR::Range(0.0, 60.0); }
@@ -129,6 +138,8 @@ public:
         for (const size_t channel : channels)
             if (n_record_ > 0)
                 records_.push_back(std::fopen((folder_ + "/channel" + std::to_string(channel)).c_str(), "wb"));
+        for (std::FILE *record : records_)
+            if (record) std::setvbuf(record, nullptr, _IONBF, 0);
         return reinterpret_cast<SoapySDR::Stream *>(this);
     }
 
@@ -144,11 +155,13 @@ public:
         header_->sent = 0;
         header_->t0_s = now_s();
         header_->is_active = 1;
+        trace("play", header_->t0_s, clock_hz());
         return 0;
     }
 
     int deactivateStream(SoapySDR::Stream *, const int, const long long) override {
         header_->is_active = 0;
+        trace("stop");
         return 0;
     }
 
@@ -177,6 +190,10 @@ public:
     }
 
 private:
+    void trace(const char *name, double first = 0.0, double second = 0.0) {
+        if (trace_) std::fprintf(trace_, "%.6f %s %.6f %.6f\n", now_s(), name, first, second);
+    }
+
     double clock_hz() const { return header_->rate_hz * header_->speed; }
 
     // Samples that were played so far; an underflow, or a wait for late samples, sets the clock back.
@@ -190,6 +207,7 @@ private:
             header_->fault &= ~uint64_t(UNDERFLOW_ONCE);
         }
         header_->t0_s = now_s() - double(header_->sent) / clock_hz();
+        if (header_->sent > 0) trace("play", header_->t0_s, clock_hz());
         return double(header_->sent);
     }
 
@@ -230,6 +248,7 @@ private:
     Sample *ring_ = nullptr;
     std::vector<size_t> channels_;
     std::vector<std::FILE *> records_;
+    std::FILE *trace_ = nullptr;
     uint64_t n_told_ = 0;
 };
 

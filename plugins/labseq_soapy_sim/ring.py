@@ -34,6 +34,16 @@ class Fault(enum.IntFlag):
     STALL = 16
 
 
+def read_trace(folder: Path) -> list[tuple[float, str, float, float]]:
+    """Changes of the transmitters, with ``record`` among the radio's arguments: time, name, two numbers.
+
+    "open", "close", "stop", "gain" (channel, dB), "play" (sample n is at the connectors at the first number
+    + n / the second).
+    """
+    lines = (line.split() for line in (folder / "trace").read_text("ascii").splitlines())
+    return [(float(time_s), name, float(first), float(second)) for time_s, name, first, second in lines]
+
+
 class Ring:
     """The latest samples of both channels.
 
@@ -57,6 +67,11 @@ class Ring:
     def set_fault(self, fault: Fault) -> None:
         """Set the radio's faults from now on."""
         self._header["fault"] = int(fault)
+
+    @property
+    def is_transmitting(self) -> bool:
+        """Whether its transmitters are on, also without samples, as after the death of the process."""
+        return bool(self._header["is_active"])
 
     @property
     def is_playing(self) -> bool:

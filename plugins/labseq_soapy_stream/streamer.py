@@ -99,6 +99,7 @@ class Streamer:
         self._settling = False
         self._underflows = self._dark = 0
         self._status_s = self._marker_s = 0.0
+        self._parent = os.getppid()
         self._alone = self._leaving = False
         self._terminated = False
 
@@ -183,7 +184,7 @@ class Streamer:
                 self._marker_s = now_s
                 if not Path(self._setup.marker).exists():
                     self._leave("")
-        elif self._commands.closed:
+        elif self._commands.closed or os.getppid() != self._parent:  # a copy of labseq may keep the pipe open
             self._continue_alone("labseq is gone")
         elif not self._setup.hold and now_s - self._commands.last_s > self._setup.max_wait_s:
             self._continue_alone(f"labseq sent nothing for {self._setup.max_wait_s:g} s")
@@ -215,6 +216,9 @@ def stream(commands: CommandReader, messages: StatusWriter) -> None:
     """Open the radio, stream, close it."""
     setup = commands.setup
     radio = open_radio(setup)
+    opened = Path(setup.marker).with_suffix(".opened")  # it stays if this process is killed
+    with contextlib.suppress(OSError):
+        opened.write_text(str(os.getpid()), "ascii")
     try:
         facts = set_up(radio, setup)
         samples = radio.stream(sorted(setup.channels), setup.stream)
@@ -230,10 +234,15 @@ def stream(commands: CommandReader, messages: StatusWriter) -> None:
     finally:
         with contextlib.suppress(SoapyError):
             radio.close()
-        with contextlib.suppress(OSError):
-            own = Path(setup.marker)
-            if own.read_text("ascii") == str(os.getpid()):
-                own.unlink()
+            remove_own(opened)
+        remove_own(Path(setup.marker))
+
+
+def remove_own(file: Path) -> None:
+    """Remove a file if it has the number of this process."""
+    with contextlib.suppress(OSError):
+        if file.read_text("ascii") == str(os.getpid()):
+            file.unlink()
 
 
 def main() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
@@ -116,8 +117,21 @@ def depth(samples: NDArray[np.complex64], n_loop: int, full: slice) -> NDArray[n
     return np.where(np.abs(np.resize(loop, len(samples))) > 0.05 * np.abs(loop).max(), factor, 0.0) ** 4
 
 
+def assert_ramped_down(folder: Path) -> None:
+    """What both outputs were sent goes to nothing in a linear ramp of 10 ms."""
+    for channel in (0, 1):
+        samples = recorded(folder, channel)
+        assert not samples[-1000:].any()
+        lit = np.flatnonzero(samples)
+        full = slice(int(lit[0]) + 20_000, int(lit[-1]) - 20_000)
+        falling = depth(samples, 80, full)[full.stop :]
+        assert not np.isnan(falling).any(), "a phase jumped"
+        known = falling[np.abs(samples[full.stop :]) > 0.02]
+        assert np.abs(np.diff(known)).max() < 20 / (0.01 * 1.2e6)
+
+
 LABSEQ = """
-import sys, time
+import json, os, sys
 from labseq.plugin import Context, SiteGrid
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
@@ -125,28 +139,34 @@ context = Context("static_tweezers", SiteGrid(3, 4))
 tweezers = SoapyStaticTweezers(SoapySettings.model_validate_json(sys.argv[1]), context)
 tweezers.open()
 tweezers.start()
-print("on", flush=True)
+child = os.fork() if sys.argv[2:] else None
+if child == 0:
+    sys.stdin.read()  # until the test ends: it has a copy of the pipe to the streaming process
+    os._exit(0)
+found = tweezers.emergency()
+print(json.dumps(found and [str(found.script), dict(found.arguments)]), flush=True)
 sys.stdin.read()
 tweezers.close()
 """
 
 
 @contextmanager
-def another_labseq(folder: Path, **settings: Any) -> Generator[subprocess.Popen[str]]:
-    """A process that has the array on; it turns it off when its standard input closes."""
+def another_labseq(
+    folder: Path, *, forks: bool = False, **settings: Any
+) -> Generator[tuple[subprocess.Popen[str], Any]]:
+    """A process that has the array on, and its emergency script with arguments; it ends with its input."""
     need_radio()
     device = f"{SMALL['device']},folder={folder},record=10000000"
     chosen = SoapySettings.model_validate({**SMALL, "device": device, **settings})
     process = subprocess.Popen(
-        [sys.executable, "-c", LABSEQ, chosen.model_dump_json()],
+        [sys.executable, "-c", LABSEQ, chosen.model_dump_json(), *(["forks"] if forks else [])],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
     assert process.stdout is not None
     try:
-        assert process.stdout.readline() == "on\n"
-        yield process
+        yield process, json.loads(process.stdout.readline())
     finally:
         process.kill()
         process.communicate()

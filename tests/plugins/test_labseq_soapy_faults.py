@@ -21,7 +21,7 @@ from labseq_soapy_stream.streamer import Streamer, repeated
 from labseq import DeviceError, TransientError
 from labseq.errors import StopRequested
 
-from .labseq_soapy_rig import Rig, another_labseq, depth, made, opened, recorded, until
+from .labseq_soapy_rig import Rig, another_labseq, assert_ramped_down, made, opened, recorded, until
 
 
 def raised(kind: type[Exception], call: Callable[[], object]) -> Callable[[], bool]:
@@ -159,19 +159,6 @@ def test_after_its_process_was_killed_the_radio_can_be_opened_again() -> None:
         assert rig.ring.is_playing
 
 
-def assert_ramped_down(folder: Path) -> None:
-    """What both outputs were sent goes to nothing in a linear ramp of 10 ms."""
-    for channel in (0, 1):
-        samples = recorded(folder, channel)
-        assert not samples[-1000:].any()
-        lit = np.flatnonzero(samples)
-        full = slice(int(lit[0]) + 20_000, int(lit[-1]) - 20_000)
-        falling = depth(samples, 80, full)[full.stop :]
-        assert not np.isnan(falling).any(), "a phase jumped"
-        known = falling[np.abs(samples[full.stop :]) > 0.02]
-        assert np.abs(np.diff(known)).max() < 20 / (0.01 * 1.2e6)
-
-
 def end_by_a_signal(rig: Rig) -> None:
     os.kill(link_of(rig).pid, signal.SIGTERM)
 
@@ -198,19 +185,12 @@ def test_the_light_is_ramped_down_by_a_signal_and_when_labseq_hangs(
     assert_ramped_down(tmp_path)
 
 
-def test_the_light_is_ramped_down_when_labseq_is_killed(tmp_path: Path) -> None:
-    with another_labseq(tmp_path) as labseq:
-        labseq.kill()
-        ring = Ring(tmp_path)
-        until(lambda: not ring.is_playing)
-    assert_ramped_down(tmp_path)
-
-
 def test_with_hold_the_light_stays_until_the_next_labseq_ends_it(tmp_path: Path) -> None:
     def alone() -> list[Path]:
         return list((Path(os.environ["LABSEQ_STATE"]) / "soapy").glob("*.alone"))
 
-    with another_labseq(tmp_path, on_exit="hold") as labseq:
+    with another_labseq(tmp_path, on_exit="hold") as (labseq, script):
+        assert script is None, "the light is to stay"
         ring = Ring(tmp_path)
         labseq.kill()
         labseq.wait()
