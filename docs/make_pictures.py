@@ -4,7 +4,7 @@
 
 Each is made in an empty folder by the commands that its page shows. Other scripts make the rest:
 ``make_gallery.py`` the patterns, ``make_planner_tables.py`` the planners' figures, ``make_paper_figures.py``
-the paper's, ``make_run_picture.py`` the README's.
+the paper's, ``make_run_picture.py`` the README's, ``make_off_picture.py`` that of the safety page.
 """
 
 from __future__ import annotations

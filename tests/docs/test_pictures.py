@@ -6,6 +6,7 @@ import re
 from contextlib import chdir
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image, ImageChops, ImageStat
 
@@ -14,7 +15,7 @@ from .running import labseq
 from .scripts import load_script
 
 STATIC = ROOT / "docs" / "_static"
-BY_OTHERS = ("patterns/", "planners/", "paper/", "run.svg")
+BY_OTHERS = ("patterns/", "planners/", "paper/", "run.svg", "off_after_kill.png")
 """Made by scripts with tests of their own."""
 
 
@@ -59,3 +60,12 @@ def test_the_picture_of_the_readme_can_be_made_again(tmp_path: Path) -> None:
     assert "compact-225" in text
     assert "1/2" in text
     assert "compact-225" in (STATIC / "run.svg").read_text("utf-8")
+
+
+def test_the_picture_of_outputs_after_a_kill_can_be_drawn_again(tmp_path: Path) -> None:
+    script = load_script("make_off_picture")
+    on = np.where(script.TIMES_S < 0.02, 0.5, 0.0)
+    watched, alone = script.Outputs(70 * on, on, on > 0), script.Outputs(0 * on + 35, on, on >= 0)
+    script.draw(watched, alone, tmp_path / "off.png")
+    with Image.open(tmp_path / "off.png") as made, Image.open(STATIC / "off_after_kill.png") as kept:
+        assert made.size == kept.size
