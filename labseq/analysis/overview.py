@@ -44,7 +44,7 @@ from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
-from labseq.messages import clean
+from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.pictures.figures import make_figure, save_figure
@@ -406,9 +406,12 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
     """Quantities at the points of a scan, with their fits.
 
     Raises:
-        ConfigError: See :func:`labseq.analysis.scanned.scan_report`.
+        ConfigError: The run has no scan; or see :func:`labseq.analysis.scanned.scan_report`.
     """
     report = scan_report(_with_shots(run), request)
+    if not report.found.axes:
+        wanted = "a run of a sequence with 'scan:'; `labseq show --scan` prints the values of this one"
+        raise cannot_draw(run, "it has no scan", wanted)
     fits = report.fits or (None,) * len(report.values)
     rows = [scan_panels(report.found, one, fit) for (one, _), fit in zip(report.values, fits, strict=True)]
     shown = [panel for row in rows for panel in row]
@@ -490,13 +493,16 @@ def _with_shots(run: Run) -> Run:
 
 
 _IMAGES: Final = "shots with an 'image' step or a rearrangement"
+_KEPT: Final = (
+    "shots whose frames were kept: 'record_frames: all' in the sequence, or --set record_frames=all"
+)
 
 CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] = MappingProxyType(
     {
         "image": (
             "the average image",
             lambda s: _image_rows(s, average_panel),
-            "readable shots whose frames were kept",
+            _KEPT,
         ),
         "loading": (
             "the loading",
@@ -565,7 +571,7 @@ def note_of(run: Run) -> str:
 def cannot_draw(run: Run, what: str, expected: str) -> ConfigError:
     """The error for a picture that cannot be drawn from a run."""
     text = f"the picture cannot be drawn from this run: {what}"
-    return ConfigError(Problem(text, clean(str(run.path)), expected=expected))
+    return ConfigError(Problem(text, visible(str(run.path)), expected=expected))
 
 
 def grid_of(run: Run) -> SiteGrid:

@@ -14,12 +14,13 @@ from labseq.analysis.fits import Fit, fit_points
 from labseq.analysis.statistics import as_mapping
 from labseq.console.text import columns, count_of
 from labseq.errors import ConfigError, Problem
-from labseq.messages import clean
+from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording import Run
+from labseq.recording.columns import Column, make_column
 from labseq.recording.points import ScanPoint, scan_points
-from labseq.recording.quantities import Quantity, find_quantity, select_shots
-from labseq.units import UNITS, dimension_of, factor_of, readable_unit, scaled, si_unit_of, split_quantity
+from labseq.recording.quantities import Quantity, description_of, find_quantity, select_shots
+from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of, split_quantity
 
 MIN_FULL: Final = 0.5
 """Maps are drawn if at least this fraction of their cells has a point."""
@@ -42,10 +43,12 @@ class Axis:
     Attributes:
         address: The address, and those that change together with it.
         words: Its different values as written, in the order of the scan.
+        numbers: The same as numbers, and the unit of these; None if they are no numbers of one dimension.
     """
 
     address: str
     words: tuple[str, ...]
+    numbers: tuple[tuple[float, ...], str] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +77,7 @@ class Scanned:
 
     def on_axis(self, number: int) -> tuple[list[float], str] | None:
         """Each point's value on an axis, and the unit that it is written in; None if these are no numbers."""
-        numbers = numbers_of(self.axes[number].words)
+        numbers = self.axes[number].numbers
         if numbers is None:
             return None
         return [numbers[0][place[number]] for place in self.places], numbers[1]
@@ -99,16 +102,15 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     if not points or not points[0].parameters:  # --set may have replaced every address
         return None
     rows = [tuple(map(clean, row)) for row in run.scan["written"]]
-    columns = list(zip(*rows, strict=True))
+    columns, values = list(zip(*rows, strict=True)), list(zip(*run.scan["points"], strict=True))
+    numbers = [_numbers(*one) for one in zip(values, columns, strict=True)]
     addresses = list(map(clean, points[0].written))
     varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]
     together: dict[int, list[str]] = {}
     for i in varied:
-        leader = next((k for k in together if _follows(columns[i], columns[k])), i)
+        leader = next((k for k in together if _follows(columns, numbers, i, k)), i)
         together.setdefault(leader, []).append(addresses[i])
-    axes = tuple(
-        Axis(" with ".join(names), tuple(dict.fromkeys(columns[i]))) for i, names in together.items()
-    )
+    axes = tuple(_axis(" with ".join(names), columns[i], values[i]) for i, names in together.items())
     written = [tuple(map(clean, point.written.values())) for point in points]
     places = tuple(
         tuple(axis.words.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
@@ -116,36 +118,36 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     return Scanned(axes, places, tuple(points))
 
 
-def _follows(values: Sequence[str], others: Sequence[str]) -> bool:
-    """Whether the values of an address change together with those of another, and not by chance.
+def _axis(address: str, words: Sequence[str], values: Sequence[Any]) -> Axis:
+    of_word = dict(zip(words, values, strict=True))
+    return Axis(address, tuple(of_word), _numbers([*of_word.values()], [*of_word]))
+
+
+def _follows(
+    columns: Sequence[Sequence[str]], numbers: Sequence[tuple[Sequence[float], str] | None], i: int, k: int
+) -> bool:
+    """Whether the values of address i change together with those of address k, and not by chance.
 
     No two points of an optimiser share a value; numbers must then rise or fall together.
     """
-    if len({*zip(values, others, strict=True)}) > len({*others}):
+    others, own, along = columns[k], numbers[i], numbers[k]
+    if len({*zip(columns[i], others, strict=True)}) > len({*others}):
         return False
-    numbers, along = numbers_of(values), numbers_of(others)
-    if len({*others}) < len(others) or numbers is None or along is None:
+    if len({*others}) < len(others) or own is None or along is None:
         return True
-    steps = np.diff(np.array(numbers[0])[np.argsort(along[0], kind="stable")])
+    steps = np.diff(np.array(own[0])[np.argsort(along[0], kind="stable")])
     return bool((steps >= 0).all() or (steps <= 0).all())
 
 
-def numbers_of(words: Sequence[str]) -> tuple[list[float], str] | None:
-    """Values as numbers in one unit, that of the largest; None if they are not numbers of one dimension."""
-    found = [split_quantity(word) for word in words]
-    units = {unit for _, unit in found}
-    if any(math.isnan(number) for number, _ in found) or not units:
+def _numbers(values: Sequence[Any], words: Sequence[str]) -> tuple[tuple[float, ...], str] | None:
+    """Values in SI as numbers in the unit of the largest, and that; None unless they have one dimension."""
+    if not all(type(value) in (int, float) for value in values):
         return None
-    if len(units) == 1:
-        numbers, unit = [number for number, _ in found], units.pop()
-    else:
-        dimensions = {dimension_of(unit) for unit in units}
-        if len(dimensions) > 1 or "" in dimensions:
-            return None
-        in_si = [scaled(number, factor_of(unit)) for number, unit in found]
-        unit = found[int(np.argmax(np.abs(in_si)))][1]
-        numbers = [value / factor_of(unit) for value in in_si]
-    return numbers, _MICRO.sub("µ", unit)
+    units = [split_quantity(word)[1] for word in words]
+    if len({dimension_of(unit) for unit in units}) > 1:
+        return None
+    unit = units[int(np.argmax(np.abs(values)))]
+    return tuple(float(f"{value / factor_of(unit):.12g}") for value in values), _MICRO.sub("µ", unit)
 
 
 def is_geometric(values: Sequence[float]) -> bool:
@@ -216,6 +218,8 @@ class ScanReport:
             ][:-1]
         else:
             tables = self.table()
+        if not found.axes:
+            tables = ["the run has no scan: these are all its shots", "", *tables]
         return [*tables, *(line for fit in self.fits for line in ("", *fit.lines()))]
 
     def table(self, most: int = 0) -> list[str]:
@@ -260,28 +264,43 @@ class ScanReport:
         fits = {name: fit.as_dict() for name, fit in zip(names, self.fits, strict=False)}
         return {"points": points} | ({"fits": fits} if fits else {})
 
-    def csv_rows(self) -> list[list[Any]]:
-        """A header and a row for each point: scanned values, shots, quantities and their intervals."""
-        parts = [f"{quantity.name}{end}" for quantity, _ in self.values for end in ("", " low", " high")]
-        rows: list[list[Any]] = [[*self.found.points[0].parameters, "shots", *parts]]
-        for i, point in enumerate(self.found.points):
-            numbers = [n for _, values in self.values for n in (values[i].value, *values[i].interval)]
-            shown = ["" if math.isnan(n) else n for n in numbers]
-            rows.append([*point.parameters.values(), len(point.shots), *shown])
-        return rows
+    def columns(self, units: Mapping[str, str]) -> list[Column]:
+        """A row for each point, SI: scanned values, shots, quantities and their intervals.
+
+        Args:
+            units: Address -> SI unit.
+        """
+        points = self.found.points
+        found = [
+            make_column(name, [point.parameters[name] for point in points], units.get(name, ""), "scanned")
+            for name in points[0].parameters
+        ]
+        found.append(make_column("shots", [len(point.shots) for point in points], "", "shots at the point"))
+        for quantity, means in self.values:
+            about = description_of(quantity.name)
+            parts = (
+                ("", [one.value for one in means], f"mean over the shots of: {about}"),
+                (" low", [one.interval[0] for one in means], "lower end of its 1 sigma interval"),
+                (" high", [one.interval[1] for one in means], "upper end of its 1 sigma interval"),
+            )
+            found += [
+                make_column(f"{quantity.name}{end}", of, quantity.unit, text) for end, of, text in parts
+            ]
+        return found
 
 
 def scan_report(run: Run, request: ScanRequest) -> ScanReport:
-    """Quantities at the points of a run's scan.
+    """Quantities at the points of a run's scan; without a scan, over all shots.
 
     Raises:
-        ConfigError: The run has no scan or no shots, there is no such quantity, or the fit cannot be made.
+        ConfigError: The run has no shots, there is no such quantity, or the fit cannot be made.
         RecordingError: The scan in run.json is damaged.
     """
+    if not run.shots:
+        raise ConfigError(Problem("the run has no shots yet", visible(str(run.path))))
     found = scanned(run, request.where)
     if found is None:
-        what = "the scan has no shots yet" if run.record.get("scan") else "the run has no scan"
-        raise ConfigError(Problem(what, clean(str(run.path)), expected="a run of a sequence with 'scan:'"))
+        found = Scanned((), ((),), (ScanPoint({}, {}, select_shots(run, request.where)),))
     names = request.names or (*_aim(run), *(WITHOUT_TARGET if run.target.is_none else DEFAULT))
     quantities = [find_quantity(run, name) for name in names]
     values = tuple((quantity, found.over(quantity)) for quantity in quantities)

@@ -23,7 +23,7 @@ from labseq.console.output import as_line, json_writer, report_compiling, say, s
 from labseq.console.runs import chosen_run
 from labseq.console.text import columns, count_of, percent, plural, settings_text
 from labseq.errors import ConfigError, Problem
-from labseq.messages import clean
+from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import check_place
 from labseq.plain import to_plain
@@ -246,17 +246,19 @@ def analyse_run(
         The exit code: 1 if the analysis of a shot failed.
     """
     run = chosen_run(path)
-    failed = False
-    for settings in _wanted(run, use, overrides):
+    wanted, failed = _wanted(run, use, overrides, may_be_none=request is not None), False
+    for settings in wanted:
         done = analyse_missing(run, settings, again=again)
         _report(done)
         failed = failed or bool(done.failures)
     if request is not None:
-        say("", *scan_report(run, request).lines())
+        say(*([""] if wanted else []), *scan_report(run, request).lines())
     return int(failed)
 
 
-def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[str, Any]]:
+def _wanted(
+    run: Run, use: str | None, overrides: Sequence[str], *, may_be_none: bool
+) -> list[dict[str, Any]]:
     """The settings of each analysis to run."""
     own = analyses_of(run)
     if use is not None:
@@ -265,9 +267,9 @@ def _wanted(run: Run, use: str | None, overrides: Sequence[str]) -> list[dict[st
     if overrides:
         what, hint = "it does not say which analysis has this setting", "name it with --use"
         raise ConfigError(Problem(what, clean(f"--set {overrides[0]}"), hint=hint))
-    if not own:
+    if not own and not may_be_none:
         what, hint = "the run's sequence has no analysis", "name one with --use"
-        raise ConfigError(Problem(what, clean(str(run.path)), hint=hint))
+        raise ConfigError(Problem(what, visible(str(run.path)), hint=hint))
     return own
 
 
@@ -340,7 +342,7 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
     if path.exists() and not replace:
         hint = "--force replaces it"
         raise ConfigError(
-            Problem("this file exists already", clean(str(path)), expected="a new name", hint=hint)
+            Problem("this file exists already", visible(str(path)), expected="a new name", hint=hint)
         )
     chosen = chosen_run(run)
     if request.shot is not None:

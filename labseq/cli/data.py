@@ -15,7 +15,7 @@ from labseq.files import explained
 from labseq.messages import visible
 from labseq.recording import Run, data_root
 from labseq.recording.doctor import Report, examine as find_damage
-from labseq.recording.export import ENDINGS, check_export, export_run, files_of, write_rows
+from labseq.recording.export import ENDINGS, check_export, export_run, files_of, write_columns
 
 MAX_ROWS: Final = 200
 """Maximum number of findings that are printed."""
@@ -119,10 +119,11 @@ def export_points(
     opened = chosen_run(run)
     path = output or Path(f"{opened.path.parent.name}_{opened.path.name}.points.csv")
     check_export(kind, path, replace=replace)
-    rows = scan_report(opened, request).csv_rows()
+    report = scan_report(opened, request)
     with explained(path):
-        write_rows(path, rows)
-    say(f"written: {path}")
+        write_columns(path, report.columns(opened.units))
+    for file in files_of(kind, path):
+        say(f"written: {file}")
 
 
 def state_lines(run: Run) -> list[str]:

@@ -79,8 +79,12 @@ def arrange(arguments: Sequence[str]) -> list[str]:
 
 
 def _is_no_quantity(argument: str) -> bool:
-    """Whether an argument after ``--scan`` is another option, or the run: a path or a number."""
-    return argument.startswith("-") or argument.isdecimal() or "/" in argument or os.path.exists(argument)  # noqa: PTH110 - of any text
+    """Whether an argument after ``--scan`` is another option, or the run: a number, or a path."""
+    if argument.startswith("-") or argument.isdecimal() or {"/", os.sep}.intersection(argument):
+        return True
+    from labseq.recording.folders import RUN_FILE  # takes 0.3 s with numpy, which the command needs anyway
+
+    return argument == RUN_FILE or os.path.exists(os.path.join(argument, RUN_FILE))  # noqa: PTH110, PTH118 - of any text
 
 
 def _report_usage(error: Any, arguments: Sequence[str]) -> int:

@@ -173,7 +173,7 @@ def _read_timing(run: Run) -> RunTiming:
     timing = timing_of(run, evenly(run.shots, PART_SHOTS))
     if not timing.n_read:
         what = "the run has no shots yet whose files can be read"
-        raise ConfigError(Problem(what, clean(str(run.path)), expected="at least one"))
+        raise ConfigError(Problem(what, visible(str(run.path)), expected="at least one"))
     return timing
 
 

@@ -50,7 +50,7 @@ def summary_lines(run: Run) -> list[str]:
         *_skipped_rows(run),
         *_best_rows(run),
         *(_atom_rows(run) if run.target.is_none else statistics_rows(statistics)),
-        ("duration", _duration(run)),
+        ("wall time", _wall_time(run)),
     ]
     if run.n_damaged_lines:
         rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
@@ -189,12 +189,12 @@ def _numbers(shots: Sequence[int]) -> str:
     return ", ".join(str(shot) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
 
 
-def _duration(run: Run) -> str:
-    """Wall time from the start of the run to the end of its last shot."""
+def _wall_time(run: Run) -> str:
+    """Time on the computer's clock from the start of the run to the end of its last shot."""
     ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
     try:
         start = datetime.fromisoformat(str(run.record["t_start_utc"]))
         duration = max(datetime.fromisoformat(text) for text in ends if text) - start
     except (KeyError, ValueError, TypeError):  # no shots, or a damaged index
         return "-"
-    return format_quantity(duration.total_seconds(), "time")
+    return f"{format_quantity(duration.total_seconds(), 'time')} on the computer's clock"

@@ -70,6 +70,7 @@ GROUPS: Final = {
     "calibration.": "id of the calibration in use",
 }
 """Prefix of such columns -> their description."""
+RESULT: Final = "result of an analysis"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +90,13 @@ class Column:
     description: str
 
 
+def make_column(
+    name: str, values: Sequence[Any], units: str, description: str, *, text: bool = False
+) -> Column:
+    """A column of the narrowest type that can hold all values, or of text."""
+    return Column(name, _array(values, text=text), units, description)
+
+
 def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     """The shots of a run as columns, from the index alone.
 
@@ -99,7 +107,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     analysed = result_columns(run.path)
     fixed = [_fixed(row) for row in rows]
     columns = [
-        Column(name, _array([values[name] for values in fixed], text=name in _TEXTS), unit_of(name), about)
+        make_column(name, [values[name] for values in fixed], unit_of(name), about, text=name in _TEXTS)
         for name, about in DESCRIPTIONS.items()
     ]
     taken = {*DESCRIPTIONS}
@@ -113,10 +121,10 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
             taken.add(full_name)
             units = unit_of(name) if prefix else run.units.get(name, "")
             about = _description(prefix, name, scanned=name in scanned)
-            columns.append(Column(full_name, _array([group.get(name) for group in groups]), units, about))
+            columns.append(make_column(full_name, [group.get(name) for group in groups], units, about))
     for name, values in analysed.items():
         of_rows = [values.get(row["shot"]) if row["counts"] else None for row in rows]
-        columns.append(Column(name, _array(of_rows), unit_of(name), "result of an analysis"))
+        columns.append(make_column(name, of_rows, unit_of(name), RESULT))
     return columns
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import ConfigError, Problem, one_of
 from labseq.files import whole_file
-from labseq.recording.columns import columns_of
+from labseq.recording.columns import Column, columns_of
 from labseq.recording.reader import Run
 from labseq.recording.tables import check_installed, dataframe_of, dataset_of, facts_of
 
@@ -83,7 +83,11 @@ def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list
 
 
 def _write_csv(run: Run, path: Path) -> None:
-    columns = columns_of(run)
+    write_columns(path, columns_of(run))
+
+
+def write_columns(path: Path, columns: Sequence[Column]) -> None:
+    """Write columns to a CSV file, and their units and descriptions to the file next to it."""
     rows = zip(*(map(_cell, column.values.tolist()) for column in columns), strict=True)
     about = [(column.name, column.units, column.description) for column in columns]
     table, units = files_of("csv", path)

@@ -19,7 +19,7 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern
 from labseq.model.estimate import Estimated, Rate, mean
-from labseq.recording.columns import FRACTIONS, figures_in
+from labseq.recording.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, figures_in
 from labseq.recording.results import PREFIX, result_columns
 from labseq.recording.schema import unit_of
 from labseq.recording.shot import Shot, caching_loader
@@ -254,6 +254,15 @@ def quantity_problem(
             what = f"there is no image '{clean(image)}' for '{clean(name)}'"
             return what, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
     return None
+
+
+def description_of(name: str) -> str:
+    """The description of a quantity whose name has been checked."""
+    kind = split_name(name)[0]
+    if kind in OF_IMAGES:
+        return OF_IMAGES[kind].about
+    of_group = next((about for prefix, about in GROUPS.items() if name.startswith(prefix)), RESULT)
+    return DESCRIPTIONS.get(name, of_group)
 
 
 def image_names(run: Run) -> list[str]:

@@ -83,7 +83,7 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
         what = something_else(path) or "there is no such file"
         names = [name for name in files_in(path.parent, (".npy", ".txt", ".h5")) if name != path.name]
         hint = did_you_mean(path.name, names)
-        raise ConfigError(Problem(what, clean(str(path)), expected=FORMS, hint=hint))
+        raise ConfigError(Problem(what, visible(str(path)), expected=FORMS, hint=hint))
     if match:
         return _shot(path, match[2])
     label = visible(str(path))

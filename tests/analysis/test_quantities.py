@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from labseq.errors import ConfigError
 from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording.points import scan_points
-from labseq.recording.quantities import figures_with_images, follow_atoms, select_shots
+from labseq.recording.quantities import OF_IMAGES, figures_with_images, follow_atoms, select_shots
 
 
 def at_points(run: labseq.Run, name: str) -> list[Estimated]:
@@ -138,7 +139,18 @@ def test_the_commands_show_write_and_draw_the_same_points(
     answer = json.loads(printed("show", run, *scan, "--json", "--where", "loading > 0.74"))
     shots = select_shots(lifetime, ["loading > 0.74"])
     assert sum(point["shots"] for point in answer["points"]) == len(shots) < 12
-    assert printed("export", run, *scan, "-o", "points.csv") == "written: points.csv\n"
+    assert printed("export", run, *scan, "-o", "points.csv") == (
+        "written: points.csv\nwritten: points.units.csv\n"
+    )
+    with (tmp_path / "points.units.csv").open(newline="") as file:
+        assert [*csv.reader(file)] == [
+            ["column", "units", "description"],
+            ["shot.hold.duration", "s", "scanned"],
+            ["shots", "", "shots at the point"],
+            ["survival:before,after", "", f"mean over the shots of: {OF_IMAGES['survival'].about}"],
+            ["survival:before,after low", "", "lower end of its 1 sigma interval"],
+            ["survival:before,after high", "", "upper end of its 1 sigma interval"],
+        ]
     header, first, *rest = (tmp_path / "points.csv").read_text().splitlines()
     assert header.startswith('shot.hold.duration,shots,"survival:before,after","survival:before,after low"')
     assert float(first.split(",")[2]) == rate.value

@@ -12,10 +12,19 @@ import pytest
 from labseq.analysis.charts import draw_curves, draw_map
 from labseq.analysis.overview import overview, picture_of
 from labseq.recording import Run
+from labseq.units import parse_any
 
 from .records import make_shot
 
 Write = Callable[..., Run]
+
+
+def si(word: str) -> Any:
+    """A value as run.json has it."""
+    try:
+        return parse_any(word)[0] if " " in word else float(word)
+    except ValueError:
+        return word
 
 
 def scan(*columns: tuple[str, Sequence[str]], repeats: int = 1) -> dict[str, Any]:
@@ -23,7 +32,7 @@ def scan(*columns: tuple[str, Sequence[str]], repeats: int = 1) -> dict[str, Any
     written = [list(row) for row in zip(*(words for _, words in columns), strict=True)]
     return {
         "addresses": [address for address, _ in columns],
-        "points": written,
+        "points": [[si(word) for word in row] for row in written],
         "written": written,
         "point_of_shot": [point for point in range(len(written)) for _ in range(repeats)],
     }

@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.analysis.overview import scan_picture
 from labseq.analysis.replay import ReplayRequest
+from labseq.analysis.scanned import ScanRequest
 from labseq.analysis.terminal import analyse_run, replay_run
 from labseq.errors import ConfigError
 
@@ -115,6 +117,21 @@ def test_an_analysis_is_made_up_and_reported(run, capsys):
     assert capsys.readouterr().out == f"survival: 2 shots analysed; see {path}\n"
     assert analyse_run(run.path, "survival", ["atoms=moved"], again=False) == 0
     assert "0 shots analysed, 2 had a result already" in capsys.readouterr().out
+
+
+def test_quantities_need_neither_analysis_nor_scan(run, capsys):
+    assert analyse_run(run.path, None, [], ScanRequest(("loading",)), again=False) == 0
+    expected = run.quantity("loading").over(run.shots).scaled(100)
+    assert capsys.readouterr().out.splitlines() == [
+        "the run has no scan: these are all its shots",
+        "",
+        "shots  loading",
+        f"    2  {expected} %",
+    ]
+    with pytest.raises(ConfigError, match="there is no axis to fit along; expected a scan of one"):
+        analyse_run(run.path, None, [], ScanRequest(fit="linear"), again=False)
+    with pytest.raises(ConfigError, match=r"it has no scan; expected .*`labseq show --scan` prints"):
+        scan_picture(run, ScanRequest())
 
 
 def test_an_analysis_that_fails_exits_with_1(run, capsys):

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 from hypothesis import given, strategies as st
 
@@ -16,10 +18,20 @@ from labseq.cli.entry import arrange
         (["--debug", "doctor", "--dry-run"], ["--debug", "doctor", "--dry-run"]),
         (["run", "doctor", "--dry-run"], ["run", "doctor", "--dry-run=full"]),
         (["show", "--", "--dry-run", "--debug"], ["show", "--", "--dry-run", "--debug"]),
+        (["show", "--scan", "7"], ["show", "--scan=", "7"]),
+        (["show", "--scan", "data/1"], ["show", "--scan=", "data/1"]),
+        (["show", "--scan", "filling"], ["show", "--scan", "filling"]),  # though a file has this name
+        (["show", "--scan", "0001_of"], ["show", "--scan=", "0001_of"]),
         ([], []),
     ],
 )
-def test_arrange(given_arguments: list[str], expected: list[str]) -> None:
+def test_arrange(
+    given_arguments: list[str], expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "0001_of").mkdir()
+    for name in ("filling", "0001_of/run.json"):
+        (tmp_path / name).touch()
     assert arrange(given_arguments) == expected
 
 

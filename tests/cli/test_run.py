@@ -156,7 +156,7 @@ def test_for_people(perform: Any) -> None:
         "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %",
         "seen defect-free  2 of 2 (100.0 %)",
         "filling           99.8(2) %",
-        "duration          2 s",
+        "wall time         2 s on the computer's clock",
     ]
     assert "shot 0  defect-free after 2 cycles  filling 100.0 %  1.9 s" in lines
 

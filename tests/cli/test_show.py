@@ -249,7 +249,7 @@ def test_json_holds_the_same(folder: Path, capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("table", "printed", "json_wanted"),
     [
-        (Tables(scan=ScanRequest()), "the run has no scan", True),
+        (Tables(scan=ScanRequest()), "the run has no shots yet", True),
         (Tables(timing=True), "no shots yet whose files can be read", False),
     ],
 )

@@ -139,10 +139,13 @@ def test_average_image_loading_map_and_counts_of_any_run(
     assert (n, unit) == (2, "counts")
     for what in ("loading", "counts"):
         picture_of(run, what).save(tmp_path / f"{what}.png")
-    with pytest.raises(
-        labseq.ConfigError, match=r"nothing to show of the average image; expected .* frames were kept"
-    ):
+    with pytest.raises(labseq.ConfigError) as caught:
         picture_of(run, "image")
+    assert str(caught.value) == (
+        f"{run.path}: the picture cannot be drawn from this run: there is nothing to show of the average "
+        "image; expected shots whose frames were kept: 'record_frames: all' in the sequence, or "
+        "--set record_frames=all"
+    )
 
     kept = write(tmp_path, make_shot(0), make_shot(1))
     mean, n = average_frame(kept.shots, image=1)
