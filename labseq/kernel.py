@@ -1,17 +1,16 @@
-"""Compiled functions: a numba decorator that takes explicit signatures, and a cache keyed by the source.
+"""Compiled functions: a numba decorator that takes explicit signatures, and a cache of machine code.
 
 Because every kernel has explicit signatures, no new dtype or layout can cost a compile
-in the middle of a shot. After its module was imported, :func:`load_kernels` compiles a
-kernel or loads its machine code from the user's cache; otherwise its first call does.
-Several processes compile what the cache lacks. A helper, which only kernels call, is part
-of their machine code and is not loaded.
+in the middle of a shot. :func:`load_kernels` compiles the kernels of all imported modules or
+loads them from the user's cache; otherwise the first call of a kernel does. Several processes
+compile what the cache lacks. numba itself is imported only then.
 
-numba's own cache notices an edit of a kernel's file, but not of a kernel or constant
-imported from another file: it would continue to use the old machine code. So each
-kernel is kept in a folder named after everything that it is compiled from: its file,
-the kernels that its module imports from other files (and theirs), the constants that
-it names, numba's settings, and the versions of Python, numba and numpy. An edit
-anywhere therefore leads to a new folder.
+Python and other kernels use different machine code of a function: the former has a
+wrapper that converts arguments, the latter can be inlined. Each is made when something
+needs it, and kept in a file named after everything that it is compiled from: the function's
+bytecode, the constants that it names, the same of all kernels that it calls, the processor,
+numba's settings, and the versions of Python, numba and numpy. An edit anywhere therefore
+leads to a new file.
 """
 
 from __future__ import annotations
@@ -21,17 +20,15 @@ import hashlib
 import importlib
 import os
 import pickle
-import re
-import shutil
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from functools import cached_property, update_wrapper
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar, cast
 
 import numpy as np
@@ -50,43 +47,9 @@ WORTH_A_PROCESS_S: Final = 3.0
 COMPILE_S: Final = 0.003
 """Scale of the estimates of the time for compiling, in seconds; measured on a laptop's core."""
 
-_FOLDER_NAME = re.compile(r"[0-9a-f]{24}")
 _INTERPRETED = threading.Event()
-_KERNELS: dict[int, tuple[Any, str]] = {}  # id of a kernel -> itself, its digest
-_PENDING: dict[int, _Kernel] = {}  # id of a kernel that is neither compiled nor loaded yet
+_PENDING: dict[_Kernel, None] = {}  # neither compiled nor loaded yet
 _ANNOUNCE: list[Callable[[float], None]] = []
-
-
-@dataclass(eq=False)
-class _Kernel:
-    """A kernel, and what is needed to compile or load it; its folder is None if it cannot be kept."""
-
-    dispatcher: Any
-    signatures: list[str]
-    folder: Path | None
-    is_helper: bool
-    builds_on: frozenset[str]  # modules
-    is_begun: bool = False
-
-    @property
-    def module(self) -> str:
-        return self.dispatcher.py_func.__module__
-
-    @property
-    def compile_s(self) -> float:
-        """Roughly how long compiling takes, in seconds."""
-        return COMPILE_S * len(self.signatures) * (30 + len(self.dispatcher.py_func.__code__.co_code) / 10)
-
-    def is_in_use(self) -> bool:
-        """Whether its module is the imported one, and not one that was edited and imported again since."""
-        return getattr(sys.modules.get(self.module), "__dict__", None) is self.dispatcher.py_func.__globals__
-
-    def is_cached(self) -> bool:
-        if self.folder is None:
-            return False
-        code, cache = self.dispatcher.py_func.__code__, self.dispatcher._cache  # noqa: SLF001
-        # a copy of labseq in another place has a folder of its own below that of the digest
-        return any(Path(cache.cache_path).glob(f"*{code.co_name}-{code.co_firstlineno}.*.nbi"))
 
 
 def const(dtype: str, ndim: int) -> str:
@@ -157,20 +120,25 @@ def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
     Raises:
         PluginLoadError: A kernel cannot be compiled.
     """
-    wanted = [one for one in _PENDING.values() if one.is_in_use() and not one.is_helper]
-    if not all(one.is_cached() for one in wanted):
-        _compile_in_processes(
-            [one for one in _PENDING.values() if one.is_in_use() and not one.is_cached()], poll
-        )
+    wanted = [one for one in list(_PENDING) if one.is_in_use()]
+    if not wanted or _is_interpreted():
+        return
+    if not all(one.is_cached() for one in wanted if not one.is_helper):
+        _compile_in_processes([one for one in wanted if not one.is_cached()], poll)
     for one in wanted:
         poll()
         try:
-            _load(one)
+            if not one.is_helper:
+                one.load()
         except Exception as error:
-            _PENDING.pop(id(one.dispatcher), None)  # the next session may do without it
-            name = one.dispatcher.py_func.__name__
-            reason = f"kernel '{name}' cannot be compiled: {type(error).__name__}: {error}"
+            _PENDING.pop(one, None)  # the next session may do without it
+            reason = f"kernel '{one.function.__name__}' cannot be compiled: {type(error).__name__}: {error}"
             raise error if isinstance(error, LabseqError) else PluginLoadError(one.module, reason) from error
+
+
+def _decorator(signature: str | Sequence[str], fused: bool, *, is_helper: bool) -> Callable[[F], F]:
+    signatures = [signature] if isinstance(signature, str) else list(signature)
+    return lambda function: cast("F", _Kernel(cast("FunctionType", function), signatures, fused, is_helper))
 
 
 def _numba() -> Any:
@@ -179,113 +147,239 @@ def _numba() -> Any:
     return numba  # as Any: it ships no types
 
 
-def _decorator(signature: str | Sequence[str], fused: bool, *, is_helper: bool) -> Callable[[F], F]:
-    signatures = [signature] if isinstance(signature, str) else list(signature)
-
-    def decorate(function: F) -> F:
-        if _INTERPRETED.is_set() or _numba().config.DISABLE_JIT:
-            return function
-        return cast("F", _define(cast("FunctionType", function), signatures, fused, is_helper))
-
-    return decorate
+def _is_interpreted() -> bool:
+    return _INTERPRETED.is_set() or _numba().config.DISABLE_JIT
 
 
-def _define(function: FunctionType, signatures: list[str], fused: bool, is_helper: bool) -> Any:
-    from numba.core.compiler_lock import global_compiler_lock
+class _Kernel:
+    """A function that is compiled, or loaded from the cache, when it is first needed."""
 
-    config = _numba().config
-    with global_compiler_lock:
-        callees = _callees(function)
-        digest = _digest(function, callees)
-        folder = _folder(digest) if Path(function.__code__.co_filename).is_file() else None
-        before = config.CACHE_DIR  # kernels of other packages stay where they are
-        config.CACHE_DIR = str(folder or "")
-        try:
-            dispatcher = _numba().njit(
-                cache=folder is not None,
-                nogil=True,
-                error_model="numpy",
-                no_cfunc_wrapper=True,
-                fastmath={"contract"} if fused else False,
-            )(function)
-        finally:
-            config.CACHE_DIR = before
-        _KERNELS[id(dispatcher)] = dispatcher, digest
-        builds_on = frozenset(callee.py_func.__module__ for callee, _ in callees)
-        _defer(_Kernel(dispatcher, signatures, folder, is_helper, builds_on))
-    return dispatcher
+    def __init__(self, function: FunctionType, signatures: list[str], fused: bool, is_helper: bool) -> None:
+        update_wrapper(self, function)
+        self.function = function
+        self.signatures = signatures
+        self.is_helper = is_helper
+        self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"} if fused else False}
+        self._dispatchers: dict[bool, Any] = {}
+        self._compiling: Any = None  # one of them, while it is compiled; it may call itself
+        self._call: Callable[..., Any] = self._first_call
+        _PENDING[self] = None
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._call(*args, **kwargs)
+
+    def _first_call(self, *args: Any, **kwargs: Any) -> Any:
+        self._call = self.function if _is_interpreted() else self.dispatcher(for_python=True)
+        return self._call(*args, **kwargs)
+
+    def __reduce__(self) -> str:
+        return self.function.__qualname__
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Numba asks for it when it compiles a call."""
+        return _numba().types.Dispatcher(self._compiling or self.dispatcher(for_python=False))
+
+    def load(self) -> None:
+        """Compile it or load it from the cache: for Python, or a helper for kernels."""
+        dispatcher = self.dispatcher(for_python=not self.is_helper)
+        if not self.is_helper:
+            self._call = dispatcher
+
+    def dispatcher(self, *, for_python: bool) -> Any:
+        """Numba's object that calls the machine code, or that lets kernels call it."""
+        from numba.core.compiler_lock import global_compiler_lock
+
+        with global_compiler_lock:
+            if for_python not in self._dispatchers:
+                options = self._options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not for_python}
+                self._compiling = _numba().njit(**options)(self.function)
+                self._compiling._cache = _Cache(self, for_python)  # noqa: SLF001 - numba has no other way
+                try:
+                    for signature in self.signatures:
+                        self._compiling.compile(signature)
+                    self._compiling.disable_compile()
+                    self._dispatchers[for_python] = self._compiling
+                finally:
+                    self._compiling = None
+                if for_python != self.is_helper:
+                    _PENDING.pop(self, None)
+        return self._dispatchers[for_python]
+
+    @property
+    def module(self) -> str:
+        return self.function.__module__
+
+    @property
+    def compile_s(self) -> float:
+        """Roughly how long compiling takes, in seconds."""
+        return COMPILE_S * len(self.signatures) * (30 + len(self.function.__code__.co_code) / 10)
+
+    def is_in_use(self) -> bool:
+        """Whether its module is the imported one, and not one that was edited and imported again since."""
+        return getattr(sys.modules.get(self.module), "__dict__", None) is self.function.__globals__
+
+    def is_cached(self) -> bool:
+        cache = _Cache(self, not self.is_helper)
+        return all(cache.path(signature).is_file() for signature in self.signatures)
+
+    @cached_property
+    def named(self) -> dict[str, Any]:
+        """The values of all names in its code that are not its own variables."""
+        code, cells = self.function.__code__, self.function.__closure__ or ()
+        scope = self.function.__globals__ | dict(zip(code.co_freevars, cells, strict=True))
+        found = {name: scope[name] for name in _names(code) if name in scope}
+        for module in [value for value in found.values() if isinstance(value, ModuleType)]:
+            found |= {f"{module.__name__}.{name}": vars(module).get(name) for name in _names(code)}
+        return {name: getattr(value, "cell_contents", value) for name, value in found.items()}
+
+    @property
+    def callees(self) -> list[_Kernel]:
+        return [value for value in self.named.values() if isinstance(value, _Kernel)]
+
+    @cached_property
+    def source(self) -> str:
+        """What it is compiled from, without the kernels that it calls."""
+        constants = [_constant(name, value) for name, value in sorted(self.named.items())]
+        options = (self.module, self.function.__qualname__, self.signatures, self._options)
+        return repr((options, _code(self.function.__code__), [text for text in constants if text]))
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of everything that it is compiled from."""
+        reached = [self]
+        for one in reached:
+            reached += [callee for callee in one.callees if callee not in reached]
+        parts = [_environment(), self.source, *sorted(one.source for one in reached)]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
 
 
-def _defer(one: _Kernel) -> None:
-    """Load a kernel when Python calls it or numba compiles a call of it, if not before."""
-    dispatcher = one.dispatcher
-
-    def callable_for(*_: Any) -> Any:
-        _load(one)
-        return dispatcher
-
-    def get_call_template(args: Any, kws: Any) -> Any:
-        _load(one)
-        return type(dispatcher).get_call_template(dispatcher, args, kws)
-
-    # Attributes of the object go before those of its class. They stay once it is loaded: a thread whose
-    # call began before that would otherwise ask numba to compile, which is disabled by then.
-    dispatcher._compile_for_args = callable_for  # noqa: SLF001
-    dispatcher.get_call_template = get_call_template
-    _PENDING[id(dispatcher)] = one
+def _names(code: CodeType) -> Iterator[str]:
+    """All names in a function's code, and in that of the functions within it."""
+    yield from (*code.co_names, *code.co_freevars)
+    for value in code.co_consts:
+        if isinstance(value, CodeType):
+            yield from _names(value)
 
 
-def _load(one: _Kernel) -> None:
-    """Load a kernel from the cache, or compile it with all that it calls."""
-    from numba.core.compiler_lock import global_compiler_lock
+def _code(code: CodeType) -> tuple[object, ...]:
+    """A function's code without its place in the file."""
+    values = [_code(value) if isinstance(value, CodeType) else value for value in code.co_consts]
+    names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
+    return code.co_code, values, names, code.co_flags, code.co_argcount, code.co_kwonlyargcount
 
-    dispatcher = one.dispatcher
-    with global_compiler_lock:
-        if one.is_begun:  # it calls itself, or another thread was faster
-            return
-        one.is_begun = True
-        _PENDING.pop(id(dispatcher), None)
-        try:
+
+def _constant(name: str, value: object) -> str:
+    """Text of a constant that a kernel is compiled with; "" for anything else."""
+    if isinstance(value, np.ndarray):
+        return repr((name, value.dtype.str, value.shape, value.tobytes()))
+    if isinstance(value, bool | int | float | complex | str | tuple | np.generic):
+        return repr((name, type(value).__name__, value))
+    if isinstance(value, type) and hasattr(value, "__members__"):  # an enumeration
+        return repr((name, list(cast("Any", value))))
+    return ""
+
+
+def _environment() -> str:
+    """Text of everything but its code that machine code depends on."""
+    from numba.core.registry import cpu_target
+
+    versions = (sys.version, _numba().__version__, np.__version__)
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    return repr((versions, settings, cast("Any", cpu_target).target_context.codegen().magic_tuple()))
+
+
+class _Cache:
+    """Keeps a kernel's machine code in files; numba's dispatcher uses it as its cache."""
+
+    cache_path = None
+
+    def __init__(self, owner: _Kernel, for_python: bool) -> None:
+        self._owner = owner
+        self._for_python = for_python
+
+    def path(self, signature: str) -> Path:
+        number, kind = self._owner.signatures.index(signature), "python" if self._for_python else "kernels"
+        name = f"{self._owner.function.__name__}-{self._owner.digest}-{number}.{kind}"
+        return cache_root() / "kernels" / name
+
+    def load_overload(self, signature: str, context: Any) -> Any:
+        """Numba's result of compiling, or None; unlike numba's own cache it imports nothing for compiling."""
+        from numba.core.compiler import CompileResult
+        from numba.core.runtime.nrt import rtsys
+
+        with suppress(Exception):  # whatever is wrong with the cache, it can be compiled
+            path = self.path(signature)
+            data = path.read_bytes()
+            if hashlib.sha256(data[32:]).digest() == data[:32]:  # else a crash has truncated it
+                rtsys.initialize(context)
+                result = cast("Any", CompileResult)._rebuild(context, *pickle.loads(data[32:]))  # noqa: S301, SLF001
+                with suppress(OSError):
+                    os.utime(path)
+                return result
+        while _ANNOUNCE:
+            missing = {self._owner, *(other for other in list(_PENDING) if not other.is_cached())}
+            _ANNOUNCE.pop()(sum(other.compile_s for other in missing))
+        return None
+
+    def save_overload(self, signature: str, result: Any) -> None:
+        """Write a file, unless that is impossible."""
+        with suppress(Exception):
+            (name, kind, (code, bitcode)), *rest = result._reduce()  # noqa: SLF001
+            if (
+                self._for_python
+            ):  # kernels do not inline it, and its bitcode takes longer to read than the rest
+                bitcode = _stub(result.fndesc.llvm_cpython_wrapper_name)
+            data = _pickled(((name, kind, (code, bitcode)), *rest))
+            path = self.path(signature)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _delete_unused(path.parent)
+            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+                file.write(hashlib.sha256(data).digest() + data)
             try:
-                _build(one)
-            except (OSError, EOFError, pickle.UnpicklingError):
-                # a full disk, or files truncated by a crash: compile without the cache
-                if one.folder is not None:
-                    shutil.rmtree(one.folder, ignore_errors=True)
-                dispatcher._cache.disable()  # noqa: SLF001
-                _build(one)
-            dispatcher.disable_compile()
-        except BaseException:
-            one.is_begun = False
-            _PENDING[id(dispatcher)] = one
-            raise
+                Path(file.name).replace(path)
+            except OSError:  # Windows: another process reads it
+                Path(file.name).unlink()
 
 
-def _build(one: _Kernel) -> None:
-    from numba.core import event
-    from numba.core.runtime.nrt import rtsys
+def _stub(name: str) -> bytes:
+    """Bitcode that says only that a function is defined."""
+    from llvmlite import binding
 
-    context = one.dispatcher.targetctx
+    return binding.parse_assembly(f'define void @"{name}"() {{ unreachable }}').as_bitcode()
 
-    class Compiling(event.Listener):
-        def on_start(self, event: Any) -> None:  # noqa: ARG002 - numba names it
-            vars(context).pop("refresh", None)
-            while _ANNOUNCE:
-                missing = [one, *(other for other in _PENDING.values() if not other.is_cached())]
-                _ANNOUNCE.pop()(sum(other.compile_s for other in missing))
 
-        def on_end(self, event: Any) -> None:
-            pass
+def _pickled(values: object) -> bytes:
+    from io import BytesIO
 
-    # before numba loads machine code, it would import all that it needs for compiling, which takes 0.4 s
-    rtsys.initialize(context)
-    context.refresh = lambda: None
-    try:
-        with event.install_listener("numba:compile", Compiling()):
-            for signature in one.signatures:
-                one.dispatcher.compile(signature)
-    finally:
-        vars(context).pop("refresh", None)
+    from numba.core.environment import Environment
+    from numba.core.serialize import NumbaPickler
+
+    class Pickler(NumbaPickler):
+        def reducer_override(self, obj: Any) -> Any:
+            if isinstance(obj, Environment):
+                return _unpickle_environment, (obj.globals.get("__name__"), obj.consts, obj.env_name)
+            return super().reducer_override(obj)
+
+    buffer = BytesIO()
+    Pickler(buffer, protocol=4).dump(values)
+    return buffer.getvalue()
+
+
+def _unpickle_environment(module: str, consts: list[object], name: str) -> Any:
+    """Constants of compiled code; its module is not imported, because compiled code needs nothing else of it.
+
+    That saves 0.1 s for modules of numba itself.
+    """
+    from numba.core.environment import Environment, lookup_environment
+
+    known: Any = lookup_environment(name)
+    if known is None:
+        known = cast("Any", Environment)(getattr(sys.modules.get(module), "__dict__", {"__name__": module}))
+        known.consts[:] = consts
+        known.env_name = name
+        cast("Any", Environment)._memo[name] = known  # noqa: SLF001
+    return known
 
 
 def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> None:
@@ -296,13 +390,13 @@ def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> N
     seconds, graph = dict[str, float](), dict[str, set[str]]()
     for one in kernels:
         seconds[one.module] = seconds.get(one.module, 0.0) + one.compile_s
-        graph.setdefault(one.module, set()).update(one.builds_on)
+        graph.setdefault(one.module, set()).update(callee.module for callee in one.callees)
     n_workers = min(MAX_WORKERS, n_cores(), len(seconds))
     if n_workers < 2 or sum(seconds.values()) < WORTH_A_PROCESS_S:
         return
     while _ANNOUNCE:
         _ANNOUNCE.pop()(1.0 + max(sum(seconds.values()) / n_workers, *seconds.values()))
-    order = TopologicalSorter({module: on & seconds.keys() for module, on in graph.items()})
+    order = TopologicalSorter({module: (on & seconds.keys()) - {module} for module, on in graph.items()})
     order.prepare()
     with ThreadPoolExecutor(n_workers) as pool, ExitStack() as stack:
         idle = [stack.enter_context(_Worker()) for _ in range(n_workers)]
@@ -359,8 +453,8 @@ def serve() -> None:
     for line in sys.stdin:
         with suppress(Exception):
             importlib.import_module(line.strip())
-            for one in [one for one in _PENDING.values() if one.module == line.strip()]:
-                _load(one)
+            for one in [one for one in _PENDING if one.module == line.strip()]:
+                one.load()
         print("done", file=answer, flush=True)
 
 
@@ -371,57 +465,16 @@ def n_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _callees(function: FunctionType) -> list[tuple[Any, str]]:
-    """The kernels that a function's module imports from other files, with their digests."""
-    taken = list(function.__globals__.values())
-    for module in [value for value in taken if isinstance(value, ModuleType)]:
-        taken += vars(module).values()
-    kernels = [_KERNELS[id(value)] for value in taken if id(value) in _KERNELS]
-    file = function.__code__.co_filename
-    return [(kernel, digest) for kernel, digest in kernels if kernel.py_func.__code__.co_filename != file]
+_CLEANED: set[Path] = set()
 
 
-def _digest(function: FunctionType, callees: list[tuple[Any, str]]) -> str:
-    """Digest of everything that a kernel is compiled from."""
-    parts: list[object] = [sys.version, _numba().__version__, np.__version__]
-    parts += sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    parts.append(_source(function))
-    parts += sorted({digest for _, digest in callees})
-    for name in function.__code__.co_names:
-        value = function.__globals__.get(name)
-        if isinstance(value, np.ndarray):
-            parts.append((name, value.dtype.str, value.shape, value.tobytes()))
-        elif isinstance(value, bool | int | float | complex | str | tuple | np.generic):
-            parts.append((name, value))
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
-
-
-def _source(function: FunctionType) -> bytes:
-    try:
-        return Path(function.__code__.co_filename).read_bytes()
-    except OSError:  # typed at a prompt
-        return function.__code__.co_code
-
-
-def _folder(digest: str) -> Path | None:
-    """Create the folder of a digest and mark it as used; None if nothing can be written."""
-    try:
-        root = cache_root() / "kernels"
-        folder = root / digest
-        if not folder.exists():
-            _delete_unused(root)
-            folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder)
-        tempfile.TemporaryFile(dir=folder).close()
-    except (OSError, RuntimeError):  # RuntimeError: the user has no home
-        return None
-    return folder
-
-
-def _delete_unused(root: Path) -> None:
+def _delete_unused(folder: Path) -> None:
+    """Delete files that no process has loaded for long, once per process."""
+    if folder in _CLEANED:
+        return
+    _CLEANED.add(folder)
     too_old = time.time() - UNUSED_DAYS * 86400
-    for folder in root.iterdir() if root.is_dir() else ():
-        ours = _FOLDER_NAME.fullmatch(folder.name) and not folder.is_symlink()
+    for path in folder.iterdir():
         with suppress(OSError):  # another process may be deleting it too
-            if ours and folder.stat().st_mtime < too_old:
-                shutil.rmtree(folder, ignore_errors=True)
+            if path.is_file() and path.stat().st_mtime < too_old:
+                path.unlink()

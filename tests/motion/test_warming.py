@@ -12,14 +12,14 @@ from labseq import Plan, SiteGrid, TargetPattern
 motion.warm()
 motion.warm_rendering()
 kernel.load_kernels()
-warm, kernels = set(sys.modules), dict(kernel._PENDING)
+warm, pending = set(sys.modules), list(kernel._PENDING)
 target = TargetPattern([[False, True]], [[True, False]])
 plan = Plan.from_batches([([(0, 0)], [(0, 1)])])
 motion.check_plan(plan, [[True, False]], target, 1)
 program = motion.tone_program(plan, SiteGrid(1, 2))
 motion.render(program)
 print(sorted(name for name in set(sys.modules) - warm if name.startswith("labseq")))
-print([one.dispatcher for key, one in kernels.items() if key not in kernel._PENDING])
+print([one for one in pending if one not in kernel._PENDING or one._dispatchers])
 """
 
 
