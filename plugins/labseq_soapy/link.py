@@ -19,7 +19,7 @@ from labseq_soapy_stream.messages import Facts, Setup, received, send
 from labseq_soapy_stream.output import Samples
 
 from labseq.plugin import Clock, DeviceError, wait_for
-from labseq_soapy.emergency import start_of
+from labseq_soapy import emergency
 
 OPEN_S: Final = 60.0
 """How long a radio may take to open: some load their firmware."""
@@ -72,6 +72,7 @@ class Link:
                 start_new_session=True,  # so that Ctrl-C in a terminal does not end it before labseq
             )
         self.pid = self._process.pid
+        self._started = emergency.start_of(self.pid)
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._in, self._out = self._process.stdin, self._process.stdout
@@ -96,7 +97,7 @@ class Link:
         buffered_s = facts.buffered / facts.rate_hz if facts else 0.0
         return {
             "pid": self.pid,
-            "started": start_of(self.pid),
+            "started": self._started,
             "opened": str(Path(self._setup.marker).with_suffix(".opened")),
             "ramp_s": self._setup.ramp_s + buffered_s,
             "device": self._setup.device,
@@ -143,20 +144,37 @@ class Link:
             raise DeviceError(self._name, text)
 
     def close(self) -> None:
-        """Let the process ramp down and end; one that does not is killed. Legal in any state."""
+        """Let the process ramp down and end; one that does not is killed. Legal in any state.
+
+        Raises:
+            DeviceError: The transmitters may still be on.
+        """
         self._closing.set()
         with contextlib.suppress(OSError):
             self._send({"do": "end"})
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(END_S + self._setup.ramp_s)
-        except subprocess.TimeoutExpired:
+        try:
+            self.switch_off()
+        finally:
             self._process.kill()
             self._process.wait()
-        for thread in self._threads:
-            thread.join()
-        for pipe in (self._in, self._out):
-            with contextlib.suppress(OSError):
-                pipe.close()
+            for thread in self._threads:
+                thread.join()
+            for pipe in (self._in, self._out):
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+    def switch_off(self) -> None:
+        """End the process, if it has not ended, and the transmission if it did not do so itself.
+
+        Raises:
+            DeviceError: The transmitters may still be on.
+        """
+        try:
+            emergency.off(**self.emergency_arguments())
+        except emergency.EmergencyError as error:
+            raise DeviceError(self._name, str(error)) from error
 
     def _do(self, what: str, **values: Any) -> None:
         self.check()

@@ -172,10 +172,11 @@ class SoapyStaticTweezers(StaticTweezers):
         return n_samples / rate_hz
 
     def safe_state(self) -> None:
-        """Ramp the array down; a dead stream is dark already.
+        """Ramp the array down; where the stream is dead, switch the radio's transmitters off.
 
         Raises:
-            DeviceError: The process hangs; it was killed, which turns the light off too.
+            DeviceError: The process hangs; it was killed, and the transmitters were switched off. Or they may
+                still be on.
         """
         link = self._link
         if link is None or self._depth == 0.0:
@@ -186,6 +187,7 @@ class SoapyStaticTweezers(StaticTweezers):
             if link.hangs:
                 self._disconnect()
                 raise
+            link.switch_off()
             self._depth = 0.0
 
     def emergency(self) -> Emergency | None:

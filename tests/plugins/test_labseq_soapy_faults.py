@@ -152,7 +152,9 @@ def test_after_its_process_was_killed_the_radio_can_be_opened_again() -> None:
         with pytest.raises(DeviceError, match=text):
             rig.tweezers.ramp(0.5, 0.1)
         assert not rig.ring.is_playing
+        assert rig.ring.is_transmitting, "its local oscillator leaks"
         rig.tweezers.safe_state()
+        assert not rig.ring.is_transmitting
         rig.tweezers.close()
         rig.tweezers.open()
         rig.tweezers.start()
