@@ -12,11 +12,19 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar, cast
 
-from labseq.errors import DeviceError, DeviceHungError, LabseqError, PlanError, StopRequested
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceHungError,
+    LabseqError,
+    PlanError,
+    StopRequested,
+)
+from labseq.messages import error_text, format_error
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -118,6 +126,27 @@ def stop_on_signals(stop: StopFlag) -> Generator[None]:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
+def readable(error: LabseqError) -> LabseqError:
+    """One of labseq's own errors as a plugin raised it, or one of the same kind if its text is unusable.
+
+    A text is unusable if it cannot be read, is longer than ``MAX_ERROR``, or has control characters.
+    """
+    text, given, is_config = error_text(error), "", issubclass(type(error), ConfigError)
+    with suppress(BaseException):
+        given = str(error)
+    if text == given or (is_config and given and all(c.isprintable() or c == "\n" for c in given)):
+        return error  # a ConfigError may have many problems, a line each
+    if is_config:
+        return ConfigError(text)
+    kinds: list[type[LabseqError]] = [k for k in type(error).__mro__ if issubclass(k, LabseqError)]
+    kind = next(one for one in kinds if one.__module__ == LabseqError.__module__)
+    made = kind.__new__(kind, text)
+    with suppress(BaseException):
+        made.__dict__.update(vars(error))
+    made.args = (text,)
+    return made
+
+
 class GuardedCall:
     """A call that a worker thread carries out.
 
@@ -125,6 +154,8 @@ class GuardedCall:
         done: Set when it has returned.
         result: What it returned.
         error: What it raised, or None.
+        own_error: The same if it is one of labseq's own errors, else None.
+        text: Kind and text of the error, or "".
     """
 
     def __init__(self, work: partial[Any]) -> None:
@@ -132,6 +163,8 @@ class GuardedCall:
         self.done = threading.Event()
         self.result: Any = None
         self.error: BaseException | None = None
+        self.own_error: LabseqError | None = None
+        self.text = ""
 
     def run(self) -> None:
         """Carry it out; called by the worker thread."""
@@ -139,6 +172,9 @@ class GuardedCall:
             self.result = self._work()
         except BaseException as error:  # noqa: BLE001 - handed to the thread that waits
             self.error = error
+            self.text = format_error(error)  # in this thread, because it may take long
+            if issubclass(type(error), LabseqError):  # isinstance() asks the object itself
+                self.error = self.own_error = readable(cast("LabseqError", error))
         self.done.set()
 
 
@@ -226,7 +262,15 @@ class Guard:
             StopRequested: The run was asked to stop, and the call did not return in its grace time.
         """
         call = GuardedCall(work)
-        self._worker(owner).submit(call)
+        try:
+            worker = self._worker(owner)
+        except (
+            RuntimeError,
+            MemoryError,
+        ):  # no thread can be started: better without a limit than not at all
+            call.run()
+            return call
+        worker.submit(call)
         deadline = time.monotonic() + timeout_s
         while not call.done.wait(min(POLL_S, max(0.0, deadline - time.monotonic()))):
             if grace_s < math.inf and self._stop.is_set:
@@ -264,7 +308,7 @@ class Guard:
             if owner == "planner":
                 raise PlanError(f"{text}; if it is only slow, raise 'timeouts: {{plan: ...}}' in the profile")
             raise DeviceHungError(owner, text, timeout_s)
-        if isinstance(call.error, LabseqError):
-            raise call.error
-        text = f"{name}raised {type(call.error).__name__}" + (f": {call.error}" if str(call.error) else "")
+        if call.own_error is not None:
+            raise call.own_error
+        text = f"{name}raised {call.text}"
         raise (PlanError(text) if owner == "planner" else DeviceError(owner, text)) from call.error

@@ -8,6 +8,8 @@ from importlib.util import find_spec
 from typing import Any, Final
 
 _MAX_LENGTH: Final = 60
+MAX_ERROR: Final = 2000
+"""Maximum number of characters of an error's text that labseq shows, logs and records."""
 
 
 def install_hint(extra: str) -> str:
@@ -23,6 +25,50 @@ def visible(text: str) -> str:
 def clean(text: str) -> str:
     """A text on one line, shortened to 60 characters, with unprintable characters as escapes."""
     return visible(text if len(text) <= _MAX_LENGTH else text[: _MAX_LENGTH - 3] + "...")
+
+
+def error_text(error: BaseException) -> str:
+    r"""The text of any error, whatever a plugin made of it: one line of limited length, "" if it has none.
+
+    Example:
+        >>> print(error_text(ValueError("no\nanswer\x1b[2J")))
+        no answer\x1b[2J
+    """
+    try:
+        text = str.__str__(str(error))  # of a subclass of str, too
+    except BaseException as another:  # noqa: BLE001 - its __str__ may raise anything
+        return f"(its text cannot be read: {_kind_name(another)})"
+    return _one_line(text)
+
+
+def format_error(error: BaseException) -> str:
+    """Kind and text of any error, see :func:`error_text`; of a group, also those of its first error.
+
+    Example:
+        >>> format_error(KeyError("typo"))
+        "KeyError: 'typo'"
+    """
+    text = error_text(error)
+    text = f"{_kind_name(error)}: {text}" if text else _kind_name(error)
+    try:
+        if issubclass(type(error), BaseExceptionGroup):
+            first: BaseException = vars(BaseExceptionGroup)["exceptions"].__get__(error)[0]
+            return _one_line(f"{text}; the first: {format_error(first)}")
+    except BaseException:  # noqa: BLE001, S110 - too deep
+        pass
+    return text
+
+
+def _kind_name(error: BaseException) -> str:
+    try:
+        return clean(str.__str__(type(error).__name__))
+    except BaseException:  # noqa: BLE001 - of a metaclass
+        return "an error"
+
+
+def _one_line(text: str) -> str:
+    line = visible(" ".join(text[: MAX_ERROR + 1].split()))
+    return line if max(len(text), len(line)) <= MAX_ERROR else f"{line[:MAX_ERROR]} ..."
 
 
 def shown(value: Any, raw: str = "") -> str:

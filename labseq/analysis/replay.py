@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from labseq.config.addresses import Override, split_overrides
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.guard import Guard, StopFlag
-from labseq.messages import clean
+from labseq.messages import clean, format_error
 from labseq.model import (
     CalibrationEntry,
     CycleRecord,
@@ -120,7 +120,7 @@ class ReplayedImages:
                 seen = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
                 certainty = float(np.mean(confidence))
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
-                self.failures[shot.index, i] = f"{type(error).__name__}: {error}"
+                self.failures[shot.index, i] = format_error(error)
                 continue
             appeared, vanished = seen & ~image.occupancy, image.occupancy & ~seen
             self.appeared += appeared

@@ -18,10 +18,10 @@ from labseq.config.document import Document
 from labseq.config.profile import MotionSettings
 from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
 from labseq.kernel import load_kernels
+from labseq.messages import format_error
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
-from labseq.plugins.calls import format_error
 from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
 from labseq.session.lab import construct

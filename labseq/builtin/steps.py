@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
+from labseq.messages import format_error
 from labseq.plugin import (
     COMPUTER,
     ConfigError,
@@ -208,7 +209,7 @@ class DeviceStep(Step):
             except LabseqError as error:
                 return {"do": str(error)}
             except Exception as error:  # noqa: BLE001 - of the driver, for example an unknown argument
-                what = f"check_command() raised {type(error).__name__}: {error}"
+                what = f"check_command() raised {format_error(error)}"
                 return {"do": f"{self.settings.name}: {what}"}
         return {}
 

@@ -13,15 +13,14 @@ from types import ModuleType
 from typing import Any, Final, TypeVar, cast
 
 from labseq.errors import LabseqError, PluginLoadError
-from labseq.guard import Guard
+from labseq.guard import Guard, readable
+from labseq.messages import error_text, format_error
 from labseq.registry import Owner
 
 T = TypeVar("T")
 
 MAX_PRINTED: Final = 60
 """Maximum number of characters of a plugin's printed text that are quoted."""
-MAX_ERROR: Final = 500
-"""Maximum number of characters of a plugin's own error that are quoted."""
 LOCAL_PACKAGE: Final = "labseq_local"
 """Package of the modules of plugins from folders."""
 
@@ -94,44 +93,41 @@ class _PrintsToStderr:
 
 
 def _named(owner: Owner, what: str, error: BaseException) -> LabseqError:
-    is_own = isinstance(error, PluginLoadError) and error.plugin == owner.name
-    if isinstance(error, LabseqError) and (what or is_own):
-        return error
-    text = f"{type(error).__name__}: {error.msg}" if isinstance(error, SyntaxError) else format_error(error)
+    kind = type(error)  # isinstance() asks the object itself
+    if issubclass(kind, LabseqError) and (what or getattr(error, "plugin", None) == owner.name):
+        return readable(cast("LabseqError", error))
+    text = format_error(error)
+    if issubclass(kind, SyntaxError):
+        text = f"{kind.__name__}: {error_text(ValueError(getattr(error, 'msg', '')))}"
     if place := error_location(error, owner.home):
         text = f"{text} ({place})"
     return owner.fault(f"{what} raised {text}" if what else text)
 
 
-def format_error(error: BaseException) -> str:
-    """Type and text of an error that a plugin raised, on one line of limited length.
-
-    Example:
-        >>> format_error(KeyError("typo"))
-        "KeyError: 'typo'"
-    """
-    try:
-        text = str(error)
-    except (Exception, SystemExit) as another:  # noqa: BLE001 - it may raise anything
-        text = f"(its text cannot be read: {type(another).__name__})"
-    text = " ".join(f"{type(error).__name__}: {text[: 2 * MAX_ERROR]}".split()).rstrip(":")
-    text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= MAX_ERROR else f"{text[:MAX_ERROR]} ..."
-
-
 def error_location(error: BaseException, home: Path | None) -> str:
     """File and line that an error came from, in the plugin's own code if possible; "" if unknown."""
-    if isinstance(error, SyntaxError) and error.filename:
-        return f"{error.filename}:{error.lineno or 1}"
-    chain = [error]
-    while (cause := chain[0].__cause__ or chain[0].__context__) is not None and cause not in chain:
+    if issubclass(type(error), SyntaxError) and getattr(error, "filename", None):
+        return f"{error.filename}:{error.lineno or 1}"  # pyright: ignore[reportAttributeAccessIssue]
+    chain, seen = [error], {id(error)}
+    while (cause := _cause(chain[0])) is not None and id(cause) not in seen:
         chain.insert(0, cause)
-    frames = [frame for one in chain for frame in traceback.extract_tb(one.__traceback__)]
+        seen.add(id(cause))
+    frames = [frame for one in chain for frame in traceback.extract_tb(_TRACE(one))]
     own = [f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)]
     labseqs = (Path(__file__).parent, Path(__file__).parent.parent / "guard.py")
     foreign = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & {*labseqs}]
     frame = (own or foreign or [None])[-1]
     return "" if frame is None else f"{frame.filename}:{frame.lineno}"
+
+
+_CAUSE: Final[Callable[[BaseException], BaseException | None]] = vars(BaseException)["__cause__"].__get__
+_CONTEXT: Final[Callable[[BaseException], BaseException | None]] = vars(BaseException)["__context__"].__get__
+_TRACE: Final = vars(BaseException)["__traceback__"].__get__
+
+
+def _cause(error: BaseException) -> BaseException | None:
+    """What an error came from, whatever its class makes of these attributes."""
+    return _CAUSE(error) or _CONTEXT(error)
 
 
 def import_file(name: str, path: Path) -> ModuleType:

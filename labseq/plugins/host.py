@@ -21,10 +21,10 @@ from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.files import PLUGIN_PATH, PLUGINS
 from labseq.hookspecs import LABSEQ_API
+from labseq.messages import format_error
 from labseq.plugins.calls import (
     call_plugin,
     forget,
-    format_error,
     import_file,
     module_location,
     plugin_location,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import RecordingError
+from labseq.messages import format_error
 from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.recording import schema
 from labseq.recording.hdf5 import (
@@ -66,7 +67,7 @@ class ShotEncoder:
                 self._write_shot(file["entry"], shot)
         except Exception as error:  # a plugin's camera or step may put anything into the record
             where = f"shot {shot.shot_index} (attempt {shot.attempt})"
-            what = f"cannot be laid out as a file: {type(error).__name__}: {error}"
+            what = f"cannot be laid out as a file: {format_error(error)}"
             raise RecordingError(where, f"{what}; see the plugin that made it") from error
         return buffer.getbuffer()
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from labseq.errors import DeviceError, LabseqError
 from labseq.guard import Guard
+from labseq.messages import format_error
 from labseq.model import (
     CalibrationEntry,
     CameraFacts,
@@ -164,33 +165,52 @@ Outcome = dict[str, LabseqError | None]
 """Device name -> its failure, or None; in the order of the calls."""
 
 
-def make_safe(lab: Lab, guard: Guard) -> Outcome:
-    """Bring every device to its safe state; the failure of one never stops the others.
+def make_safe(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Outcome:
+    """Bring every device, or those of these names, to its safe state; no failure stops the others.
 
     Each device has its own timeout.
     """
-    return _each(lab.safe_order(), guard, "safe_state", lab.timeouts.safe_state_s)
+    return _each(lab.safe_order(), guard, "safe_state", lab.timeouts.safe_state_s, names)
 
 
-def close_all(lab: Lab, guard: Guard) -> Outcome:
-    """Close every device in the safe order, then the simulation; failures never stop the others."""
+def close_all(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Outcome:
+    """Close every device in the safe order, then the simulation; or those of these names."""
     parts: list[tuple[str, Hardware | Simulation]] = list(lab.safe_order())
     if lab.simulation is not None:
         parts.append(("simulation", lab.simulation))
-    return _each(parts, guard, "close", lab.timeouts.safe_state_s)
+    return _each(parts, guard, "close", lab.timeouts.safe_state_s, names)
 
 
 def _each(
-    parts: Iterable[tuple[str, Hardware | Simulation]], guard: Guard, method: str, timeout_s: float
+    parts: Iterable[tuple[str, Hardware | Simulation]],
+    guard: Guard,
+    method: str,
+    timeout_s: float,
+    names: Container[str] | None,
 ) -> Outcome:
-    outcome: Outcome = {}
-    for name, part in parts:
-        try:
-            guard.call_despite_stop(name, timeout_s, getattr(part, method))
-            outcome[name] = None
-        except LabseqError as failure:
-            outcome[name] = failure
-    return outcome
+    chosen = [part for part in parts if names is None or part[0] in names]
+    return {name: attempt(guard, name, timeout_s, part, method) for name, part in chosen}
+
+
+def attempt(guard: Guard, name: str, timeout_s: float, part: object, method: str) -> LabseqError | None:
+    """Call a method of a device even if the run is asked to stop; returns why it failed, or None."""
+    try:
+        guard.call_despite_stop(name, timeout_s, method_of(part, method))
+    except LabseqError as failure:
+        return failure
+    except BaseException as failure:  # noqa: BLE001 - Ctrl-C where it has no handler: the others come first
+        return DeviceError(name, f"{method}() was interrupted by {format_error(failure)}")
+    return None
+
+
+def method_of(part: object, method: str) -> Callable[[], Any]:
+    """A method that is only looked up when it is called, because a driver may fail even then."""
+
+    def act() -> Any:
+        return getattr(part, method)()
+
+    act.__name__ = method
+    return act
 
 
 def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:
@@ -198,4 +218,7 @@ def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:
     parts: dict[str, Hardware | Simulation] = dict(lab.hardware())
     if lab.simulation is not None:
         parts["simulation"] = lab.simulation
-    return {name: guard.call(name, lab.timeouts.call_s, part.describe) for name, part in parts.items()}
+    return {
+        name: guard.call(name, lab.timeouts.call_s, method_of(part, "describe"))
+        for name, part in parts.items()
+    }

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from labseq.errors import LabseqError
 from labseq.guard import DRIVER_MARGIN_S, Guard
+from labseq.messages import error_text
 from labseq.model import ShotRecord
 from labseq.roles import LeaderLink, find_leader, leaders
 from labseq.sequencer.lab import Lab
@@ -60,12 +61,14 @@ class LeaderAnswers:
 
     def failed(self, error: BaseException) -> None:
         """Answer "failed" with a reason; a device that cannot is a warning."""
-        reason = str(error) or type(error).__name__
+        reason = error_text(error) or type(error).__name__
         for name, leader in leaders(dict(self.lab.hardware())):
             try:
                 self._answer(name, leader, "failed", self.guard.call_despite_stop, reason)
-            except LabseqError as failure:
-                text = f"the failure could not be reported to the system behind '{name}': {failure}"
+            except Exception as failure:  # noqa: BLE001 - the first error is the one to report
+                text = (
+                    f"the failure could not be reported to the system behind '{name}': {error_text(failure)}"
+                )
                 self.emit("warning", {"text": text})
 
     def _answer(

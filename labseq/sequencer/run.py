@@ -15,10 +15,11 @@ from typing import Any, Final, Protocol
 
 from labseq.errors import LabseqError, StopRequested
 from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
+from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
 from labseq.roles import RunObserver, Step, StepContext, offers
-from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe
+from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import RunningShot, Stages
@@ -69,12 +70,13 @@ class StateTable:
         self.state = State.CLOSED
         self._changed = changed
 
-    def to(self, state: State) -> None:
-        """Change the state."""
+    def to(self, state: State, *, announce: bool = True) -> None:
+        """Change the state, and report it unless the devices come first."""
         if state not in TRANSITIONS[self.state]:
             raise AssertionError(f"a run cannot go from {self.state.value} to {state.value}")
         self.state = state
-        self._changed(state)
+        if announce:
+            self._changed(state)
 
 
 def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Collection[str]) -> None:
@@ -91,12 +93,15 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
         if name in names:
             stop.check()
             # A slow open() must end first: its last actions would undo the safe state.
-            guard.call_despite_stop(name, timeout_s, part.open)
+            guard.call_despite_stop(name, timeout_s, method_of(part, "open"))
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
     for name, device in lab.hardware():
-        if name in names and offers(device, "settle") and (longest_s := device.settling_timeout_s) > 0:
+        if name not in names or not offers(device, "settle"):
+            continue
+        longest_s = guard.call(name, timeout_s, partial(getattr, device, "settling_timeout_s"))
+        if longest_s > 0:
             emit("settling", {"device": name, "timeout_s": longest_s})
             guard.call(name, longest_s + DRIVER_MARGIN_S, device.settle)
 
@@ -107,14 +112,13 @@ def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
     Raises:
         LabseqError: One of them fails.
     """
-    timeout_s = lab.timeouts.safe_state_s
-    devices = [(name, device) for name, device in lab.safe_order() if name in names]
-    for name, device in devices:
-        guard.call_despite_stop(name, timeout_s, device.safe_state)
-    for name, device in devices:
-        guard.call_despite_stop(name, timeout_s, device.close)
-    if lab.simulation is not None and "simulation" in names:
-        guard.call_despite_stop("simulation", timeout_s, lab.simulation.close)
+    _raise_first(make_safe(lab, guard, names))
+    _raise_first(close_all(lab, guard, names))
+
+
+def _raise_first(outcome: Outcome) -> None:
+    for failure in filter(None, outcome.values()):
+        raise failure
 
 
 def plan_timelines(
@@ -162,7 +166,7 @@ def _named(number: int, name: str) -> Generator[None]:
     except LabseqError:
         raise
     except BaseException as error:
-        raise LabseqError(f"step {number} ({name}) raised {type(error).__name__}: {error}") from error
+        raise LabseqError(f"step {number} ({name}) raised {format_error(error)}") from error
 
 
 class ShotSink(Protocol):
@@ -211,7 +215,7 @@ class Sequencer:
         self._seed = seed
         self._policy = policy
         self._parameters = dict(parameters or {})
-        self._states = StateTable(lambda state: self._emit("state", {"state": state.value}))
+        self._states = StateTable(self._announce)
         self._unsafe: dict[str, LabseqError] = {}
         self._timelines = plan_timelines(self.lab, self.guard, self._steps)
 
@@ -284,21 +288,24 @@ class Sequencer:
         if self.state is not State.CLOSED:
             if self.state is not State.SAFE:
                 self._secure()
-            self._states.to(State.CLOSING)
+            self._states.to(State.CLOSING, announce=False)
             with self._stop.held():
                 outcome = close_all(self.lab, self.guard)
+            self._announce(State.CLOSING)
             self._report("closed", outcome)
             self.guard.end()
             self._states.to(State.CLOSED)
         return self._unsafe
 
     def _secure(self) -> None:
-        self._states.to(State.MAKING_SAFE)
+        self._states.to(State.MAKING_SAFE, announce=False)
         with self._stop.held():
             outcome = make_safe(self.lab, self.guard)
         self._unsafe = {name: error for name, error in outcome.items() if error is not None}
-        self._report("safe_state", outcome)  # only now: neither a screen nor a disk may delay the devices
-        self._states.to(State.SAFE)
+        self._states.to(State.SAFE, announce=False)
+        self._announce(State.MAKING_SAFE)  # only now: neither a screen nor a disk may delay the devices
+        self._report("safe_state", outcome)
+        self._announce(State.SAFE)
 
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
         """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
@@ -384,11 +391,8 @@ class Sequencer:
     def _recover(self) -> None:
         """Make the devices safe that may still be busy."""
         self._states.to(State.RECOVERING)
-        lab, timeout_s = self.lab, self.lab.timeouts.safe_state_s
-        busy = [("mobile_tweezers", lab.mobile_tweezers), ("camera", lab.camera)]
         with self._stop.held():
-            for name, device in busy if lab.lines is None else (*busy, ("lines", lab.lines)):
-                self.guard.call_despite_stop(name, timeout_s, device.safe_state)
+            _raise_first(make_safe(self.lab, self.guard, {"mobile_tweezers", "camera", "lines"}))
 
     def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
         """Make the devices safe; only then answer the other control system and write the shot."""
@@ -398,8 +402,9 @@ class Sequencer:
         self._close_record(record, status, error)
         try:
             self._sink.write_shot(record)
-        except LabseqError as failure:
-            self._emit("warning", {"text": f"the interrupted shot could not be written: {failure}"})
+        except Exception as failure:  # noqa: BLE001 - the first error is the one to report
+            text = f"the interrupted shot could not be written: {error_text(failure)}"
+            self._emit("warning", {"text": text})
         self._emit("shot_finished", {"shot": record})
 
     def _leaders(self, record: ShotRecord) -> LeaderAnswers:
@@ -407,12 +412,15 @@ class Sequencer:
 
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status
-        record.error = "" if error is None else f"{type(error).__name__}: {error}"
+        record.error = "" if error is None else format_error(error)
         record.t_end_utc = _utc_now()
 
     def _report(self, event: str, outcome: Outcome) -> None:
         for name, error in outcome.items():
             self._emit(event, {"device": name, "ok": error is None, "error": str(error or "")})
+
+    def _announce(self, state: State) -> None:
+        self._emit("state", {"state": state.value})
 
     def _emit(self, name: str, values: Mapping[str, Any]) -> None:
         self._observer.event(name, values)

@@ -13,6 +13,7 @@ import labseq
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import Lock, knows_no_locks
+from labseq.messages import format_error
 from labseq.recording import Run
 from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
@@ -171,7 +172,7 @@ def analyse_missing(run: Run, settings: Mapping[str, Any], *, again: bool = Fals
     failures: dict[int, str] = {}
 
     def failed(shot: int, error: BaseException) -> None:
-        failures[shot] = f"{type(error).__name__}: {error}"
+        failures[shot] = format_error(error)
 
     with results_of(run.path, prepared, again=again) as (log, before):
         n_done = analyse(prepared, (s for s in run.shots if s.index not in before), log, failed)

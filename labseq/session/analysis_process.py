@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.errors import LabseqError
+from labseq.messages import format_error
 from labseq.recording import Shot, open_run
 from labseq.recording.reader import Follower
 from labseq.session.analyses import analyse, analyses_of, prepare, results_of
@@ -91,7 +92,7 @@ def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Shot]
 
 def _report(shot: int, error: BaseException) -> None:
     traceback.print_exception(error)
-    print(f"{FAILED}shot {shot}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)  # noqa: T201 - its log
+    print(f"{FAILED}shot {shot}: {format_error(error)}", file=sys.stderr, flush=True)  # noqa: T201 - its log
 
 
 if __name__ == "__main__":

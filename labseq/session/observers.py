@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from labseq.errors import DeviceTimeoutError, LabseqError
 from labseq.guard import Guard, StopFlag
+from labseq.messages import format_error
 from labseq.model import CycleRecord, ShotRecord, StageTiming
 from labseq.plugins import PluginHost
 from labseq.recording import open_run
@@ -98,9 +99,9 @@ class Observers:
             return
         try:
             self._observer.event(name, values)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken screen must not stop the run
+        except BaseException as error:  # noqa: BLE001 - a broken screen must not stop the run
             self._observer = None
-            self._write("warning", {"text": f"the live view failed and is off: {error!r}"})
+            self._write("warning", {"text": f"the live view failed and is off: {format_error(error)}"})
 
     def _write(self, name: str, values: Mapping[str, Any]) -> None:
         if self.log is None or name in _QUIET:

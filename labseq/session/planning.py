@@ -20,11 +20,11 @@ from labseq.config.profile import load_profile
 from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
 from labseq.guard import Guard
-from labseq.messages import clean, visible
+from labseq.messages import clean, format_error, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
-from labseq.plugins.calls import error_location, format_error
+from labseq.plugins.calls import error_location
 from labseq.roles import Context, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, load_plugins, resolve
 from labseq.session.lab import construct, parallelism_of

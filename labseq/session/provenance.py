@@ -18,6 +18,7 @@ from typing import Any, Final
 import labseq
 from labseq.calibration.store import encode_entry
 from labseq.errors import StopRequested
+from labseq.messages import format_error
 from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
 from labseq.session.assembly import Assembly, Setting
@@ -160,7 +161,7 @@ def ending(error: BaseException | None) -> tuple[RunStatus, str]:
     if isinstance(error, StopRequested):
         return "stopped", str(error)
     status: RunStatus = "stopped" if isinstance(error, KeyboardInterrupt) else "failed"
-    return status, f"{type(error).__name__}: {error}"
+    return status, format_error(error)
 
 
 def plugins_of(assembly: Assembly) -> tuple[dict[str, str], ...]:

@@ -24,10 +24,11 @@ from labseq.errors import (
 from labseq.files import Holder, Lock, knows_no_locks
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
+from labseq.messages import format_error
 from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.sequencer.lab import Timeouts, in_safe_order
+from labseq.sequencer.lab import Timeouts, attempt, in_safe_order, method_of
 from labseq.session.chosen import HARDWARE_KINDS, DryRun, check_dry_run, load_plugins
 from labseq.session.lab import WARM_S, construct, timeouts_of
 from labseq.session.profile import ResolvedProfile, choose_plugins, resolve_profile
@@ -139,30 +140,29 @@ def make_each_safe(
     """
     guard = Guard()
     outcome: dict[str, LabseqError | None] = {}
-    if simulation is not None:
-        guard.call_despite_stop("simulation", timeouts.call_s, simulation.open)
+    if simulation is not None and (
+        failure := attempt(guard, "simulation", timeouts.call_s, simulation, "open")
+    ):
+        outcome["simulation"] = failure
     for name, device in devices:
-        opened = attempt(guard, name, timeouts.call_s, device.open)
+        opened = attempt(guard, name, timeouts.call_s, device, "open")
         # it may be possible to make it safe even if it did not open
-        safe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
-        closed = attempt(guard, name, timeouts.safe_state_s, device.close)
+        safe = attempt(guard, name, timeouts.safe_state_s, device, "safe_state")
+        closed = attempt(guard, name, timeouts.safe_state_s, device, "close")
         outcome[name] = opened or safe
-        if observer is not None:
-            for event, failure in (("safe_state", outcome[name]), ("closed", closed)):
-                observer.event(event, {"device": name, "ok": failure is None, "error": str(failure or "")})
+        for event, failure in (("safe_state", outcome[name]), ("closed", closed)):
+            _report(observer, event, name, failure)
     if simulation is not None:
-        guard.call_despite_stop("simulation", timeouts.call_s, simulation.close)
+        attempt(guard, "simulation", timeouts.call_s, simulation, "close")
     guard.end()
     return outcome
 
 
-def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], None]) -> LabseqError | None:
-    """Call a device without interruption by a stop request; returns why the call failed, or None."""
-    try:
-        guard.call_despite_stop(name, timeout_s, method)
-    except LabseqError as failure:
-        return failure
-    return None
+def _report(observer: RunObserver | None, event: str, name: str, failure: LabseqError | None) -> None:
+    """Report the outcome of a device; a screen that fails must not keep the next one from being made safe."""
+    if observer is not None:
+        with suppress(BaseException):
+            observer.event(event, {"device": name, "ok": failure is None, "error": str(failure or "")})
 
 
 def construct_hardware(
@@ -203,9 +203,8 @@ def make_profile_devices_safe(
         attempted = make_each_safe(in_safe_order(made), timeouts_of(hardware.profile), simulation, observer)
     refused: dict[str, LabseqError] = {role: e for role, e in hardware.refused.items() if role != "detector"}
     refused |= failures
-    if observer is not None:
-        for role, error in refused.items():
-            observer.event("safe_state", {"device": role, "ok": False, "error": str(error)})
+    for role, error in refused.items():
+        _report(observer, "safe_state", role, error)
     return SafeStateReport(attempted, refused)
 
 
@@ -418,13 +417,13 @@ def check_each_device(
                 found = _examined(guard, name, device, timeouts)
             finally:
                 with stop.held():
-                    unsafe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
-                    unclosed = attempt(guard, name, timeouts.safe_state_s, device.close)
+                    unsafe = attempt(guard, name, timeouts.safe_state_s, device, "safe_state")
+                    unclosed = attempt(guard, name, timeouts.safe_state_s, device, "close")
             tried.append(replace(found, unsafe=unsafe, unclosed=unclosed))
     finally:
         if simulation is not None and tried:
             with stop.held():
-                unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation.close)
+                unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation, "close")
             tried[0] = replace(tried[0], unclosed=unclosed)
         guard.end()
     return tried
@@ -437,8 +436,8 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> Check
         if name != "simulation" and offers(device, "warm"):
             guard.call(name, WARM_S, device.warm)
             load_kernels()  # else a self test might have to compile within its timeout
-        guard.call_despite_stop(name, timeouts.call_s, device.open)
-        described: Any = guard.call(name, timeouts.call_s, device.describe)
+        guard.call_despite_stop(name, timeouts.call_s, method_of(device, "open"))
+        described: Any = guard.call(name, timeouts.call_s, method_of(device, "describe"))
         if not isinstance(described, Mapping):
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
@@ -450,6 +449,8 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts) -> Check
         return replace(found, latency_s=statistics.median(readings_s))
     except LabseqError as failure:
         return replace(found, failure=failure)
+    except Exception as failure:  # noqa: BLE001 - of the driver's class
+        return replace(found, failure=DeviceError(name, format_error(failure)))
 
 
 def _reading_s(guard: Guard, name: str, device: Hardware | Simulation, timeout_s: float) -> float:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.guard import Guard, StopFlag, stop_on_signals
+from labseq.messages import error_text
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
 from labseq.recording.best import best_point
@@ -228,7 +229,7 @@ class Session:
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down()
-        self._observers.finish_analyses()
+        self._try(self._observers.finish_analyses)
         if error is None and self.scan_run.is_adaptive:
             self._try(self._report_best, writer.run_dir)
         if error is None and unsafe:
@@ -318,5 +319,5 @@ class Session:
         """Write to disk at the end of a run; a full disk must not hide the error that ended the run."""
         try:
             act(*args, **kwargs)
-        except LabseqError as failure:
-            self._warn(str(failure))
+        except Exception as failure:  # noqa: BLE001 - nothing hides the error that ended the run
+            self._warn(error_text(failure))

@@ -161,7 +161,7 @@ MOBILE, SHUTTER, CAMERA, STATIC = (
 )
 CAMERAS = "'andor', 'frames', 'genicam', 'pylon', 'virtual'"
 NO_CAMERA = f"camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected one of {CAMERAS}"
-JAM = "shutter              NOT SAFE: shutter: jam() raised OSError: jammed"
+JAM = "shutter              NOT SAFE: shutter: safe_state() raised OSError: jammed"
 TO_IXON = {"camera: {use: virtual": "camera: {use: ixon"}
 TO_JAMMED = {"use: fine": "use: no_safe_state"}
 

@@ -133,7 +133,7 @@ def test_the_run_stops_if_they_cannot_be_made_safe() -> None:
     )
     with pytest.raises(DeviceError, match="on"):
         made.run()
-    assert made.made_safe()[1:] == SAFE_ORDER
+    assert made.made_safe() == ["mobile_tweezers", "camera", *SAFE_ORDER]
 
 
 def test_no_policy_continues_after_a_call_that_hangs() -> None:

@@ -8,9 +8,11 @@ import pytest
 
 from labseq.builtin.steps import DeviceStep, WaitStep
 from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
+from labseq.messages import MAX_ERROR
 from labseq.sequencer.lab import Timeouts
 from labseq.sequencer.run import TRANSITIONS, State
 from labseq.testing.fakes import ListSink
+from tests.hostile import HOSTILE, LOST
 from tests.sequencer.rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 
@@ -195,7 +197,7 @@ def test_a_simulation_that_fails_is_named_and_all_devices_are_safe(method):
         assert rig.observer.of("closed")[-1] == {
             "device": "simulation",
             "ok": False,
-            "error": "simulation: fail() raised ValueError: nothing there",
+            "error": "simulation: close() raised ValueError: nothing there",
         }
     else:
         with pytest.raises(DeviceError, match=r"simulation: fail\(\) raised ValueError: nothing there"):
@@ -278,15 +280,72 @@ def test_no_device_is_made_safe_beside_an_open_that_is_only_slow(monkeypatch):
     assert rig.made_safe() == SAFE_ORDER
 
 
-@pytest.mark.parametrize(
-    "call", ["camera.arm", "camera.read", "static_tweezers.open", "mobile_tweezers.open"]
-)
-def test_any_error_leaves_every_device_safe(call):
-    rig = Rig(fail_on={call: RuntimeError("cable")})
-    with pytest.raises(DeviceError, match="raised RuntimeError: cable"):
-        rig.run()
+CALLS = [f"{name}.{call}" for name in SAFE_ORDER for call in ("open", "safe_state", "close")]
+CALLS += ["camera.arm", "camera.trigger", "camera.read", "static_tweezers.start"]
+
+
+@pytest.mark.parametrize("error", HOSTILE)
+def test_any_error_of_any_call_leaves_every_device_safe_and_closed_once(error):
+    for call in CALLS:
+        device, method = call.split(".")
+        rig = Rig(fail_on={call: HOSTILE[error]})
+        if method in ("safe_state", "close"):
+            rig.run()
+            text = next(v["error"] for v in rig.observer.of("closed" if method == "close" else method)
+                        if v["device"] == device)  # fmt: skip
+        else:
+            with pytest.raises(DeviceError) as caught:
+                rig.run()
+            assert caught.value.exit_code == 3
+            text = str(caught.value)
+            if method != "open" and call != "static_tweezers.start":
+                assert rig.record().status == "failed"
+                assert len(rig.record().error) < 2 * MAX_ERROR
+        assert text.isprintable(), call
+        assert 0 < len(text) < 2 * MAX_ERROR, call
+        assert rig.made_safe() == SAFE_ORDER, call
+        assert [c.device for c in rig.lab.calls if c.method == "close"] == SAFE_ORDER, call
+        assert rig.sequencer.state is State.CLOSED
+
+
+def test_a_driver_that_fails_when_a_method_is_looked_up_never_stops_the_others():
+    rig = Rig()
+
+    class Gone(type(rig.lab.camera)):
+        @property
+        def safe_state(self):
+            raise OSError("gone")
+
+        close = safe_state
+
+    rig.lab.camera.__class__ = Gone
+    rig.run()
+    others = [name for name in SAFE_ORDER if name != "camera"]
+    assert rig.made_safe() == others
+    assert [c.device for c in rig.lab.calls if c.method == "close"] == others
+    assert str(rig.unsafe["camera"]) == "camera: safe_state() raised OSError: gone"
+
+
+def test_without_threads_the_devices_are_made_safe_all_the_same(monkeypatch):
+    rig = Rig()
+    rig.sequencer.open()
+    rig.sequencer.guard.end()
+
+    def refuse(_):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    assert not rig.sequencer.shut_down()
     assert rig.made_safe() == SAFE_ORDER
-    assert rig.sequencer.state is State.CLOSED
+
+
+def test_a_transient_failure_with_an_unusable_text_still_repeats_the_shot():
+    rig = Rig(fail_on={"camera.read": [LOST]})
+    rig.run()
+    failed, done = rig.sink.shots
+    assert (failed.status, done.status) == ("failed", "complete")
+    assert failed.error.isprintable()
+    assert len(failed.error) < 2 * MAX_ERROR
 
 
 def test_safety_comes_before_the_record():

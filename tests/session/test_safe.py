@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 import labseq
+from labseq.cli.entry import main
 from labseq.errors import ConfigError
 from labseq.recording import find_dead_run, mark_active, marker_roots
-from labseq.session.safe import SafeStateReport, make_profile_safe
-from labseq.testing.fakes import RecordingObserver
+from labseq.session.safe import SafeStateReport, check_devices, make_each_safe, make_profile_safe
+from labseq.testing.fakes import RecordingObserver, fake_lab
+from tests.hostile import HOSTILE
 
 from .small_runs import OWN_DEVICE, PROFILE as SMALL_PROFILE
 
 PROFILE = f"{SMALL_PROFILE}plugin_folders: [plugins]\ndevices:\n  shutter: SHUTTER\n"
+OPEN_ORDER = ["static_tweezers", "camera", "mobile_tweezers"]
 SAFE_ORDER = ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
 
 INIT = "def __init__(self, settings, context): "
@@ -76,6 +80,54 @@ def test_what_concerns_no_device_is_reported_at_the_end(old: str, new: str, says
     assert "shutter" in outcome.attempted
     assert outcome.problems is not None
     assert says in str(outcome.problems)
+
+
+HOSTILE_DEVICE = """
+from tests.hostile import HOSTILE
+
+
+def fail(self, *_, **__):
+    raise HOSTILE[WHAT]
+
+"""
+
+
+@pytest.mark.parametrize("what", ["broken text", "tricky class", "escapes", "broken error of labseq"])
+def test_no_error_of_a_device_keeps_the_others_from_being_made_safe(
+    what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for methods in (["open", "safe_state", "close"], ["describe"]):
+        write("{use: mine}")
+        plugin = Path("plugins/mine.py")
+        text = plugin.read_text("utf-8").replace("return {}", "pass")
+        for method in methods:
+            text = text.replace(f"def {method}(self): pass", f"{method} = fail")
+        plugin.write_text(HOSTILE_DEVICE.replace("WHAT", repr(what)) + text, "utf-8")
+        outcome, events = secured()
+        assert [t["device"] for t in events] == SAFE_ORDER
+        assert [t["ok"] for t in events] == [True, "open" not in methods, True, True]
+        assert all(str(failure).isprintable() for failure in outcome.failures)
+        report = check_devices("./p.yaml")
+        assert [one.name for one in report.devices if one.ok] == ["simulation", *OPEN_ORDER]
+    with pytest.raises(SystemExit) as leaving:
+        main(["--debug", "devices", "./p.yaml"])
+    assert leaving.value.code == 3
+    found = capsys.readouterr()
+    assert "\x1b" not in found.out + found.err
+
+
+def test_a_simulation_or_a_screen_that_fails_keeps_no_device_from_being_made_safe() -> None:
+    lab, seen = fake_lab(simulated=True), list[str]()
+
+    def fail(*_: object) -> None:
+        raise HOSTILE["base exception"]
+
+    vars(lab.simulation)["open"] = vars(lab.simulation)["close"] = fail
+    screen = cast("Any", SimpleNamespace(event=fail))
+    outcome = make_each_safe(lab.safe_order(), lab.timeouts, lab.simulation, screen)
+    assert [name for name, failure in outcome.items() if failure] == ["simulation"]
+    seen = [call.device for call in lab.calls if call.method == "close"]
+    assert seen == SAFE_ORDER
 
 
 def test_all_are_safe_in_order_without_a_detector() -> None:
