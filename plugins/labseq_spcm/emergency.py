@@ -2,8 +2,8 @@
 
 labseq's watchdog loads this file by its path after the run that used the card has died. It needs nothing
 but Python's standard library. The order: stop, so that the outputs go to their stop level of 0 V; lowest
-amplitude; output relays open, which takes effect with WRITESETUP only; DDS reset. A reset of the whole card
-follows where a step was refused.
+amplitude; output relays open, which takes effect with WRITESETUP only; DDS reset; reset of the card, which
+disables its outputs even if the library, new in this process, should take them for disabled already.
 """
 
 from __future__ import annotations
@@ -105,7 +105,6 @@ class _Card:
 
     def switch_off(self, *, is_dds: bool) -> str:
         """All steps, also after one that was refused; then check that the card took them."""
-        refused: list[str] = []
         steps: list[tuple[int, int, str]] = [
             (SPC_M2CMD, M2CMD_CARD_STOP | M2CMD_DATA_STOPDMA, "stop"),
             (SPC_AMP0, LOWEST_MV, "lowest amplitude of output 0"),
@@ -113,24 +112,25 @@ class _Card:
             (SPC_ENABLEOUT0, 0, "disabling output 0"),
             (SPC_ENABLEOUT1, 0, "disabling output 1"),
             (SPC_M2CMD, M2CMD_CARD_WRITESETUP, "writing the set-up"),
-            *([(SPC_DDS_CMD, SPCM_DDS_CMD_RESET, "resetting the DDS")] if is_dds else []),
+            *([(SPC_DDS_CMD, SPCM_DDS_CMD_RESET, "reset of the DDS")] if is_dds else []),
+            (SPC_M2CMD, M2CMD_CARD_RESET, "reset of the card"),
         ]
+        refused: dict[str, str] = {}
         for register, value, what in steps:
             # once more after an error: it may be one from before, which blocks the library until it is read
             if self._write(register, value) and (reason := self._write(register, value)):
-                refused.append(f"{what}: {reason}")
-        done = "card stopped, outputs 0 and 1 disabled"
-        if refused:
-            if reason := self._write(SPC_M2CMD, M2CMD_CARD_RESET):
-                raise EmergencyError(f"{'; '.join(refused)}; reset of the card: {reason}")
-            done = f"card reset, which disables its outputs; refused before: {'; '.join(refused)}"
+                refused[what] = reason
+        reasons = "; ".join(f"{what}: {reason}" for what, reason in refused.items())
+        if len(refused) > 1 and "reset of the card" in refused:
+            raise EmergencyError(reasons)
         status = self._read(SPC_M2STATUS)
         enabled = [n for n, register in enumerate((SPC_ENABLEOUT0, SPC_ENABLEOUT1)) if self._read(register)]
         if enabled or not status & M2STAT_CARD_READY:
-            raise EmergencyError(
-                f"the card reads status {status:#x} and enabled outputs {enabled} after: {done}"
-            )
-        return done
+            text = f"the card reads status {status:#x} and enabled outputs {enabled}"
+            raise EmergencyError(f"{text}; {reasons}" if reasons else text)
+        done = "card stopped, outputs 0 and 1 disabled"
+        how = "" if "reset of the card" in refused else " by its reset"
+        return f"{done}{how}; refused: {reasons}" if refused else done
 
     def close(self) -> None:
         """Give the card back."""

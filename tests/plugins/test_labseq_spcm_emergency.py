@@ -149,6 +149,7 @@ def test_the_script_stops_the_card_first_and_writes_the_set_up_to_open_the_relay
         (r.SPC_ENABLEOUT1, 0),
         (r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP),
         (r.SPC_DDS_CMD, r.SPCM_DDS_CMD_RESET),
+        (r.SPC_M2CMD, r.M2CMD_CARD_RESET),
     ]
 
 
@@ -238,17 +239,25 @@ def test_a_card_that_a_dying_process_still_holds_is_waited_for(
     assert str(error.value) == f"the card '{CARD}' cannot be opened for 2 s: '{CARD}' is in use"
 
 
-def test_a_card_that_refuses_a_step_is_reset(card: Stubborn) -> None:
+def test_the_reset_of_the_card_makes_up_for_a_step_that_is_refused(card: Stubborn) -> None:
     card.refused = ((r.SPC_ENABLEOUT0, 0),)
     reason = "disabling output 0: SPC_ENABLEOUT0 (30091): not now"
     assert script.off("", CARD, "dds") == (
-        f"card reset, which disables its outputs; refused before: {reason}"
+        f"card stopped, outputs 0 and 1 disabled by its reset; refused: {reason}"
     )
     assert (card.running, card.outputs_on) == (False, (False, False))
     card.refused += ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
     with pytest.raises(script.EmergencyError) as error:
         script.off("", CARD, "dds")
     assert str(error.value) == f"{reason}; reset of the card: SPC_M2CMD (100): not now"
+
+
+def test_without_the_reset_the_outputs_are_off_all_the_same(card: Stubborn) -> None:
+    card.refused = ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
+    assert script.off("", CARD, "replay") == (
+        "card stopped, outputs 0 and 1 disabled; refused: reset of the card: SPC_M2CMD (100): not now"
+    )
+    assert (card.running, card.outputs_on) == (False, (False, False))
 
 
 def test_a_card_in_use_elsewhere_is_refused_and_one_that_dies_with_labseq_needs_no_script(
