@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -296,11 +295,9 @@ def _panels(record: ShotRecord, target: TargetPattern) -> list[ShotPanel]:
     made = iter(record.cycles)
     ended_by = [next(made, None) if image.cycle >= 0 else None for image in record.images]
     after = [*ended_by[1:], next(made, None)]  # a shot that was interrupted may lack the last image
-    cycles = count()
-    titles = [f"end of cycle {next(cycles)}" if cycle else "image" for cycle in ended_by]
     return [
-        _panel(image, f"{title}: {_seen(image, target)}", cycle)
-        for image, title, cycle in zip(record.images, titles, after, strict=True)
+        _panel(image, f"{clean(image.name)}: {_seen(image, target)}", cycle)
+        for image, cycle in zip(record.images, after, strict=True)
     ]
 
 

@@ -24,15 +24,15 @@ STEP: Final = "step_"
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Number those names that occur more than once, from 0.
+    """The names of steps; those that occur more than once with the index of the step.
 
     Example:
         >>> unique_names(["load", "image", "rearrange", "image"])
-        ('load', 'image_0', 'rearrange', 'image_1')
+        ('load', 'step_1_image', 'rearrange', 'step_3_image')
     """
     found: list[str] = []
     for i, name in enumerate(names):
-        unique = f"{name}_{names[:i].count(name)}" if names.count(name) > 1 else name
+        unique = f"{STEP}{i}_{name}" if names.count(name) > 1 else name
         while unique in found or (unique != name and unique in names):
             unique += "_"
         found.append(unique)

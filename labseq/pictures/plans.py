@@ -273,7 +273,8 @@ def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> No
     axes.set_xlim(extent.left, extent.right)
     axes.set_ylim(extent.bottom, extent.top)
     axes.set_axis_off()
-    axes.set_title(title, fontsize=8, pad=2, y=1.0)  # a fixed y spares matplotlib a search
+    fits = extent.width * sheet.site_in * POINTS_PER_INCH / (0.6 * max(1, len(title)))
+    axes.set_title(title, fontsize=min(8, fits), pad=2, y=1.0)  # a fixed y spares matplotlib a search
     closed = np.concatenate([edge, edge[:1]])
     axes.plot(closed[:, 0], closed[:, 1], color="0.88", linewidth=0.6, zorder=0)
 

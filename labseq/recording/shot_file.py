@@ -216,10 +216,12 @@ def read_content(path: Path) -> ShotContent:
         return ShotContent(_record(entry), run, TargetPattern(fill, clear, run["target.name"]))
 
 
-def read_occupancies(path: Path) -> NDArray[np.uint8]:
-    """Read the occupancies of a shot's file and nothing else: uint8 (n_images, n_rows, n_cols)."""
+def read_occupancies(path: Path) -> tuple[list[tuple[int, int, str]], NDArray[np.uint8]]:
+    """Read step, cycle and name of each image of a shot's file, and uint8 (n_images, n_rows, n_cols)."""
     with opened(path) as entry:
-        return entry["detection/occupancy"][()]
+        rows = entry["detection/images"][()]
+        names = zip(rows["step"].tolist(), rows["cycle"].tolist(), rows["name"], strict=True)
+        return [(step, cycle, name.decode()) for step, cycle, name in names], entry["detection/occupancy"][()]
 
 
 def read_frames(path: Path) -> dict[int, Frame]:

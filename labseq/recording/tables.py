@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -82,7 +83,9 @@ def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
     if occupancies:
         meaning = f"1 where the detector saw an atom, 0 where not, {NO_IMAGE} where there is no such image"
         about = {"units": "", "description": meaning}
-        data["occupancy"] = ((axis, "image", "row", "col"), _occupancies(run), about)
+        names, stack = _occupancies(run)
+        data["occupancy"] = ((axis, "image", "row", "col"), stack, about)
+        data["image"] = ("image", np.array(names, object), {"units": "", "description": "name of the image"})
     dataset = xr.Dataset(data) if grid is None else _on_grid(xr.Dataset(data), grid)
     for name, meaning in (("fill", "hold an atom"), ("clear", "be empty")):
         about = {"units": "", "description": f"1 where the target must {meaning}"}
@@ -90,14 +93,17 @@ def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
     return dataset.assign_attrs(facts_of(run))
 
 
-def _occupancies(run: Run) -> NDArray[np.int8]:
+def _occupancies(run: Run) -> tuple[list[str], NDArray[np.int8]]:
+    """The names of all images, in the order of a shot, and the occupancies at each."""
     from labseq.recording.shot_file import read_occupancies
 
     found = [read_occupancies(shot.file) for shot in run.shots]
-    stack = np.full((len(found), max(map(len, found), default=0), *run.target.shape), NO_IMAGE, np.int8)
-    for of_shot, occupancies in zip(stack, found, strict=True):
-        of_shot[: len(occupancies)] = occupancies
-    return stack
+    known = dict.fromkeys(image for images, _ in found for image in images)
+    names = [name for *_, name in sorted(known, key=itemgetter(0, 1))]
+    stack = np.full((len(found), len(names), *run.target.shape), NO_IMAGE, np.int8)
+    for of_shot, (images, occupancies) in zip(stack, found, strict=True):
+        of_shot[[names.index(name) for *_, name in images]] = occupancies
+    return names, stack
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -64,7 +64,8 @@ def image(
     atoms: np.ndarray[Any, Any], step: int, cycle: int, at_s: float, *, kept: bool = False
 ) -> ImageRecord:
     frame = Frame(np.arange(600, dtype=np.uint16).reshape(20, 30), 0.045, at_s, "camera") if kept else None
-    return ImageRecord(frame, atoms, np.ones(SHAPE, np.float32), step, cycle, at_s, 0.045)
+    name = "image" if cycle < 0 else f"rearrange_cycle_{cycle}"
+    return ImageRecord(frame, atoms, np.ones(SHAPE, np.float32), step, cycle, at_s, 0.045, name)
 
 
 def make_shot(

@@ -26,7 +26,7 @@ def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> N
         0,
     ]
     assert drawing.panels[0].title.endswith("batches")
-    assert drawing.panels[1].title.startswith("end of cycle 0: ")
+    assert drawing.panels[1].title.startswith("rearrange_cycle_0: ")
     assert drawing.sites_px is not None
     assert drawing.sites_px.shape == (20, 20, 2)
 
@@ -38,7 +38,7 @@ def test_frames_lie_under_the_sites(compact: Run, tmp_path: Path) -> None:
 
 def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:
     panels = shot_picture(write([make_shot(0, n_cycles=2)]), 0, cycle=1).panels
-    assert [panel.title.partition(":")[0] for panel in panels] == ["end of cycle 0", "end of cycle 1"]
+    assert [panel.title.partition(":")[0] for panel in panels] == ["rearrange_cycle_0", "rearrange_cycle_1"]
 
 
 def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> None:

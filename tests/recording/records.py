@@ -57,7 +57,7 @@ def make_run(**changes: Any) -> RunRecord:
         record_frames="all",
         grid_spacing_m=4.49e-6,
         lattice="triangular",
-        steps=("load", "image_0", "rearrange", "image_1"),
+        steps=("load", "step_1_image", "rearrange", "step_3_image"),
     )
     return dataclasses.replace(run, **changes)
 

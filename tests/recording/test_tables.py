@@ -156,10 +156,18 @@ def test_a_scan_that_is_no_product_has_an_axis_of_points(tmp_path: Path) -> None
 def test_without_a_scan_the_axis_is_that_of_the_shots(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     for index in (0, 2):
-        writer.write_shot(make_shot(index))
-    data = open_run(writer.run_dir).to_xarray()
+        shot = make_shot(index)
+        del shot.images[1 : 2 if index else 1]  # the second needs one cycle less
+        writer.write_shot(shot)
+    run = open_run(writer.run_dir)
+    data = run.to_xarray()
     assert data["shot"].values.tolist() == [0, 2]
     assert data["occupancy"].dims == ("shot", "image", "row", "col")
+    assert data["image"].values.tolist() == ["image_0", "image_1", "image_2"]
+    assert (data["occupancy"].isel(shot=1).sel(image="image_1") == -1).all()
+    for at, shot in zip((0, 1), run.shots, strict=True):
+        last = data["occupancy"].isel(shot=at).sel(image="image_2")
+        np.testing.assert_array_equal(last, shot.occupancies[-1])
     assert data["target_fill"].values.sum() == 6
 
 

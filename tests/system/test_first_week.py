@@ -254,7 +254,7 @@ def test_an_analyst(desk: Desk) -> None:
         names, occupancy = entry["detection/images"]["name"], entry["detection/occupancy"][()]
         target = entry["target/fill"][()] == 1
         filling = {name.decode(): sites[target].mean() for name, sites in zip(names, occupancy, strict=True)}
-    assert filling["rearrange_cycle_0"] > 0.95 > filling["image_0"]
+    assert filling["rearrange_cycle_0"] > 0.95 > filling["step_1_image"]
 
     Path("lifetime.yaml").write_text(LIFETIME)
     desk.labseq("run", "lifetime.yaml", "--seed", "4", "--set", "shot.hold.duration=33 s")
