@@ -173,9 +173,10 @@ class LeaderDevice(Device):
             return self._dialogue.new_events()
 
     def describe(self) -> Mapping[str, Any]:
-        """Address, version of the protocol, deadline."""
+        """Address, version of the protocol, deadline, and the file with the token."""
         address, deadline_s = self._link.address, self.deadline_s
-        return {"model": "leader", "address": address, "protocol": VERSION, "deadline_s": deadline_s}
+        about = {"model": "leader", "address": address, "protocol": VERSION, "deadline_s": deadline_s}
+        return about | ({"token_file": str(file)} if (file := self._link.token_file) else {})
 
     def _listen(self) -> None:
         try:

@@ -10,7 +10,7 @@ from typing import Final
 from labseq.plugin import clean, visible
 
 GO: Final = "go"
-VERSION: Final = 1
+VERSION: Final = 2
 MAX_LINE: Final = 200
 """Longest line in bytes; more is noise."""
 MAX_EVENTS: Final = 100

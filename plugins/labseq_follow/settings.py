@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import Duration, Settings, clean, setting_error
+from labseq.plugin import Duration, FilePath, Settings, clean, setting_error
 
 SIMULATED: Final = "simulated"
 
@@ -43,15 +43,20 @@ class TcpLeaderSettings(LeaderSettings):
     port: int = Field(
         default=5750, ge=0, le=65535, description="port on which labseq listens; 0: any free one"
     )
+    token_file: FilePath | None = Field(
+        default=None,
+        description="file with the token that a control system must send first, 16 to 100 letters or "
+        "digits; without it `leader.token` in the state folder, which labseq makes",
+    )
     allow_remote: bool = Field(
-        default=False, description="whether other computers may connect: any that reaches the port"
+        default=False, description="whether other computers may connect, with the token"
     )
 
     @model_validator(mode="after")
     def _check_host(self) -> Self:
         if not self.allow_remote and not _is_loopback(self.host):
             what = f"host is '{clean(self.host)}', which other computers can reach"
-            hint = "or set 'allow_remote: true' in a network where every computer may connect"
+            hint = "or set 'allow_remote: true' in a network in which nobody listens"
             raise setting_error(
                 what, "an address that only this computer can reach, such as 127.0.0.1", hint, at=("host",)
             )

@@ -9,6 +9,7 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from labseq_follow.leader import LeaderDevice, tcp_leader
@@ -21,17 +22,24 @@ MAX_WAIT_S = 60.0
 """A test fails after this time; on a busy computer nothing takes as long."""
 
 
+def token_file() -> Path:
+    return Path(os.environ["LABSEQ_STATE"]) / "leader.token"
+
+
 class TcpPeer:
     """A leader that connects over TCP.
 
     Args:
         address: Of labseq, "127.0.0.1:5750".
+        token: What it sends after `hello`; "" to send nothing.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, token: str | None = None) -> None:
         host, _, port = address.rpartition(":")
         self.socket = socket.create_connection((host, int(port)), timeout=MAX_WAIT_S)
         self._lines = self.socket.makefile("rb")
+        if token != "":
+            self.say(f"hello {token or token_file().read_text().strip()}")
 
     def say(self, *lines: str) -> None:
         self.send("".join(f"{line}\n" for line in lines).encode())
@@ -100,7 +108,7 @@ def led(context: Context | None = None, **settings: Any) -> Generator[tuple[Lead
     """The same, and a leader that is connected."""
     with listening(context, **settings) as device:
         peer = TcpPeer(device.describe()["address"])
-        assert peer.hear().startswith("hello labseq 1 deadline=")
+        assert peer.hear().startswith("hello labseq 2 deadline=")
         try:
             yield device, peer
         finally:

@@ -88,7 +88,7 @@ def test_it_reports_its_state_at_any_time() -> None:
         waiting.join()
         assert peer.ask("state?") == "state busy"
         assert (device.read("state"), device.read("is_connected")) == ("busy", True)
-        assert peer.ask("hello") == "hello labseq 1 deadline=10"
+        assert peer.ask("hello") == "hello labseq 2 deadline=10"
 
 
 def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> None:
@@ -151,7 +151,7 @@ def on_a_line() -> Generator[tuple[Any, PtyPeer]]:
     device = serial_leader(SerialLeaderSettings(port=peer.port), Context("leader"))
     device.open()
     try:
-        assert peer.hear() == "hello labseq 1 deadline=10"
+        assert peer.hear() == "hello labseq 2 deadline=10"
         yield device, peer
     finally:
         device.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import signal
 import socket
 import subprocess
@@ -11,11 +13,12 @@ from typing import Any
 
 import pytest
 from labseq_follow.leader import LeaderDevice, serial_leader
+from labseq_follow.links import MAX_NEWCOMERS
 from labseq_follow.settings import SerialLeaderSettings
 
-from labseq.plugin import Context, DeviceError
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError
 
-from .labseq_follow_rig import PtyPeer, TcpPeer, led, listening
+from .labseq_follow_rig import PtyPeer, TcpPeer, led, listening, token_file
 
 on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
 
@@ -62,6 +65,75 @@ def reconnect(device: LeaderDevice) -> TcpPeer:
         if peer.hear().startswith("hello"):
             return peer
         peer.leave()
+
+
+POST = (
+    "POST /go HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://example.org\r\n"
+    "Content-Type: text/plain\r\n\r\ngo\nhello\ngo\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("sent", "quoted"),
+    [
+        (POST, r"its first line is 'POST /go HTTP/1.1\r'"),
+        ("go\n", "its first line is 'go'"),
+        ("hello\ngo\n", "its first line is 'hello'"),
+        (f"hello {'0' * 32}\ngo\n", "its first line is 'hello 0"),
+        ("x" * 500, "its first line is 'xxx"),
+    ],
+    ids=["web page", "go", "no token", "wrong token", "no end"],
+)
+def test_without_the_token_nothing_starts(sent: str, quoted: str) -> None:
+    with listening() as device:
+        stranger = TcpPeer(device.describe()["address"], token="")
+        stranger.send(sent.encode())
+        assert stranger.hear() == "error the first line must be 'hello' and the token"
+        assert stranger.hear() == ""
+        stranger.leave()
+        peer = reconnect(device)
+        assert peer.ask("state?") == "state idle"
+        with pytest.raises(DeviceTimeoutError):
+            device.wait_for("go", 0.01)
+        assert quoted in log(device)
+        peer.leave()
+
+
+def test_200_silent_connections_neither_lead_nor_keep_the_leader_out() -> None:
+    with listening() as device:
+        strangers = [TcpPeer(device.describe()["address"], token="") for _ in range(200)]
+        peer = reconnect(device)
+        peer.say("go")
+        assert device.wait_for("go", 20.0) == ""
+        assert peer.hear() == "busy"
+        link: Any = device._link
+        assert len(link._newcomers) <= MAX_NEWCOMERS
+        for stranger in strangers:
+            stranger.leave()
+        peer.leave()
+        assert len(device.new_events()) < 20
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes of files")
+def test_the_token_is_made_for_this_user_alone_and_one_that_others_can_read_is_refused() -> None:
+    with listening() as device:
+        assert device.describe()["token_file"] == str(token_file())
+        assert token_file().stat().st_mode & 0o777 == 0o600
+    token_file().chmod(0o644)
+    hint = re.escape(f"other users can read the token in {token_file()}; run 'chmod 600 {token_file()}'")
+    with pytest.raises(DeviceError, match=hint), listening():
+        pass
+    token_file().chmod(0o600)
+    token_file().write_text("short")
+    with (
+        pytest.raises(DeviceError, match="holds no token; expected 16 to 100 letters"),
+        listening(),
+    ):
+        pass
+    token_file().unlink()
+    os.mkfifo(token_file())
+    with pytest.raises(DeviceError, match="cannot be read: it is not an ordinary file"), listening():
+        pass
 
 
 def test_a_second_leader_is_turned_away_with_a_line_that_says_so() -> None:
