@@ -18,11 +18,12 @@ from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
-from labseq.roles import RunObserver, Step, StepContext, offers
+from labseq.roles import Hardware, RunObserver, Step, StepContext, offers
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import RunningShot, Stages
+from labseq.watchdog import Watchdog
 
 
 class State(Enum):
@@ -79,21 +80,32 @@ class StateTable:
             self._changed(state)
 
 
-def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Collection[str]) -> None:
+def open_devices(
+    lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Collection[str], watchdog: Watchdog
+) -> None:
     """Open the simulation and the devices of these names; then wait for those that need time.
 
-    Static tweezers among them are turned on.
+    Static tweezers among them are turned on. The watchdog learns how each is switched off.
 
     Raises:
         LabseqError: One of them fails, or the run is asked to stop.
     """
     timeout_s = lab.timeouts.call_s
-    simulation = () if lab.simulation is None else (("simulation", lab.simulation),)
-    for name, part in (*simulation, *lab.hardware()):
+    if lab.simulation is not None and "simulation" in names:
+        guard.call_despite_stop("simulation", timeout_s, method_of(lab.simulation, "open"))
+    order = {name: n for n, (name, _) in enumerate(lab.safe_order())}
+    for name, part in lab.hardware():
         if name in names:
             stop.check()
+            if has_emergency(part):
+                watchdog.start()
             # A slow open() must end first: its last actions would undo the safe state.
             guard.call_despite_stop(name, timeout_s, method_of(part, "open"))
+            emergency = guard.call(name, timeout_s, part.emergency) if has_emergency(part) else None
+            if emergency is not None:
+                watchdog.add(name, order[name], emergency.script, dict(emergency.arguments))
+    for text in watchdog.notes():
+        emit("warning", {"text": text})
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
@@ -104,6 +116,11 @@ def open_devices(lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Coll
         if longest_s > 0:
             emit("settling", {"device": name, "timeout_s": longest_s})
             guard.call(name, longest_s + DRIVER_MARGIN_S, device.settle)
+
+
+def has_emergency(device: Hardware) -> bool:
+    """Whether another process can switch a device off."""
+    return getattr(type(device), "emergency", Hardware.emergency) is not Hardware.emergency
 
 
 def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
@@ -189,6 +206,7 @@ class Sequencer:
         seed: The run's seed.
         policy: Reactions to failures and exceeded budgets.
         parameters: Settings that differ from the files, recorded with each shot: address -> value.
+        watchdog: Switches the outputs off if this process dies or hangs; by default one without a log.
 
     Raises:
         LabseqError: A step fails to lay out its timeline.
@@ -205,8 +223,10 @@ class Sequencer:
         seed: int,
         policy: RunPolicy = RunPolicy(),  # noqa: B008 - frozen
         parameters: Mapping[str, Any] | None = None,
+        watchdog: Watchdog | None = None,
     ) -> None:
         self.lab = lab
+        self._watchdog = watchdog or Watchdog()
         self.guard = Guard(stop)
         self._steps = steps
         self._stop = stop
@@ -227,7 +247,7 @@ class Sequencer:
     def open(self) -> None:
         """Open the simulation, then each device, and turn the static tweezers on."""
         self._states.to(State.OPENING)
-        open_devices(self.lab, self.guard, self._stop, self._emit, {"simulation", *dict(self.lab.hardware())})
+        self._open(self.lab, {"simulation", *dict(self.lab.hardware())})
         self._states.to(State.IDLE)
 
     def change(
@@ -252,11 +272,15 @@ class Sequencer:
         if reopened:
             self._states.to(State.REOPENING)
             close_devices(self.lab, self.guard, reopened)
+            self._watchdog.forget(reopened)
         self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
         if reopened:
-            open_devices(lab, self.guard, self._stop, self._emit, reopened)
+            self._open(lab, reopened)
             self._states.to(State.IDLE)
         self._timelines = plan_timelines(self.lab, self.guard, self._steps)
+
+    def _open(self, lab: Lab, names: Collection[str]) -> None:
+        open_devices(lab, self.guard, self._stop, self._emit, names, self._watchdog)
 
     def run(self, shot_indices: Sequence[int]) -> dict[int, str]:
         """Take the shots, and repeat those that fail, as the policy says.
@@ -291,6 +315,8 @@ class Sequencer:
             self._states.to(State.CLOSING, announce=False)
             with self._stop.held():
                 outcome = close_all(self.lab, self.guard)
+            self._watchdog.forget(name for name in outcome if name not in self._unsafe)
+            self._watchdog.end()
             self._announce(State.CLOSING)
             self._report("closed", outcome)
             self.guard.end()
@@ -310,6 +336,8 @@ class Sequencer:
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
         """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
         self._states.to(State.SHOT)
+        for text in self._watchdog.notes():
+            self._emit("warning", {"text": text})
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
         shot = RunningShot(self.lab, self.guard, record, self._emit)

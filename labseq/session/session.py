@@ -33,6 +33,7 @@ from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import lock_devices, make_safe_after_crash
 from labseq.session.scan import Point
 from labseq.session.scan_run import scan_run_of
+from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
     from labseq.session.resume import ResumableRun
@@ -256,6 +257,7 @@ class Session:
             seed=record.seed,
             policy=self.assembly.policy,
             parameters={**changes, **first.parameters},
+            watchdog=Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG),
         )
         mark_active(roots, self._profile_key, writer.run_dir)
         self._observers.event("run_starting", about)

@@ -1,0 +1,395 @@
+"""The watchdog: a small process that switches the outputs off when the run that uses them dies or hangs.
+
+A run starts it before it opens its devices, tells it how each is switched off (``Emergency``), and sends a
+heartbeat. The watchdog needs the standard library alone: it must start fast, stay small, and work when
+nothing else does. Messages are lines of JSON on its standard input; an empty line is a heartbeat; the end
+of the input without ``end`` is the death of the run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any, Final
+
+WATCHDOG_LOG: Final = "watchdog.jsonl"
+"""Name of its log in the folder of a run."""
+BEAT_S: Final = 0.05
+"""Interval between two heartbeats, and between two looks of the watchdog."""
+HUNG_S: Final = 0.6
+"""A run without a heartbeat for so long hangs; no call of a run holds the interpreter nearly as long."""
+DISK_S: Final = 10.0
+"""The same while one of its threads waits for a disk, or for memory that was swapped out."""
+TERM_S: Final = 0.1
+"""How long a run that hangs may take to end after SIGTERM; then comes SIGKILL."""
+NEXT_S: Final = 0.05
+"""How long the switching off of a device delays that of the next one."""
+TRY_AGAIN_S: Final = 5.0
+"""How long switching off is tried again if it fails: a dying process may hold the device a little longer."""
+HANGS_S: Final = 1.0
+"""How long after that it counts as hanging."""
+ANSWER_S: Final = 5.0
+"""How long a run waits for an answer of the watchdog."""
+END_S: Final = 5.0
+"""How long a run waits for the end of the watchdog."""
+MAX_TEXT: Final = 500
+"""Length at which texts of errors are cut."""
+
+
+def main() -> None:
+    """Run the watchdog: lines on standard input, one answer for each device on standard output."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGPIPE"):
+        if (number := getattr(signal, name, None)) is not None:
+            signal.signal(number, signal.SIG_IGN)
+    _take_precedence()
+    _Process().watch()
+    os._exit(0)  # its threads may still wait for a device or for the run
+
+
+def _take_precedence() -> None:
+    """Real-time priority, memory that is not swapped out, and last to be ended for want of it; if allowed."""
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("-1000", encoding="ascii")
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            libc = ctypes.CDLL(None)
+            libc.mlockall(1 | 2 | 4)  # current, future, on fault
+            libc.prctl(15, b"labseq-watchdog", 0, 0, 0)  # the name in `ps` and `top`
+
+
+class _Device:
+    """A device, and how it is switched off."""
+
+    def __init__(self, order: int, script: str, arguments: dict[str, Any]) -> None:
+        self.order = order
+        self._arguments = arguments
+        name = f"labseq_emergency_{order}"
+        spec = importlib.util.spec_from_file_location(name, script)
+        if spec is None or spec.loader is None:
+            raise ImportError(f"{script} is no Python file")
+        self._module = sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(self._module)
+        self._off = self._module.off
+        if prepare := getattr(self._module, "prepare", None):
+            prepare(**arguments)
+
+    def off(self, report: Callable[[str, str], None]) -> None:
+        """Switch the device off, and try again for a while if that fails."""
+        deadline = time.monotonic() + TRY_AGAIN_S
+        while True:
+            try:
+                done = self._off(**self._arguments)
+                return report(str(done), "")
+            except BaseException as error:  # noqa: BLE001 - whatever it raises, it is tried again
+                if time.monotonic() > deadline:
+                    return report("", error_text(error))
+            time.sleep(NEXT_S)
+
+
+class _Process:
+    """The watchdog's own process."""
+
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._devices: dict[str, _Device] = {}
+        self._log: Path | None = None
+        self._what = "the run"
+        self._parent = os.getppid()
+        self._beat_s = time.monotonic()
+        self._cpu_s = -1.0
+
+    def watch(self) -> None:
+        """Watch until the run ends, dies or hangs."""
+        threading.Thread(target=self._read, daemon=True).start()
+        looked_s = time.monotonic()
+        while True:
+            try:
+                line = self._lines.get(timeout=BEAT_S)
+            except queue.Empty:
+                line = b""
+            else:
+                self._beat_s = time.monotonic()
+            if line is None or self._is_orphan():
+                return self._switch_off("died", time.monotonic())
+            if line.strip() and not self._obey(json.loads(line)):
+                return None
+            now_s = time.monotonic()
+            if now_s - looked_s > 2 * BEAT_S:  # the computer stood still, and so did the run
+                self._beat_s += now_s - looked_s - BEAT_S
+            looked_s = now_s
+            if now_s - self._beat_s > HUNG_S and self._hangs(now_s - self._beat_s):
+                self._end_run()
+                return self._switch_off("hung", self._beat_s)
+
+    def _read(self) -> None:
+        with suppress(OSError):
+            for line in sys.stdin.buffer:
+                self._lines.put(line)
+        self._lines.put(None)
+
+    def _is_orphan(self) -> bool:
+        """Whether the run is gone although another process still holds its end of the pipe."""
+        return os.name != "nt" and os.getppid() != self._parent
+
+    def _obey(self, order: dict[str, Any]) -> bool:
+        """Carry out a message; returns whether to go on."""
+        if "run" in order:
+            self._what, self._log = order["run"], Path(order["log"]) if order["log"] else None
+            sys.path += [path for path in order["path"] if path not in sys.path]
+            self._answer("")
+        elif "device" in order:
+            try:
+                device = _Device(order["order"], order["script"], order["arguments"])
+            except BaseException as error:  # noqa: BLE001 - the scripts of drivers may raise anything
+                self._answer(error_text(error))
+            else:
+                self._devices[order["device"]] = device
+                self._answer("")
+        elif "forget" in order:
+            self._devices.pop(order["forget"], None)
+        elif self._devices:  # the end, and some devices could not be made safe
+            self._switch_off("could not make its devices safe", time.monotonic())
+            return False
+        else:
+            return False
+        return True
+
+    def _answer(self, failure: str) -> None:
+        with suppress(OSError):
+            os.write(1, json.dumps({"failure": failure}).encode() + b"\n")
+
+    def _hangs(self, silent_s: float) -> bool:
+        """Whether a run without a heartbeat hangs, and does not just wait for a disk or for the processor."""
+        states, cpu_s = _threads(self._parent)
+        if "D" in states and "T" not in states:
+            return silent_s > DISK_S
+        starved = "R" in states and cpu_s == self._cpu_s
+        self._cpu_s = cpu_s
+        return not starved
+
+    def _end_run(self) -> None:
+        """End a run that hangs, so that its ports and cards are free."""
+        for name, wait_s in (("SIGTERM", TERM_S), ("SIGKILL", 2 * TERM_S)):
+            if self._is_orphan():
+                return
+            with suppress(OSError):
+                os.kill(self._parent, getattr(signal, name, signal.SIGTERM))
+            deadline = time.monotonic() + wait_s
+            while time.monotonic() < deadline and not self._is_orphan():
+                time.sleep(0.002)
+
+    def _switch_off(self, cause: str, since_s: float) -> None:
+        """Switch every device off, in the order of the safe state; none waits long for another."""
+        threads: dict[str, threading.Thread] = {}
+        for name, device in sorted(self._devices.items(), key=lambda item: item[1].order):
+
+            def report(done: str, failure: str, name: str = name) -> None:
+                self._report(cause, name, done, failure, time.monotonic() - since_s)
+
+            threads[name] = threading.Thread(target=device.off, args=[report], daemon=True)
+            threads[name].start()
+            threads[name].join(NEXT_S)
+        deadline = time.monotonic() + TRY_AGAIN_S + HANGS_S
+        for name, thread in threads.items():
+            thread.join(max(0.0, deadline - time.monotonic()))
+            if thread.is_alive():
+                self._report(cause, name, "", "switching it off hangs", time.monotonic() - since_s)
+
+    def _report(self, cause: str, name: str, done: str, failure: str, after_s: float) -> None:
+        """Write down what was done, first to the log, then for whoever looks at the terminal."""
+        row = {
+            "t_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "cause": cause,
+            "device": name,
+            "ok": not failure,
+            "text": (failure or done)[:MAX_TEXT],
+            "after_s": round(after_s, 4),
+        }
+        if self._log is not None:
+            with suppress(OSError), self._log.open("ab", buffering=0) as file:
+                file.write(json.dumps(row).encode() + b"\n")
+        what = (
+            f"is NOT off: {row['text']}" if failure else f"is off after {1e3 * after_s:.0f} ms: {row['text']}"
+        )
+        with suppress(OSError):
+            os.write(2, f"labseq-watchdog: {self._what} {cause}; {name} {what}\n".encode("utf-8", "replace"))
+
+
+def _threads(pid: int) -> tuple[str, float]:
+    """States of a process's threads, one letter each, and its processor time; Linux only, else ("", -1)."""
+    states, ticks = "", 0
+    with suppress(OSError, ValueError, IndexError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            text = (thread / "stat").read_text(encoding="utf-8", errors="replace")
+            fields = text.rpartition(")")[2].split()
+            states += fields[0].upper()
+            ticks += int(fields[11]) + int(fields[12])
+        return states, ticks / 100
+    return "", -1.0
+
+
+def error_text(error: BaseException) -> str:
+    """An exception as one short line, even if its own text cannot be had."""
+    try:
+        text = " ".join(str(error)[: 2 * MAX_TEXT].split())
+    except BaseException:  # noqa: BLE001 - a broken __str__
+        text = ""
+    return f"{type(error).__name__}: {text}"[:MAX_TEXT] if text else type(error).__name__
+
+
+class Watchdog:
+    """The run's side: starts the watchdog, tells it of the devices, and sends the heartbeat.
+
+    A watchdog that dies is started again. Nothing here raises: a run without a watchdog is a run
+    with a warning.
+
+    Args:
+        what: What the watchdog calls the run in its messages.
+        log: File to which it adds a line for each device that it switches off; None for none.
+    """
+
+    def __init__(self, what: str = "the run", log: Path | None = None) -> None:
+        self._about = {"run": what, "log": None if log is None else str(log.absolute()), "path": sys.path}
+        self._devices: dict[str, dict[str, Any]] = {}
+        self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._sending = threading.RLock()
+        self._ended = threading.Event()
+
+    def start(self) -> None:
+        """Start it, unless it runs already; returns once it is ready."""
+        if self._process is None:
+            self._launch()
+            threading.Thread(target=self._beat, name="labseq heartbeat", daemon=True).start()
+
+    def add(self, name: str, order: int, script: Path, arguments: object) -> None:
+        """Have it switch a device off after the death of this process.
+
+        Args:
+            name: The device.
+            order: Its place in the order of the safe state.
+            script: See ``Emergency``.
+            arguments: See ``Emergency``.
+        """
+        self.start()
+        device = {"device": name, "order": order, "script": str(script), "arguments": arguments}
+        with self._sending:
+            self._devices[name] = device
+        self._tell(device)  # without the lock: heartbeats go on while it loads libraries
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Leave devices alone from now on: they are safe and closed."""
+        with self._sending:
+            for name in names:
+                if self._devices.pop(name, None) is not None:
+                    self._send({"forget": name})
+
+    def end(self) -> None:
+        """End it; it then switches off the devices that it was not told to forget. Legal at any time."""
+        self._ended.set()
+        with self._sending:
+            process, self._process = self._process, None
+            if process is not None and process.stdin is not None:
+                with suppress(OSError, ValueError):
+                    process.stdin.write(b'{"end": true}\n')
+                with suppress(OSError, ValueError):
+                    process.stdin.close()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(END_S)
+
+    def notes(self) -> list[str]:
+        """What went wrong since the last call, for the user."""
+        notes: list[str] = []
+        with suppress(queue.Empty):
+            while True:
+                notes.append(self._notes.get_nowait())
+        return notes
+
+    def _launch(self) -> None:
+        """Start the process, and tell it all it must know."""
+        flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(
+            subprocess, "CREATE_NEW_PROCESS_GROUP", 0
+        )
+        self._answers = queue.SimpleQueue()
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - this file, no shell
+                [sys.executable, "-I", "-S", __file__],
+                bufsize=0,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C and a lost terminal are not for it
+                creationflags=flags,
+            )
+        except OSError as error:
+            self._note(f"cannot be started: {error.strerror or error}")
+            return
+        threading.Thread(target=self._hear, args=[self._process.stdout, self._answers], daemon=True).start()
+        for message in (self._about, *self._devices.values()):
+            self._tell(message)
+
+    def _hear(self, answers: IO[bytes], into: queue.SimpleQueue[bytes]) -> None:
+        with answers, suppress(OSError, ValueError):
+            for line in answers:
+                into.put(line)
+        into.put(b"")
+
+    def _tell(self, message: dict[str, Any]) -> None:
+        """Send a message that is answered, and note the failure that the answer names."""
+        try:
+            if not self._send(message):
+                return
+            answer = self._answers.get(timeout=ANSWER_S)
+            failure = json.loads(answer)["failure"] if answer else "it ended"
+        except queue.Empty:
+            failure = "it does not answer"
+        except (TypeError, ValueError) as error:
+            failure = error_text(error)
+        if failure:
+            name = message.get("device")
+            self._note(f"cannot switch off '{name}': {failure}" if name else failure)
+
+    def _send(self, message: dict[str, Any] | None) -> bool:
+        """Send a message, or a heartbeat; returns whether it could be sent."""
+        line = b"\n" if message is None else json.dumps(message).encode() + b"\n"
+        with self._sending, suppress(OSError, ValueError):
+            if self._process is not None and self._process.stdin is not None:
+                self._process.stdin.write(line)
+                return True
+        return False
+
+    def _beat(self) -> None:
+        """Send heartbeats; start the watchdog again if it is gone."""
+        n_starts = 1
+        while not self._ended.wait(BEAT_S):
+            if self._send(None) or self._ended.is_set():
+                continue
+            if n_starts == 3:
+                self._note("has ended three times and is not started again")
+                return
+            n_starts += 1
+            self._note("has ended, and is started again")
+            with self._sending:
+                if not self._ended.is_set():
+                    self._launch()
+
+    def _note(self, text: str) -> None:
+        self._notes.put(f"the watchdog that switches the outputs off if labseq dies {text}")
+
+
+if __name__ == "__main__":
+    main()

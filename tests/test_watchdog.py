@@ -1,0 +1,188 @@
+"""The watchdog: outputs off after any death or hang of their process, and never without one."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from labseq import watchdog
+from labseq.watchdog import Watchdog
+
+EMERGENCY = """
+import pathlib
+
+def prepare(name, then=""):
+    if then == "missing":
+        raise OSError("no such library")
+
+def off(name, then=""):
+    if then == "fails":
+        class Broken(BaseException):
+            def __str__(self):
+                raise ValueError
+        raise Broken
+    if then == "hangs":
+        import time
+        time.sleep(60)
+    pathlib.Path(name).unlink(missing_ok=True)
+    return "shutter closed"
+"""
+
+RUN = """
+import ctypes, os, signal, sys, threading, time
+from pathlib import Path
+from labseq.watchdog import Watchdog
+
+folder = Path(sys.argv[1])
+dog = Watchdog("the run", folder / "watchdog.jsonl")
+for order, name in (2, "second"), (1, "first"):
+    (folder / name).touch()
+    dog.add(name, order, folder / "emergency.py", {"name": str(folder / name)})
+print("on", *dog.notes(), flush=True)
+"""
+SAFE = "dog.forget(['first', 'second']); dog.end()"
+
+ENDS = {  # what the process does -> the cause that the watchdog names
+    "kill -9": ("os.kill(os.getpid(), signal.SIGKILL)", "died"),
+    "_exit": ("os._exit(0)", "died"),
+    "crash in C": ("ctypes.string_at(0)", "died"),
+    "an error": ("raise ValueError", "died"),
+    "fork": ("if os.fork(): os.kill(os.getpid(), signal.SIGKILL)\ntime.sleep(1)", "died"),
+    "stopped": ("os.kill(os.getpid(), signal.SIGSTOP)", "hung"),
+    "a C call": ("ctypes.PyDLL(None).sleep(30)", "hung"),
+    "a busy C call": ("import re; re.match('(a+)+$', 'a' * 40 + 'b')", "hung"),
+    "unsafe": ("dog.forget(['other']); dog.end()", "could not make its devices safe"),
+}
+
+
+def start(folder, then):
+    (folder / "emergency.py").write_text(EMERGENCY, encoding="utf-8")
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN + then, str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def rows(folder):
+    file = folder / "watchdog.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def await_rows(folder, n):
+    deadline = time.monotonic() + 20.0
+    while len(rows(folder)) < n and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return rows(folder)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ends in the POSIX way")
+@pytest.mark.parametrize("end", ENDS)
+def test_outputs_go_off_in_order_whatever_ends_the_process(tmp_path, end):
+    then, cause = ENDS[end]
+    process = start(tmp_path, then)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "on\n"
+    found = await_rows(tmp_path, 2)
+    assert [(row["device"], row["cause"], row["ok"]) for row in found] == [
+        ("first", cause, True),
+        ("second", cause, True),
+    ]
+    assert {row["text"] for row in found} == {"shutter closed"}
+    assert not (tmp_path / "first").exists()
+    _, err = process.communicate(timeout=20.0)
+    assert f"labseq-watchdog: the run {cause}; second is off after" in err
+
+
+def test_nothing_is_switched_off_without_need(tmp_path):
+    busy = "[sum(range(1000)) for _ in range(30000)]; import gc; gc.collect(); time.sleep(0.8)\n"
+    process = start(tmp_path, busy + SAFE)
+    process.communicate(timeout=60.0)  # until the watchdog, too, has closed its end
+    assert rows(tmp_path) == []
+    assert (tmp_path / "first").exists()
+
+
+def test_a_device_that_cannot_be_switched_off_does_not_delay_the_others(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(watchdog, "TRY_AGAIN_S", 0.2)
+    monkeypatch.setattr(watchdog, "HANGS_S", 0.1)
+    script = tmp_path / "emergency.py"
+    script.write_text(EMERGENCY, encoding="utf-8")
+    process = watchdog._Process()
+    process._obey({"run": "the run", "log": str(tmp_path / "watchdog.jsonl"), "path": []})
+    for order, (name, then) in enumerate(
+        {"fails": "fails", "hangs": "hangs", "third": "", "lost": "missing"}.items()
+    ):
+        arguments = {"name": str(tmp_path / name), "then": then}
+        process._obey({"device": name, "order": order, "script": str(script), "arguments": arguments})
+    process._obey({"device": "typo", "order": 9, "script": str(tmp_path / "typo.py"), "arguments": {}})
+    failures = [json.loads(line)["failure"] for line in capfd.readouterr().out.splitlines()]
+    assert failures[:5] == ["", "", "", "", "OSError: no such library"]
+    assert failures[5].startswith("FileNotFoundError")
+    process._switch_off("died", time.monotonic())
+    first, *failed = rows(tmp_path)
+    assert (first["device"], first["ok"]) == ("third", True)
+    assert {row["device"]: row["text"] for row in failed} == {
+        "fails": "Broken",
+        "hangs": "switching it off hangs",
+    }
+    assert "fails is NOT off: Broken" in capfd.readouterr().err
+
+
+def test_a_watchdog_that_dies_is_started_again(tmp_path):
+    again = """
+os.kill(dog._process.pid, signal.SIGKILL)
+while not (notes := dog.notes()):
+    time.sleep(0.01)
+print(*notes, flush=True)
+while dog._process.poll() is not None:
+    time.sleep(0.01)
+time.sleep(0.5)
+os._exit(0)
+"""
+    process = start(tmp_path, again)
+    out, _ = process.communicate(timeout=30.0)
+    assert "the watchdog that switches the outputs off if labseq dies has ended, and is started again" in out
+    assert [row["device"] for row in await_rows(tmp_path, 2)] == ["first", "second"]
+
+
+@pytest.mark.parametrize(
+    ("states", "cpu_s", "silent_s", "hangs"),
+    [
+        ("SS", 1.0, 1.0, True),
+        ("TT", 1.0, 1.0, True),
+        ("RS", 2.0, 1.0, True),  # a C call that computes
+        ("RS", 1.0, 1.0, False),  # it wants to run, and does not get the processor
+        ("DS", 1.0, 5.0, False),  # it waits for a disk
+        ("DS", 1.0, 11.0, True),
+        ("DT", 1.0, 1.0, True),
+        ("", -1.0, 1.0, True),  # not on this system
+    ],
+)
+def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, cpu_s, silent_s, hangs):
+    process = watchdog._Process()
+    process._cpu_s = 1.0
+    monkeypatch.setattr(watchdog, "_threads", lambda pid: (states, cpu_s))
+    assert process._hangs(silent_s) is hangs
+
+
+def test_without_a_watchdog_there_is_a_warning(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    dog = Watchdog()
+    dog.add("lines", 0, Path("emergency.py"), {})
+    assert any("cannot be started: No such file" in note for note in dog.notes())
+    dog.end()
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="memory as Linux reports it")
+def test_the_watchdog_is_small(tmp_path):
+    dog = Watchdog()
+    dog.start()
+    assert dog._process is not None
+    text = Path(f"/proc/{dog._process.pid}/status").read_text()
+    resident = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS"))
+    dog.end()
+    assert resident < 20_000  # kB
