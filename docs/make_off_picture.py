@@ -63,6 +63,8 @@ sys.stdin.read()
 OUTSIDE: Final = """
 import json, runpy, sys, threading
 scripts = [(runpy.run_path(script), arguments) for script, arguments in json.loads(sys.stdin.readline())]
+for script, arguments in scripts:
+    script.get("prepare", dict)(**arguments)
 print("ready", flush=True)
 sys.stdin.read()
 for script, arguments in scripts:

@@ -62,27 +62,25 @@ class StatusWriter:
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe
-        self._outbox: queue.SimpleQueue[Message | threading.Event] = queue.SimpleQueue()
-        threading.Thread(target=self._write, daemon=True).start()
+        self._outbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
 
     def post(self, message: Message) -> None:
         """Send a message soon."""
         self._outbox.put(message)
 
     def finish(self) -> None:
-        """Wait until all messages were sent; not long, for labseq may be gone."""
-        sent = threading.Event()
-        self._outbox.put(sent)
-        sent.wait(1.0)
+        """Wait until all messages were sent; not long, for labseq may hang, and not if it is gone."""
+        self._outbox.put(None)
+        self._thread.join(1.0)
 
     def _write(self) -> None:
         with contextlib.suppress(OSError):
             while True:
-                message = self._outbox.get()
-                if isinstance(message, threading.Event):
-                    message.set()
-                else:
-                    send(self._pipe, message)
+                if (message := self._outbox.get()) is None:
+                    return
+                send(self._pipe, message)
 
 
 class Streamer:
