@@ -165,12 +165,12 @@ class _Kernel:
         self._call: Callable[..., Any] = self._first_call
         _PENDING[self] = None
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self._call(*args, **kwargs)
+    def __call__(self, *args: Any) -> Any:
+        return self._call(*args)
 
-    def _first_call(self, *args: Any, **kwargs: Any) -> Any:
+    def _first_call(self, *args: Any) -> Any:
         self._call = self.function if _is_interpreted() else self.dispatcher(for_python=True)
-        return self._call(*args, **kwargs)
+        return self._call(*args)
 
     def __reduce__(self) -> str:
         return self.function.__qualname__

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import re
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,6 +41,10 @@ _NOT_NAMES: Final = {"true", "false", "null"}
 _SETTINGS: Final = ("labseq.settings", "Settings")
 
 Factory = Callable[..., Any]
+Offered = Factory | str
+Model = type[Any] | str | None
+Call = Callable[["Owner", str, Callable[[], Any]], Any]
+"""How code of a plugin is run: ``call(owner, what, work)``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +84,10 @@ class Entry:
         name: The name that a sequence or profile uses.
         factory: ``factory(settings, context)``; steps: ``factory(settings)``;
             patterns: ``factory(settings, grid)``; scanners: ``factory(settings, space)``.
+            An installed plugin may give the place of factory, settings and ``simulated`` as text,
+            ``"package.module:Name"``; they are imported when something first needs them.
         settings_model: pydantic model of its settings, a subclass of
-            ``labseq.plugin.Settings``; None if it takes none.
+            ``labseq.plugin.Settings``, or its place; None if it takes none.
         origin: Name of the plugin that registered it.
         virtual_time: Whether it keeps to the session's clock only, so that a run
             need not wait in real time.
@@ -99,6 +106,11 @@ class Entry:
     simulated: Mapping[str, Any] | None = None
     owner: Owner = field(default=Owner("labseq"), compare=False, repr=False)
 
+    @property
+    def is_place(self) -> bool:
+        """Whether its plugin gave places, and nothing was imported yet."""
+        return any(isinstance(one, str) and ":" in one for one in (self.factory, self.settings_model))
+
 
 class Registry:
     """Filled by the plugins' ``labseq_register``; read by the session.
@@ -110,7 +122,8 @@ class Registry:
         contested: Kind and name that more than one plugin offers -> the error.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, call: Call = lambda _owner, _what, work: work()) -> None:
+        self._call = call
         self.contested: dict[tuple[str, str], PluginLoadError] = {}
         self._entries: dict[tuple[str, str], Entry] = {}
         self._owner = Owner("labseq")
@@ -122,14 +135,13 @@ class Registry:
 
         Nothing of the plugin stays if the block fails.
         """
-        own = Registry()
+        own = Registry(self._call)
         own._owner, own._entries, own.contested = owner, self._entries, self.contested
         try:
             yield own
         except BaseException:
             own._is_closed = True
-            for entry in self.entries(owner.name):
-                del self._entries[entry.kind, entry.name]
+            self.forget(owner.name)
             raise
         finally:
             own._is_closed = True
@@ -138,11 +150,11 @@ class Registry:
         self,
         kind: str,
         name: str,
-        factory: Factory,
-        settings_model: type[Any] | None,
+        factory: Offered,
+        settings_model: Model,
         *,
         virtual_time: bool = False,
-        simulated: Mapping[str, Any] | None = None,
+        simulated: Mapping[str, Any] | str | None = None,
     ) -> None:
         fault = self._owner.fault
         if not isinstance(name, str) or not name:  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -154,8 +166,6 @@ class Registry:
         if self._is_closed:
             text = f"it registers {kind} '{name}' after its labseq_register has returned"
             raise fault(f"{text}; register everything there")
-        if not callable(factory):
-            raise fault(f"the factory of {kind} '{name}' cannot be called")
         taken = self._entries.get((kind, name))
         if taken is not None:
             text = f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them"
@@ -163,73 +173,79 @@ class Registry:
             if taken.origin != self._owner.name:
                 self.contested[kind, name] = error
             raise error
-        if settings_model is not None and not _is_settings(settings_model):
-            text = f"the settings model of {kind} '{name}' is {settings_model!r:.200}"
-            raise fault(f"{text}; expected a subclass of labseq.plugin.Settings")
-        if simulated is not None:
-            known = {} if settings_model is None else settings_model.model_fields
-            if not isinstance(simulated, Mapping) or not set(simulated) <= set(known):  # pyright: ignore[reportUnnecessaryIsInstance]
-                text = f"'simulated' of {kind} '{name}' is {simulated!r:.200}"
-                raise fault(f"{text}; expected settings of its model")
-        self._entries[kind, name] = Entry(
-            kind, name, factory, settings_model, self._owner.name, virtual_time, simulated, self._owner
-        )
+        parts: tuple[Any, Any, Any] = factory, settings_model, simulated
+        entry = Entry(kind, name, *parts[:2], self._owner.name, virtual_time, parts[2], self._owner)
+        if not entry.is_place:
+            _check(entry)
+        self._entries[kind, name] = entry
 
-    def planner(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def _imported(self, key: tuple[str, str]) -> Entry:
+        """An entry that is given by places no longer."""
+        entry = self._entries[key]
+        if entry.is_place:
+            parts = (entry.factory, entry.settings_model, entry.simulated)
+            what = f"the import of {entry.kind} '{entry.name}'"
+            factory, model, simulated = self._call(entry.owner, what, lambda: [*map(_import_place, parts)])
+            simulated = simulated() if callable(simulated) else simulated
+            entry = replace(entry, factory=factory, settings_model=model, simulated=simulated)
+            _check(entry)
+            self._entries[key] = entry
+        return entry
+
+    def forget(self, origin: str) -> None:
+        """Remove all that a plugin offers."""
+        for key in self.offers(origin):
+            del self._entries[key]
+
+    def planner(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer a planner: ``factory(settings, context) -> Planner``."""
         self._add("planner", name, factory, settings_model)
 
-    def detector(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def detector(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer a detector: ``factory(settings, context) -> Detector``."""
         self._add("detector", name, factory, settings_model)
 
-    def step(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def step(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer a step of a shot: ``factory(settings) -> Step``."""
         self._add("step", name, factory, settings_model)
 
-    def pattern(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def pattern(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer a target pattern: ``factory(settings, grid) -> TargetPattern``."""
         self._add("pattern", name, factory, settings_model)
 
-    def simulation(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def simulation(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer a simulation: ``factory(settings, context) -> Simulation``."""
         self._add("simulation", name, factory, settings_model, virtual_time=True)
 
-    def scanner(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def scanner(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer a scanner for adaptive scans: ``factory(settings, space) -> Scanner``."""
         self._add("scanner", name, factory, settings_model)
 
-    def analysis(self, name: str, factory: Factory, settings_model: type[Any] | None = None) -> None:
+    def analysis(self, name: str, factory: Offered, settings_model: Model = None) -> None:
         """Offer an analysis of shots: ``factory(settings, context) -> Analysis``."""
         self._add("analysis", name, factory, settings_model)
 
-    def camera(
-        self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any
-    ) -> None:
+    def camera(self, name: str, factory: Offered, settings_model: Model = None, **options: Any) -> None:
         """Offer a camera. Options: ``virtual_time``, ``simulated`` (see :class:`Entry`)."""
         self._add("camera", name, factory, settings_model, **options)
 
     def static_tweezers(
-        self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any
+        self, name: str, factory: Offered, settings_model: Model = None, **options: Any
     ) -> None:
         """Offer static tweezers. Options as for :meth:`camera`."""
         self._add("static_tweezers", name, factory, settings_model, **options)
 
     def mobile_tweezers(
-        self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any
+        self, name: str, factory: Offered, settings_model: Model = None, **options: Any
     ) -> None:
         """Offer mobile tweezers. Options as for :meth:`camera`."""
         self._add("mobile_tweezers", name, factory, settings_model, **options)
 
-    def device(
-        self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any
-    ) -> None:
+    def device(self, name: str, factory: Offered, settings_model: Model = None, **options: Any) -> None:
         """Offer any other instrument. Options as for :meth:`camera`."""
         self._add("device", name, factory, settings_model, **options)
 
-    def lines(
-        self, name: str, factory: Factory, settings_model: type[Any] | None = None, **options: Any
-    ) -> None:
+    def lines(self, name: str, factory: Offered, settings_model: Model = None, **options: Any) -> None:
         """Offer a timing box that switches lines. Options as for :meth:`camera`."""
         self._add("lines", name, factory, settings_model, **options)
 
@@ -239,26 +255,53 @@ class Registry:
         Raises:
             UnknownPluginError: Nothing of that kind has this name.
         """
-        entry = self._entries.get((kind, name))
-        if entry is None:
+        if (kind, name) not in self._entries:
             known = self.names(kind)
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean '{close[0]}'?" if close else ""
             raise UnknownPluginError(kind, name, known, hint)
-        return entry
+        return self._imported((kind, name))
 
     def find(self, kind: str, name: str) -> Entry | None:
         """Find an entry, or None."""
-        return self._entries.get((kind, name))
+        return self._imported((kind, name)) if (kind, name) in self._entries else None
 
     def names(self, kind: str) -> list[str]:
         """Names of all entries of a kind, sorted."""
         return sorted(name for k, name in self._entries if k == kind)
 
+    def offers(self, origin: str | None = None) -> list[tuple[str, str]]:
+        """Kind and name of all entries, or of those of one plugin, sorted; nothing is imported."""
+        keys = [key for key, entry in self._entries.items() if origin in (None, entry.origin)]
+        return sorted(keys, key=lambda key: (KINDS.index(key[0]), key[1]))
+
     def entries(self, origin: str | None = None) -> list[Entry]:
         """All entries, or those of one plugin, by kind and name."""
-        found = [e for e in self._entries.values() if origin in (None, e.origin)]
-        return sorted(found, key=lambda e: (KINDS.index(e.kind), e.name))
+        return [self._imported(key) for key in self.offers(origin)]
+
+
+def _import_place(given: Any) -> Any:
+    """What ``"package.module:Name"`` names; anything else as it is."""
+    if not isinstance(given, str):
+        return given
+    module, _, name = given.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _check(entry: Entry) -> None:
+    """Raise for a factory, a settings model or simulated settings that cannot be used."""
+    fault, model, simulated = entry.owner.fault, entry.settings_model, entry.simulated
+    label = f"{entry.kind} '{entry.name}'"
+    if not callable(entry.factory):
+        raise fault(f"the factory of {label} cannot be called")
+    if model is not None and not _is_settings(model):
+        text = f"the settings model of {label} is {model!r:.200}"
+        raise fault(f"{text}; expected a subclass of labseq.plugin.Settings")
+    if simulated is not None:
+        known = {} if model is None else model.model_fields
+        if not isinstance(simulated, Mapping) or not set(simulated) <= set(known):  # pyright: ignore[reportUnnecessaryIsInstance]
+            text = f"'simulated' of {label} is {simulated!r:.200}"
+            raise fault(f"{text}; expected settings of its model")
 
 
 def _is_settings(model: object) -> bool:

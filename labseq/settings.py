@@ -53,7 +53,9 @@ class Settings(BaseModel):
         0.02
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False, defer_build=True
+    )
 
 
 class NoSettings(Settings):

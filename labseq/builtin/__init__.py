@@ -13,49 +13,24 @@ LABSEQ_API: Final = _API
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the built-in steps, patterns, detectors and analyses."""
-    from labseq.builtin.analyses import SurvivalAnalysis, SurvivalSettings
-    from labseq.builtin.equalise import EqualiseSettings, EqualiseStep
-    from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
-    from labseq.builtin.probes import (
-        CheckOverlaySettings,
-        CheckOverlayStep,
-        CheckSitesSettings,
-        CheckSitesStep,
-        ProbeSettings,
-        ProbeStep,
-    )
-    from labseq.builtin.rearrange import RearrangeSettings, RearrangeStep
-    from labseq.builtin.steps import (
-        DeviceSettings,
-        DeviceStep,
-        ImageSettings,
-        ImageStep,
-        LoadSettings,
-        LoadStep,
-        RampSettings,
-        RampStep,
-        ReleaseSettings,
-        ReleaseStep,
-        WaitSettings,
-        wait_step,
-    )
-    from labseq.detection.threshold import BlindDetector, ThresholdDetector, ThresholdSettings
-    from labseq.detection.weighted import WeightedDetector, WeightedSettings
-
-    registry.step("load", LoadStep, LoadSettings)
-    registry.step("image", ImageStep, ImageSettings)
-    registry.step("rearrange", RearrangeStep, RearrangeSettings)
-    registry.step("ramp", RampStep, RampSettings)
-    registry.step("release", ReleaseStep, ReleaseSettings)
-    registry.step("probe", ProbeStep, ProbeSettings)
-    registry.step("check_sites", CheckSitesStep, CheckSitesSettings)
-    registry.step("check_overlay", CheckOverlayStep, CheckOverlaySettings)
-    registry.step("equalise", EqualiseStep, EqualiseSettings)
-    registry.step("wait", wait_step, WaitSettings)
-    registry.step("device", DeviceStep, DeviceSettings)
-    registry.pattern("compact", compact, CompactSettings)
-    registry.pattern("bitmap", bitmap, BitmapSettings)
-    registry.detector("threshold", ThresholdDetector, ThresholdSettings)
-    registry.detector("weighted", WeightedDetector, WeightedSettings)
-    registry.detector("blind", BlindDetector)
-    registry.analysis("survival", SurvivalAnalysis, SurvivalSettings)
+    steps, probes, patterns = "labseq.builtin.steps", "labseq.builtin.probes", "labseq.builtin.patterns"
+    rearrange, equalise = "labseq.builtin.rearrange", "labseq.builtin.equalise"
+    threshold, weighted = "labseq.detection.threshold", "labseq.detection.weighted"
+    analyses = "labseq.builtin.analyses"
+    registry.step("load", f"{steps}:LoadStep", f"{steps}:LoadSettings")
+    registry.step("image", f"{steps}:ImageStep", f"{steps}:ImageSettings")
+    registry.step("rearrange", f"{rearrange}:RearrangeStep", f"{rearrange}:RearrangeSettings")
+    registry.step("ramp", f"{steps}:RampStep", f"{steps}:RampSettings")
+    registry.step("release", f"{steps}:ReleaseStep", f"{steps}:ReleaseSettings")
+    registry.step("probe", f"{probes}:ProbeStep", f"{probes}:ProbeSettings")
+    registry.step("check_sites", f"{probes}:CheckSitesStep", f"{probes}:CheckSitesSettings")
+    registry.step("check_overlay", f"{probes}:CheckOverlayStep", f"{probes}:CheckOverlaySettings")
+    registry.step("equalise", f"{equalise}:EqualiseStep", f"{equalise}:EqualiseSettings")
+    registry.step("wait", f"{steps}:wait_step", f"{steps}:WaitSettings")
+    registry.step("device", f"{steps}:DeviceStep", f"{steps}:DeviceSettings")
+    registry.pattern("compact", f"{patterns}:compact", f"{patterns}:CompactSettings")
+    registry.pattern("bitmap", f"{patterns}:bitmap", f"{patterns}:BitmapSettings")
+    registry.detector("threshold", f"{threshold}:ThresholdDetector", f"{threshold}:ThresholdSettings")
+    registry.detector("weighted", f"{weighted}:WeightedDetector", f"{weighted}:WeightedSettings")
+    registry.detector("blind", f"{threshold}:BlindDetector")
+    registry.analysis("survival", f"{analyses}:SurvivalAnalysis", f"{analyses}:SurvivalSettings")

@@ -136,6 +136,7 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
     else:
         document, spec = load_profile(profile, beside=Path())  # the plugins that it names need not exist
         host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load)
+    host.import_all()
     if answer is None:
         say(*plugins_table(host))
     else:
@@ -155,7 +156,7 @@ def plugins_table(host: PluginHost) -> list[str]:
 
 
 def _offers(host: PluginHost, info: PluginInfo) -> list[str]:
-    return [f"{entry.kind}:{entry.name}" for entry in host.registry.entries(info.name)]
+    return [f"{kind}:{name}" for kind, name in host.registry.offers(info.name)]
 
 
 def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:

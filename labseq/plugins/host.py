@@ -176,7 +176,7 @@ class PluginHost:
     """
 
     def __init__(self, max_wait_s: float = LOAD_S) -> None:
-        self.registry = Registry()
+        self.registry = Registry(call_plugin)
         self._patience_s = max_wait_s
         self._used: set[str] = set()
         self._pluggy = pluggy.PluginManager("labseq")
@@ -238,6 +238,15 @@ class PluginHost:
                 raise ConfigError(Problem(what, expected="a folder with plugins")) from error
             for path in paths:
                 self._load_path(path)
+
+    def import_all(self) -> None:
+        """Import all that the plugins offer; each failure is kept for the report."""
+        for info in self.infos:
+            try:
+                self.registry.entries(info.name)
+            except PluginLoadError as error:
+                self.registry.forget(info.name)
+                self._infos[info.name] = replace(info, state="failed", reason=error.reason)
 
     def _load_path(self, path: Path) -> None:
         name = plugin_name(path)

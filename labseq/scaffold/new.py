@@ -233,7 +233,9 @@ def _plugins_of(folder: Path) -> PluginHost:
     if not folder.is_dir():
         raise ConfigError(Problem("there is no such folder", visible(str(folder)), hint="make it first"))
     own = folder / PLUGINS
-    return load_plugins([own] if own.is_dir() else [])
+    host = load_plugins([own] if own.is_dir() else [])
+    host.import_all()
+    return host
 
 
 def read_template(name: str) -> str:

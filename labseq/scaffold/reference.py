@@ -650,6 +650,7 @@ def explain_topic(what: str, program: Any) -> None:
         ConfigError: There is no such thing.
     """
     host = load_plugins()
+    host.import_all()
     left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
     left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
     found = topics(host.registry, program)

@@ -55,7 +55,9 @@ def write_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None)
         raise ConfigError(Problem(what, expected=listing(FILE_KINDS), hint=did_you_mean(kind, FILE_KINDS)))
     if plugins is None:
         plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
-    text = schema_text(kind, load_plugins(plugins).registry)
+    host = load_plugins(plugins)
+    host.import_all()
+    text = schema_text(kind, host.registry)
     if output is None:
         say(text.rstrip())
         return

@@ -8,7 +8,6 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Register the camera ``andor``; in a dry run the simulated camera is used."""
-    from labseq_andor.camera import AndorCamera
-    from labseq_andor.settings import SIMULATED, AndorSettings
-
-    registry.camera("andor", AndorCamera, AndorSettings, simulated={"camera": SIMULATED, "serial": 0})
+    simulated = {"camera": "simulated", "serial": 0}
+    camera, settings = "labseq_andor.camera:AndorCamera", "labseq_andor.settings:AndorSettings"
+    registry.camera("andor", camera, settings, simulated=simulated)

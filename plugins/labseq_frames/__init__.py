@@ -8,6 +8,5 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Register the camera ``frames``; it runs on the session's clock."""
-    from labseq_frames.camera import FramesCamera, FramesSettings
-
-    registry.camera("frames", FramesCamera, FramesSettings, virtual_time=True)
+    camera, settings = "labseq_frames.camera:FramesCamera", "labseq_frames.camera:FramesSettings"
+    registry.camera("frames", camera, settings, virtual_time=True)

@@ -1,9 +1,6 @@
 """The parallel sort-and-compression algorithm of Tian et al., for any target on any grid."""
 
-from __future__ import annotations
-
 from labseq.plugin import Registry, hookimpl
-from labseq_psca.planner import PscaPlanner, PscaSettings
 
 LABSEQ_API = 1
 
@@ -11,4 +8,4 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the planner ``psca``."""
-    registry.planner("psca", PscaPlanner, PscaSettings)
+    registry.planner("psca", "labseq_psca.planner:PscaPlanner", "labseq_psca.planner:PscaSettings")

@@ -8,10 +8,6 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the static tweezers ``soapy``; in a dry run on a simulated radio, if that can be compiled."""
-    from labseq_soapy_sim import can_build
-
-    from labseq_soapy.settings import SoapySettings
-    from labseq_soapy.static_tweezers import SoapyStaticTweezers
-
-    simulated = {"device": "simulated"} if can_build() else None
-    registry.static_tweezers("soapy", SoapyStaticTweezers, SoapySettings, simulated=simulated)
+    module = "labseq_soapy.static_tweezers"
+    settings, simulated = "labseq_soapy.settings:SoapySettings", f"{module}:simulated_settings"
+    registry.static_tweezers("soapy", f"{module}:SoapyStaticTweezers", settings, simulated=simulated)

@@ -34,6 +34,13 @@ Measured: 26 to 34 ms with the simulated radio, which buffers 20 ms. A real one 
 """
 
 
+def simulated_settings() -> dict[str, str] | None:
+    """Settings of a simulated radio; None if it cannot be compiled."""
+    from labseq_soapy_sim import can_build
+
+    return {"device": "simulated"} if can_build() else None
+
+
 class SoapyStaticTweezers(StaticTweezers):
     """Plays a loop of tones for each AOD on two outputs of a radio.
 

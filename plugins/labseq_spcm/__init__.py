@@ -8,8 +8,6 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the mobile tweezers ``spcm``; in a dry run they play on a simulated card."""
-    from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
-    from labseq_spcm.settings import SpcmSettings
-
+    tweezers, settings = "labseq_spcm.mobile_tweezers:SpcmMobileTweezers", "labseq_spcm.settings:SpcmSettings"
     simulated = {"card": "simulated", "trigger": "software", "serial": 0}
-    registry.mobile_tweezers("spcm", SpcmMobileTweezers, SpcmSettings, simulated=simulated)
+    registry.mobile_tweezers("spcm", tweezers, settings, simulated=simulated)

@@ -8,7 +8,7 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the lines ``ttl``; in a dry run the box is simulated."""
-    from labseq_ttl.go_lines import ttl_lines
-    from labseq_ttl.settings import SIMULATED, TtlSettings
-
-    registry.lines("ttl", ttl_lines, TtlSettings, simulated={"port": SIMULATED, "start": "serial"})
+    simulated = {"port": "simulated", "start": "serial"}
+    registry.lines(
+        "ttl", "labseq_ttl.go_lines:ttl_lines", "labseq_ttl.settings:TtlSettings", simulated=simulated
+    )

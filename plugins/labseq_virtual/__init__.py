@@ -8,18 +8,15 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Offer the simulation, and a virtual driver for each hardware role."""
-    from labseq_virtual import camera, devices, settings, simulation, tweezers
-
-    registry.simulation("virtual", simulation.VirtualSimulation, settings.SimulationSettings)
-    registry.camera("virtual", camera.VirtualCamera, settings.CameraSettings, virtual_time=True)
-    registry.static_tweezers(
-        "virtual", tweezers.VirtualStaticTweezers, settings.StaticTweezersSettings, virtual_time=True
-    )
-    registry.mobile_tweezers(
-        "virtual", tweezers.VirtualMobileTweezers, settings.MobileTweezersSettings, virtual_time=True
-    )
-    registry.device("virtual", devices.VirtualDevice, settings.DeviceSettings, virtual_time=True)
-    registry.lines("virtual", devices.VirtualLines, settings.LinesSettings, virtual_time=True)
-    registry.device(
-        "virtual_spot_meter", devices.VirtualSpotMeter, settings.SpotMeterSettings, virtual_time=True
-    )
+    module, settings = "labseq_virtual", "labseq_virtual.settings"
+    registry.simulation("virtual", f"{module}.simulation:VirtualSimulation", f"{settings}:SimulationSettings")
+    for kind, factory, model in (
+        (registry.camera, "camera:VirtualCamera", "CameraSettings"),
+        (registry.static_tweezers, "tweezers:VirtualStaticTweezers", "StaticTweezersSettings"),
+        (registry.mobile_tweezers, "tweezers:VirtualMobileTweezers", "MobileTweezersSettings"),
+        (registry.device, "devices:VirtualDevice", "DeviceSettings"),
+        (registry.lines, "devices:VirtualLines", "LinesSettings"),
+    ):
+        kind("virtual", f"{module}.{factory}", f"{settings}:{model}", virtual_time=True)
+    spot_meter = f"{module}.devices:VirtualSpotMeter"
+    registry.device("virtual_spot_meter", spot_meter, f"{settings}:SpotMeterSettings", virtual_time=True)
