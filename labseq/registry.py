@@ -41,8 +41,8 @@ _NOT_NAMES: Final = {"true", "false", "null"}
 _SETTINGS: Final = ("labseq.settings", "Settings")
 
 Factory = Callable[..., Any]
-Offered = Factory | str
-Model = type[Any] | str | None
+FactoryOrPlace = Factory | str
+ModelOrPlace = type[Any] | str | None
 Call = Callable[["Owner", str, Callable[[], Any]], Any]
 """How code of a plugin is run: ``call(owner, what, work)``."""
 
@@ -150,8 +150,8 @@ class Registry:
         self,
         kind: str,
         name: str,
-        factory: Offered,
-        settings_model: Model,
+        factory: FactoryOrPlace,
+        settings_model: ModelOrPlace,
         *,
         virtual_time: bool = False,
         simulated: Mapping[str, Any] | str | None = None,
@@ -197,55 +197,61 @@ class Registry:
         for key in self.offers(origin):
             del self._entries[key]
 
-    def planner(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def planner(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer a planner: ``factory(settings, context) -> Planner``."""
         self._add("planner", name, factory, settings_model)
 
-    def detector(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def detector(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer a detector: ``factory(settings, context) -> Detector``."""
         self._add("detector", name, factory, settings_model)
 
-    def step(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def step(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer a step of a shot: ``factory(settings) -> Step``."""
         self._add("step", name, factory, settings_model)
 
-    def pattern(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def pattern(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer a target pattern: ``factory(settings, grid) -> TargetPattern``."""
         self._add("pattern", name, factory, settings_model)
 
-    def simulation(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def simulation(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer a simulation: ``factory(settings, context) -> Simulation``."""
         self._add("simulation", name, factory, settings_model, virtual_time=True)
 
-    def scanner(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def scanner(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer a scanner for adaptive scans: ``factory(settings, space) -> Scanner``."""
         self._add("scanner", name, factory, settings_model)
 
-    def analysis(self, name: str, factory: Offered, settings_model: Model = None) -> None:
+    def analysis(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer an analysis of shots: ``factory(settings, context) -> Analysis``."""
         self._add("analysis", name, factory, settings_model)
 
-    def camera(self, name: str, factory: Offered, settings_model: Model = None, **options: Any) -> None:
+    def camera(
+        self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None, **options: Any
+    ) -> None:
         """Offer a camera. Options: ``virtual_time``, ``simulated`` (see :class:`Entry`)."""
         self._add("camera", name, factory, settings_model, **options)
 
     def static_tweezers(
-        self, name: str, factory: Offered, settings_model: Model = None, **options: Any
+        self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None, **options: Any
     ) -> None:
         """Offer static tweezers. Options as for :meth:`camera`."""
         self._add("static_tweezers", name, factory, settings_model, **options)
 
     def mobile_tweezers(
-        self, name: str, factory: Offered, settings_model: Model = None, **options: Any
+        self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None, **options: Any
     ) -> None:
         """Offer mobile tweezers. Options as for :meth:`camera`."""
         self._add("mobile_tweezers", name, factory, settings_model, **options)
 
-    def device(self, name: str, factory: Offered, settings_model: Model = None, **options: Any) -> None:
+    def device(
+        self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None, **options: Any
+    ) -> None:
         """Offer any other instrument. Options as for :meth:`camera`."""
         self._add("device", name, factory, settings_model, **options)
 
-    def lines(self, name: str, factory: Offered, settings_model: Model = None, **options: Any) -> None:
+    def lines(
+        self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None, **options: Any
+    ) -> None:
         """Offer a timing box that switches lines. Options as for :meth:`camera`."""
         self._add("lines", name, factory, settings_model, **options)
 

@@ -1,13 +1,16 @@
 """The plugin host: loading, blocking, reporting."""
 
+import re
 import signal
 import sys
+from fractions import Fraction
 
 import pytest
 
 from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, UnknownPluginError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost
+from labseq.settings import Settings
 
 GOOD = """
 from labseq.plugin import hookimpl
@@ -58,6 +61,40 @@ def test_a_package_is_loaded_as_it_is_now(tmp_path):
         host = PluginHost()
         host.load_folders([tmp_path / folder])
         assert vars(host.get("planner", "mine").factory)["value"] == value
+
+
+PLACES = GOOD.replace('"mine", Mine)', '"mine", "fractions:Fraction", "labseq.plugin:Settings")')
+
+
+def test_what_is_given_by_its_place_is_imported_when_it_is_named(host, tmp_path):
+    assert load(host, tmp_path, PLACES).state == "loaded"
+    assert host.registry.names("planner") == ["mine"]
+    entry = host.get("planner", "mine")
+    assert (entry.factory, entry.settings_model) == (Fraction, Settings)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        (
+            "fractions:",
+            "no_such_module:",
+            "the import of planner 'mine' raised ModuleNotFoundError: No module",
+        ),
+        (":Fraction", ":Fiction", "the import of planner 'mine' raised AttributeError: module 'fractions'"),
+        ("fractions:Fraction", "math:pi", "the factory of planner 'mine' cannot be called"),
+        (":Settings", ":Problem", "the settings model of planner 'mine' is <class 'labseq.errors.Problem'>"),
+    ],
+)
+def test_a_place_where_nothing_is_names_the_plugin(host, tmp_path, old, new, reason):
+    load(host, tmp_path, PLACES.replace(old, new))
+    with pytest.raises(PluginLoadError, match=re.escape(reason)) as caught:
+        host.get("planner", "mine")
+    assert caught.value.plugin == "mine"
+    host.import_all()
+    assert host.infos[-1].state == "failed"
+    assert host.infos[-1].reason.startswith(reason)
+    assert host.registry.names("planner") == []
 
 
 def test_other_files_are_ignored_and_odd_names_reported(host, tmp_path):

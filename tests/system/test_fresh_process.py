@@ -45,6 +45,24 @@ print(loaded())
     assert last == "[]"
 
 
+def test_a_check_imports_only_the_drivers_and_planners_that_it_names(tmp_path: Path) -> None:
+    code = """
+import sys
+from labseq.cli import main
+try:
+    main(["check", "compact_225"])
+except SystemExit as leaving:
+    assert not leaving.code
+print(*sorted(name for name in sys.modules if name.startswith("labseq_") and "." in name))
+"""
+    *_, modules = printed(code, cwd=tmp_path).splitlines()
+    assert {name.split(".")[0] for name in modules.split()} == {
+        "labseq_climb",
+        "labseq_psca",
+        "labseq_virtual",
+    }
+
+
 def test_no_kernel_is_loaded_in_a_shot_of_the_virtual_lab(tmp_path: Path) -> None:
     """Else the first run compiles it in the call of a device, which then counts as hung."""
     code = """
