@@ -86,7 +86,7 @@ def opened(*args: Any, **settings: Any) -> Generator[Rig]:
         rig.tweezers.close()
 
 
-def until(condition: Callable[[], bool]) -> None:
+def until(condition: Callable[[], bool], longest_s: float = WAIT_S) -> None:
     """Wait until something has come about."""
     pause = threading.Event()
     clock: Clock = NeverStopped()
@@ -97,7 +97,7 @@ def until(condition: Callable[[], bool]) -> None:
         pause.wait(longest_s)
         return None
 
-    assert wait_for(poll, WAIT_S, clock), "it did not come about"
+    assert wait_for(poll, longest_s, clock), "it did not come about"
 
 
 def recorded(folder: Path, channel: int = 0) -> NDArray[np.complex64]:

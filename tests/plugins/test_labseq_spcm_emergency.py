@@ -6,16 +6,17 @@ import ctypes
 import json
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from labseq_soapy_sim import Ring
 from labseq_spcm import emergency as script
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, SimulatedCard, Span, installed, registers as r
-from labseq_spcm_sim.emergency import Connection
+from labseq_spcm_sim.emergency import ADDRESS, Connection
 from labseq_spcm_sim.library import _library
 from labseq_spcm_sim.setup import Refusal
 
@@ -23,6 +24,8 @@ from labseq.plugin import Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
 from .emergency import Done, outsider
+from .labseq_soapy_rig import need_radio, until
+from .small_run import PROFILE, SEQUENCE
 
 LABSEQ = """
 import json, sys, threading
@@ -280,3 +283,52 @@ def test_a_card_in_use_elsewhere_is_refused_and_one_that_dies_with_labseq_needs_
     inside.open()
     assert inside.emergency() is None
     inside.close()
+
+
+def test_a_run_that_is_killed_leaves_card_and_radio_off(tmp_path: Path) -> None:
+    """From the command line to the connectors, through the watchdog."""
+    need_radio()
+    comb = "{centre: 100 MHz, step: 60 kHz}"
+    radio = (
+        f"device: 'simulated,speed=1,buffer=0.02,record=100000000,folder={tmp_path}', sample_rate: 1.2 MHz"
+    )
+    static = f"{{use: soapy, {radio}, row_frequency: {comb}, column_frequency: {comb}}}"
+    tones = "max_row_tones: 16, max_column_tones: 5"
+    mobile = f"{{use: spcm, card: simulated@{tmp_path}/card, mode: dds, {tones}}}"
+    profile = PROFILE.replace("STATIC", static).replace("MOBILE", mobile)
+    (tmp_path / "p.yaml").write_text(profile, encoding="utf-8")
+    (tmp_path / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    output = tmp_path / "output"
+    command = [sys.executable, "-m", "labseq", "run", "s.yaml", "--shots", "1000", "--output", "runs"]
+    with output.open("wb") as file:
+        labseq = subprocess.Popen(command, cwd=tmp_path, stdout=file, stderr=subprocess.STDOUT)
+
+    def is_ready(condition: Callable[[], bool]) -> Callable[[], bool]:
+        def check() -> bool:
+            assert labseq.poll() is None, output.read_text("utf-8")
+            return condition()
+
+        return check
+
+    try:
+        until(is_ready((tmp_path / ADDRESS).exists), 120.0)
+        card = Connection(str(tmp_path / "card"))
+        until(is_ready(lambda: card("state") == (True, (True, True))), 120.0)
+    finally:
+        labseq.kill()
+        labseq.wait()
+    until(lambda: len(log_of(tmp_path)) == 2)
+    assert log_of(tmp_path) == {
+        "mobile_tweezers": "card stopped, outputs 0 and 1 disabled",
+        "static_tweezers": "streaming process ended, radio ramped down and closed",
+    }
+    assert card("state") == (False, (False, False))
+    assert not Ring(tmp_path).is_transmitting
+    card("power_off")
+
+
+def log_of(folder: Path) -> dict[str, str]:
+    """What the watchdog has done: device -> text."""
+    files = folder.glob("runs/*/*/watchdog.jsonl")
+    rows = [json.loads(line) for file in files for line in file.read_text("utf-8").splitlines()]
+    return {row["device"]: row["text"] for row in rows}
