@@ -2,13 +2,12 @@
 
     python docs/make_off_picture.py
 
-Twice: with the drivers' emergency scripts, which run in a process of their own, and without. The simulated
-hardware plays in real time and outlives the killed process; times differ a little between computers.
+Twice: with labseq's watchdog and without. The simulated hardware plays in real time and outlives the killed
+process; times differ a little between computers.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -32,9 +31,10 @@ AFTER_S: Final = 0.1
 STEP_S: Final = 0.5e-3
 
 LABSEQ: Final = """
-import json, sys
+import sys
 from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, SiteGrid
+from labseq.watchdog import Watchdog
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
@@ -52,25 +52,16 @@ mobile.open()
 static.open()
 plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 3)
 mobile.prepare(tone_program(plan, motion=motion))
-found = [mobile.emergency(), static.emergency()]
-print(json.dumps([[str(one.script), dict(one.arguments)] for one in found]), flush=True)
-sys.stdin.readline()
+if sys.argv[2] == "watched":
+    watchdog = Watchdog()
+    for order, device in enumerate((mobile, static)):
+        found = device.emergency()
+        watchdog.add(str(order), order, found.script, dict(found.arguments))
 mobile.play()
 static.start()
-print("on", flush=True)
+print(static.emergency().arguments["pid"], flush=True)
 sys.stdin.read()
 """
-OUTSIDE: Final = """
-import json, runpy, sys, threading
-scripts = [(runpy.run_path(script), arguments) for script, arguments in json.loads(sys.stdin.readline())]
-for script, arguments in scripts:
-    script.get("prepare", dict)(**arguments)
-print("ready", flush=True)
-sys.stdin.read()
-for script, arguments in scripts:
-    threading.Thread(target=script["off"], kwargs=arguments).start()
-"""
-
 Values = NDArray[np.float64]
 
 
@@ -94,21 +85,16 @@ TIMES_S: Final = np.arange(-BEFORE_S, AFTER_S, STEP_S)
 
 def record(folder: Path, *, is_watched: bool) -> Outputs:
     """Kill a process whose tweezers are on; without a watch its streaming process is killed, too."""
-    labseq = _started([sys.executable, "-c", LABSEQ, str(folder)])
-    jobs = json.loads(_line(labseq))
-    outside = _started([sys.executable, "-I", "-c", OUTSIDE])
-    _send(outside, json.dumps(jobs))
-    assert _line(outside) == "ready"
-    _send(labseq, "play")
-    assert _line(labseq) == "on"
-    time.sleep(2 * BEFORE_S)
-    killed_s = time.monotonic()
-    labseq.kill()
-    if not is_watched:
-        os.kill(jobs[1][1]["pid"], signal.SIGKILL)
-        outside.kill()
-    for process in (outside, labseq):
-        process.communicate()
+    how = "watched" if is_watched else "alone"
+    command = [sys.executable, "-c", LABSEQ, str(folder), how]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as labseq:  # noqa: S603
+        assert labseq.stdout is not None
+        streaming = int(labseq.stdout.readline())
+        time.sleep(2 * BEFORE_S)
+        killed_s = time.monotonic()
+        labseq.kill()
+        if not is_watched:
+            os.kill(streaming, signal.SIGKILL)
     time.sleep(max(0.0, killed_s + 2 * AFTER_S - time.monotonic()))
     card = Connection(str(folder / "card"))
     outputs = Outputs(_of_card(card, killed_s), *_of_radio(folder, killed_s))
@@ -140,21 +126,6 @@ def _of_radio(folder: Path, killed_s: float) -> tuple[Values, NDArray[np.bool_]]
     return np.array(rms), np.array([state == [True] for state in states])
 
 
-def _started(command: list[str]) -> subprocess.Popen[str]:
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603
-
-
-def _line(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-def _send(process: subprocess.Popen[str], line: str) -> None:
-    assert process.stdin is not None
-    process.stdin.write(line + "\n")
-    process.stdin.flush()
-
-
 def draw(watched: Outputs, alone: Outputs, path: Path) -> None:
     """Draw both records, one below the other."""
     figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(8, 5.2), layout="constrained")
@@ -162,7 +133,7 @@ def draw(watched: Outputs, alone: Outputs, path: Path) -> None:
     left_alone = {"card_mv": "left alone", "radio": "left alone, its streaming process killed, too"}
     for axes, name in ((top, "card_mv"), (bottom, "radio")):
         axes.plot(times_ms, getattr(alone, name), color="#b00020", linestyle="--", label=left_alone[name])
-        axes.plot(times_ms, getattr(watched, name), color="#00509d", label="switched off from outside")
+        axes.plot(times_ms, getattr(watched, name), color="#00509d", label="with labseq's watchdog")
         axes.axvline(0, color="0.4", linewidth=0.8)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
@@ -181,7 +152,7 @@ def draw(watched: Outputs, alone: Outputs, path: Path) -> None:
 
 
 def make(path: Path = PICTURE) -> tuple[Outputs, Outputs]:
-    """Record and draw; returns what was put out with the scripts and without."""
+    """Record and draw; returns what was put out with the watchdog and without."""
     with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
         watched, alone = record(Path(one), is_watched=True), record(Path(other), is_watched=False)
     draw(watched, alone, path)
