@@ -15,6 +15,7 @@ from labseq.drivers.serial_port import (
     open_port,
     ports_here,
     ports_text,
+    serial_emergency,
 )
 from labseq.drivers.settings import CameraSettings, CoolingSettings, IndustrialCameraSettings
 from labseq.errors import (
@@ -283,6 +284,7 @@ __all__ = [
     "ports_text",
     "render",
     "scaled",
+    "serial_emergency",
     "setting_error",
     "settle",
     "site_time_s",

@@ -6,12 +6,13 @@ import errno
 import importlib
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from labseq.errors import DeviceError
-from labseq.roles import Clock
+from labseq.roles import Clock, Emergency
 
 T = TypeVar("T")
 
@@ -112,6 +113,34 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
         return serial.serial_for_url(port, baudrate=baud_rate, timeout=SLICE_S, **options)
     except (*BROKEN, ValueError, NotImplementedError) as error:
         raise DeviceError(device, f"cannot open {port}: {_reason(error)}") from error
+
+
+def serial_emergency(port: Port, messages: Sequence[tuple[bytes, bytes, float]]) -> Emergency | None:
+    """How another process switches off a device on a serial line: the port is opened and messages are sent.
+
+    Args:
+        port: The open port.
+        messages: For each: the bytes; the end of the answer, b"" for none; and how long it may take, or the
+            pause after a message without one, in seconds.
+
+    Returns:
+        None if there is nothing to send, or no real port, as in a simulation.
+    """
+    name = getattr(port, "port", None)
+    if not messages or not isinstance(name, str):
+        return None
+    own: Any = port
+    options = {key: getattr(own, key, None) for key in _OPTIONS}
+    values = [
+        {"send": sent.decode("latin-1"), "until": end.decode("latin-1"), "within_s": within_s}
+        for sent, end, within_s in messages
+    ]
+    given = {key: value for key, value in options.items() if value is not None}
+    script = Path(__file__).with_name("serial_emergency.py")
+    return Emergency(script, {"port": name, "options": given, "messages": values})
+
+
+_OPTIONS: Final = ("baudrate", "bytesize", "parity", "stopbits", "rtscts", "dsrdtr", "xonxoff")
 
 
 def is_network_port(url: str) -> bool:

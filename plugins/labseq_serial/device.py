@@ -12,11 +12,13 @@ from labseq.plugin import (
     Device,
     DeviceError,
     DeviceTimeoutError,
+    Emergency,
     LabseqError,
     LimitError,
     TransientError,
     clean,
     format_quantity,
+    serial_emergency,
     unknown_name,
 )
 from labseq_serial.line import Line, open_line
@@ -119,9 +121,22 @@ class Instrument:
 
     def call(self, call: Call) -> None:
         """Carry out a call of the description; its arguments were checked with the profile."""
+        self.carry_out(*self._named(call))
+
+    def message(self, call: Call) -> tuple[bytes, bytes, float]:
+        """What a call sends, the end of its reply, and how long that may take; or the pause after it."""
+        settings, (name, values) = self._settings, self._named(call)
+        command = settings.commands[name]
+        sent = (command.text(values) + settings.write_ends_with).encode(settings.encoding)
+        if command.reply is None:
+            return sent, b"", settings.pause
+        end = settings.read_ends_with.encode(settings.encoding)
+        return sent, end, command.timeout or settings.timeout
+
+    def _named(self, call: Call) -> tuple[str, dict[str, Scalar]]:
         name, given = call_of(call)
         arguments = self._settings.commands[name].arguments
-        self.carry_out(name, {key: arguments[key].value_of(value) for key, value in given.items()})
+        return name, {key: arguments[key].value_of(value) for key, value in given.items()}
 
     def _differing(self, makes: Mapping[str, Scalar]) -> str | None:
         """Describe the first value that is not as a command makes it; None if all are."""
@@ -199,6 +214,16 @@ class SerialDevice(Device):
             failures = self._ready(on_open=False).carry_out_all(self._settings.safe_state)
         if failures:
             raise DeviceError(self._name, "; ".join(map(self._unnamed, failures)))
+
+    def emergency(self) -> Emergency | None:
+        """The commands of the safe state, which another process sends."""
+        instrument, settings = self._instrument, self._settings
+        if instrument is None or not settings.safe_state:
+            return None
+        messages = [(b"", b"", settings.wait_after_open)] if settings.wait_after_open else []
+        return serial_emergency(
+            instrument.line.port, [*messages, *map(instrument.message, settings.safe_state)]
+        )
 
     def command(self, name: str, **arguments: Any) -> None:
         """Carry out a declared command.

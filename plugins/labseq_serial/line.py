@@ -33,6 +33,7 @@ class Line:
     """An open port, and one exchange on it after the other.
 
     Attributes:
+        port: The open port.
         broken: Whether the port was lost; it must be opened again.
         aborted: Set by another thread to end a wait for a reply.
     """
@@ -40,7 +41,7 @@ class Line:
     def __init__(self, port: Port, settings: SerialSettings, device: str, clock: Clock) -> None:
         self.broken = False
         self.aborted = threading.Event()
-        self._port = port
+        self.port = port
         self._settings = settings
         self._device = device
         self._clock = clock
@@ -65,8 +66,8 @@ class Line:
         end = settings.read_ends_with.encode(settings.encoding) if answered else b""
         try:
             with self._unbroken(text, timeout_s):
-                self._port.reset_input_buffer()
-                self._port.write(sent)
+                self.port.reset_input_buffer()
+                self.port.write(sent)
             came = self._receive(text, sent if settings.echo else b"", end, timeout_s)
         finally:
             self._free_s = self._clock.now() + settings.pause
@@ -79,7 +80,7 @@ class Line:
     def close(self) -> None:
         """Close the port; legal in any state."""
         with suppress(*BROKEN):
-            self._port.close()
+            self.port.close()
 
     def _receive(self, text: str, echo: bytes, end: bytes, timeout_s: float) -> bytes:
         """Read the bytes between the echo and the end; nothing is read if both are empty."""
@@ -88,7 +89,7 @@ class Line:
         def look(_: float) -> int | None:
             if self.aborted.is_set():
                 raise DeviceError(self._device, f"'{clean(text)}' was aborted by the safe state")
-            came.extend(self._port.read(min(max(1, self._port.in_waiting), MAX_REPLY)))
+            came.extend(self.port.read(min(max(1, self.port.in_waiting), MAX_REPLY)))
             at = came.find(end, len(echo))
             return at if at >= 0 or len(came) > len(echo) + MAX_REPLY else None
 

@@ -15,10 +15,12 @@ from labseq.plugin import (
     Clock,
     DeviceError,
     DeviceTimeoutError,
+    Emergency,
     Port,
     clean,
     format_quantity,
     open_port,
+    serial_emergency,
     wait_for,
 )
 from labseq_ttl.protocol import NAME, PER_LINE, STOP, VERSION, Edge, framed, unframed
@@ -132,6 +134,10 @@ class Conversation:
                 self.ask("off", tries=1)
         finally:
             self._aborted = False
+
+    def emergency(self) -> Emergency | None:
+        """How another process turns all lines off; None without a real port."""
+        return serial_emergency(self._port, [(STOP, b"!", BOOT_S)])
 
     def close(self) -> None:
         """Close the port; legal in any state."""

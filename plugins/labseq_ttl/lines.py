@@ -14,6 +14,7 @@ from labseq.plugin import (
     Context,
     DeviceError,
     DeviceTimeoutError,
+    Emergency,
     LineProgram,
     Lines,
     LinesFacts,
@@ -133,6 +134,10 @@ class TtlLines(Lines):
             self._disconnect()
             self._connect()  # which turns all lines off
         self.access.lines_set(off_program(self._specs))
+
+    def emergency(self) -> Emergency | None:
+        """The byte that turns all lines off; a box that is reset by the opening of its port does so too."""
+        return None if self._box is None else self._box.line.emergency()
 
     def check_program(self, program: LineProgram) -> None:
         """Refuse a program that the box cannot play.

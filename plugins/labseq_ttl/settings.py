@@ -92,7 +92,7 @@ class TtlSettings(Settings):
         "box's start input",
     )
     watchdog_timeout: Annotated[Duration, Field(le=MAX_WATCHDOG_S)] = Field(
-        default=0.0,
+        default=2.0,
         description="how long the box waits for a sign of life from labseq before it turns all lines off, "
         "while no program runs; 0: for ever",
     )

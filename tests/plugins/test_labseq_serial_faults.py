@@ -17,6 +17,7 @@ from labseq.guard import StopFlag
 from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
 from labseq.sequencer.clock import RealClock
 
+from .emergency import outsider
 from .labseq_serial_rig import Counterpart, opened, settings
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
@@ -274,3 +275,27 @@ def test_whatever_comes_is_a_value_or_an_error(counterpart: Counterpart, noise: 
             assert isinstance(synth.read("temperature"), float)
         except DeviceError as error:
             assert str(error).isprintable()
+
+
+def test_another_process_sends_the_commands_of_the_safe_state(counterpart: Counterpart) -> None:
+    with opened(counterpart.port) as synth:
+        synth.command("open")
+        emergency = synth.emergency()
+    assert emergency is not None
+    n_before = len(counterpart.log)
+    with outsider({"synth": (str(emergency.script), emergency.arguments)}) as other:
+        assert (other.prepared, other.heavy_modules) == ({"synth": None}, [])
+        done = other.off()["synth"].text
+        assert done == f"sent 'FREQ 1.000000', 'CLOSE' to {counterpart.port}"
+        assert counterpart.log[n_before:] == ["FREQ 1.000000", "CLOSE"]
+        counterpart.order("fault", "silent", 2)
+        assert "no answer to 'CLOSE'" in other.off()["synth"].text
+        counterpart.order("unplug")
+        assert other.off()["synth"].text.startswith("SerialException: ")
+
+
+def test_without_a_safe_state_or_a_port_there_is_nothing_to_send(counterpart: Counterpart) -> None:
+    with opened(counterpart.port, safe_state=[]) as synth:
+        assert synth.emergency() is None
+    with opened("simulated") as synth:
+        assert synth.emergency() is None

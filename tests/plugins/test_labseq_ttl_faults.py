@@ -18,6 +18,7 @@ from labseq_ttl_sim.simavr import SimavrBox, runner
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.roles.shot import NeverStopped
 
+from .emergency import outsider
 from .labseq_ttl_rig import Rig, make_rig, need_simavr, rig, works
 
 MIDDLE = 10_000
@@ -239,7 +240,7 @@ def test_garbage_does_no_harm() -> None:
 
 @pytest.mark.parametrize(
     ("says", "text"),
-    [("!off 0000", "a command to turn all lines off"), ("!alone 0000", "heard nothing for 0 s")],
+    [("!off 0000", "a command to turn all lines off"), ("!alone 0000", "heard nothing for 2 s")],
 )
 def test_a_box_that_turned_all_lines_off_by_itself_is_an_error(says: str, text: str) -> None:
     with rig() as lab:
@@ -375,6 +376,20 @@ def test_a_box_with_lights_out_hears_signs_of_life_until_it_is_closed(plugged: S
         works(lab)
         assert any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
     assert not any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
+
+
+def test_another_process_turns_all_lines_off(plugged: SimavrBox) -> None:
+    with rig(port=plugged.name) as lab:
+        emergency = lab.lines.emergency()
+        assert emergency is not None
+        lab.driver_box.set_lines(0x204)
+        with outsider({"lines": (str(emergency.script), emergency.arguments)}) as other:
+            assert (other.prepared, other.heavy_modules) == ({"lines": None}, [])
+            lab.lines._heartbeat = None
+            assert other.off()["lines"].text == f"sent '!' to {plugged.name}"
+        assert lab.driver_box.state().on == 0
+    with rig() as simulated:
+        assert simulated.lines.emergency() is None
 
 
 def test_the_command_gives_a_box_its_serial_number(
