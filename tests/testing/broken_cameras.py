@@ -1,12 +1,14 @@
 """Cameras that break one promise each."""
 
 import random
+import time
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from labseq.model import CameraFacts, Frame
+from labseq.plugin import CameraDriver, ExposureResult, Series
 from labseq.roles import Context, Trigger
 from labseq.testing import CameraContract
 from labseq.testing.fakes import RecordingCamera
@@ -123,6 +125,59 @@ class SaysItExposesByItself(RecordingCamera):
         super().arm(n_frames, exposure_s, "software" if trigger == "internal" else trigger)
 
 
+class Driver(CameraDriver):
+    """A camera whose frames are ready at once, made as the tutorial makes one."""
+
+    series: Any = None
+    n_fired = n_taken = 0
+
+    @property
+    def facts(self) -> CameraFacts:
+        return CameraFacts(1e-3, max_exposure_s=10.0, triggers=("software",))
+
+    def describe(self) -> dict[str, Any]:
+        return {}
+
+    def _connect(self) -> None:
+        pass
+
+    def _disconnect(self) -> None:
+        pass
+
+    def _start(self, series: Series) -> None:
+        self.series, self.n_fired, self.n_taken = series, 0, 0
+
+    def _fire(self) -> None:
+        self.n_fired += 1
+
+    def _take(self, timeout_s: float) -> ExposureResult | None:
+        is_due = self.n_taken < self.n_fired
+        self.wait(self.series.exposure_s if is_due else timeout_s)
+        self.n_taken += is_due
+        return ExposureResult(self.n_taken - 1, np.zeros((16, 16), np.uint16)) if is_due else None
+
+    def wait(self, duration_s: float) -> None:
+        self._clock.sleep(duration_s)
+
+    def _stop(self) -> None:
+        pass
+
+
+class WaitsInRealTime(Driver):
+    def wait(self, duration_s: float) -> None:
+        time.sleep(min(duration_s, 1e-3))
+
+
+class DriverCountsOnFromTheLastSeries(Driver):
+    def _start(self, series: Series) -> None:
+        self.series, self.n_fired = series, self.n_taken
+
+
+class StopsASeriesThatIsNotThere(Driver):
+    def _stop(self) -> None:
+        self.n_fired = self.series.n_frames
+
+
 PLANTED = Planted(
     CameraContract(),
     RecordingCamera,
@@ -142,5 +197,8 @@ PLANTED = Planted(
         (SharesItsBuffer, "test_frames_do_not_change"),
         (TriggersUnarmed, "test_refuses_trigger_without_arm"),
         (StaysArmed, "test_refuses_trigger_without_arm"),
+        (WaitsInRealTime, "test_works"),
+        (DriverCountsOnFromTheLastSeries, "test_numbers_its_frames"),
+        (StopsASeriesThatIsNotThere, "test_safe_state_in_every_state"),
     ),
 )

@@ -111,6 +111,11 @@ class NoTargets(Suite):
             "called time.sleep(1e-09)\nto do: wait with context.clock",
         ),
         (
+            CameraContract(),
+            broken_cameras.WaitsInRealTime,
+            "0 s passed on context.clock during work that takes 0.0099 s\nto do: wait with context.clock (",
+        ),
+        (
             broken_steps.PLANTED.suite,
             broken_steps.GivesTuples,
             "gave a tuple\nto do: return a list of Timeline",

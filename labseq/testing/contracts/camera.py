@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, Final, get_args
 
 import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import Frame
 from labseq.roles import Camera, Trigger, offers
-from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
+from labseq.testing.contracts.hardware import ALWAYS_SAFE, WORKS, Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import promise, refusal
+
+NUMBERED: Final = "frames are numbered from 0 in each series, and later ones have later time stamps"
 
 
 class CameraContract(HardwareContract[Camera]):
@@ -25,6 +27,7 @@ class CameraContract(HardwareContract[Camera]):
         timeout_s: Timeout for a frame beyond its exposure, in seconds.
     """
 
+    bases: ClassVar[tuple[str, ...]] = (WORKS, ALWAYS_SAFE, NUMBERED)
     role: ClassVar[str] = "camera"
     how_it_works: ClassVar[str] = (
         "after arm(n) each trigger() exposes a frame, which read() returns; _take of a CameraDriver returns "
@@ -37,6 +40,10 @@ class CameraContract(HardwareContract[Camera]):
     def work(self, device: Camera) -> None:
         """One image."""
         self.take(device)
+
+    def work_time_s(self) -> float:
+        """The exposure."""
+        return self.exposure_s * (1 - self.exposure_tolerance)
 
     def uses(self) -> Mapping[str, Action[Camera]]:
         """Arm, trigger, read."""
@@ -132,7 +139,7 @@ class CameraContract(HardwareContract[Camera]):
             refusal(DeviceError, "a second trigger after arm(1)", camera.trigger)
 
     @promise(
-        "frames are numbered from 0 in each series, and later ones have later time stamps",
+        NUMBERED,
         "subtract the library's number of the first frame of the series",
     )
     def test_numbers_its_frames(self, factory: Factory[Camera]) -> None:

@@ -49,6 +49,11 @@ class Wait(Generic[D]):
 
 
 WORKS: Final = "factory(context) makes the device, and it can be opened, used as in a shot, and closed"
+USE_THE_CLOCK: Final = (
+    "wait with context.clock (self._clock of a CameraDriver): first context.clock.sleep until the result is "
+    "due, then labseq.plugin.wait_for if the device may be late; in tests and rehearsals the clock is "
+    "virtual, and time.sleep or a blocking read of a library does not move it"
+)
 ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
 
 
@@ -64,7 +69,7 @@ class HardwareContract(Generic[D]):
         max_wait_s: Real time after which a call counts as hung, in seconds.
     """
 
-    basis: ClassVar[str] = WORKS
+    bases: ClassVar[tuple[str, ...]] = (WORKS, ALWAYS_SAFE)
     role: ClassVar[str] = "device"
     how_it_works: ClassVar[str] = ""
     max_wait_s: ClassVar[float] = 10.0
@@ -84,6 +89,10 @@ class HardwareContract(Generic[D]):
 
     def work(self, device: D) -> None:
         """Do once what the role does in a shot; the device is open."""
+
+    def work_time_s(self) -> float:
+        """Time that the work takes at least on the context's clock, in seconds."""
+        return 0.0
 
     def ready(self, device: D) -> None:
         """Do what is needed before any work; the device is open."""
@@ -175,10 +184,20 @@ class HardwareContract(Generic[D]):
             detail = f"its constructor {format_error(error)}"
             raise ContractViolation(WORKS, detail, advice if about_arguments else "") from error
         with self.opened(factory) as (device, context):
+            before_s, needed_s = context.clock.now(), self.work_time_s()
+            detail, cause, advice = "", None, self.how_it_works
             try:
                 self.call_in_time(context, "its work", self.work, device)
+            except CallHungError as error:
+                detail, cause = str(error), error
             except Exception as error:
-                raise ContractViolation(WORKS, f"it {format_error(error)}", self.how_it_works) from error
+                raise ContractViolation(WORKS, f"it {format_error(error)}", advice) from error
+            passed_s = context.clock.now() - before_s
+            if passed_s < needed_s:
+                which = f"{passed_s:g} s passed on context.clock during work that takes {needed_s:g} s"
+                detail, advice = f"{detail}, and {which}" if detail else which, USE_THE_CLOCK
+            if detail:
+                raise ContractViolation(WORKS, detail, advice) from cause
             device.close()
 
     @promise("the constructor does no I/O and changes no shared state")

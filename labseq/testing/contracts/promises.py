@@ -83,7 +83,8 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
 
     The sentence is kept as the test's attribute ``promise``. A test that cannot continue because
     another promise is broken is skipped if a test of that promise fails, so that a fault is reported once.
-    So is every test of a suite whose ``basis`` is broken: the promise that all others need.
+    So is a test that fails while one of the suite's ``bases`` is broken: the first is a promise that all
+    others need; those after it count if their own test fails with an error of the same line.
     """
 
     def decorate(test: Callable[P, None]) -> Callable[P, None]:
@@ -97,9 +98,12 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
                     pytest.skip(f"cannot continue: {error}")
                 raise
             except _FAILURES as error:
-                basis = getattr(args[0], "basis", text)
-                if basis != text and _is_reported_elsewhere(basis, *args, *kwargs.values()):
-                    pytest.skip(f"cannot continue: promise: {basis}")
+                for n, basis in enumerate(getattr(args[0], "bases", ())):
+                    if basis == text:
+                        break
+                    where = _where(error) if n else ()
+                    if _is_reported_elsewhere(basis, *args, *kwargs.values(), where=where):
+                        pytest.skip(f"cannot continue: promise: {basis}")
                 raise ContractViolation(text, format_error(error), advice) from _of_the_plugin(error)
 
         run.__dict__["promise"] = text
@@ -108,16 +112,28 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
     return decorate
 
 
-def _is_reported_elsewhere(promise: str, *args: Any) -> bool:
-    """Whether a test of that promise fails too; ``args`` are the suite and its tests' arguments."""
+def _where(error: BaseException) -> tuple[object, ...]:
+    """The line that raised an error, if it is one of the plugin's; () else."""
+    cause = _of_the_plugin(error)
+    if cause is None or cause.__traceback__ is None:
+        return (error,)
+    last = traceback.extract_tb(cause.__traceback__)[-1]
+    return type(cause), last.filename, last.lineno
+
+
+def _is_reported_elsewhere(promise: str, *args: Any, where: tuple[object, ...] = ()) -> bool:
+    """Whether a test of that promise fails too, at this line if one is given.
+
+    ``args`` are the suite and its tests' arguments.
+    """
     suite = args[0]
     tests = (getattr(type(suite), name) for name in dir(suite) if name.startswith("test_"))
     for test in tests:
         if getattr(test, "promise", None) == promise:
             try:
                 test.__wrapped__(*args)
-            except _FAILURES:
-                return True
+            except _FAILURES as error:
+                return not where or where == _where(error)
     return False
 
 

@@ -45,7 +45,7 @@ class StepContract:
     the target wants filled, image after image.
     """
 
-    basis: ClassVar[str] = RUNS
+    bases: ClassVar[tuple[str, ...]] = (RUNS,)
 
     @pytest.fixture
     def factory(self) -> Factory:
