@@ -77,6 +77,7 @@ from labseq.model import (
     VisitedPoint,
     Waveform,
     as_occupancy,
+    follow_atoms,
 )
 from labseq.motion import (
     Renderer,
@@ -263,6 +264,7 @@ __all__ = [
     "expected",
     "find_leader",
     "fitting_batches",
+    "follow_atoms",
     "format_quantity",
     "from_the_centre",
     "helper_kernel",

@@ -247,8 +247,8 @@ class ScanReport:
             for i, word in enumerate(down.words)
         ]
         header = ("", *across.words)
-        title = f"{title_of(quantity)}; down: {down.address}, across: {across.address}"
-        return [title, *columns([header, *rows], right=range(len(header)))]
+        title = [title_of(quantity), f"down: {down.address}", f"across: {across.address}"]
+        return [*title, *columns([header, *rows], right=range(len(header)))]
 
     def as_dict(self) -> dict[str, Any]:
         """The points and fits, SI: points are counted from 0."""

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.model import Occupancy
+from labseq.model import Occupancy, follow_atoms
 from labseq.model.estimate import Rate
 from labseq.recording import Run, Shot
-from labseq.recording.quantities import follow_atoms
 
 Counts = NDArray[np.int64]
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from labseq.plugin import Context, CycleRecord, ImageRecord, Occupancy, Plan, RecordedShot, Settings
+from labseq.plugin import Context, CycleRecord, ImageRecord, Occupancy, RecordedShot, Settings, follow_atoms
 
 
 class SurvivalSettings(Settings):
@@ -62,38 +62,8 @@ class SurvivalAnalysis:
         }
 
     def _expected(self, before: Occupancy, played: Sequence[CycleRecord]) -> Occupancy:
-        held, moved = before.copy(), np.zeros(before.shape, np.bool_)
-        for cycle in played:
-            held, moved = after_moves(held, moved, cycle.plan.first(cycle.n_batches_played))
+        moved, held = follow_atoms(before, played)
         return {"all": held | moved, "moved": moved, "held": held}[self.atoms]
-
-
-def after_moves(held: Occupancy, moved: Occupancy, plan: Plan) -> tuple[Occupancy, Occupancy]:
-    """Where atoms are after a plan if none is lost.
-
-    Args:
-        held: bool (n_rows, n_cols), atoms that have not been moved yet.
-        moved: bool (n_rows, n_cols), those that have.
-        plan: The plan.
-
-    Returns:
-        The same after the plan; what left the grid is in neither.
-
-    Example:
-        >>> row = np.array([[True, True, False]])
-        >>> plan = Plan.from_batches([([(0, 1)], [(0, 2)])])
-        >>> held, moved = after_moves(row, np.zeros_like(row), plan)
-        >>> held.astype(int).tolist(), moved.astype(int).tolist()
-        ([[1, 0, 0]], [[0, 0, 1]])
-    """
-    held, moved = held.copy(), moved.copy()
-    for batch in plan.batches:
-        sources, goals = tuple(batch.from_sites.T), batch.to_sites
-        carried = held[sources] | moved[sources]
-        held[sources] = moved[sources] = False
-        inside = carried & ((goals >= 0) & (goals < held.shape)).all(axis=1)
-        moved[tuple(goals[inside].T)] = True
-    return held, moved
 
 
 def _place(record: ImageRecord | CycleRecord) -> tuple[int, int]:

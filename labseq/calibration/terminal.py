@@ -211,7 +211,7 @@ def _origin_text(value: Any) -> str:
 
 
 def _time_text(taken_utc: str) -> str:
-    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # in one piece
 
 
 N_MARKS: Final = 10

@@ -23,6 +23,7 @@ from labseq.model.records import (
     StepTiming,
     TimedBy,
     TimelineEntry,
+    follow_atoms,
 )
 from labseq.model.scanning import RandomStream, ScanRange, ScanSpace, VisitedPoint
 from labseq.model.signals import (
@@ -83,6 +84,7 @@ __all__ = [
     "VisitedPoint",
     "Waveform",
     "as_occupancy",
+    "follow_atoms",
     "grid_facts",
     "read_only",
     "same_grid",

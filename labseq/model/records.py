@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.model.arrays import Occupancy
 from labseq.model.camera import Frame
 from labseq.model.grid import TargetPattern
 from labseq.model.plan import Plan, PlanReport
@@ -169,6 +170,27 @@ class CycleRecord:
     def n_atom_moves_played(self) -> int:
         """Atom moves in the batches that were played."""
         return int(self.plan.batch_offsets[self.n_batches_played])
+
+
+def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occupancy, Occupancy]:
+    """Where atoms are after cycles without losses.
+
+    Args:
+        before: bool (n_rows, n_cols), the image that the first cycle was planned on.
+        cycles: The cycles, in order.
+
+    Returns:
+        The sites of moved atoms and of those that stayed, bool (n_rows, n_cols), without ejected ones.
+    """
+    atoms, moved = before.copy(), np.zeros_like(before)
+    for cycle in cycles:
+        for batch in cycle.plan.batches[: cycle.n_batches_played]:
+            start, end = tuple(batch.from_sites.T), batch.to_sites
+            carried = atoms[start]
+            atoms[start] = moved[start] = False
+            inside = carried & ((end >= 0) & (end < before.shape)).all(axis=1)
+            atoms[tuple(end[inside].T)] = moved[tuple(end[inside].T)] = True
+    return moved, atoms & ~moved
 
 
 @dataclass(slots=True, eq=False)

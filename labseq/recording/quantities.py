@@ -10,19 +10,18 @@ import operator
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
-from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern
+from labseq.model import ImageRecord, TargetPattern, follow_atoms
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.recording.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, figures_in
 from labseq.recording.results import PREFIX, result_columns
 from labseq.recording.schema import unit_of
-from labseq.recording.shot import Shot, caching_loader
+from labseq.recording.shot import Shot
 from labseq.units import parse_any
 
 if TYPE_CHECKING:
@@ -72,27 +71,6 @@ class Quantity:
             return NOTHING
 
 
-def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occupancy, Occupancy]:
-    """Where atoms are after cycles without losses.
-
-    Args:
-        before: bool (n_rows, n_cols), the image that the first cycle was planned on.
-        cycles: The cycles, in order.
-
-    Returns:
-        The sites of moved atoms and of those that stayed, bool (n_rows, n_cols).
-    """
-    atoms, moved = before.copy(), np.zeros_like(before)
-    for cycle in cycles:
-        for batch in cycle.plan.batches[: cycle.n_batches_played]:
-            start, end = tuple(batch.from_sites.T), batch.to_sites
-            carried = atoms[start]
-            atoms[start] = moved[start] = False
-            inside = carried & ((end >= 0) & (end < before.shape)).all(axis=1)
-            atoms[tuple(end[inside].T)] = moved[tuple(end[inside].T)] = True
-    return moved, atoms & ~moved
-
-
 def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
     """The image of a name, or of an index counted from 0."""
     images = shot.images
@@ -118,28 +96,27 @@ def _loading(shot: Shot, _: TargetPattern, name: str = "") -> tuple[float, float
     return NOTHING if image is None else (float(image.occupancy.mean()), 1)
 
 
-def _filling(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
+def _defects(shot: Shot, target: TargetPattern, name: str) -> tuple[int, int] | None:
+    """Defects and surplus atoms on an image; without a name on the last one, from the index."""
     if name:
         image = _image(shot, name, -1)
-        return NOTHING if image is None or target.is_none else (target.filling_fraction(image.occupancy), 1)
-    if not math.isnan(shot.filling_fraction):
+        return image and (target.n_defects(image.occupancy), target.n_surplus(image.occupancy))
+    images = shot.summary.images
+    return (images.n_defects[-1], images.n_surplus[-1]) if len(images) else None
+
+
+def _filling(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
+    if not name and not math.isnan(shot.filling_fraction):
         return shot.filling_fraction, 1
-    n_defects = shot.summary.images.n_defects  # from the index
-    return (1 - n_defects[-1] / target.n_atoms, 1) if n_defects and target.n_atoms else NOTHING
+    defects = _defects(shot, target, name) if target.n_atoms else None
+    return NOTHING if defects is None else (1 - defects[0] / target.n_atoms, 1)
 
 
 def _defect_free(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
-    if name:
-        image = _image(shot, name, -1)
-        return NOTHING if image is None or target.is_none else (target.is_met_by(image.occupancy), 1)
-    if not math.isnan(shot.filling_fraction):
+    if not name and not math.isnan(shot.filling_fraction):
         return shot.success, 1
-    images = shot.summary.images
-    return (
-        (not images.n_defects[-1] and not images.n_surplus[-1], 1)
-        if len(images) and not target.is_none
-        else NOTHING
-    )
+    defects = None if target.is_none else _defects(shot, target, name)
+    return NOTHING if defects is None else (not any(defects), 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,21 +184,6 @@ def make_quantity(
         return NOTHING if found is None else (float(found), 1)
 
     return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
-
-
-def figures_with_images(
-    row: Mapping[str, Any], names: Iterable[str], run_dir: Path, target: TargetPattern
-) -> dict[str, float]:
-    """The figures in a line of the index, and those of these quantities that follow from images.
-
-    The shot's file is read for the latter only.
-    """
-    figures, shot = figures_in(row), Shot(run_dir / row["file"], dict(row), caching_loader())
-    for name in names:
-        if split_name(name)[0] in OF_IMAGES:
-            value = make_quantity(name, target).of_shot(shot)
-            figures |= {} if math.isnan(value) else {name: value}
-    return figures
 
 
 def quantity_problem(

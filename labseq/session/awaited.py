@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from labseq.errors import DeviceError
@@ -63,13 +63,6 @@ class AwaitedResults:
         for used in self._unwritten:
             self._observers.event(_USED, used)
         self._unwritten = []
-
-    def figures(self, names: Collection[str], shot: int) -> dict[str, float]:
-        """The values of those of these quantities that are results, for a shot that has them."""
-        for name in names:
-            self.await_shots(name, [shot])
-        found = {name: self.values[name][shot] for name in names if name in self.values}
-        return {name: value for name, value in found.items() if value is not None}
 
     def await_shots(self, name: str, shots: Sequence[int]) -> None:
         """Wait until the values of a quantity are known, if it is a result.

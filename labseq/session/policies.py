@@ -175,7 +175,7 @@ class Checks:
         checks: The checks of the sequence.
         rows: The index's lines of earlier shots of a resumed run, in order.
         warn: Receives the warnings.
-        figures_of: A line of the index -> the values of the quantities of its shot.
+        values_of: A line of the index -> the value of each check for its shot; nan if it has none.
 
     Attributes:
         left_open: The last of the earlier shots, and why a check would skip the rest of its point, or "".
@@ -186,17 +186,17 @@ class Checks:
         checks: Sequence[CheckSettings],
         rows: Iterable[Mapping[str, Any]],
         warn: Callable[[str], None],
-        figures_of: Callable[[Mapping[str, Any]], Mapping[str, float]] = figures_in,
+        values_of: Callable[[Mapping[str, Any]], Sequence[float]],
     ) -> None:
-        self._figures_of = figures_of
+        self._values_of = values_of
         self._checks = [(check, deque[float](maxlen=check.shots)) for check in checks]
         self._warn = warn
         self._unseen = {check.value for check in checks if not check.value.startswith(PREFIX)}
         self.left_open = -1, ""
         for row in rows:
+            self._unseen.clear()  # the warning was given then
             skipping = [message for check, message in self._look(row) if check.then == "skip_point"]
             self.left_open = row["shot"], skipping[0] if skipping else ""  # earlier skips are recorded
-            self._unseen.clear()  # the warning was given then
 
     def after(self, row: Mapping[str, Any]) -> str:
         """Check a shot that was taken.
@@ -211,7 +211,6 @@ class Checks:
             CheckFailedError: A check that stops the run failed.
         """
         skipped = ""
-        self._warn_unchecked(row)
         for check, message in self._look(row):
             if check.then == "stop":
                 raise CheckFailedError(message, check.value)
@@ -221,22 +220,19 @@ class Checks:
                 self._warn(f"shot {row['shot']}: {message}")
         return skipped
 
-    def _warn_unchecked(self, row: Mapping[str, Any]) -> None:
-        """Warn, after the first shot, of figures that it does not have: their names may be misspelt."""
-        figures = self._figures_of(row) if self._unseen else {}
-        for value in sorted(self._unseen.difference(figures)):
-            self._warn(missing_figure(row["shot"], value, _CHECKED, figures))
-        self._unseen.clear()
-
     def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
         """The checks that fail after a shot, each with a message."""
         broken: list[tuple[CheckSettings, str]] = []
-        figures = self._figures_of(row) if self._checks else {}
-        for check, values in self._checks:
-            values.append(figures.get(check.value, math.nan))
+        of_shot = self._values_of(row)
+        for (check, values), value in zip(self._checks, of_shot, strict=True):
+            if math.isnan(value) and check.value in self._unseen:  # its name may be misspelt
+                self._unseen.discard(check.value)
+                self._warn(missing_figure(row["shot"], check.value, _CHECKED, figures_in(row)))
+            values.append(value)
             if message := _failure(check, values):
                 broken.append((check, message))
                 values.clear()  # the next message comes after as many shots again
+        self._unseen.clear()
         return broken
 
 

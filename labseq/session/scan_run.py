@@ -467,13 +467,13 @@ class Results:
         shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
         if self.awaited is not None:
             self.awaited.await_shots(self.quantity.name, [shot.index for shot in shots])
-        figures = [MappingProxyType(self._figures(shot)) for shot in shots]
+        figures = [MappingProxyType(figures_in(shot.row) | self._value(shot)) for shot in shots]
         score = sign * self.quantity.over(shots).value
         return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))
 
-    def _figures(self, shot: Shot) -> dict[str, float]:
-        results = self.awaited.figures([self.quantity.name], shot.index) if self.awaited else {}
-        return figures_in(shot.row) | results
+    def _value(self, shot: Shot) -> dict[str, float]:
+        value = self.quantity.of_shot(shot)
+        return {} if math.isnan(value) else {self.quantity.name: value}
 
 
 class ScannerCall:

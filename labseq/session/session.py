@@ -15,9 +15,19 @@ from labseq.errors import ConfigError, DeviceError, LabseqError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.messages import error_text
 from labseq.model import RunRecord, TimelineEntry
-from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, marker_roots, open_run
+from labseq.recording import (
+    Run,
+    RunWriter,
+    Shot,
+    clear_active,
+    data_root,
+    mark_active,
+    marker_roots,
+    open_run,
+)
 from labseq.recording.best import best_point
-from labseq.recording.quantities import figures_with_images
+from labseq.recording.quantities import make_quantity
+from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, plan_timelines
@@ -267,13 +277,16 @@ class Session:
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
-        names = [check.value for check in settings]
+        quantities = [make_quantity(check.value, target, self._awaited.values) for check in settings]
+        load = caching_loader()
 
-        def figures_of(row: Mapping[str, Any]) -> dict[str, float]:
-            figures = figures_with_images(row, names, writer.run_dir, target)
-            return figures | self._awaited.figures(names, row["shot"])
+        def values_of(row: Mapping[str, Any]) -> list[float]:
+            shot = Shot(writer.run_dir / row["file"], dict(row), load)
+            for quantity in quantities:
+                self._awaited.await_shots(quantity.name, [shot.index])
+            return [quantity.of_shot(shot) for quantity in quantities]
 
-        checks = Checks(settings, before, self._warn, figures_of)
+        checks = Checks(settings, before, self._warn, values_of)
         self.scan_run.follow(writer, self._observers)
         self.scan_run.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
 

@@ -16,10 +16,10 @@ from labseq.analysis.fits import MODELS, Fit, fit_points
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
 from labseq.errors import ConfigError
-from labseq.model import CycleRecord, Plan, PlanReport
+from labseq.model import CycleRecord, Plan, PlanReport, follow_atoms
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording.points import scan_points
-from labseq.recording.quantities import OF_IMAGES, figures_with_images, follow_atoms, select_shots
+from labseq.recording.quantities import OF_IMAGES, select_shots
 
 
 def at_points(run: labseq.Run, name: str) -> list[Estimated]:
@@ -81,13 +81,6 @@ def test_a_wrong_name_is_answered_with_the_nearest(lifetime: labseq.Run, name: s
     with pytest.raises(ConfigError) as caught:
         lifetime.quantity(name)
     assert printed in str(caught.value)
-
-
-def test_a_check_between_shots_has_the_quantities_of_images(lifetime: labseq.Run) -> None:
-    shot, name = lifetime.shots[3], "survival:before,after"
-    figures = figures_with_images(shot.row, [name, "success"], lifetime.path, lifetime.target)
-    assert figures[name] == lifetime.quantity(name).of_shot(shot)
-    assert figures["n_atoms"] == shot.occupancies[1].sum()
 
 
 def test_shots_are_selected_by_any_quantity(lifetime: labseq.Run) -> None:

@@ -9,10 +9,9 @@ import pytest
 
 from labseq.analysis.survival import Survival, steps_that_load
 from labseq.errors import RecordingError
-from labseq.model import CycleRecord, Plan, PlanReport
+from labseq.model import CycleRecord, Plan, PlanReport, follow_atoms
 from labseq.model.estimate import Rate
 from labseq.recording import Run
-from labseq.recording.quantities import follow_atoms
 
 from .records import make_shot
 

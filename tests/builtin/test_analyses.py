@@ -13,8 +13,8 @@ import pytest
 from hypothesis import assume, given, strategies as st
 from hypothesis.extra.numpy import arrays
 
-from labseq.builtin.analyses import SurvivalAnalysis, SurvivalSettings, after_moves
-from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport
+from labseq.builtin.analyses import SurvivalAnalysis, SurvivalSettings
+from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, follow_atoms
 from labseq.roles import Context
 from labseq.testing import AnalysisContract
 
@@ -94,6 +94,6 @@ def test_a_legal_batch_keeps_the_number_of_atoms(atoms, goals, n_moves):
     stays[0, :n_moves] = False
     assume(not stays[0, goals[:n_moves]].any())
     plan = Plan.from_batches([([(0, c) for c in range(n_moves)], [(0, c) for c in goals[:n_moves]])])
-    held, moved = after_moves(atoms, np.zeros_like(atoms), plan)
+    moved, held = follow_atoms(atoms, [cycle_of(plan, 0)])
     assert (held == stays).all()
     assert np.count_nonzero(held | moved) == np.count_nonzero(held) + np.count_nonzero(moved) == atoms.sum()

@@ -143,13 +143,24 @@ def test_a_result_that_does_not_come_is_no_value_and_an_analysis_that_dies_ends_
 
 
 def test_a_check_waits_for_the_analysis_of_each_shot(tmp_path: Path) -> None:
-    check = "{value: analysis.mean.filling, at_least: 2, shots: 2, then: stop}"
-    path = write(tmp_path, f"shots: 6\npolicy: {{checks: [{check}]}}\nanalysis: [{{use: mean}}]\n")
-    with labseq.Session.open(path, output=tmp_path / "data") as session:
+    checks = """
+    - {value: "loading:last", at_most: 0}
+    - {value: analysis.mean.filling, at_least: 2, shots: 2, then: stop}"""
+    path, seen = (
+        write(tmp_path, f"shots: 6\npolicy:\n  checks:{checks}\nanalysis: [{{use: mean}}]\n"),
+        RecordingObserver(),
+    )
+    with labseq.Session.open(path, output=tmp_path / "data", observer=seen) as session:
         with pytest.raises(CheckFailedError, match=r"analysis\.mean\.filling is 0\.\d+ on the mean of the"):
             session.run()
         assert session.run_dir is not None
-        assert len(labseq.open_run(session.run_dir).shots) == 2
+        run = labseq.open_run(session.run_dir)
+    loading = run.quantity("loading")
+    assert [one["text"] for one in seen.of("warning")] == [
+        f"shot {i}: loading:last is {loading.of_shot(run.shots[i]):.6g}; it should be at most 0"
+        for i in (0, 1)
+    ]
+    assert len(run.shots) == 2
 
 
 @pytest.mark.parametrize(
