@@ -19,7 +19,8 @@ class SpcmSettings(Settings):
     card: str = Field(
         default="/dev/spcm0",
         min_length=1,
-        description="device name in the vendor's driver; `simulated` for a card that exists only in software",
+        description="device name in the vendor's driver; `simulated` for a card that exists only in "
+        "software, `simulated@FOLDER/NAME` for one that outlives the process",
     )
     serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
     mode: Mode = Field(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from labseq_soapy import emergency as script
 from labseq_soapy_sim import Ring, read_trace
 
 from .emergency import Done, outsider
-from .labseq_soapy_rig import another_labseq, assert_ramped_down, recorded, until
+from .labseq_soapy_rig import another_labseq, assert_ramped_down, need_radio, recorded, until
 
 Labseq = subprocess.Popen[str]
 RAMPED = "streaming process ended, radio ramped down and closed"
@@ -66,6 +65,10 @@ def test_a_plain_process_switches_the_radio_off(
         pid = job[1]["pid"]
         until(lambda: bool(np.count_nonzero(recorded(tmp_path)) > 50_000))
         fail(labseq, pid)
+        if fail is kill_both:
+            until(lambda: not script._runs(pid, job[1]["started"]))
+            assert not Ring(tmp_path).is_playing
+            assert Ring(tmp_path).is_transmitting, "no samples, but the leakage of its local oscillator"
         done: Done = outside.off()["radio"]
         assert done.text == text
         assert not outside.heavy_modules
@@ -95,22 +98,19 @@ def test_the_streaming_process_ends_with_labseq_although_a_copy_of_labseq_holds_
     assert read_trace(tmp_path)[-1][1] == "close"
 
 
-def test_a_radio_without_its_process_transmits_on_until_it_is_opened_again(tmp_path: Path) -> None:
-    with another_labseq(tmp_path) as (labseq, job):
-        until(lambda: bool(np.count_nonzero(recorded(tmp_path)) > 50_000))
-        kill_both(labseq, job[1]["pid"])
-        until(lambda: not script._runs(job[1]["pid"], job[1]["started"]))
-        ring = Ring(tmp_path)
-        until(lambda: not ring.is_playing)
-        assert ring.is_transmitting, "no samples, but the leakage of its local oscillator"
-        assert last_lit_s(tmp_path) < time.monotonic() + float(job[1]["ramp_s"])
-        job[1]["device"] = job[1]["device"].replace("driver=capture", "driver=none")
-        with pytest.raises(script.EmergencyError) as error:
-            script.off(**job[1])
+def test_a_radio_that_cannot_be_opened_again_may_transmit_and_the_text_says_so(tmp_path: Path) -> None:
+    need_radio()
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    opened = tmp_path / "opened"
+    opened.write_text(str(dead.pid), "ascii")
+    with pytest.raises(script.EmergencyError) as error:
+        script.off(dead.pid, 1, str(opened), 0.01, "driver=none", [0, 1], {})
     assert str(error.value) == (
-        f"the radio '{job[1]['device']}' cannot be opened again: SoapySDR::Device::make() no match; it plays "
-        "nothing any more, but its transmitters stay on with their gain: switch it off by hand"
+        "the radio 'driver=none' cannot be opened again: SoapySDR::Device::make() no match; it plays nothing "
+        "any more, but its transmitters stay on with their gain: switch it off by hand"
     )
+    assert opened.exists(), "the next attempt tries it again"
 
 
 def test_wrong_arguments_give_one_clear_line_and_a_process_that_took_the_number_lives() -> None:

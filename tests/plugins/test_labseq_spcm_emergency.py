@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -185,6 +186,35 @@ def test_a_missing_library_and_wrong_arguments_give_one_clear_line() -> None:
     assert done["name"].text == (
         "EmergencyError: the card's device name is 0; expected a text such as '/dev/spcm0'"
     )
+
+
+C_LIBRARY = """
+#include <stdint.h>
+#include <stdio.h>
+#include <string.h>
+#define CARD ((void *)0x7fff12345678)
+typedef int32_t i32;
+typedef uint32_t u32;
+void *spcm_hOpen(const char *name) { return strcmp(name, "/dev/spcm7") ? 0 : CARD; }
+void spcm_vClose(void *card) { puts(card == CARD ? "closed" : "wrong handle"); fflush(stdout); }
+u32 spcm_dwSetParam_i32(void *card, i32 reg, i32 value) { printf("%d=%d ", reg, value); return 0; }
+u32 spcm_dwGetParam_i32(void *card, i32 reg, i32 *value) { *value = reg == 110 ? 4 : 0; return 0; }
+u32 spcm_dwGetErrorInfo_i32(void *card, u32 *reg, i32 *value, char *text) { return 0; }
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_the_functions_of_a_c_library_are_called_as_its_header_declares_them(tmp_path: Path) -> None:
+    (tmp_path / "spcm.c").write_text(C_LIBRARY)
+    library = tmp_path / "libspcm_linux.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, tmp_path / "spcm.c"], check=True)
+    arguments = {"library": str(library), "card": "/dev/spcm7", "mode": "replay"}
+    code = f"import runpy; print(runpy.run_path({script.__file__!r})['off'](**{arguments!r}))"
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [
+        "100=262208 30010=80 30110=80 30091=0 30191=0 100=2 100=1 closed",
+        "card stopped, outputs 0 and 1 disabled",
+    ]
 
 
 class Stubborn(SimulatedCard):
