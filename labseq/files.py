@@ -10,11 +10,13 @@ import errno
 import json
 import os
 import platform
+import stat
 import warnings
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from io import BufferedReader
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
@@ -118,14 +120,53 @@ def explained(path: Path) -> Generator[None]:
         raise RecordingError(path, f"cannot be written: {reason}; {advice}") from error
 
 
-def read_file(path: Path) -> bytes:
-    """Read a whole file.
+MAX_DOCUMENT: Final = 64 << 20
+"""Largest JSON document that is read, in bytes."""
+MAX_LINE: Final = 16 << 20
+"""Longest line of a file of JSON lines, in bytes."""
+
+
+def open_ordinary(path: Path) -> BufferedReader:
+    """Open a file to read it.
 
     Raises:
-        RecordingError: It cannot be read.
+        OSError: It cannot be read, or is a pipe or a device, which could block for ever.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "this is not an ordinary file")
+    return path.open("rb")
+
+
+def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:
+    """Read a whole file of limited size.
+
+    Raises:
+        RecordingError: It cannot be read, or is too large.
     """
     try:
-        return path.read_bytes()
+        with open_ordinary(path) as file:
+            n_bytes = os.fstat(file.fileno()).st_size
+            if n_bytes > max_bytes:
+                raise RecordingError(path, f"is larger than {max_bytes >> 20} MiB; restore it from a backup")
+            return file.read(n_bytes)
+    except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
+        reason = getattr(error, "strerror", None) or error
+        raise RecordingError(path, f"cannot be read: {reason}; check the disk") from error
+
+
+def lines_in(path: Path) -> Generator[bytes]:
+    r"""The lines of a file with their ends; the last one may lack its "\n".
+
+    Raises:
+        RecordingError: It cannot be read, or a line is too long.
+    """
+    try:
+        with open_ordinary(path) as file:
+            while line := file.readline(MAX_LINE + 1):
+                if len(line) > MAX_LINE:
+                    what = f"has a line longer than {MAX_LINE >> 20} MiB; restore it from a backup"
+                    raise RecordingError(path, what)
+                yield line
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error
 
@@ -201,7 +242,7 @@ def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
     """
     if not path.exists():
         return [], []
-    found = [parse_object(line) for line in whole_lines(read_file(path)).split(b"\n")[:-1]]
+    found = [parse_object(line) for line in lines_in(path) if line.endswith(b"\n")]
     rows = [row for row in found if row is not None]
     return rows, [number for number, row in enumerate(found, start=1) if row is None]
 
@@ -460,11 +501,11 @@ class Lock:
 
     def _other(self) -> Holder:
         try:
-            values: dict[str, Any] = json.loads(self._about.read_bytes())
+            values = parse_object(read_file(self._about)) or {}
             return Holder(
                 str(values["what"]), int(values["pid"]), str(values["host"]), str(values["since_utc"])
             )
-        except (OSError, ValueError, TypeError, KeyError):
+        except (RecordingError, ValueError, TypeError, KeyError):
             return Holder("", 0, "", "")
 
 

@@ -99,9 +99,35 @@ def _repr(value: Any) -> str:
 
 
 def parse_object(data: bytes) -> dict[str, Any] | None:
-    """Read a JSON object; None if it is anything else."""
+    """Read a JSON object; None if it is anything else, or nested deeper than 32."""
     try:
-        value = json.loads(data)
-    except (ValueError, RecursionError):
+        value = parse_value(data)
+    except ValueError:
         return None
     return cast("dict[str, Any]", value) if isinstance(value, dict) else None
+
+
+def parse_value(data: bytes | str) -> Any:
+    """Read JSON of limited depth.
+
+    Raises:
+        ValueError: It is not JSON, or nested deeper than 32.
+    """
+    try:
+        value = json.loads(data)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+    if _is_too_deep(value):
+        raise ValueError("it is nested too deep")
+    return value
+
+
+def _is_too_deep(value: Any) -> bool:
+    level: list[Any] = [value]
+    for _ in range(_MAX_DEPTH):
+        level = [one for one in level if isinstance(one, dict | list)]
+        if not level:
+            return False
+        inner = [one.values() if isinstance(one, dict) else one for one in level]
+        level = [one for several in inner for one in several]
+    return any(isinstance(one, dict | list) for one in level)

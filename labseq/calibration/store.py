@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 import labseq
-from labseq.errors import ConfigError, Problem
-from labseq.files import whole_file
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.files import read_file, whole_file
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts, same_grid
+from labseq.plain import parse_object
 from labseq.units import format_quantity
 
 FORMAT: Final = "labseq-calibration"
@@ -95,12 +96,13 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
         ConfigError: It is missing, damaged, of another format, or written by a newer labseq.
     """
     try:
-        content = json.loads(path.read_bytes())
-    except OSError as error:
-        raise ConfigError(Problem(f"it cannot be read: {error.strerror}", str(path))) from error
-    except (ValueError, RecursionError) as error:
-        raise damaged(path, f"it is not JSON ({error})") from error
-    if not isinstance(content, dict) or content.get("format") != file_format:
+        content = parse_object(read_file(path))
+    except RecordingError as error:
+        what = f"it {str(error).removeprefix(f'{error.path}: ').partition(';')[0]}"
+        raise ConfigError(Problem(what, str(path))) from error
+    if content is None:
+        raise damaged(path, "it is not JSON, or no object")
+    if content.get("format") != file_format:
         raise damaged(path, f"its format is not '{file_format}'")
     version = str(content.get("format_version"))
     major = version.partition(".")[0]
@@ -109,7 +111,7 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
     if int(major) > int(FORMAT_VERSION.partition(".")[0]):
         what, expected = f"its format version is {version}", f"{FORMAT_VERSION} or older"
         raise ConfigError(Problem(what, str(path), expected=expected, hint="update labseq"))
-    return cast("dict[str, Any]", content)
+    return content
 
 
 def damaged(path: Path, why: str) -> ConfigError:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -18,7 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 from labseq.config.document import StoredText
 from labseq.config.find import find_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
-from labseq.files import Holder, Lock, Process, explained, write_file
+from labseq.files import Holder, Lock, Process, explained, read_file, write_file
 from labseq.messages import visible
 from labseq.plain import dumps, parse_object
 from labseq.recording.folders import STOP_FILE
@@ -29,13 +31,14 @@ from labseq.session.check import CheckReport, check
 from labseq.session.options import Options
 from labseq.session.provenance import now_utc
 from labseq.session.session import Session
-from labseq.text_files import decode, read_bytes
+from labseq.text_files import MAX_BYTES, decode, read_bytes
 
 FOLDER: Final = "queue"
 FORMAT: Final = 1
 """Version of an entry's file."""
 EntryStatus = Literal["waiting", "running", "stopped", "failed"]
 
+_POSITION: Final = re.compile(r"-?\d{1,1000}(/0*[1-9]\d{0,999})?")
 _NUMBER: Final = re.compile(r"(\d{4,})\.(?:json|id)")
 
 
@@ -243,22 +246,42 @@ def _read(file: Path) -> Entry | None:
         RecordingError: It is damaged, or cannot be read.
     """
     try:
-        values = parse_object(file.read_bytes()) or {}
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise RecordingError(file, f"cannot be read: {error.strerror}; check the disk") from error
+        values = parse_object(read_file(file)) or {}
+    except RecordingError:
+        if not os.path.lexists(file):
+            return None
+        raise
     if values.get("format") != FORMAT:
         raise RecordingError(file, f"is not a queue entry of format {FORMAT}; move it away")
     try:
+        if not _POSITION.fullmatch(str(values.get("position"))):
+            raise ValueError("position: expected a number such as 3 or 5/2")
         entry = _adapter().validate_python(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise RecordingError(
-            file, f"is a damaged queue entry: {place}: {first['msg']}; move it away"
-        ) from error
+        _check(entry, file)
+    except ValueError as error:
+        what = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise RecordingError(file, f"is a damaged queue entry: {what}; move it away") from error
     return replace(entry, options=replace(entry.options, overrides=tuple(entry.options.overrides)))
+
+
+def _check(entry: Entry, file: Path) -> None:
+    """Check what the types do not tell.
+
+    Raises:
+        ValueError: It is not as :meth:`Queue.add` writes it.
+    """
+    datetime.fromisoformat(entry.added_utc)
+    if file.name != f"{entry.id:04d}.json":
+        raise ValueError("id: expected the number in the name of the file")
+    if len(entry.text) > MAX_BYTES:
+        raise ValueError(f"text: it is longer than {MAX_BYTES >> 10} KiB")
+    paths = {"sequence": entry.sequence, "output": entry.options.output, "run_dir": entry.run_dir}
+    for name, path in paths.items():
+        if path is not None and (".." in path.parts or "\0" in str(path)):
+            raise ValueError(f"{name}: expected a path without '..'")
 
 
 @cache

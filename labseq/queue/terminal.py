@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from labseq.console.errors import exit_code_of, report, warning_lines
 from labseq.console.output import say
 from labseq.console.text import columns, plural
-from labseq.messages import clean
+from labseq.messages import MAX_ERROR, clean, visible
 from labseq.plain import dumps
 from labseq.queue.queue import Entry, Opening, Queue, QueueRun
 from labseq.recording import data_root
@@ -89,9 +89,9 @@ def _notes(entry: Entry) -> list[str]:
         what = "was changed or removed since; the queued text will run"
         notes.append(f"{entry.id}: {clean(_short(entry.sequence))} {what}")
     if entry.error:
-        notes.append(f"{entry.id}: {entry.error.splitlines()[0]}")
+        notes.append(f"{entry.id}: {visible(entry.error.splitlines()[0][:MAX_ERROR])}")
     if entry.state in {"stopped", "failed"} and entry.run_dir is not None:
-        notes.append(f"{entry.id}: labseq resume {entry.run_dir}")
+        notes.append(f"{entry.id}: labseq resume {visible(str(entry.run_dir))}")
     return notes
 
 

@@ -21,18 +21,21 @@ import numpy as np
 
 import labseq
 from labseq.errors import RecordingError
-from labseq.files import whole_file
+from labseq.files import read_file, whole_file
 from labseq.plain import plain_text
 from labseq.recording import folders, schema
 from labseq.recording.columns import columns_of
 from labseq.recording.hdf5 import link_name, load_filter, set_attributes
 from labseq.recording.reader import Run
 from labseq.recording.shot import Shot
+from labseq.recording.shot_file import read_content
 from labseq.recording.tables import facts_of
 
 FORMAT: Final = "labseq-archive"
 FORMAT_VERSION: Final = "3.0"
 
+MAX_COPY: Final = 1 << 30
+"""Largest file of the run's folder that is copied, in bytes."""
 _SHARED: Final = ("target", "run")
 _WORTH_PACKING: Final = 1024
 """Arrays of at least this size are compressed, in bytes; smaller ones would grow."""
@@ -55,9 +58,9 @@ def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
         set_attributes(file, {**facts_of(run), **formats, "NX_class": "NXroot", "default": "table"})
         file.attrs["archived_by"] = f"labseq {labseq.__version__}"
         _write_table(file.create_group("table"), run)
-        _write_files(file.create_group("run"), run.path)
+        left_out += _write_files(file.create_group("run"), run.path)
         shots = _Shots(file.create_group("shots"), frames=frames)
-        for shot in (*run.shots, *run.attempts):
+        for shot in {shot.file: shot for shot in (*run.attempts, *run.shots)}.values():
             try:
                 shot.verify()
                 shots.add(shot)
@@ -79,13 +82,18 @@ def _write_table(group: h5py.Group, run: Run) -> None:
         set_attributes(dataset, {"units": column.units, "description": column.description})
 
 
-def _write_files(group: h5py.Group, run_dir: Path) -> None:
-    """Copy the files of the run's folder unchanged: texts as text, others as bytes."""
+def _write_files(group: h5py.Group, run_dir: Path) -> list[str]:
+    """Copy the files of the run's folder: texts as text, others as bytes; returns what was left out."""
+    left_out: list[str] = []
     results = group.create_group(folders.RESULTS_FOLDER)
     for goal, folder in ((group, run_dir), (results, run_dir / folders.RESULTS_FOLDER)):
         for path in sorted(folder.iterdir()) if folder.is_dir() else ():
             if path.is_file() and path.suffix != ".part" and not path.name.startswith("."):
-                _write_file(goal, plain_text(path.name), path.read_bytes())
+                if not path.resolve().is_relative_to(run_dir.resolve()):
+                    left_out.append(f"{path}: is a link to a file that is not of this run; it was not copied")
+                    continue
+                _write_file(goal, plain_text(path.name), read_file(path, MAX_COPY))
+    return left_out
 
 
 def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
@@ -114,6 +122,7 @@ class _Shots:
         Raises:
             RecordingError: Its frames are compressed and the package for it is missing.
         """
+        read_content(shot.file)  # refuses what would lead out of the file
         with h5py.File(shot.file, "r", locking=False) as source:
             entry: Any = source["entry"]
             for camera in entry.get("camera", {}).values() if self._frames else ():

@@ -7,10 +7,11 @@ Nothing is deleted: files that do not belong are moved to the folder ``quarantin
 from __future__ import annotations
 
 import hashlib
-import json
+import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -18,11 +19,22 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import RecordingError
-from labseq.files import LineLog, Lock, Process, explained, read_file, sync_folder, whole_lines, write_file
+from labseq.files import (
+    LineLog,
+    Lock,
+    Process,
+    explained,
+    lines_in,
+    open_ordinary,
+    read_file,
+    sync_folder,
+    write_file,
+)
 from labseq.plain import dumps, parse_object
 from labseq.recording import folders
 from labseq.recording.markers import ACTIVE_FOLDER, Marker, markers_in
 from labseq.recording.run_file import (
+    SHOT_FILE,
     STATUSES,
     OtherFormatError,
     encode_state,
@@ -37,7 +49,6 @@ QUARANTINE: Final = "quarantine"
 LOG_FILE: Final = "doctor.jsonl"
 
 _TO_QUARANTINE: Final = "moved to quarantine"
-_SHOT_NAME: Final = re.compile(r"shot_\d{6,}(\.attempt_\d+)?(\.take_(\d+))?\.h5")
 _RUN_NAME: Final = re.compile(r"\d{4,}_.*", re.DOTALL)
 _CLAIM: Final = re.compile(r"\.\d{4,}\.claim")
 _YOUNG_S: Final = 60.0
@@ -159,30 +170,42 @@ class _LineFile:
     """
 
     def __init__(self, path: Path) -> None:
-        data = read_file(path) if path.exists() else b""
-        whole = whole_lines(data)
+        self._before = [*lines_in(path)] if path.exists() else []
         self.path = path
-        self.kept = whole.split(b"\n")[:-1]
+        self.kept = [line[:-1] for line in self._before if line.endswith(b"\n")]
         self.removed: list[bytes] = []
         self.problems: list[tuple[str, Path, str]] = []
         self.rows: list[_Line] = []
-        self._before = data
-        if unfinished := data[len(whole) :]:
-            self.removed.append(unfinished)
+        if len(self.kept) < len(self._before):
+            self.removed.append(self._before[-1])
             self.problems.append(("torn last line", path, _TO_QUARANTINE))
-        for number, line in enumerate(list(self.kept), start=1):
+        damaged: list[int] = []
+        for number, line in enumerate(self.kept, start=1):
             row = parse_object(line)
             if row is None:
-                self.remove(line, f"line {number} is damaged")
+                self.removed.append(line)
+                damaged.append(number)
             else:
                 self.rows.append((line, row))
+        self.kept = [line for line, _ in self.rows]
+        each = [f"line {number} is damaged" for number in damaged]
+        many = [f"{len(damaged)} lines are damaged, from line {damaged[0]} on"] if damaged else []
+        found = each if len(damaged) <= _MAX_FINDINGS else many
+        self.problems += [(what, path, _TO_QUARANTINE) for what in found]
 
-    def remove(self, line: bytes, what: str = "") -> None:
-        """Remove the first such line; ``what`` is the reason, unless another finding reports it."""
-        self.kept.remove(line)
-        self.removed.append(line)
-        if what:
-            self.problems.append((what, self.path, _TO_QUARANTINE))
+    def remove(self, lines: Collection[bytes], what: str = "") -> None:
+        """Remove the first of such lines; ``what`` is the reason, unless another finding reports it."""
+        gone, kept = Counter(lines), list[bytes]()
+        for line in self.kept:
+            if gone[line] > 0:
+                gone[line] -= 1
+            else:
+                kept.append(line)
+        self.kept = kept
+        self.removed += lines
+        if what and lines:
+            texts = [what] if len(lines) > _MAX_FINDINGS else [what] * len(lines)
+            self.problems += [(text, self.path, _TO_QUARANTINE) for text in texts]
 
     def save(self) -> None:
         """Write the file if it has changed.
@@ -190,8 +213,8 @@ class _LineFile:
         Raises:
             RecordingError: It cannot be written; the old file is unchanged.
         """
-        data = b"".join(line + b"\n" for line in self.kept)
-        if data == self._before:
+        lines = [line + b"\n" for line in self.kept]
+        if lines == self._before:
             return
         if self.removed:
             goal = _quarantine_of(self.path.parent) / self.path.name
@@ -200,7 +223,7 @@ class _LineFile:
                 file.write(b"".join(line + b"\n" for line in self.removed))
             with explained(goal):
                 sync_folder(goal.parent)
-        write_file(self.path, data)
+        write_file(self.path, b"".join(lines))
 
 
 class _Check:
@@ -235,9 +258,8 @@ class _Check:
             self._check_state()
             self._check_shots(shots, str(record.get("run_id")))
             skipped = _LineFile(self.folder / folders.SKIPPED_FILE)
-            for line, row in skipped.rows:
-                if not is_skip_row(row, record["n_shots"]):
-                    skipped.remove(line, "a line names no shots of this run, or no reason")
+            wrong = [line for line, row in skipped.rows if not is_skip_row(row, record["n_shots"])]
+            skipped.remove(wrong, "a line names no shots of this run, or no reason")
             logs = [results / name for name in names_in(results) if name.endswith(".jsonl")]
             for lines in (skipped, *map(_LineFile, (self.folder / folders.EVENTS_FILE, *logs))):
                 self._save(lines)
@@ -253,8 +275,8 @@ class _Check:
                 if not name.endswith(".lock.holder"):
                     continue
                 try:
-                    process = Process.from_plain(json.loads((folder / name).read_bytes()))
-                except (OSError, ValueError, AttributeError):
+                    process = Process.from_plain(parse_object(read_file(folder / name)) or {})
+                except RecordingError:
                     continue  # the file is just being written or deleted
                 if process is not None and process.is_here and not process.is_running:
                     self._quarantine("a lock whose holder is gone", folder / name, folder)
@@ -309,19 +331,20 @@ class _Check:
     def _check_shots(self, folder: Path, run_id: str) -> None:
         """Compare the index with the files of the shots."""
         index = _LineFile(self.folder / folders.INDEX_FILE)
-        of_file: dict[str, list[_Line]] = {}
+        of_file, wrong = dict[str, list[_Line]](), list[bytes]()
         for line, row in index.rows:
             if is_index_row(row) and _is_name_of(
                 row["file"], row["shot"], row["attempt"], counts=row["counts"]
             ):
                 of_file.setdefault(row["file"], []).append((line, row))
             else:
-                index.remove(line, "a line of the index is not a shot's")
+                wrong.append(line)
+        index.remove(wrong, "a line of the index is not a shot's")
         counted = {row["shot"] for same in of_file.values() for _, row in same if row["counts"]}
         for file, same in of_file.items():
             self.n_whole += self._check_file(self.folder / file, same, index)
         for name in names_in(folder):
-            if _SHOT_NAME.fullmatch(name) and f"{folder.name}/{name}" not in of_file:
+            if SHOT_FILE.fullmatch(file := f"{folder.name}/{name}") and file not in of_file:
                 row = self._row_of_stray(folder / name, run_id)
                 if row is not None:
                     # The last line of a shot counts, so another line of this shot keeps counting.
@@ -334,37 +357,43 @@ class _Check:
     def _check_file(self, path: Path, lines: list[_Line], index: _LineFile) -> bool:
         """Whether the file of a shot exists unchanged; further lines of the index for it are removed."""
         try:
-            data = path.read_bytes()
+            n_bytes, sha256 = self._size_and_hash(path, {row["bytes"] for _, row in lines})
         except FileNotFoundError:
-            for line, _ in lines:
-                index.remove(line)
+            index.remove([line for line, _ in lines])
             remedy = "its line moved to quarantine; if you find the file, put it back and run this again"
             index.problems.append(("the shot's file is missing", path, remedy))
             return False
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return False
-        sha256 = hashlib.sha256(data).hexdigest()
         good = [i for i, (_, row) in enumerate(lines) if row["sha256"] == sha256]
         if not good:
-            what, remedy = _what_changed(data, lines[-1][1]["bytes"]), f"{_TO_QUARANTINE}, with its line"
+            what, remedy = _what_changed(n_bytes, lines[-1][1]["bytes"]), f"{_TO_QUARANTINE}, with its line"
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
-                for line, _ in lines:
-                    index.remove(line)
+                index.remove([line for line, _ in lines])
             return False
-        for i, (line, _) in enumerate(lines):
-            if i != good[-1]:
-                index.remove(line, f"a second line for {path.name}")
+        second = [line for i, (line, _) in enumerate(lines) if i != good[-1]]
+        index.remove(second, f"a second line for {path.name}")
         return True
+
+    @staticmethod
+    def _size_and_hash(path: Path, sizes: Collection[int]) -> tuple[int, str]:
+        """Size of a file, and its SHA-256; "" for a huge one that has none of the sizes."""
+        with open_ordinary(path) as file:
+            n_bytes = os.fstat(file.fileno()).st_size
+            is_hashed = n_bytes < _HUGE or n_bytes in sizes
+            return n_bytes, hashlib.file_digest(file, "sha256").hexdigest() if is_hashed else ""
 
     def _row_of_stray(self, path: Path, run_id: str) -> dict[str, Any] | None:
         """The line for a file that has none, if the file is a whole shot of this run."""
-        from labseq.recording.shot_file import read_content, read_frames  # h5py takes 0.1 s to import
+        from labseq.recording.shot_file import iter_frames, read_content  # h5py takes 0.1 s to import
 
         try:
-            data = path.read_bytes()
             content = read_content(path)
-            read_frames(path)
+            for _ in iter_frames(path):  # each must be readable
+                pass
+            n_bytes = path.stat().st_size
+            _, sha256 = self._size_and_hash(path, [n_bytes])
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return None
@@ -382,8 +411,7 @@ class _Check:
         if not _is_name_of(file, record.shot_index, record.attempt, counts=counts):
             self._quarantine("a shot under a name that is not its own", path)
             return None
-        sha256 = hashlib.sha256(data).hexdigest()
-        return index_row(record, content.target, file=file, sha256=sha256, n_bytes=len(data))
+        return index_row(record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
 
     def _save(self, lines: _LineFile) -> None:
         """Save a file of lines, and report its defects."""
@@ -417,16 +445,21 @@ class _Check:
 _CHECK_PERMISSIONS: Final = "left: check its permissions and the disk"
 
 
-def _what_changed(data: bytes, n_bytes: int) -> str:
-    if not data:
+_HUGE: Final = 1 << 30
+_MAX_FINDINGS: Final = 100
+"""Damaged lines of a file that are reported one by one."""
+
+
+def _what_changed(found: int, n_bytes: int) -> str:
+    if not found:
         return "the shot's file is empty"
-    if len(data) < n_bytes:
-        return f"the shot's file is cut off: {len(data)} of {n_bytes} bytes"
+    if found < n_bytes:
+        return f"the shot's file is cut off: {found} of {n_bytes} bytes"
     return "the checksum does not hold: a byte has changed since it was written"
 
 
 def _is_name_of(file: str, shot_index: int, attempt: int, *, counts: bool) -> bool:
-    match = _SHOT_NAME.fullmatch(file.rpartition("/")[2])
+    match = SHOT_FILE.fullmatch(file)
     take = int(match[3] or 1) if match else 1
     return file == folders.shot_file_name(shot_index, attempt, counts=counts, take=take)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Container, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import h5py
 import numpy as np
-from h5py import h5a, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - h5py ships no types
+from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t  # pyright: ignore[reportAttributeAccessIssue] - h5py ships no types
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
 from labseq.messages import install_hint
-from labseq.plain import dumps, plain_text, to_plain
+from labseq.plain import dumps, parse_value, plain_text, to_plain
 from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
 
 _STRING: Final = h5py.string_dtype()
@@ -61,8 +61,14 @@ def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
             value = value.item()
         elif field.dtype == "texts":
             value = tuple(value)
-        found[field.attribute] = int(value) if field.dtype == "integer" else value
+        value = int(value) if field.dtype == "integer" else value
+        if not isinstance(value, _KINDS[field.dtype]):
+            raise TypeError(f"'{field.name}' is {type(value).__name__}; expected {field.dtype}")
+        found[field.attribute] = value
     return found
+
+
+_KINDS: Final = {"text": str, "texts": tuple, "integer": int, "int64": int, "bool": bool, "float64": float}
 
 
 def write_texts(group: Any, fields: Sequence[Field], record: Any) -> None:
@@ -79,7 +85,7 @@ def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
     """Read texts and JSON: attribute of the record -> value; those of a newer minor format are ignored."""
     texts = {field: group[field.name][()].decode() for field in fields if field.name in group}
     return {
-        field.attribute: json.loads(text) if field.dtype == "json" else text for field, text in texts.items()
+        field.attribute: parse_value(text) if field.dtype == "json" else text for field, text in texts.items()
     }
 
 
@@ -113,7 +119,7 @@ def read_values(group: Any) -> dict[str, Any]:
         if kind is None:
             value = value.tolist()
         else:
-            value = json.loads(value) if kind == "application/json" else value.decode()
+            value = parse_value(value) if kind == "application/json" else value.decode()
         found[str(dataset.attrs["address"])] = value
     return found
 
@@ -162,6 +168,88 @@ def _of_columns(dtype: np.dtype[Any], table: Table) -> tuple[Any, Any, Any]:
         np.array(list(map(plain_text, texts)), _STRING) for texts in describe_columns(dtype, table)
     )
     return units, descriptions, h5s.create_simple(units.shape)
+
+
+MAX_OBJECTS: Final = 10_000
+"""Largest number of groups and datasets in a shot's file."""
+MAX_DEPTH: Final = 8
+"""Deepest group in a shot's file."""
+_FILTERS: Final = frozenset({1, 2, 3, 32000, 32001, 32004, 32008, 32015, 32026})
+"""deflate, shuffle, fletcher32, LZF, Blosc, LZ4, bitshuffle, Zstd, Blosc2; others would load libraries."""
+_MAX_RATIO: Final = 64
+"""By how much frames can be compressed."""
+_SMALL: Final = 1 << 24
+
+
+def check_contents(file: Any, n_bytes: int) -> None:
+    """Refuse what leads out of a file, and what declares more data than the file can hold.
+
+    Args:
+        file: The file, opened; nothing but its structure is read.
+        n_bytes: Its size.
+
+    Raises:
+        ValueError: It has links to other files, an object twice, data in other files, unknown filters,
+            types or objects, or declares more data than it has.
+    """
+    n_objects = n_declared = 0
+    pending: list[tuple[Any, str]] = [(file.id, "")]
+    while pending:
+        group, where = pending.pop()
+        for name in group:
+            n_objects += 1
+            place = f"{where}/{name.decode('utf-8', 'backslashreplace')}"
+            if n_objects > MAX_OBJECTS or place.count("/") > MAX_DEPTH:
+                raise ValueError(f"it has more than {MAX_OBJECTS} objects, or groups too deep, up to {place}")
+            kind = group.links.get_info(name).type
+            if kind == h5l.TYPE_SOFT and group.links.get_val(name).startswith(b"/entry/camera/"):
+                continue
+            if kind != h5l.TYPE_HARD:
+                raise ValueError(f"{place} is a link that leads elsewhere")
+            node = h5o.open(group, name)
+            if h5o.get_info(node).rc > 1:
+                raise ValueError(f"{place} is in the file twice")
+            if isinstance(node, h5g.GroupID):
+                pending.append((node, place))
+            elif isinstance(node, h5d.DatasetID):
+                n_declared += _declared_bytes(node, place, n_bytes)
+            else:
+                raise ValueError(f"{place} is neither a group nor a dataset")  # noqa: TRY004 - of the file
+    if n_declared > n_bytes:
+        raise ValueError(f"its datasets declare {n_declared} bytes, and the file has {n_bytes}")
+
+
+def _declared_bytes(dataset: Any, place: str, n_bytes: int) -> int:
+    """Bytes that a dataset declares; 0 for one that is compressed, whose size is checked here.
+
+    Raises:
+        ValueError: Its data are not in the file, or are more than it can hold.
+    """
+    kind, plist = dataset.get_type(), dataset.get_create_plist()
+    if plist.get_external_count() or plist.get_layout() == h5d.VIRTUAL:
+        raise ValueError(f"{place} keeps its data in another file")
+    _check_type(kind, place)
+    size = math.prod(dataset.get_space().get_simple_extent_dims()) * kind.get_size()
+    if plist.get_layout() == h5d.CHUNKED:
+        size = max(size, math.prod(plist.get_chunk()) * kind.get_size())
+    filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
+    if not filters <= _FILTERS:
+        raise ValueError(f"{place} has the filter {min(filters - _FILTERS)}, which labseq does not use")
+    limit = max(_SMALL, _MAX_RATIO * n_bytes) if filters else n_bytes
+    if size > limit:
+        raise ValueError(f"{place} declares {size} bytes, and the file has {n_bytes}")
+    return 0 if filters else size
+
+
+def _check_type(kind: Any, place: str) -> None:
+    """Refuse types that refer to other places or can repeat them: references, and sequences of any length."""
+    if isinstance(kind, h5t.TypeCompoundID):
+        for i in range(kind.get_nmembers()):
+            _check_type(kind.get_member_type(i), place)
+    elif isinstance(kind, h5t.TypeArrayID):
+        _check_type(kind.get_super(), place)
+    elif not isinstance(kind, h5t.TypeIntegerID | h5t.TypeFloatID | h5t.TypeStringID | h5t.TypeEnumID):
+        raise ValueError(f"{place} has a type that labseq does not use")  # noqa: TRY004 - of the file
 
 
 def link_name(name: str, taken: Container[str]) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.errors import RecordingError
-from labseq.files import Process, explained, state_root, sync_folder, write_file
+from labseq.files import Process, explained, read_file, state_root, sync_folder, write_file
 from labseq.plain import dumps, parse_object
 from labseq.recording.folders import slug
 
@@ -142,8 +142,8 @@ def _markers(roots: Sequence[Path], profile_key: str) -> list[Marker]:
 
 def _read(path: Path) -> Marker:
     try:
-        values = parse_object(path.read_bytes()) or {}
-    except OSError:
+        values = parse_object(read_file(path)) or {}
+    except RecordingError:
         values = {}
     run_dir, profile = values.get("run_dir"), values.get("profile")
     return Marker(

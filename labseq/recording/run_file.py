@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from numbers import Real
@@ -24,10 +25,13 @@ from labseq.model import RunRecord, ShotRecord, TargetPattern
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, parse_object, to_plain
 from labseq.recording import schema
-from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
+from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, SHOTS_FOLDER, STATE_FILE
 
 SIMULATION: Final = "simulation."
 """Prefix of the names of readings that only a simulation can know."""
+
+SHOT_FILE: Final = re.compile(SHOTS_FOLDER + r"/shot_\d{6,}(\.attempt_\d+)?(\.take_(\d+))?\.h5")
+"""A shot's file in a line of the index."""
 
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 
@@ -54,6 +58,8 @@ def check_version(path: Path, found: str, known: str) -> None:
         raise OtherFormatError(path, f"has format version {found}, this labseq reads {known}; {advice}")
 
 
+_MAX_INT: Final = 2**63
+_DICTS_IN_RUN: Final = ("units", "overrides", "scan", "devices", "resolved", "provenance")
 _IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
 
 
@@ -96,6 +102,9 @@ def read_run(folder: Path) -> dict[str, Any]:
         raise RecordingError(path, "is damaged, or not labseq's; restore it from a backup")
     check_version(path, str(record.get("format_version")), schema.RUN_FORMAT_VERSION)
     wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
+    wrong += [name for name in _DICTS_IN_RUN if not isinstance(record.get(name) or {}, dict)]
+    if not wrong and not 0 <= record["n_shots"] < _MAX_INT:
+        wrong = ["n_shots"]
     if wrong:
         raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; restore it from a backup")
     return record
@@ -130,8 +139,8 @@ def encode_state(status: RunStatus, error: str = "") -> bytes:
 def read_state_file(folder: Path) -> dict[str, Any]:
     """The content of STATE as it is; empty if it is missing or damaged."""
     try:
-        return parse_object((folder / STATE_FILE).read_bytes()) or {}
-    except OSError:
+        return parse_object(read_file(folder / STATE_FILE)) or {}
+    except RecordingError:
         return {}
 
 
@@ -272,9 +281,9 @@ def _number(value: Any) -> Any:
     """A number of the index; JSON has null for nan and infinities."""
     if value is None:
         return math.nan
-    if type(value) not in (int, float):
-        raise TypeError(value)
-    return value
+    if type(value) is float or (type(value) is int and -_MAX_INT <= value < _MAX_INT):
+        return value
+    raise TypeError(value)
 
 
 def index_row(
@@ -335,6 +344,10 @@ def is_index_row(row: Mapping[str, Any]) -> bool:
     if not all(isinstance(row.get(name, _NOTHING), kind) for name, kind in _NEEDED_IN_INDEX):
         return False
     if not all(isinstance(row.get(name), kind) for name, kind in _KINDS_IN_INDEX if name in row):
+        return False
+    if not SHOT_FILE.fullmatch(row["file"]) or not all(
+        -_MAX_INT <= value < _MAX_INT for value in row.values() if type(value) is int
+    ):
         return False
     try:
         summary_of(row)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.files import read_file
+from labseq.files import open_ordinary
 from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.model.records import ShotStatus
 from labseq.recording.run_file import ShotSummary, summary_of
@@ -205,7 +205,13 @@ class Shot:
         Raises:
             RecordingError: A byte has changed since it was written.
         """
-        if hashlib.sha256(read_file(self.file)).hexdigest() != self.row.get("sha256"):
+        try:
+            with open_ordinary(self.file) as file:
+                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            what = f"cannot be read: {error.strerror}; check the disk"
+            raise RecordingError(self.file, what) from error
+        if sha256 != self.row.get("sha256"):
             raise RecordingError(self.file, "has changed since it was written; restore it from a backup")
 
     @property

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import RecordingError
-from labseq.messages import format_error
+from labseq.messages import error_text, format_error
 from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.recording import schema
 from labseq.recording.hdf5 import (
+    check_contents,
     describe,
     link_name,
     load_filter,
@@ -35,6 +36,7 @@ from labseq.recording.hdf5 import (
     write_values,
 )
 from labseq.recording.run_file import check_version, sha256_of_text
+from labseq.text_files import something_else
 
 _AXES: Final = ("t_s", ".", ".")
 
@@ -231,16 +233,21 @@ def read_frames(path: Path) -> dict[int, Frame]:
         RecordingError: As for :func:`read_content`; or the frames are compressed
             and the package for it is missing.
     """
-    frames: dict[int, Frame] = {}
+    return dict(sorted(iter_frames(path)))
+
+
+def iter_frames(path: Path) -> Generator[tuple[int, Frame]]:
+    """Read the frames one by one, with the index of the image of each; see :func:`read_frames`."""
     with opened(path) as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
-            load_filter(path, group["frames"])
+            stack = group["frames"]
+            load_filter(path, stack)
             values = schema.EXPOSURES.arguments(Frame, group["exposures"][()])
             camera = str(group.attrs["name"])
-            for index, image, known in zip(group["image"][()], group["frames"][()], values, strict=True):
+            for i, (index, known) in enumerate(zip(group["image"][()], values, strict=True)):
+                image = stack[i]
                 image.flags.writeable = False
-                frames[int(index)] = Frame(image, camera=camera, **known)
-    return dict(sorted(frames.items()))
+                yield int(index), Frame(image, camera=camera, **known)
 
 
 def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
@@ -256,6 +263,8 @@ def opened(path: Path) -> Generator[Any]:
     Raises:
         RecordingError: It is missing, damaged, or of another format.
     """
+    if what := something_else(path):
+        raise RecordingError(path, f"cannot be read: {what}; restore it from a backup")
     if not path.is_file():
         raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
     try:
@@ -264,9 +273,12 @@ def opened(path: Path) -> Generator[Any]:
             if file.attrs.get("format") != schema.FORMAT:
                 raise RecordingError(path, "is not a shot's file of labseq")
             check_version(path, str(file.attrs.get("format_version")), schema.FORMAT_VERSION)
+            check_contents(file, path.stat().st_size)
             yield cast("Any", file["entry"])
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise RecordingError(path, f"is damaged: {error}; restore it from a backup") from error
+    except RecordingError:
+        raise
+    except Exception as error:  # of h5py, numpy, and whatever a damaged file has instead of the values
+        raise RecordingError(path, f"is damaged: {error_text(error)}; restore it from a backup") from error
 
 
 def _record(entry: Any) -> ShotRecord:

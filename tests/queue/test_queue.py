@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
@@ -89,3 +90,26 @@ def test_a_new_field_of_a_later_labseq_is_no_damage(queue: Queue) -> None:
     file = queue.folder / "0001.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "colour": "red"}))
     assert len(queue.entries()) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"position": "1e30000000"}, "position: expected a number such as 3 or 5/2"),
+        ({"position": "1/0"}, "position: expected a number such as 3 or 5/2"),
+        ({"id": 7}, "id: expected the number in the name of the file"),
+        ({"options": {"output": "../../.."}}, "output: expected a path without '..'"),
+        ({"run_dir": "../x"}, "run_dir: expected a path without '..'"),
+        ({"added_utc": "yesterday"}, "Invalid isoformat string: 'yesterday'"),
+        ({"text": "x" * (1 << 19)}, "text: it is longer than 256 KiB"),
+    ],
+    ids=str,
+)
+def test_an_entry_that_labseq_did_not_write_is_refused(
+    queue: Queue, changes: dict[str, Any], what: str
+) -> None:
+    file = queue.folder / f"{add(queue).id:04d}.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+    with pytest.raises(RecordingError) as caught:
+        queue.entries()
+    assert str(caught.value) == f"{file}: is a damaged queue entry: {what}; move it away"
