@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -101,11 +102,16 @@ class SoapyStaticTweezers(StaticTweezers):
             self._tones.tune(self._facts)
             self.radio.started(self._tones.tones_hz)
         except BaseException:
-            self._disconnect()
+            with suppress(DeviceError):  # the first error is reported
+                self._disconnect()
             raise
 
     def close(self) -> None:
-        """Ramp down and close the radio; legal in any state."""
+        """Ramp down and close the radio; legal in any state.
+
+        Raises:
+            DeviceError: Its transmitters may still be on.
+        """
         self._disconnect()
 
     def load(self, amplitudes: Amplitudes | None) -> None:
@@ -300,9 +306,11 @@ class SoapyStaticTweezers(StaticTweezers):
     def _disconnect(self) -> None:
         link, self._link, self._facts = self._link, None, None
         self._depth, self._dark, self._is_loaded, self._amplitudes = 0.0, 0, False, None
-        if link is not None:
-            link.close()
-        self.radio.disconnect()
+        try:
+            if link is not None:
+                link.close()
+        finally:
+            self.radio.disconnect()
 
 
 def _calibrated(context: Context) -> Amplitudes:

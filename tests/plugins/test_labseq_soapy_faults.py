@@ -6,6 +6,7 @@ import os
 import queue
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -159,6 +160,21 @@ def test_after_its_process_was_killed_the_radio_can_be_opened_again() -> None:
         rig.tweezers.open()
         rig.tweezers.start()
         assert rig.ring.is_playing
+
+
+def test_a_radio_that_is_gone_with_its_process_is_not_safe(tmp_path: Path) -> None:
+    with opened(arguments=f"folder={tmp_path}") as rig:
+        rig.tweezers.start()
+        link = link_of(rig)
+        link._setup = replace(link._setup, device="driver=none")
+        os.kill(link.pid, signal.SIGKILL)
+        until(raised(DeviceError, rig.tweezers.check_interlocks))
+        for call in (rig.tweezers.safe_state, rig.tweezers.close):
+            with pytest.raises(
+                DeviceError, match=r"'driver=none' cannot be opened again: .*: switch it off by hand"
+            ):
+                call()
+        rig.tweezers.close()
 
 
 def end_by_a_signal(rig: Rig) -> None:
