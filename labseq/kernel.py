@@ -111,6 +111,17 @@ def announcing(announce: Callable[[float], None]) -> Generator[None]:
             _ANNOUNCE.remove(announce)
 
 
+def import_numba() -> None:
+    """Import numba in a thread, because other warming leaves a core idle meanwhile."""
+
+    def attempt() -> None:
+        with suppress(Exception):  # load_kernels will report it
+            _numba()
+
+    if not _INTERPRETED.is_set():
+        threading.Thread(target=attempt, name="import numba").start()
+
+
 def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
     """Compile the kernels of all modules imported so far, or load them from the cache.
 

@@ -88,6 +88,7 @@ class Package:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "cache"
     monkeypatch.setenv("LABSEQ_CACHE", str(folder))
+    monkeypatch.setattr(labseq.kernel, "_PENDING", {})  # without those that other tests have imported
     return folder
 
 

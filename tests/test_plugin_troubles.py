@@ -260,7 +260,7 @@ class Point:
 
     def __init__(self, name: str, distribution: str, load: Callable[[], object]) -> None:
         self.name = self.value = name
-        self.dist = SimpleNamespace(metadata={"Name": distribution, "Version": "1.2"})
+        self.dist = SimpleNamespace(read_text=lambda _: f"Name: {distribution}\nVersion: 1.2\n\nVersion: 2")
         self.load = load
 
 

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from labseq.cli.live import observer_for
 from labseq.cli.summary import json_summary, summary_lines
 from labseq.console.errors import lines_of
+from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import existing_run
 from labseq.console.text import plural, quoted
@@ -27,6 +27,9 @@ from labseq.roles import RunObserver
 from labseq.session.options import Options
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text, running_here
+
+if TYPE_CHECKING:
+    from labseq.cli.live import LiveView
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
@@ -48,10 +51,19 @@ def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: boo
     run_session(resume, as_json=as_json)
 
 
+def _observer() -> LogLines | LiveView:
+    """Shows the run on a terminal, or prints lines; only the former imports rich."""
+    if not sys.stdout.isatty():
+        return LogLines(sys.stdout)
+    from labseq.cli.live import observer_for
+
+    return observer_for(sys.stdout)
+
+
 def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bool) -> None:
     """Run the session that ``opening`` opens with an observer; print the result even if the run failed."""
     answer = stdout_to_stderr() if as_json else None
-    observer = observer_for(sys.stdout)
+    observer = _observer()
     session: Session | None = None
     failure: BaseException | None = None
     try:

@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, cast
 
 import pluggy
 
-from labseq import hookspecs
+from labseq import __version__, hookspecs
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.files import PLUGIN_PATH, PLUGINS
 from labseq.hookspecs import LABSEQ_API
@@ -207,16 +207,15 @@ class PluginHost:
 
     def load_builtin(self, module: ModuleType) -> None:
         """Register a module of labseq itself; its failure is a bug in labseq and raises."""
-        info = PluginInfo(module.__name__, "built in", _version("labseq"))
+        info = PluginInfo(module.__name__, "built in", __version__)
         self._register(info, None, lambda: module)
         self._infos[info.name] = info
 
     def load_entry_points(self) -> None:
         """Load every installed plugin; each failure is kept for the report."""
         for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
-            about: Any = {} if point.dist is None else point.dist.metadata  # parsed at each access
-            version = about.get("Version") or ""
-            source = f"the distribution {about.get('Name') or 'unknown'} {version}".rstrip()
+            name, version = ("", "") if point.dist is None else name_and_version(point.dist)
+            source = f"the distribution {name or 'unknown'} {version}".rstrip()
             info = PluginInfo(point.name, "installed", version, source=source)
             self._load(info, partial(module_location, point.value.partition(":")[0]), point.load)
 
@@ -354,8 +353,9 @@ def _states_api(path: Path) -> bool:
     return b"LABSEQ_API" in path.read_bytes()
 
 
-def _version(distribution: str) -> str:
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return ""
+def name_and_version(distribution: importlib.metadata.Distribution) -> tuple[str, str]:
+    """Name and version of an installed package, or ""; to parse all its metadata takes long."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    head = text.partition("\n\n")[0]
+    found = dict(re.findall(r"^(Name|Version): *(.*?) *$", head, re.MULTILINE))
+    return found.get("Name", ""), found.get("Version", "")

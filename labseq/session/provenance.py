@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import getpass
 import hashlib
-import importlib.metadata
 import os
 import platform
 import subprocess
 import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ from labseq.errors import StopRequested
 from labseq.messages import format_error
 from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
+from labseq.plugins.host import name_and_version
 from labseq.session.assembly import Assembly, Setting
 from labseq.session.options import NOT_SET
 
@@ -94,8 +95,8 @@ def _git(folder: Path, *arguments: str) -> str | None:
 @functools.cache
 def _packages() -> dict[str, str]:
     """Name -> version of each installed package; read only once, because it takes as long as a short shot."""
-    about = [distribution.metadata for distribution in importlib.metadata.distributions()]
-    return {name: one["Version"] for one in about if (name := one["Name"])}
+    found = [name_and_version(distribution) for distribution in distributions()]
+    return {name: version for name, version in found if name}
 
 
 def _user() -> str:

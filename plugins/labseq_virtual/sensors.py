@@ -334,20 +334,22 @@ def _dark_counts(register: Register, output: Output, mean_electrons: float) -> C
     value = np.minimum(np.arange(len(p)), output.well) / output.electrons_per_adu + output.offset
     nearest = np.rint(value).astype(np.int64)
     probability = np.zeros(FULL_SCALE + 1)
+    n_counts = min(FULL_SCALE, int(nearest[-1]) + reach) + 1  # those above are impossible
+    below = _below(nearest - reach - value - 0.5, spread)
     for distance in range(-reach, reach + 1):
         count = nearest + distance
-        share = _rounded(count - value, spread) * p
-        probability += np.bincount(np.clip(count, 0, FULL_SCALE), share, len(probability))
+        below_next = _below(count - value + 0.5, spread)
+        share = (below_next - below) * p
+        probability[:n_counts] += np.bincount(np.clip(count, 0, n_counts - 1), share, n_counts)
+        below = below_next
     return CountDistribution.of(probability)
 
 
-def _rounded(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
-    """Probability that Gaussian noise of s.d. ``spread`` is rounded to a count ``distance`` off the mean."""
+def _below(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
+    """Probability that Gaussian noise of s.d. ``spread`` is below a distance from its mean."""
     from scipy.special import ndtr
 
-    if spread == 0:
-        return (np.abs(distance) <= 0.5).astype(float)
-    return ndtr((distance + 0.5) / spread) - ndtr((distance - 0.5) / spread)
+    return (distance > 0).astype(float) if spread == 0 else ndtr(distance / spread)
 
 
 Floats = NDArray[np.float32]
