@@ -60,7 +60,7 @@ class ConfigError(LabseqError, ValueError):
     """A sequence, a profile or an option has an error.
 
     Attributes:
-        problems: All problems that were found, in file order.
+        problems: All problems that were found, each once, in file order.
     """
 
     exit_code: ClassVar[int] = 2
@@ -70,7 +70,7 @@ class ConfigError(LabseqError, ValueError):
             problems = Problem(problems)
         if isinstance(problems, Problem):
             problems = (problems,)
-        self.problems: tuple[Problem, ...] = tuple(problems)
+        self.problems: tuple[Problem, ...] = tuple(dict.fromkeys(problems))
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
 

@@ -175,6 +175,10 @@ FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
 """A file, relative to the sequence or profile that names it; in Python, to the working folder."""
 Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0), AfterValidator(_not_too_long)]
 """Seconds, 0 to :data:`MAX_DURATION_S`; "45 ms"."""
+PositiveDuration: TypeAlias = Annotated[
+    float, _quantity("time"), Field(gt=0), AfterValidator(_not_too_long)
+]  # not built on Duration, whose limit would be named for values below 0
+"""Seconds, more than 0, to :data:`MAX_DURATION_S`; "45 ms"."""
 Length: TypeAlias = Annotated[float, _quantity("length")]
 """Metres; "4.49 um"."""
 Frequency: TypeAlias = Annotated[float, _quantity("frequency")]

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from labseq.builtin.rearrange import play
-from labseq.builtin.steps import PositiveDuration
 from labseq.detection.sites import measure_shift
 from labseq.motion import (
     FastOffset,
@@ -28,6 +27,7 @@ from labseq.plugin import (
     Duration,
     Length,
     Occupancy,
+    PositiveDuration,
     ReportsSignals,
     Settings,
     Shot,

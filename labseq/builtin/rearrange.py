@@ -9,7 +9,6 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.builtin.steps import PositiveDuration
 from labseq.plugin import (
     COMPUTER,
     CycleRecord,
@@ -18,6 +17,7 @@ from labseq.plugin import (
     Plan,
     PlanError,
     PlanReport,
+    PositiveDuration,
     Settings,
     Shot,
     Step,

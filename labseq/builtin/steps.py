@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -14,6 +14,7 @@ from labseq.plugin import (
     Duration,
     Fraction,
     LabseqError,
+    PositiveDuration,
     Problem,
     Settings,
     Shot,
@@ -28,9 +29,6 @@ from labseq.plugin import (
     offers,
     setting_error,
 )
-
-PositiveDuration: TypeAlias = Annotated[Duration, Field(gt=0)]
-"""Seconds, more than 0; "45 ms"."""
 
 
 class LoadSettings(Settings):

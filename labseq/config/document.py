@@ -137,15 +137,18 @@ class Document:
         """Create an error for a problem at a location; see :meth:`problem`."""
         return ConfigError(self.problem(loc, what, expected, hint, key))
 
-    def with_values(self, values: Iterable[tuple[Loc, Node]]) -> Document:
+    def with_values(self, values: Iterable[tuple[Loc, Node, Mark | None]]) -> Document:
         """A copy with other values at some locations, and its expressions computed again.
+
+        Args:
+            values: Location, value and place of its key, as for :meth:`Node.replaced`.
 
         Raises:
             ConfigError: An expression can no longer be computed.
         """
         root = self.written
-        for loc, node in values:
-            root = root.replaced(loc, node)
+        for loc, node, key in values:
+            root = root.replaced(loc, node, key=key)
         document = replace(self, root=root, expressions=None)
         return document if self.expressions is None else document.evaluated()
 
@@ -163,7 +166,8 @@ class Document:
             ConfigError: The address does not exist, or the value is no YAML.
         """
         loc = find(self.root, address, self.name, origin, may_add)
-        return self.with_values([(loc, compose(value, self.name, origin) or Node(None, Mark(0, 0, origin)))])
+        node = compose(value, self.name, origin) or Node(None, Mark(0, 0, origin))
+        return self.with_values([(loc, node, None)])
 
     def override_all(
         self,

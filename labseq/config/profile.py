@@ -30,6 +30,7 @@ from labseq.settings import (
     FrequencyComb,
     Length,
     Name,
+    PositiveDuration,
     Power,
     Settings,
     Speed,
@@ -409,18 +410,17 @@ class MobileTweezersChoice(MotionSettings, Choice):
     """The plugin of the mobile tweezers, and how they move."""
 
 
-Timeout: TypeAlias = Annotated[Duration, Field(gt=0)]
-
-
 class TimeoutSettings(Settings):
     """How long calls into plugins may take before they count as hung."""
 
-    call: Timeout = Field(
+    call: PositiveDuration = Field(
         default=10.0, description="longest device call, in addition to the duration of its action"
     )
-    safe_state: Timeout = Field(default=5.0, description="longest time for a device to reach its safe state")
-    plan: Timeout = Field(default=5.0, description="longest planning of a cycle")
-    load: Timeout = Field(
+    safe_state: PositiveDuration = Field(
+        default=5.0, description="longest time for a device to reach its safe state"
+    )
+    plan: PositiveDuration = Field(default=5.0, description="longest planning of a cycle")
+    load: PositiveDuration = Field(
         default=30.0, description="longest loading of a plugin, and longest call of a constructor"
     )
 

@@ -157,8 +157,8 @@ class Scan:
 
     def put(self, document: Document, point: int, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of a point."""
-        pairs = self.values(point)
-        return document.with_values((axis.loc, node) for axis, node in pairs if axis.of_profile == profile)
+        pairs = [(axis, node) for axis, node in self.values(point) if axis.of_profile == profile]
+        return document.with_values((axis.loc, node, axis.key) for axis, node in pairs)
 
     def at_first_point(self, document: Document, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of the first point.

@@ -23,6 +23,7 @@ from labseq.settings import (
     FormatVersion,
     Name,
     PatternChoice,
+    PositiveDuration,
     Settings,
     Text,
     Variables,
@@ -35,7 +36,7 @@ from labseq.settings import (
 class StepPolicySettings(Settings):
     """``policy`` of a step, in place of the run's policy."""
 
-    timeout: Annotated[Duration, Field(gt=0)] | None = Field(
+    timeout: PositiveDuration | None = Field(
         default=None, description="longest duration of an attempt at the step; a longer one has failed"
     )
     retries: int = Field(

@@ -120,7 +120,7 @@ class Node:
             node = child
         return node.mark
 
-    def replaced(self, loc: Loc, new: Node, *, same_key: bool = False) -> Node:
+    def replaced(self, loc: Loc, new: Node, *, key: Mark | None = None, same_key: bool = False) -> Node:
         """A copy with the value at ``loc`` replaced, or added to a mapping.
 
         The parents must exist; an empty parent becomes a mapping.
@@ -128,14 +128,15 @@ class Node:
         Args:
             loc: The location.
             new: The new value.
-            same_key: Whether problems of its key still belong to the place where the key is; otherwise they
-                belong to the new value's place: an option that replaces a value gives its key too.
+            key: The place of its key; None for the place of the new value: an option that replaces a value
+                gives its key too.
+            same_key: Whether problems of its key still belong to the place where the key is.
         """
         if not loc:
             return new
         step, rest = loc[0], loc[1:]
         child = self.child(step)
-        inner = (child or Node({}, new.mark)).replaced(rest, new, same_key=same_key)
+        inner = (child or Node({}, new.mark)).replaced(rest, new, key=key, same_key=same_key)
         if isinstance(step, int):
             items = list(self.value) if isinstance(self.value, list) else []
             items[step] = inner
@@ -143,7 +144,7 @@ class Node:
         values = dict(self.value) if isinstance(self.value, dict) else {}
         values[step] = inner
         keeps_key = child is not None and (rest or same_key)
-        return Node(values, self.mark, self.keys if keeps_key else {**self.keys, step: new.mark})
+        return Node(values, self.mark, self.keys if keeps_key else {**self.keys, step: key or new.mark})
 
 
 @lru_cache(maxsize=8)  # nodes are immutable, and most sessions of a process read the same profile

@@ -10,7 +10,7 @@ from labseq.drivers import Cooling
 from labseq.errors import ConfigError, LimitError
 from labseq.model import SensorMode
 from labseq.roles import Context, Simulation, offers
-from labseq.settings import Duration, Settings, Temperature
+from labseq.settings import Duration, PositiveDuration, Settings, Temperature
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 
@@ -32,7 +32,7 @@ class CameraSettings(Settings):
     binning: PositiveInt = Field(
         default=1, description="pixels of the sensor per pixel of a frame, along each axis"
     )
-    max_exposure: Annotated[Duration, Field(gt=0)] = Field(default=10.0, description="longest exposure")
+    max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure")
 
     @property
     def mode(self) -> SensorMode:
@@ -126,7 +126,7 @@ class CoolingSettings(Settings):
         default=1.0, description="how far from it the sensor may be, in kelvins"
     )
     steady: Duration = Field(default=5.0, description="how long it must have been within that")
-    timeout: Annotated[Duration, Field(gt=0)] = Field(default=900.0, description="how long it may take")
+    timeout: PositiveDuration = Field(default=900.0, description="how long it may take")
 
     def spec(self) -> Cooling:
         """The same for drivers."""

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from labseq.plugin import CameraSettings, CoolingSettings, Duration, Frequency
+from labseq.plugin import CameraSettings, CoolingSettings, Frequency, PositiveDuration
 from labseq_andor.heads import IXON_897, Head, known_head, readout_s
 
 SIMULATED: Final = "simulated"
@@ -49,7 +49,7 @@ class AndorSettings(CameraSettings):
     preamp_gain: PositiveFloat | None = Field(
         default=None, description="gain of the pre-amplifier, one of those the camera has; none: its first"
     )
-    vertical_shift_speed: Annotated[Duration, Field(gt=0)] | None = Field(
+    vertical_shift_speed: PositiveDuration | None = Field(
         default=None,
         description="time to shift the rows by one, such as `0.5 us`; none: what Andor recommends",
     )

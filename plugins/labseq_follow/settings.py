@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
-from typing import Annotated, Final, Literal, Self, TypeAlias
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import Duration, FilePath, Settings, clean, setting_error
+from labseq.plugin import Duration, FilePath, PositiveDuration, Settings, clean, setting_error
 
 SIMULATED: Final = "simulated"
-
-PositiveDuration: TypeAlias = Annotated[Duration, Field(gt=0)]
 
 
 class LeaderSettings(Settings):

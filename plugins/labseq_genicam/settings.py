@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field, NonNegativeInt
 
-from labseq.plugin import Duration, Fraction, Frequency, IndustrialCameraSettings, Settings
+from labseq.plugin import Duration, Fraction, Frequency, IndustrialCameraSettings, PositiveDuration, Settings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"]
 
@@ -66,10 +66,10 @@ class GenicamSettings(IndustrialCameraSettings):
         description="bytes of a network packet (GigE); none: as the camera is set, or less if the network "
         "does not transmit that",
     )
-    packet_timeout: Annotated[Duration, Field(gt=0)] = Field(
+    packet_timeout: PositiveDuration = Field(
         default=20e-3, description="time after which a missing network packet is requested again (GigE)"
     )
-    frame_timeout: Annotated[Duration, Field(gt=0)] = Field(
+    frame_timeout: PositiveDuration = Field(
         default=0.5, description="time without a packet after which an incomplete frame is abandoned (GigE)"
     )
     faults: FaultSettings = Field(default=FaultSettings(), description="failures of the simulated camera")

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Final, Literal, Self, TypeAlias
+from typing import Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import Duration, Settings, Text, clean, closest, is_network_port, one_of, setting_error
+from labseq.plugin import (
+    Duration,
+    PositiveDuration,
+    Settings,
+    Text,
+    clean,
+    closest,
+    is_network_port,
+    one_of,
+    setting_error,
+)
 from labseq_serial.patterns import Sent, Template, compiled, example_of
 from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
 
@@ -16,7 +26,6 @@ RESERVED: Final = frozenset({"self", "name", "owner", "timeout_s", "function"})
 """Names that arguments cannot have, because labseq's own calls use them."""
 _SLACK: Final = 1e-9
 
-PositiveDuration: TypeAlias = Annotated[Duration, Field(gt=0)]
 """Seconds, more than 0; "0.5 s"."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self, TypeAlias
+from typing import Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -13,6 +13,7 @@ from labseq.plugin import (
     UNITS,
     ZERO_CELSIUS_K,
     Duration,
+    PositiveDuration,
     Settings,
     Text,
     clean,
@@ -373,7 +374,7 @@ class ValueSettings(TypedSettings):
         default=None,
         description="condition on the value; if it is not met, no atoms are picked up and the run ends",
     )
-    timeout: Annotated[Duration, Field(gt=0)] | None = Field(
+    timeout: PositiveDuration | None = Field(
         default=None, description="how long the reply may take; none: as for all"
     )
     example: Text | None = Field(

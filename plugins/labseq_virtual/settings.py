@@ -19,13 +19,13 @@ from labseq.plugin import (
     Fraction,
     Frequency,
     Length,
+    PositiveDuration,
     Settings,
     Temperature,
     Voltage,
     format_quantity,
 )
 
-PositiveDuration = Annotated[Duration, Field(gt=0)]
 PositiveLength = Annotated[Length, Field(gt=0)]
 
 

@@ -185,6 +185,8 @@ exposure: 45 ms => exposure: 0,5 ms
   16:23: exposure is 0; expected more than 0
 exposure: 45 ms => exposure: 0 ms
   16:23: exposure is '0 ms'; expected more than 0
+exposure: 45 ms => exposure: -45 ms
+  16:23: exposure is '-45 ms'; expected more than 0
 exposure: 45 ms => exposure: 1e999
   16:23: exposure is 1e999; expected a finite number
 - 50 ms => - 50 MHz

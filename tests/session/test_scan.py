@@ -135,7 +135,7 @@ WRONG = [
         "scan: {shot.sort.cycles: [2, 3], shot.sort.window: [[60 ms, 40 ms], 60 ms]}",
         ["53: the list has 2 entries, but cycles is 3 (the scan puts it into 'shot.sort.window')"],
     ),
-    ("scan: {profile.camera.gian: [3]}", ["30: 'gian' is not a setting of camera 'virtual' ("]),
+    ("scan: {profile.camera.gian: [3, 4]}", ["8: 'gian' is not a setting of camera 'virtual' ("]),
     ("scan: {profile.grid.rows: [19, 20]}", ["8: a scan cannot change 'profile.grid.rows' ("]),
     ("scan: {profile.calibrations.use.sites: [a, b]}", ["8: a scan cannot change 'profile.calibrations.use"]),
     ("scan: {profile.camera.use: [virtual, andor]}", ["38: a scan cannot change the driver of camera ("]),
