@@ -39,7 +39,7 @@ from labseq.analysis.scanned import (
     title_of,
 )
 from labseq.analysis.statistics import Statistics, statistics_of
-from labseq.analysis.survival import Survival, SurvivalCounts, steps_that_load
+from labseq.analysis.survival import Survival, SurvivalCounts
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
@@ -49,7 +49,7 @@ from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.pictures.figures import make_figure, save_figure
 from labseq.recording import Run, Shot
-from labseq.recording.quantities import Quantity
+from labseq.recording.quantities import Quantity, steps_that_load
 from labseq.roles import Context
 from labseq.units import factor_of
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from labseq.errors import RecordingError
 from labseq.model import Occupancy, follow_atoms
 from labseq.model.estimate import Rate
-from labseq.recording import Run, Shot
+from labseq.recording import Shot
 
 Counts = NDArray[np.int64]
 
@@ -104,13 +102,6 @@ class Survival:
                 self.by_cycle.append((_nothing(seen.shape), _nothing(seen.shape)))
             self.by_cycle[cycle][0].add(moved, seen)
             self.by_cycle[cycle][1].add(kept, seen)
-
-
-def steps_that_load(run: Run) -> frozenset[int]:
-    """Indices of the steps of a run's shots that load atoms."""
-    resolved: Mapping[str, Any] = run.record.get("resolved") or {}
-    steps: Sequence[Mapping[str, Any]] = resolved.get("shot", ())
-    return frozenset(i for i, step in enumerate(steps) if "load" in step)
 
 
 def _nothing(shape: tuple[int, ...]) -> SurvivalCounts:

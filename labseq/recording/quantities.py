@@ -273,11 +273,17 @@ def quantity_of(run: Run, name: str) -> Quantity:
     return make_quantity(name, run.target, _numbers(run) if name.startswith(PREFIX) else None)
 
 
+def steps_that_load(run: Run) -> frozenset[int]:
+    """Indices of the steps of a run's shots that load atoms."""
+    resolved: Mapping[str, Any] = run.record.get("resolved") or {}
+    steps: Sequence[Mapping[str, Any]] = resolved.get("shot", ())
+    return frozenset(i for i, step in enumerate(steps) if "load" in step)
+
+
 def _check_no_load(run: Run, name: str) -> None:
     """Refuse survival between images with a loading between them, as far as the run's record tells."""
     kind, images = split_name(name)
-    steps: Sequence[Mapping[str, Any]] = (run.record.get("resolved") or {}).get("shot", ())
-    loads = [i for i, step in enumerate(steps) if "load" in step]
+    loads = steps_that_load(run)
     if kind != "survival" or not loads or not run.shots:
         return
     try:

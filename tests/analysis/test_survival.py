@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from labseq.analysis.survival import Survival, steps_that_load
+from labseq.analysis.survival import Survival
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport, follow_atoms
 from labseq.model.estimate import Rate
 from labseq.recording import Run
+from labseq.recording.quantities import steps_that_load
 
 from .records import make_shot
 

@@ -95,8 +95,10 @@ def test_a_scan_follows_an_analysis_and_a_resumed_one_decides_alike(tmp_path: Pa
 
     run_dir = interrupted(path, "shot_finished", 4)  # before the results of the second point are read
     assert len(points(labseq.open_run(run_dir))) == 1
-    with (run_dir / "analysis" / "mean.jsonl").open("a") as file:  # made again since, with other values
-        file.writelines(json.dumps({"shot": shot, "filling": 9.0}) + "\n" for shot in (0, 1))
+    results = run_dir / "analysis" / "mean.jsonl"
+    about, *_ = results.read_text("utf-8").splitlines()
+    others = [json.dumps({"shot": shot, "filling": 9.0}) for shot in (0, 1)]
+    results.write_text("\n".join([about, *others, ""]), "utf-8")  # of other values, and without the last ones
     again = resumed(run_dir)
     assert table(again) == table(whole)
     values = {one["point"]: one["value"] for one in points(whole)}
