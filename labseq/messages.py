@@ -12,9 +12,15 @@ MAX_ERROR: Final = 2000
 """Maximum number of characters of an error's text that labseq shows, logs and records."""
 
 
-def install_hint(extra: str) -> str:
-    """The command that installs an extra here; environments that uv made have no pip of their own."""
-    return f"{'pip' if find_spec('pip') else 'uv pip'} install 'labseq[{extra}]'"
+def install_hint(extra: str, package: str = "labseq") -> str:
+    """The command that installs a package here; environments that uv made have no pip of their own.
+
+    Args:
+        extra: What of the package, for example "plot"; "" for the package alone.
+        package: Its name.
+    """
+    what = f"'{package}[{extra}]'" if extra else package
+    return f"{'pip' if find_spec('pip') else 'uv pip'} install {what}"
 
 
 def visible(text: str) -> str:

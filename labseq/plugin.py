@@ -38,7 +38,7 @@ from labseq.files import Process, cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
 from labseq.kernel import const, helper_kernel, kernel
-from labseq.messages import clean, closest, visible
+from labseq.messages import clean, closest, install_hint, visible
 from labseq.model import (
     COMPUTER,
     AxisTones,
@@ -272,6 +272,7 @@ __all__ = [
     "helper_kernel",
     "hookimpl",
     "idle_program",
+    "install_hint",
     "is_network_port",
     "is_write_timeout",
     "kernel",

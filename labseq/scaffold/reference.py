@@ -141,7 +141,9 @@ def _plain_table(table: Table, width: int) -> list[str]:
 def _fact(title: str, cell: str) -> str:
     if title != "default":
         return cell
-    return {"required": "required", "none": "may be left out"}.get(cell, f"default: {cell}")
+    if cell.startswith("required"):
+        return cell
+    return "may be left out" if cell == "none" else f"default: {cell}"
 
 
 def _wrapped(text: str, width: int, indent: str, hang: str = "") -> list[str]:
@@ -167,9 +169,10 @@ FILES: Final[Mapping[str, type[BaseModel]]] = {"sequence": SequenceSpec, "profil
 _CHOSEN: Final = {"target": "pattern", "devices": "device", "shot": "step", "scan": "scanner"}
 """Key that names plugins -> their kind, if that is not the key itself."""
 _ADDED_BY_LOADER: Final[Mapping[tuple[type[BaseModel], str], str]] = {
-    (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`"
+    (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`",
+    (SequenceSpec, "shots"): "required without `scan`",
 }
-"""Keys that the model needs and the loader adds, with their defaults."""
+"""Keys that the model needs and the loader adds: their defaults, or when they are needed."""
 _KEY_HEADER: Final = ("key", "value", "default", "meaning")
 _NO_SETTINGS: Final = "It takes no settings."
 

@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq.plugin import Context, DeviceError, ExposureResult, wait_for
+from labseq.plugin import Context, DeviceError, ExposureResult, install_hint, wait_for
 from labseq_andor.settings import SIMULATED, AndorSettings
 
 OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"
@@ -80,7 +80,7 @@ def load_pylablib(name: str) -> Any:
         return importlib.import_module("pylablib.devices.Andor.AndorSDK2")
     except ModuleNotFoundError as error:
         text = f"the Python package 'pylablib' cannot be imported ({error})"
-        install = 'install it with `pip install "labseq[andor]"`'
+        install = f"install it with {install_hint('andor')}"
         raise DeviceError(name, f"{text}; {install}; {OTHERWISE}") from error
 
 

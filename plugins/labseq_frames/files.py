@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Problem, RecordingError, Run, open_run
+from labseq.plugin import Problem, RecordingError, Run, install_hint, open_run
 
 PNG: Final = (".png",)
 TIFF: Final = (".tif", ".tiff")
@@ -183,7 +183,7 @@ def load(package: str, name: str, path: Path) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         text = f"reading it needs {name}, which cannot be imported ({error})"
-        raise BadFramesError(path, text, hint='install it with `pip install "labseq[frames]"`') from error
+        raise BadFramesError(path, text, hint=f"install it with {install_hint('frames')}") from error
 
 
 def format_shape(shape: tuple[int, ...]) -> str:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from labseq.plugin import ConfigError, ScanRange, ScanSpace, Settings, VisitedPoint
+from labseq.plugin import ConfigError, ScanRange, ScanSpace, Settings, VisitedPoint, install_hint
 
 
 class OptunaSettings(Settings):
@@ -97,7 +97,7 @@ def _optuna() -> Any:
     try:
         optuna = importlib.import_module("optuna")
     except ImportError as error:
-        text = "the scanner 'optuna' needs the package of that name; pip install 'labseq[optuna]'"
-        raise ConfigError(f"{text} ({error})") from error
+        text = f"the scanner 'optuna' needs the package of that name ({error})"
+        raise ConfigError(f"{text}; install it with {install_hint('optuna')}") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

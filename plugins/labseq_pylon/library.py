@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
-from labseq.plugin import DeviceError, LimitError, check_step, one_of
+from labseq.plugin import DeviceError, LimitError, check_step, install_hint, one_of
 
 OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
 
@@ -49,9 +49,7 @@ def load_pypylon(name: str) -> Sdk:
             pylon, genicam = (importlib.import_module(f"pypylon.{part}") for part in ("pylon", "genicam"))
     except ImportError as error:
         text = f"the Python package 'pypylon' cannot be imported ({error})"
-        raise DeviceError(
-            name, f'{text}; install it with `pip install "labseq[pylon]"`; {OTHERWISE}'
-        ) from error
+        raise DeviceError(name, f"{text}; install it with {install_hint('pylon')}; {OTHERWISE}") from error
     return Sdk(name, pylon, genicam)
 
 

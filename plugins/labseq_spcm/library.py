@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from labseq.plugin import Context, DeviceError, Emergency
+from labseq.plugin import Context, DeviceError, Emergency, install_hint
 from labseq_spcm.settings import SpcmSettings
 
 if TYPE_CHECKING:
@@ -91,5 +91,7 @@ def load_spcm(name: str, library: Library) -> Any:
 
 
 def _not_installed(name: str, error: ModuleNotFoundError) -> DeviceError:
-    text = f"the Python package 'spcm' cannot be imported ({error}); install it with `pip install spcm`"
+    text = (
+        f"the Python package 'spcm' cannot be imported ({error}); install it with {install_hint('', 'spcm')}"
+    )
     return DeviceError(name, text)

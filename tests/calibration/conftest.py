@@ -39,6 +39,19 @@ class Lab:
         return calibrate(METHODS[kind], request, self.observer)
 
 
+@pytest.fixture(autouse=True)
+def unencoded(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are composed, but not rendered, except for tests that ask for ``rendered``."""
+    if "rendered" not in request.fixturenames:
+        encode = "labseq.calibration.measure.encode_figure"
+        monkeypatch.setattr(encode, lambda draw, **_: b"png" if draw() else b"")
+
+
+@pytest.fixture
+def rendered() -> None:
+    """Pictures are those that users get."""
+
+
 @pytest.fixture(scope="session")
 def make_lab() -> Callable[[Path, str], Lab]:
     return Lab

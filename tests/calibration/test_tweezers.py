@@ -37,6 +37,7 @@ def true_spread(outcome: Any = None) -> float:
     return factors(simulation.spot_powers()).separable_spread
 
 
+@pytest.mark.usefixtures("rendered")
 def test_uneven_rows_and_columns_are_made_even_and_stay_so(tmp_path: Path, make_lab: Any) -> None:
     lab = make_lab(tmp_path, PROFILE)
     with pytest.raises(ConfigError, match=r"has no device 'trap_camera'; expected .*'wavemeter'"):

@@ -77,10 +77,12 @@ def test_the_planners_of_the_tutorial(
     run(rest)
     warned = capsys.readouterr().err  # `mine` leaves much unfilled, as the page says
     assert re.fullmatch(r"warning: .* loadings have enough atoms for the target;.*\n.*\n.*\n", warned)
-    some = "returns_a_plan or fills_the_target or refuses_wrong_input or order"  # the others take long
+    some = (
+        "returns_a_plan or refuses_wrong_input or order or (fills_the_target and not OneByOne)"  # are quick
+    )
     code, out = run_pytest(capsys, "-k", some, "plugins/spiral", "test_mine.py", "labseq-helix/tests")
     assert code == 0, out
-    assert "13 passed" in out
+    assert "12 passed" in out
 
 
 def test_the_promise_that_the_tutorial_breaks(

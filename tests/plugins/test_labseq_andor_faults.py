@@ -17,7 +17,7 @@ from labseq_andor.settings import AndorSettings
 from labseq_andor_sim import SimulatedCamera
 
 from labseq import ConfigError, DeviceError, DeviceTimeoutError, TransientError
-from labseq.plugin import Context
+from labseq.plugin import Context, install_hint
 
 from .labseq_camera_rig import Rig, opened_rig
 from .needs import need_library
@@ -213,9 +213,7 @@ def test_the_safe_state_comes_through_while_a_call_hangs() -> None:
 
 def test_without_pylablib_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pylablib.devices.Andor.AndorSDK2", None)
-    assert 'install it with `pip install "labseq[andor]"`; to try things without a camera' in refusal(
-        unopened()
-    )
+    assert f"install it with {install_hint('andor')}; to try things without a camera" in refusal(unopened())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there Andor's library may be installed")

@@ -16,7 +16,7 @@ from labseq_frames.camera import FramesCamera, FramesSettings
 from labseq_frames.files import natural
 from PIL import Image
 
-from labseq.plugin import ConfigError, Context, DeviceError
+from labseq.plugin import ConfigError, Context, DeviceError, install_hint
 from labseq.testing.fakes import FakeClock
 
 from .test_labseq_frames import stack_of, write_run
@@ -222,7 +222,7 @@ def test_a_package_that_is_missing_is_named_with_the_command_that_installs_it(
 ) -> None:
     write(tmp_path / name)
     monkeypatch.setitem(sys.modules, module, None)
-    assert refusal(tmp_path / name).endswith('install it with `pip install "labseq[frames]"`')
+    assert refusal(tmp_path / name).endswith(f"install it with {install_hint('frames')}")
 
 
 @given(st.lists(st.tuples(st.text("ab", max_size=2), st.integers(0, 10**6)), unique=True))

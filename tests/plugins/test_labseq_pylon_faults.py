@@ -14,6 +14,7 @@ from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 
 from labseq import DeviceError, LimitError, TransientError
+from labseq.plugin import install_hint
 
 from .labseq_camera_rig import Rig, opened_rig
 from .needs import need_library
@@ -179,4 +180,4 @@ def test_a_camera_that_another_program_has_is_an_error(monkeypatch: pytest.Monke
 
 def test_without_pypylon_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pypylon.pylon", None)
-    assert 'install it with `pip install "labseq[pylon]"`' in str(opening())
+    assert f"install it with {install_hint('pylon')};" in str(opening())

@@ -38,6 +38,7 @@ from labseq.plugin import (
     Plan,
     RfSpec,
     ToneProgram,
+    install_hint,
 )
 from labseq.testing.fakes import FakeClock
 
@@ -289,7 +290,9 @@ for card in ("/dev/spcm0", "simulated", "/dev/spcm0"):
 
 def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "spcm", None)
-    with pytest.raises(DeviceError, match=r"'spcm' cannot be imported .* `pip install spcm`"):
+    with pytest.raises(
+        DeviceError, match=rf"'spcm' cannot be imported .*; install it with {install_hint('', 'spcm')}$"
+    ):
         load_spcm("mobile_tweezers", VendorLibrary("/dev/spcm0"))
 
 
