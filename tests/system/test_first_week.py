@@ -243,6 +243,13 @@ def test_a_developer(desk: Desk, camera_port: int, pretend_installed: Callable[[
     desk.labseq("new", "camera", "yourcam", "--package")
     pretend_installed(Path("labseq-yourcam"))
     assert "yourcam" in desk.labseq("plugins")
+    desk.labseq("new", "step", "shade", "--package")
+    pretend_installed(Path("labseq-shade"))
+    elsewhere = Path("elsewhere/second.yaml")
+    elsewhere.parent.mkdir()
+    text = sequence.replace("plugin_folders: [plugins]", "")
+    elsewhere.write_text(text + "  - shade: {duration: 1 ms}\n")
+    desk.labseq("check", str(elsewhere))
 
 
 def test_an_analyst(desk: Desk) -> None:
