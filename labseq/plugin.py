@@ -10,6 +10,7 @@ from labseq.drivers.camera import check_step, nearest
 from labseq.drivers.serial_port import (
     BROKEN,
     Port,
+    SerialMessage,
     is_network_port,
     is_write_timeout,
     open_port,
@@ -225,6 +226,7 @@ __all__ = [
     "ScanSpace",
     "Scanner",
     "SensorMode",
+    "SerialMessage",
     "Series",
     "Settings",
     "Shot",

@@ -42,8 +42,8 @@ HANGS_S: Final = 1.0
 """How long after that it counts as hanging."""
 ANSWER_S: Final = 5.0
 """How long a run waits for an answer of the watchdog."""
-END_S: Final = 5.0
-"""How long a run waits for the end of the watchdog."""
+END_S: Final = 7.0
+"""How long a run waits for the end of the watchdog, which may have to switch devices off."""
 MAX_TEXT: Final = 500
 """Length at which texts of errors are cut."""
 
@@ -87,9 +87,9 @@ class _Device:
         if prepare := getattr(self._module, "prepare", None):
             prepare(**arguments)
 
-    def off(self, report: Callable[[str, str], None]) -> None:
-        """Switch the device off, and try again for a while if that fails."""
-        deadline = time.monotonic() + TRY_AGAIN_S
+    def off(self, report: Callable[[str, str], None], again_s: float) -> None:
+        """Switch the device off, and try again for so long if that fails."""
+        deadline = time.monotonic() + again_s
         while True:
             try:
                 done = self._off(**self._arguments)
@@ -162,7 +162,7 @@ class _Process:
         elif "forget" in order:
             self._devices.pop(order["forget"], None)
         elif self._devices:  # the end, and some devices could not be made safe
-            self._switch_off("could not make its devices safe", time.monotonic())
+            self._switch_off("could not make its devices safe", time.monotonic(), 0.0)
             return False
         else:
             return False
@@ -192,15 +192,16 @@ class _Process:
             while time.monotonic() < deadline and not self._is_orphan():
                 time.sleep(0.002)
 
-    def _switch_off(self, cause: str, since_s: float) -> None:
+    def _switch_off(self, cause: str, since_s: float, again_s: float | None = None) -> None:
         """Switch every device off, in the order of the safe state; none waits long for another."""
+        again_s = TRY_AGAIN_S if again_s is None else again_s
         threads: dict[str, threading.Thread] = {}
         for name, device in sorted(self._devices.items(), key=lambda item: item[1].order):
 
             def report(done: str, failure: str, name: str = name) -> None:
                 self._report(cause, name, done, failure, time.monotonic() - since_s)
 
-            threads[name] = threading.Thread(target=device.off, args=[report], daemon=True)
+            threads[name] = threading.Thread(target=device.off, args=[report, again_s], daemon=True)
             threads[name].start()
             threads[name].join(NEXT_S)
         deadline = time.monotonic() + TRY_AGAIN_S + HANGS_S

@@ -1,63 +1,122 @@
 """Switches a device on a serial line off from another process, with pyserial alone.
 
 The watchdog loads this file by its path when the run that used the device has died; see
-``labseq.plugin.serial_emergency``.
+``labseq.plugin.serial_emergency``. Messages are ``SerialMessage``s as JSON values.
 """
 
 from __future__ import annotations
 
 import importlib
+import re
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 SLICE_S: Final = 0.005
 MAX_SHOWN: Final = 60
+_DIFFERS: Final = "not as commanded: "
+_sent: Final[dict[int, str]] = {}
+"""Messages that are not sent again, by index -> why they failed; "" if they did not."""
 
 
-def prepare(port: str, options: Mapping[str, Any], messages: Sequence[Mapping[str, Any]]) -> None:  # noqa: ARG001
+def prepare(**_: Any) -> None:
     """Load pyserial; the port is not touched."""
     importlib.import_module("serial")
 
 
-def off(port: str, options: Mapping[str, Any], messages: Sequence[Mapping[str, Any]]) -> str:
-    """Open the port, send every message, and wait for its answer.
+def off(
+    port: str, options: Mapping[str, Any], messages: Sequence[Mapping[str, Any]], encoding: str, echo: bool
+) -> str:
+    """Open the port and send every message, also after one that fails.
+
+    Called again, it sends only what may be repeated.
 
     Args:
         port: The port, as pyserial knows it.
         options: Those of the port.
-        messages: For each, as Latin-1 text: ``send``; ``until``, the end of the answer; and ``within_s``,
-            how long the answer may take, or the pause after a message without one.
+        messages: What is sent.
+        encoding: Of the characters.
+        echo: Whether the device repeats what it is sent.
 
     Returns:
         What was sent.
 
     Raises:
-        OSError: The port cannot be opened, or an answer did not come; every message was sent.
+        OSError: The port cannot be opened, or messages failed.
     """
     serial: Any = importlib.import_module("serial")
-    silent: list[str] = []
-    with serial.serial_for_url(port, timeout=SLICE_S, write_timeout=1.0, **options) as line:
-        for message in messages:
-            line.write(message["send"].encode("latin-1"))
-            line.flush()
-            if not message["until"]:
-                time.sleep(message["within_s"])
-            elif not _answers(line, message["until"].encode("latin-1"), message["within_s"]):
-                silent.append(_shown(message["send"]))
-    if silent:
-        raise OSError(f"{port}: no answer to {', '.join(silent)}")
-    sent = [_shown(message["send"]) for message in messages if message["send"]]
-    return f"sent {', '.join(sent)} to {port}"
+    failures: list[str] = []
+    done: list[str] = []
+    with serial.serial_for_url(port, timeout=SLICE_S, **options) as opened:
+        line = _Line(opened, encoding, echo)
+        for i, message in enumerate(messages):
+            if i not in _sent:
+                failure, is_sent = line.carry_out(message)
+                if is_sent:
+                    done.append(_shown(message["send"]))
+                if is_sent and not message["repeatable"]:
+                    _sent[i] = failure
+                failures.append(failure)
+            else:
+                failures.append(_sent[i])
+    if any(failures):
+        raise OSError(f"{port}: {'; '.join(filter(None, failures))}")
+    shown = ", ".join(filter(None, done))
+    return f"sent {shown} to {port}" if shown else f"{port}: nothing had to be sent"
 
 
-def _answers(line: Any, end: bytes, within_s: float) -> bool:
-    came, deadline = b"", time.monotonic() + within_s
-    while end not in came:
-        if time.monotonic() > deadline:
-            return False
-        came += line.read(max(1, line.in_waiting))
-    return True
+class _Line:
+    """An open port."""
+
+    def __init__(self, port: Any, encoding: str, echo: bool) -> None:
+        self._port, self._encoding, self._echo = port, encoding, echo
+
+    def carry_out(self, message: Mapping[str, Any]) -> tuple[str, bool]:
+        """Send a message if it must be; returns why it failed, and whether it was sent."""
+        questions = message["unless"]
+        answers = [self._ask(question) for question in questions]
+        if questions and not any(answers):
+            return "", False
+        for answer in answers:
+            if answer and not answer.startswith(_DIFFERS):
+                return answer, False  # a toggle might turn it on
+        if failure := self._ask(message):
+            return failure, True
+        deadline = time.monotonic() + message["within_s"]
+        while failure := next(filter(None, map(self._ask, questions)), ""):
+            if time.monotonic() > deadline:
+                break
+        return failure, True
+
+    def _ask(self, message: Mapping[str, Any]) -> str:
+        """Send a message and check the reply; returns what is wrong with it."""
+        shown, within_s = _shown(message["send"]), message["within_s"]
+        sent, end = (message[key].encode(self._encoding) for key in ("send", "until"))
+        self._port.reset_input_buffer()
+        self._port.write(sent)
+        self._port.flush()
+        if not end:
+            time.sleep(within_s)
+            return ""
+        came, start = b"", len(sent) if self._echo else 0
+        deadline = time.monotonic() + within_s
+        while (at := came.find(end, start)) < 0:
+            if time.monotonic() > deadline:
+                return f"no answer to {shown}"
+            came += self._port.read(max(1, self._port.in_waiting))
+        reply = came[start:at].decode(self._encoding, "replace").strip()
+        match = re.fullmatch(message["expect"], reply, re.DOTALL)
+        if match is None or (message["error"] and re.fullmatch(message["error"], reply, re.DOTALL)):
+            return f"{shown} was answered by {_shown(reply)}"
+        if (wanted := message["value"]) is None:
+            return ""
+        value: str | int = match["value"].strip()
+        with suppress(ValueError):
+            value = int(value) if isinstance(wanted, int) else value
+        if type(value) is not type(wanted) or value not in (message["choices"] or [value]):
+            return f"{shown} was answered by {_shown(reply)}"
+        return "" if value == wanted else f"{_DIFFERS}{shown} was answered by {_shown(reply)}"
 
 
 def _shown(text: str) -> str:

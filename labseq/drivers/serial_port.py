@@ -7,6 +7,7 @@ import importlib
 import re
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 from urllib.parse import urlsplit
@@ -115,13 +116,44 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
         raise DeviceError(device, f"cannot open {port}: {_reason(error)}") from error
 
 
-def serial_emergency(port: Port, messages: Sequence[tuple[bytes, bytes, float]]) -> Emergency | None:
+@dataclass(frozen=True, slots=True)
+class SerialMessage:
+    """A message that makes a device safe, or a question.
+
+    Attributes:
+        send: What is sent, with its end.
+        until: The end of the reply; "" if none comes.
+        within_s: How long the reply may take, or the pause after a message without one, in seconds.
+        expect: Pattern of the reply, without its end and surrounding spaces.
+        error: Pattern of a reply that reports an error; None if there is none.
+        value: Of a question: what the group ``value`` of the reply must be.
+        choices: All that it may be; empty for anything.
+        repeatable: Whether it may be sent again if something failed.
+        unless: Questions. It is not sent if all of them are answered as they must be; a toggle is not sent to
+            what is off. After it was sent they must be.
+    """
+
+    send: str
+    until: str = ""
+    within_s: float = 0.0
+    expect: str = ".*"
+    error: str | None = None
+    value: str | int | None = None
+    choices: tuple[str, ...] = ()
+    repeatable: bool = True
+    unless: tuple[SerialMessage, ...] = ()
+
+
+def serial_emergency(
+    port: Port, messages: Sequence[SerialMessage], encoding: str = "latin-1", *, echo: bool = False
+) -> Emergency | None:
     """How another process switches off a device on a serial line: the port is opened and messages are sent.
 
     Args:
         port: The open port.
-        messages: For each: the bytes; the end of the answer, b"" for none; and how long it may take, or the
-            pause after a message without one, in seconds.
+        messages: What is sent.
+        encoding: Of the characters.
+        echo: Whether the device repeats what it is sent.
 
     Returns:
         None if there is nothing to send, or no real port, as in a simulation.
@@ -131,13 +163,12 @@ def serial_emergency(port: Port, messages: Sequence[tuple[bytes, bytes, float]])
         return None
     own: Any = port
     options = {key: getattr(own, key, None) for key in _OPTIONS}
-    values = [
-        {"send": sent.decode("latin-1"), "until": end.decode("latin-1"), "within_s": within_s}
-        for sent, end, within_s in messages
-    ]
     given = {key: value for key, value in options.items() if value is not None}
-    script = Path(__file__).with_name("serial_emergency.py")
-    return Emergency(script, {"port": name, "options": given, "messages": values})
+    if "://" not in name:
+        given["write_timeout"] = 1.0
+    values = [asdict(message) for message in messages]
+    arguments = {"port": name, "options": given, "messages": values, "encoding": encoding, "echo": echo}
+    return Emergency(Path(__file__).with_name("serial_emergency.py"), arguments)
 
 
 _OPTIONS: Final = ("baudrate", "bytesize", "parity", "stopbits", "rtscts", "dsrdtr", "xonxoff")

@@ -15,6 +15,7 @@ from labseq.plugin import (
     Emergency,
     LabseqError,
     LimitError,
+    SerialMessage,
     TransientError,
     clean,
     format_quantity,
@@ -123,15 +124,33 @@ class Instrument:
         """Carry out a call of the description; its arguments were checked with the profile."""
         self.carry_out(*self._named(call))
 
-    def message(self, call: Call) -> tuple[bytes, bytes, float]:
-        """What a call sends, the end of its reply, and how long that may take; or the pause after it."""
+    def message(self, call: Call) -> SerialMessage:
+        """What a call sends, and what must come of it, for another process."""
         settings, (name, values) = self._settings, self._named(call)
         command = settings.commands[name]
-        sent = (command.text(values) + settings.write_ends_with).encode(settings.encoding)
-        if command.reply is None:
-            return sent, b"", settings.pause
-        end = settings.read_ends_with.encode(settings.encoding)
-        return sent, end, command.timeout or settings.timeout
+        answered = command.reply is not None
+        return SerialMessage(
+            command.text(values) + settings.write_ends_with,
+            settings.read_ends_with if answered else "",
+            command.timeout or settings.timeout if answered else settings.pause,
+            command.reply or "",
+            command.error,
+            repeatable=command.repeatable,
+            unless=tuple(self._question(made, state) for made, state in command.makes.items()),
+        )
+
+    def _question(self, name: str, state: bool | int | str) -> SerialMessage:
+        """Asks whether a value is as a command makes it."""
+        settings, value = self._settings, self._settings.values[name]
+        return SerialMessage(
+            value.ask + settings.write_ends_with,
+            settings.read_ends_with,
+            value.timeout or settings.timeout,
+            value.reply,
+            value.error,
+            value=value.words[state] if isinstance(state, bool) else state,
+            choices=tuple(value.words) if isinstance(state, bool) else (),
+        )
 
     def _named(self, call: Call) -> tuple[str, dict[str, Scalar]]:
         name, given = call_of(call)
@@ -220,10 +239,9 @@ class SerialDevice(Device):
         instrument, settings = self._instrument, self._settings
         if instrument is None or not settings.safe_state:
             return None
-        messages = [(b"", b"", settings.wait_after_open)] if settings.wait_after_open else []
-        return serial_emergency(
-            instrument.line.port, [*messages, *map(instrument.message, settings.safe_state)]
-        )
+        ready = [SerialMessage("", within_s=settings.wait_after_open)] if settings.wait_after_open else []
+        messages = [*ready, *map(instrument.message, settings.safe_state)]
+        return serial_emergency(instrument.line.port, messages, settings.encoding, echo=settings.echo)
 
     def command(self, name: str, **arguments: Any) -> None:
         """Carry out a declared command.

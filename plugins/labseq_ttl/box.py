@@ -17,6 +17,7 @@ from labseq.plugin import (
     DeviceTimeoutError,
     Emergency,
     Port,
+    SerialMessage,
     clean,
     format_quantity,
     open_port,
@@ -137,7 +138,7 @@ class Conversation:
 
     def emergency(self) -> Emergency | None:
         """How another process turns all lines off; None without a real port."""
-        return serial_emergency(self._port, [(STOP, b"!", BOOT_S)])
+        return serial_emergency(self._port, [SerialMessage(STOP.decode(), "!", BOOT_S)])
 
     def close(self) -> None:
         """Close the port; legal in any state."""

@@ -2,7 +2,8 @@
 
 Its standard input takes one order per line, each answered by one line of JSON: ``fault NAME N`` for its next
 N replies, ``answer HEX`` for the next one, ``say HEX`` for bytes unasked, ``speed N`` for the baud rate at
-which it works, ``set NAME VALUE``, ``log`` for what it was sent, ``unplug``, ``plug``.
+which it works, ``set NAME VALUE``, ``log`` for what it was sent,
+``state`` for its values and the time (CLOCK_MONOTONIC) of its last command, ``unplug``, ``plug``.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import pty
 import select
 import sys
 import termios
+import time
 import tty
 from pathlib import Path
 
@@ -27,6 +29,7 @@ class Instrument:
         self.link = link
         self.master = self.slave = -1
         self.log: list[str] = []
+        self.commanded_s = 0.0
         self.fault, self.n_faults = "", 0
         self.speed = termios.B9600
         self.state = {"open": "0", "frequency": "100.000000", "temperature": "21.50"}
@@ -73,6 +76,8 @@ class Instrument:
             self.unplug()
         elif order == "plug":
             self.plug()
+        elif order == "state":
+            return self.state, self.commanded_s
         return self.log if order == "log" else None
 
     def take(self, data: bytes) -> None:
@@ -81,6 +86,7 @@ class Instrument:
             line, self.came = self.came.split(b"\n", 1)
             text = line.decode("latin-1")
             self.log.append(text)
+            self.commanded_s = self.commanded_s if "?" in text else time.monotonic()
             if self.n_faults:
                 self.n_faults -= 1
                 self.misbehave(text)
