@@ -329,7 +329,9 @@ def table(run_dir: Path) -> list[Any]:
 def result(bench: Bench, job: str) -> Any:
     """What a finished job left: the tables of its runs, or the values of its calibration."""
     if job != "calibration":
-        return [table(folder) for folder in bench.runs()]
+        return sorted(
+            [table(folder) for folder in bench.runs()], key=repr
+        )  # a clock that is set changes names
     found = sorted(bench.folder.glob("calibrations/**/thresholds-*.json"))
     return json.loads(found[-1].read_text(encoding="utf-8"))["values"]
 
@@ -500,7 +502,7 @@ def next_command(bench: Bench, job: str) -> list[str] | None:
     runs = bench.runs()
     if job == "queue":
         entries = json.loads(bench.run("queue", "list", "--json"))["entries"]
-        waiting = [entry for entry in entries if entry["state"] != "failed"]
+        waiting = [entry for entry in entries if entry["state"] not in ("failed", "stopped")]
     else:
         waiting = not runs
     if waiting:
