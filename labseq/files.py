@@ -10,12 +10,16 @@ import errno
 import json
 import os
 import platform
+import signal
 import stat
+import sys
+import time
 import warnings
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from io import BufferedReader
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
@@ -354,24 +358,68 @@ def cache_root() -> Path:
     return Path(platformdirs.user_cache_dir("labseq", appauthor=False)).expanduser()
 
 
+def devices_root() -> Path:
+    """Folder of the locks and markers of the devices of this computer, for all users.
+
+    ``LABSEQ_LOCKS`` if set, else ``/var/tmp/labseq``, which lasts longer than a power cut, or on Windows
+    ``labseq`` in ProgramData.
+    """
+    if own := os.environ.get("LABSEQ_LOCKS"):
+        return Path(own).expanduser().absolute()
+    system = os.environ.get("PROGRAMDATA", r"C:\ProgramData") if os.name == "nt" else "/var/tmp"  # noqa: S108
+    return Path(system) / "labseq"
+
+
+def make_shared(folder: Path) -> None:
+    """Make a folder in which every user may make files, and delete only their own.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    if not folder.is_dir():
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(OSError):
+            folder.chmod(0o1777)
+
+
+def write_shared(path: Path, data: bytes) -> None:
+    """Write a small file, in :func:`devices_root`, that other users may change but not replace.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    make_shared(path.parent)
+    try:
+        with whole_file(path) as file:
+            file.write(data)
+        path.chmod(_FOR_ALL)
+    except PermissionError:
+        with path.open("r+b", buffering=0) as file:
+            file.write(data)
+            file.truncate()
+
+
 @dataclass(frozen=True, slots=True)
 class Process:
     """A process, identified by its id and its start, because ids are used again.
 
     Attributes:
         pid: Process id.
-        started: When it started, in seconds since 1970; 0 if that is unknown.
+        started: When it started: on Linux in seconds since the computer did, which no change of the
+            clock moves, elsewhere since 1970; 0 if that is unknown.
         host: The computer that it runs on.
+        boot: Which start of the computer; "" if unknown.
     """
 
     pid: int
     started: float
     host: str
+    boot: str = ""
 
     @classmethod
     def current(cls) -> Process:
         """This process."""
-        return cls(os.getpid(), _start_time(os.getpid()) or 0.0, platform.node())
+        return cls(os.getpid(), _start_time(os.getpid()) or 0.0, platform.node(), _boot_id())
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Process | None:
@@ -379,7 +427,7 @@ class Process:
         pid, started = values.get("pid"), values.get("started", 0.0)
         if type(pid) is not int or pid <= 0 or type(started) not in (int, float):
             return None
-        return cls(pid, float(started), str(values.get("host") or ""))
+        return cls(pid, float(started), str(values.get("host") or ""), str(values.get("boot") or ""))
 
     @property
     def is_here(self) -> bool:
@@ -389,18 +437,48 @@ class Process:
     @property
     def is_running(self) -> bool:
         """Whether it still runs; only known on its own computer."""
+        if self.boot and self.boot != _boot_id():
+            return False
         started = _start_time(self.pid)
         if started is None:
             return False
         return not (self.started and started) or abs(started - self.started) < _SAME_START_S
 
+    def end(self, grace_s: float) -> bool:
+        """End it: SIGTERM, and SIGKILL if it has not ended within the grace time.
 
-_SAME_START_S: Final = 2.0
-"""The system's clock may be corrected while a process runs, which moves its start time a little."""
+        Returns:
+            Whether it has ended.
+
+        Raises:
+            OSError: It belongs to another user.
+        """
+        for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
+            deadline_s = time.monotonic() + grace_s
+            with suppress(ProcessLookupError):
+                if self.is_running:
+                    os.kill(self.pid, number)
+            while self.is_running and time.monotonic() < deadline_s:
+                time.sleep(0.02)
+        return not self.is_running
+
+
+_SAME_START_S: Final = 0.02 if sys.platform == "linux" else 2.0
+"""Elsewhere a correction of the clock may move the start time of a process."""
+
+
+@cache
+def _boot_id() -> str:
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""
 
 
 def _start_time(pid: int) -> float | None:
-    """When a process started, in seconds since 1970; None without such a process, 0 if hidden."""
+    """When a process started, see :class:`Process`; None without such a process, 0 if hidden."""
+    if sys.platform == "linux":
+        return _start_since_boot(pid)
     import psutil  # takes 0.03 s to import
 
     try:
@@ -412,9 +490,28 @@ def _start_time(pid: int) -> float | None:
         return None
 
 
+def _start_since_boot(pid: int) -> float | None:
+    """The same on Linux, by proc(5), whose times do not follow the clock."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
+        return None if fields[0] in "ZXx" else int(fields[19]) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError):
+        try:
+            os.kill(pid, 0)
+        except PermissionError:  # it is hidden
+            return 0.0
+        except (OSError, OverflowError):
+            return None
+        return 0.0
+
+
 _NO_LOCKS: Final = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
 _FOR_ALL: Final = 0o666
 """Other users may lock the same file, whatever this user's umask is."""
+
+
+HANG_S: Final = 30.0
+"""A process that has given no sign of life for so long hangs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,26 +520,33 @@ class Holder:
 
     Attributes:
         what: Its purpose, for example "the run data/2026-01-02/0001_compact"; "" if unknown.
-        pid: Its process; 0 if unknown.
-        host: Its computer.
+        process: The process; None if unknown.
         since_utc: Since when, ISO 8601, UTC.
+        silent_s: Time since its last sign of life; 0 if it gives none.
     """
 
-    what: str
-    pid: int
-    host: str
-    since_utc: str
+    what: str = ""
+    process: Process | None = None
+    since_utc: str = ""
+    silent_s: float = 0.0
+
+    @property
+    def hangs(self) -> bool:
+        """Whether it has given no sign of life for too long."""
+        return self.silent_s > HANG_S
 
     def __str__(self) -> str:
-        if not self.pid:
+        if self.process is None:
             return "an unknown process"
-        return f"{self.what} (process {self.pid} on {self.host}, since {_local(self.since_utc)})"
+        process = f"process {self.process.pid} on {self.process.host}"
+        return f"{self.what} ({process}, since {_local(self.since_utc)})"
 
 
 class Lock:
     """A lock of the operating system on a file; it is released when its process ends, even if killed.
 
-    ``<file>.holder`` next to the file describes the process that holds it.
+    ``<file>.holder`` next to the file describes the process that holds it. The time of that file, on the
+    system's monotonic clock, is its last sign of life.
 
     Args:
         path: The file; it and its folder are made if they do not exist, and stay.
@@ -453,9 +557,7 @@ class Lock:
         self.path = path
         self._lock: BaseFileLock | None = None
         self._about = path.with_name(f"{path.name}.holder")
-        self._holder = Holder(
-            what, os.getpid(), platform.node(), datetime.now(UTC).isoformat(timespec="seconds")
-        )
+        self._holder = Holder(what, Process.current(), datetime.now(UTC).isoformat(timespec="seconds"))
 
     def take(self) -> Holder | None:
         """Take the lock if it is free.
@@ -488,8 +590,15 @@ class Lock:
     def describe(self, what: str) -> None:
         """Write the purpose of the lock to the file of its holder, if possible."""
         self._holder = replace(self._holder, what=what)
-        with suppress(OSError), whole_file(self._about) as file:
-            file.write(json.dumps(asdict(self._holder)).encode())
+        values = {"what": what, "since_utc": self._holder.since_utc, **asdict(Process.current())}
+        with suppress(OSError):
+            write_shared(self._about, json.dumps(values).encode())
+        self.beat()
+
+    def beat(self) -> None:
+        """Give a sign of life."""
+        with suppress(OSError):
+            os.utime(self._about, ns=(time.monotonic_ns(), time.monotonic_ns()))
 
     def release(self) -> None:
         """Free the lock; legal at any time."""
@@ -502,11 +611,10 @@ class Lock:
     def _other(self) -> Holder:
         try:
             values = parse_object(read_file(self._about)) or {}
-            return Holder(
-                str(values["what"]), int(values["pid"]), str(values["host"]), str(values["since_utc"])
-            )
-        except (RecordingError, ValueError, TypeError, KeyError):
-            return Holder("", 0, "", "")
+            silent_s = max(0.0, time.monotonic() - self._about.stat().st_mtime)
+            return Holder(str(values["what"]), Process.from_plain(values), str(values["since_utc"]), silent_s)
+        except (RecordingError, OSError, KeyError):
+            return Holder()
 
 
 def knows_no_locks(error: OSError) -> bool:

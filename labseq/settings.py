@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar, cast, get_args
@@ -56,6 +56,14 @@ class Settings(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False, defer_build=True
     )
+
+    def identities(self) -> Sequence[str] | None:
+        """Of a driver: what only one process can use, known before it is opened: port, card, serial number.
+
+        labseq locks it against other processes, and knows it again after a crash, whatever the profile.
+        Empty if there is nothing to lock; None (default) if unknown: the profile's path stands for it then.
+        """
+        return None
 
 
 class NoSettings(Settings):

@@ -26,7 +26,8 @@ settings.load_profile("labseq")
 
 for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not reach the tests
     os.environ.pop(_name, None)
-os.environ["LABSEQ_STATE"] = os.devnull  # for fixtures that outlive a test: leads nowhere
+for _name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere
+    os.environ[_name] = os.devnull
 
 if sys.dont_write_bytecode:  # else each process would compile the tests and numba's source again
     _BYTECODE, _TEMPORARY = cache_root() / "bytecode", Path(tempfile.gettempdir())
@@ -103,9 +104,10 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 
 @pytest.fixture(autouse=True)
 def own_state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state folder for each test and its subprocesses, so that none sees another's runs."""
+    """Folders of state and locks for each test and its subprocesses, so that none sees another's runs."""
     folder = tmp_path_factory.getbasetemp() / "state" / str(next(_NUMBERS))
     monkeypatch.setenv("LABSEQ_STATE", str(folder))
+    monkeypatch.setenv("LABSEQ_LOCKS", str(folder / "devices"))
 
 
 @pytest.fixture

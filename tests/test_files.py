@@ -263,7 +263,7 @@ def test_a_lock_has_one_holder(tmp_path: Path) -> None:
     assert first.take() is None
     holder = second.take()
     assert holder is not None
-    assert (holder.what, holder.pid) == ("labseq devices", os.getpid())
+    assert (holder.what, holder.process) == ("labseq devices", Process.current())
     first.describe("the run data/1")
     assert str(second.take()).startswith(f"the run data/1 (process {os.getpid()} on ")
     second.release()  # it holds nothing
@@ -284,7 +284,8 @@ def test_a_holder_that_is_killed_loses_its_lock(tmp_path: Path) -> None:
         child.stdout.readline()
         holder = mine.take()
         assert holder is not None
-        assert (holder.what, holder.pid) == ("the run µ", child.pid)
+        assert holder.process is not None
+        assert (holder.what, holder.process.pid) == ("the run µ", child.pid)
         child.kill()
         child.wait()
         assert mine.take() is None
@@ -297,7 +298,7 @@ def test_a_holder_that_cannot_be_read_is_still_one(tmp_path: Path, content: byte
     first.take()
     about = tmp_path / "a.lock.holder"
     about.unlink() if content is None else about.write_bytes(content)
-    assert second.take() == Holder("", 0, "", "")
+    assert second.take() == Holder()
     assert str(second.take()) == "an unknown process"
     first.release()
 

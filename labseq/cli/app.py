@@ -381,13 +381,16 @@ def plugins(
 @app.command(short_help="Bring every device of a profile to its safe state.")
 def safe(
     profile: ProfileArgument,
+    end: Annotated[
+        bool, typer.Option("--end", help="First end any process that uses the devices, even if it answers.")
+    ] = False,
     overrides: Overrides = None,
     _plugins: Plugins = None,
 ) -> None:
     """Open every device of a profile, bring it to its safe state, and close it."""
     from labseq.cli.devices import secure_profile
 
-    raise typer.Exit(secure_profile(profile, overrides or ()))
+    raise typer.Exit(secure_profile(profile, overrides or (), end=end))
 
 
 @app.command(short_help="Test every device of a profile: the first command of the day.")

@@ -100,14 +100,14 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
     return {"devices": devices, "warnings": report.warnings, "problems": []}
 
 
-def secure_profile(profile: str, overrides: Sequence[str]) -> int:
+def secure_profile(profile: str, overrides: Sequence[str], *, end: bool = False) -> int:
     """Make a profile's devices safe; print a line for each.
 
     Returns:
         The exit code: 0 if every device is safe and the profile has no error, 3 if a device
         failed, else 2.
     """
-    secured = make_profile_safe(profile, overrides, _Lines())
+    secured = make_profile_safe(profile, overrides, _Lines(), end=end)
     if secured.problems is not None:
         report(secured.problems)
     if any(secured.attempted.values()):

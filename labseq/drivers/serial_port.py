@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -49,6 +50,20 @@ def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) 
     if clock.virtual:
         clock.sleep(timeout_s)
     return None
+
+
+def port_identities(port: str) -> tuple[str, ...]:
+    """What only one process can use of a serial port: its name, and the port that a link leads to.
+
+    Example:
+        >>> port_identities("socket://Box:4001")
+        ('socket://box:4001',)
+    """
+    if "://" in port:
+        return (port.lower(),)
+    if os.name == "nt":
+        return (port.upper(),)
+    return tuple(dict.fromkeys((port, os.path.realpath(port))))
 
 
 class Port(Protocol):

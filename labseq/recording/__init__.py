@@ -5,9 +5,8 @@ from labseq.recording.columns import figures_in
 from labseq.recording.markers import (
     clear_active,
     find_dead_run,
-    lock_files,
+    lock_file,
     mark_active,
-    marker_roots,
     runs_in_progress,
 )
 from labseq.recording.reader import Run, open_run
@@ -22,9 +21,8 @@ __all__ = [
     "data_root",
     "figures_in",
     "find_dead_run",
-    "lock_files",
+    "lock_file",
     "mark_active",
-    "marker_roots",
     "open_run",
     "runs_in_progress",
 ]

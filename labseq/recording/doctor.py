@@ -32,7 +32,7 @@ from labseq.files import (
 )
 from labseq.plain import dumps, parse_object
 from labseq.recording import folders
-from labseq.recording.markers import ACTIVE_FOLDER, Marker, markers_in
+from labseq.recording.markers import Marker, markers
 from labseq.recording.run_file import (
     SHOT_FILE,
     STATUSES,
@@ -102,8 +102,8 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
         RecordingError: The folder cannot be read.
     """
     root, report = path.absolute(), Report()
-    markers = markers_in(root if not _is_run(root) else root.parent.parent)
-    active = {marker.run_dir for marker in markers if marker.is_active}
+    found = markers()
+    active = {marker.run_dir for marker in found if marker.is_active}
     for run_dir in _runs(root, report):
         is_being_made = not _may_exist(run_dir / folders.RUN_FILE) and _is_young(run_dir)
         if run_dir.resolve() in active or is_being_made:
@@ -112,7 +112,7 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
             _examine_run(run_dir, report, dry_run=dry_run)
     if not _is_run(root):
         check = _Check(root, dry_run=dry_run)
-        check.check_data_folder([marker for marker in markers if not marker.is_active])
+        check.check_data_folder([marker for marker in found if not marker.is_active])
         report.findings += check.findings
     return report
 
@@ -285,18 +285,14 @@ class _Check:
         """Check for leftovers in a data folder next to its runs."""
         for marker in stale:
             advice = f"'labseq safe {marker.profile or 'PROFILE'}', or the next run on it, makes it safe"
-            self._add("a run died here without making its hardware safe", marker.path, f"left: {advice}")
+            where = marker.run_dir or marker.path
+            self._add("a run died without making its hardware safe", where, f"left: {advice}")
         days = [self.folder / name for name in names_in(self.folder) if not name.startswith(".")]
         for folder in (self.folder, *days):
             with suppress(RecordingError):  # reported where its runs are looked for
                 for name in names_in(folder):
                     if _CLAIM.fullmatch(name) and not _is_young(folder / name):
                         self._quarantine("a leftover reservation of a run's number", folder / name, folder)
-        active = self.folder / ACTIVE_FOLDER
-        self.check_holders(active)
-        for name in names_in(active):
-            if name.endswith(".part") and not _is_young(active / name):
-                self._quarantine("half-written", active / name, active)
 
     def report_unreadable(self, error: RecordingError) -> None:
         """Report unreadable files and folders, which only the user can repair."""

@@ -1,24 +1,28 @@
-"""Markers of runs in progress: which process uses which profile's hardware, for which run.
+"""Devices in use on this computer: the locks of their processes, and the markers of runs in progress.
 
-They are in the folder ``.active`` of the data root, and in the user's state folder for runs with another
-data root, from before the devices are opened until they are safe again.
+They follow the hardware (see ``Settings.identities``), not the profile's path or the data's folder: one
+folder per computer holds them, see :func:`labseq.files.devices_root`. A lock ends with its process. A marker
+is there from before the devices are opened until they are safe: one without a process is of a run that died.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import os
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 
 from labseq.errors import RecordingError
-from labseq.files import Process, explained, read_file, state_root, sync_folder, write_file
+from labseq.files import Process, devices_root, explained, read_file, sync_folder, write_shared
 from labseq.plain import dumps, parse_object
 from labseq.recording.folders import slug
 
-ACTIVE_FOLDER: Final = ".active"
+_MARKER: Final = ".json"
+_CLEARED: Final = b"safe\n"
+"""A marker that only its owner may delete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,134 +34,129 @@ class Marker:
         owner: The process; None if the file cannot be read.
         run_dir: The run's folder; None likewise.
         profile: Key of the profile; "" likewise.
+        hardware: Identities of the devices that may be on.
     """
 
     path: Path
     owner: Process | None
     run_dir: Path | None
     profile: str
+    hardware: frozenset[str]
 
     @property
     def is_active(self) -> bool:
-        """Whether its process is known to run; false for a process on another computer."""
+        """Whether its process runs."""
         return self.owner is not None and self.owner.is_here and self.owner.is_running
 
-
-def marker_roots(root: Path) -> tuple[Path, ...]:
-    """Folders that hold the markers of a run: its data root, and the user's state folder if there is one.
-
-    The paths are absolute because some vendors' libraries change the working folder.
-    """
-    state = state_root()
-    return (root.absolute(), *(() if state is None else (state.absolute(),)))
+    def concerns(self, profile: str, hardware: Collection[str]) -> bool:
+        """Whether it is of this profile or shares a device with it; true of one that cannot be read."""
+        return self.owner is None or self.profile == profile or not self.hardware.isdisjoint(hardware)
 
 
-def mark_active(roots: Sequence[Path], profile_key: str, run_dir: Path) -> None:
-    """Mark that this process has a run in progress on a profile's hardware.
+def mark_active(profile: str, hardware: Collection[str], run_dir: Path) -> None:
+    """Mark that this process has a run in progress.
 
     Args:
-        roots: See :func:`marker_roots`; only the first must be writable.
-        profile_key: Key of the profile, for example its absolute path.
+        profile: Key of the profile, for example its absolute path.
+        hardware: Identities of its devices.
+        run_dir: The run's folder.
 
     Raises:
-        RecordingError: The first root cannot be written to.
+        RecordingError: The marker cannot be written.
     """
-    _mark(roots[0], profile_key, run_dir)
-    for root in roots[1:]:
-        with suppress(RecordingError):
-            _mark(root, profile_key, run_dir)
+    owner = Process.current()
+    marker = devices_root() / f"{_stem(profile)}.{owner.pid}{_MARKER}"
+    values = {"profile": profile, "hardware": sorted(hardware), "run_dir": str(run_dir.resolve())}
+    with explained(marker):
+        write_shared(marker, dumps({**values, **asdict(owner)}).encode())
+        sync_folder(marker.parent)
 
 
-def clear_active(roots: Sequence[Path], profile_key: str) -> None:
-    """Remove this process's markers, and those of runs that died, once the hardware is safe.
+def clear_active(profile: str, hardware: Collection[str]) -> None:
+    """Remove this process's marker, and from those of runs that died the devices that are safe now.
 
-    Markers of other running processes stay.
+    Markers of other running processes stay, and those of dead runs that have other devices.
 
     Raises:
-        RecordingError: A marker cannot be removed; all others are.
+        RecordingError: A marker cannot be changed; all others are.
     """
-    current = Process.current()
     failures: list[RecordingError] = []
-    for marker in _markers(roots, profile_key):
-        if not marker.is_active or (marker.owner and marker.owner.pid == current.pid):
-            try:
-                with explained(marker.path):
-                    marker.path.unlink(missing_ok=True)
-                    sync_folder(marker.path.parent)
-            except RecordingError as failure:
-                failures.append(failure)
+    for marker in markers():
+        is_own = marker.owner is not None and marker.owner.pid == os.getpid()
+        if not marker.concerns(profile, hardware) or (marker.is_active and not is_own):
+            continue
+        try:
+            with explained(marker.path):
+                _remove(marker, marker.hardware.difference(hardware))
+        except RecordingError as failure:
+            failures.append(failure)
     if failures:
         raise failures[0]
 
 
-def find_dead_run(roots: Sequence[Path], profile_key: str) -> Path | None:
-    """Find a run whose process died before it made a profile's hardware safe; None if there is none.
+def _remove(marker: Marker, left: frozenset[str]) -> None:
+    if left and marker.owner is not None:
+        values = {"profile": marker.profile, "hardware": sorted(left), "run_dir": str(marker.run_dir)}
+        write_shared(marker.path, dumps({**values, **asdict(marker.owner)}).encode())
+        return
+    try:
+        marker.path.unlink(missing_ok=True)
+    except PermissionError:  # another user's: its folder lets only that user delete it
+        write_shared(marker.path, _CLEARED)
+    sync_folder(marker.path.parent)
+
+
+def find_dead_run(profile: str, hardware: Collection[str]) -> Path | None:
+    """Find a run whose process died before it made these devices safe; None if there is none.
 
     Returns:
-        Its folder, or the marker itself if that cannot be read. A run on another
-        computer counts as dead, because its process cannot be looked up, and making
-        hardware safe twice does no harm.
+        Its folder, or the marker itself if that cannot be read.
     """
-    for marker in _markers(roots, profile_key):
-        if not marker.is_active:
+    for marker in markers():
+        if not marker.is_active and marker.concerns(profile, hardware):
             return marker.run_dir or marker.path
     return None
 
 
-def lock_files(roots: Sequence[Path], profile_key: str) -> tuple[Path, ...]:
-    """Files to lock so that no other process uses a profile's hardware: one in each root."""
-    return tuple(root / ACTIVE_FOLDER / f"{_stem(profile_key)}.lock" for root in roots)
+def lock_file(identity: str) -> Path:
+    """The file to lock so that no other process uses a device."""
+    return devices_root() / f"{_stem(identity)}.lock"
 
 
-def runs_in_progress(roots: Sequence[Path]) -> dict[Path, str]:
+def runs_in_progress() -> dict[Path, str]:
     """Runs in progress on this computer: folder -> key of the profile."""
-    markers = [marker for root in roots for marker in markers_in(root) if marker.is_active]
-    return {marker.run_dir: marker.profile for marker in markers if marker.run_dir is not None}
+    active = [marker for marker in markers() if marker.is_active]
+    return {marker.run_dir: marker.profile for marker in active if marker.run_dir is not None}
 
 
-def markers_in(root: Path) -> list[Marker]:
-    """The markers of all profiles in a data root."""
-    return [_read(path) for path in _files(root)]
-
-
-def _mark(root: Path, profile_key: str, run_dir: Path) -> None:
-    owner = Process.current()
-    marker = root / ACTIVE_FOLDER / f"{_stem(profile_key)}.{owner.pid}.json"
-    with explained(marker):
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        sync_folder(root)
-    values = {"profile": profile_key, "run_dir": str(run_dir.resolve()), **asdict(owner)}
-    write_file(marker, dumps(values).encode() + b"\n")
-
-
-def _stem(profile_key: str) -> str:
-    digest = hashlib.sha256(profile_key.encode("utf-8", "backslashreplace")).hexdigest()[:12]
-    return f"{slug(profile_key)[-40:]}-{digest}"
-
-
-def _markers(roots: Sequence[Path], profile_key: str) -> list[Marker]:
-    """The markers of a profile, oldest name first."""
-    return [_read(path) for root in roots for path in _files(root, _stem(profile_key)) if path.exists()]
-
-
-def _read(path: Path) -> Marker:
+def markers() -> list[Marker]:
+    """All markers on this computer, by name."""
+    folder = devices_root()
     try:
-        values = parse_object(read_file(path)) or {}
-    except RecordingError:
-        values = {}
-    run_dir, profile = values.get("run_dir"), values.get("profile")
+        files = sorted(folder / entry.name for entry in folder.iterdir() if entry.name.endswith(_MARKER))
+    except OSError:  # there is no such folder, or it cannot be read
+        return []
+    return [marker for marker in map(_read, files) if marker is not None]
+
+
+def _stem(key: str) -> str:
+    digest = hashlib.sha256(key.encode("utf-8", "backslashreplace")).hexdigest()[:12]
+    return f"{slug(key)[-40:]}-{digest}"
+
+
+def _read(path: Path) -> Marker | None:
+    """A marker; None if it is gone or cleared."""
+    data = None
+    with suppress(RecordingError):
+        data = read_file(path)
+    if data == _CLEARED or (data is None and not path.exists()):
+        return None
+    values = parse_object(data or b"") or {}
+    run_dir, profile, hardware = (values.get(key) for key in ("run_dir", "profile", "hardware"))
     return Marker(
         path,
         Process.from_plain(values),
         Path(run_dir) if isinstance(run_dir, str) else None,
         profile if isinstance(profile, str) else "",
+        frozenset(map(str, cast("list[Any]", hardware))) if isinstance(hardware, list) else frozenset(),
     )
-
-
-def _files(root: Path, stem: str = "") -> list[Path]:
-    folder = root / ACTIVE_FOLDER
-    try:
-        names = sorted(entry.name for entry in folder.iterdir())
-    except OSError:  # there is no such folder, or it cannot be read
-        return []
-    return [folder / name for name in names if name.startswith(stem) and name.endswith(".json")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -70,6 +71,17 @@ class ChosenPlugin:
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
         return self.settings.model_copy(update=dict(simulated)) == self.settings
+
+    def identities(self, role: str) -> tuple[str, ...]:
+        """What only one process can use, of the hardware of a role; () if all of it is simulated."""
+        if self.virtual_time:
+            return ()
+        found = None
+        with suppress(Exception):  # of the plugin
+            found = None if self.settings is None else self.settings.identities()
+        if found is not None:
+            return tuple(map(str, found))
+        return (f"{role} of {'' if self.document is None else self.document.path.resolve()}",)
 
     def dump(self) -> dict[str, Any]:
         """Settings for the record, SI, JSON-ready."""

@@ -67,9 +67,15 @@ class ResolvedProfile:
         )
 
     @property
-    def hardware_key(self) -> str:
-        """The name of its hardware in the markers of active runs."""
+    def key(self) -> str:
+        """The profile's name in the markers of active runs."""
         return str(self.document.path.resolve())
+
+    @property
+    def identities(self) -> Mapping[str, str]:
+        """What only one process can use of its hardware -> the role or device that uses it."""
+        hardware = {role: one for role, one in self.chosen.items() if one.entry.kind in HARDWARE_KINDS}
+        return {identity: role for role, one in hardware.items() for identity in one.identities(role)}
 
     @property
     def virtual_time(self) -> bool:

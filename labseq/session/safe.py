@@ -21,11 +21,11 @@ from labseq.errors import (
     RecordingError,
     StopRequested,
 )
-from labseq.files import Holder, Lock, knows_no_locks
+from labseq.files import Holder, Lock, Process, make_shared
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
-from labseq.recording import clear_active, data_root, find_dead_run, lock_files, marker_roots
+from labseq.recording import clear_active, find_dead_run, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, attempt, in_safe_order, method_of
@@ -37,64 +37,99 @@ from labseq.session.profile import ResolvedProfile, choose_plugins, resolve_prof
 @contextmanager
 def lock_devices(
     hardware: ResolvedProfile,
-    roots: Sequence[Path],
     what: str,
     warn: Callable[[str], object],
+    stop: StopFlag | None = None,
     *,
-    in_spite: bool = False,
+    blocked: Callable[[str, Holder], bool] | None = None,
 ) -> Generator[Callable[[str], None]]:
     """Lock a profile's devices against other processes within the block.
 
-    A lock ends with its process, also if that is killed. Locks are in the data root and in the user's
-    state folder, like the markers of runs, so that they hold whatever ``--output`` says.
+    A lock ends with its process, also if that is killed. Simulated devices are not locked.
 
     Args:
         hardware: The profile.
-        roots: See :func:`labseq.recording.marker_roots`; those that do not exist are skipped, except
-            the user's own.
         what: The use of the devices, shown to other users while they are locked.
-        warn: Receives a warning if nothing keeps others from the devices.
-        in_spite: Whether to continue, with a warning, if another process has locked them.
+        warn: Receives a warning if nothing keeps others from a device.
+        stop: Looked at again and again by a process that does not hang.
+        blocked: Called with device and holder if another process has locked it; returns whether to try
+            again. Without it that is an error.
 
     Yields:
         A function that changes this description of their use.
 
     Raises:
-        DeviceError: Another process holds them; names it.
+        DeviceError: Another process holds a device; names both.
     """
-    standing = [root for root in roots if root.is_dir() or root not in roots[:1]]
     locks: list[Lock] = []
     with ExitStack() as stack:
-        for file in lock_files(standing, hardware.hardware_key):
-            lock = Lock(file, what)
-            try:
-                holder = lock.take()
-            except OSError as error:
-                if knows_no_locks(error):
-                    text = f"the folder {file.parent} does not support file locks"
-                    warn(f"{text}: nothing keeps a run on another computer from the same devices")
-                continue
-            if holder is None:
-                stack.callback(lock.release)
-                locks.append(lock)
-            elif in_spite:
-                warn(f"its devices are in use by {holder}")
-                break
-            else:
-                raise DeviceError(hardware.profile.name, _refusal(holder))
-        else:
-            if not locks:
-                warn("no file could be locked: nothing keeps another run from the same devices")
+        for identity, role in hardware.identities.items():
+            device = role if identity.startswith(f"{role} ") else f"{role} ({identity})"
+            lock = Lock(lock_file(identity), what)
+            while True:
+                try:
+                    make_shared(lock.path.parent)
+                    holder = lock.take()
+                except OSError as error:
+                    text = f"{lock.path} cannot be locked: {error.strerror or error}"
+                    warn(f"{text}: nothing keeps another process from {device}")
+                    break
+                if holder is None:
+                    stack.callback(lock.release)
+                    locks.append(lock)
+                    break
+                if blocked is None:
+                    text = f"{device} is in use by {holder}"
+                    advice = "wait for its end, or end a run with 'labseq stop'"
+                    raise DeviceError(hardware.profile.name, f"{text}; {advice}")
+                if not blocked(device, holder):
+                    break
 
         def describe(text: str) -> None:
             for lock in locks:
                 lock.describe(text)
 
+        if stop is not None:
+            stack.enter_context(stop.beating(lambda: [lock.beat() for lock in locks]))
         yield describe
 
 
-def _refusal(holder: Holder) -> str:
-    return f"its devices are in use by {holder}; wait for its end, or end a run with 'labseq stop'"
+class _EndsHolders:
+    """Ends processes that use devices if they hang, or if that was asked for.
+
+    Args:
+        warn: Receives what is done.
+        end: Whether to end processes that do not hang, too.
+    """
+
+    def __init__(self, warn: Callable[[str], object], *, end: bool) -> None:
+        self._warn = warn
+        self._end = end
+        self._seen: set[Process | None] = set()
+
+    def __call__(self, device: str, holder: Holder) -> bool:
+        """Whether the process has ended; once for each process."""
+        if holder.process in self._seen:
+            return False
+        self._seen.add(holder.process)
+        text = f"{device} is in use by {holder}"
+        if holder.process is None or not (holder.hangs or self._end):
+            self._warn(f"{text}; it is made safe all the same ('labseq safe --end' ends that process first)")
+            return False
+        silent = f", which has not answered for {holder.silent_s:.0f} s"
+        self._warn(f"{text}{silent if holder.hangs else ''}; that process is ended first")
+        try:
+            has_ended = holder.process.end(END_S)
+        except OSError as error:
+            self._warn(f"process {holder.process.pid} cannot be ended: {error.strerror}")
+            return False
+        if not has_ended:
+            self._warn(f"process {holder.process.pid} did not end")
+        return has_ended
+
+
+END_S: Final = 10.0
+"""How long a process may take to make its devices safe after SIGTERM, before it is killed."""
 
 
 _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
@@ -208,17 +243,14 @@ def make_profile_devices_safe(
     return SafeStateReport(attempted, refused)
 
 
-def make_safe_after_crash(
-    hardware: ResolvedProfile, roots: Sequence[Path], key: str, stop: StopFlag, observer: RunObserver
-) -> None:
-    """Make the devices of a profile safe if the process of its last run died, because they may still be on.
+def make_safe_after_crash(hardware: ResolvedProfile, key: str, stop: StopFlag, observer: RunObserver) -> None:
+    """Make the devices of a profile safe if the process of their last run died, because they may still be on.
 
     This comes first, because constructing and compiling may fail.
 
     Args:
         hardware: The profile.
-        roots: See :func:`labseq.recording.marker_roots`.
-        key: Identifies its hardware.
+        key: The profile's name in the markers of runs.
         stop: The request to stop; obeyed once every device has been tried.
         observer: Receives each device's outcome, and warnings.
 
@@ -226,50 +258,54 @@ def make_safe_after_crash(
         LabseqError: The first device that is not safe.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    dead = find_dead_run(roots, key)
+    dead = find_dead_run(key, hardware.identities)
     if dead is None:
         return
-    text = f"the last run on this profile ({dead}) died; its devices are made safe first"
+    text = f"the last run on these devices ({dead}) died; they are made safe first"
     observer.event("warning", {"text": text})
     failures = make_profile_devices_safe(hardware, stop, observer).failures
     if failures:
         raise failures[0]
     try:
-        clear_active(roots, key)
+        clear_active(key, hardware.identities)
     except RecordingError as failure:
         observer.event("warning", {"text": str(failure)})
     stop.check()
 
 
 def make_profile_safe(
-    profile: str, overrides: Sequence[str] = (), observer: RunObserver | None = None
+    profile: str,
+    overrides: Sequence[str] = (),
+    observer: RunObserver | None = None,
+    *,
+    end: bool = False,
 ) -> SafeStateReport:
     """Bring every device of a profile to its safe state.
 
     It does so even while another process uses them, with a warning that names it: a run in progress fails,
-    or switches its devices on again. Ctrl-C is obeyed once every device has been tried. If all devices are
-    safe, the next run need not make them safe, however the last one ended.
+    or switches its devices on again. A process that hangs is ended first. Ctrl-C is obeyed once every device
+    has been tried. If all devices are safe, the next run need not make them safe, however the last one ended.
 
     Args:
         profile: Name or path of the profile.
         overrides: ``"profile.address=value"`` strings, as given to ``--set``.
         observer: Receives each device's outcome, and warnings.
+        end: Whether to end any other process that uses the devices first.
 
     Raises:
         ConfigError: The profile cannot be read, or does not exist; no device was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    found, roots = ProblemCollector(), marker_roots(data_root())  # now: vendors' libraries change the folder
+    found, stop = ProblemCollector(), StopFlag()
     hardware = _read(profile, overrides, found)
-    key, stop = hardware.hardware_key, StopFlag()
 
     def warn(text: str) -> None:
         if observer is not None:
             observer.event("warning", {"text": text})
 
     with ExitStack() as stack:
-        if not hardware.virtual_time:
-            stack.enter_context(lock_devices(hardware, roots, "labseq safe", warn, in_spite=True))
+        blocked = _EndsHolders(warn, end=end)
+        stack.enter_context(lock_devices(hardware, "labseq safe", warn, stop, blocked=blocked))
         stack.enter_context(stop_on_signals(stop))
         secured = make_profile_devices_safe(hardware, stop, observer)
     refused = [problem for error in hardware.refused.values() for problem in error.problems]
@@ -277,7 +313,7 @@ def make_profile_safe(
     # a problem or an override may have left out or replaced a device
     if not (secured.failures or others or overrides):
         try:
-            clear_active(roots, key)
+            clear_active(hardware.key, hardware.identities)
         except RecordingError as failure:
             warn(str(failure))
     if stop.is_set:
@@ -368,15 +404,18 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         DeviceError: Another process uses the same real devices; none was touched.
     """
     check_dry_run(dry_run)
-    roots = marker_roots(data_root())
     hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
     stop = StopFlag()
     is_virtual = dry_run != "off" or hardware.virtual_time
     clock = VirtualClock(stop) if is_virtual else RealClock(stop)
     warnings = [*hardware.warnings]
     with ExitStack() as stack:
-        if not is_virtual:
-            stack.enter_context(lock_devices(hardware, roots, "labseq devices", warnings.append))
+        stack.enter_context(lock_devices(hardware, "labseq devices", warnings.append, stop))
+        if (dead := find_dead_run(hardware.key, hardware.identities)) is not None and dry_run == "off":
+            text = (
+                f"the last run on these devices ({dead}) died; 'labseq safe {profile}' makes all of them safe"
+            )
+            warnings.append(text)
         stack.enter_context(stop_on_signals(stop))
         made, refused = construct_hardware(hardware, clock)
         simulation = made.pop("simulation", None)

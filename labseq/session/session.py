@@ -6,25 +6,16 @@ import gc
 import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
-from labseq.errors import ConfigError, DeviceError, LabseqError
+from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.messages import error_text
 from labseq.model import RunRecord, TimelineEntry
-from labseq.recording import (
-    Run,
-    RunWriter,
-    Shot,
-    clear_active,
-    data_root,
-    mark_active,
-    marker_roots,
-    open_run,
-)
+from labseq.recording import Run, RunWriter, Shot, clear_active, data_root, mark_active, open_run
 from labseq.recording.best import best_point
 from labseq.recording.quantities import make_quantity
 from labseq.recording.shot import caching_loader
@@ -76,7 +67,7 @@ class Session:
         self.run_dir: Path | None = None
         self._folder = Path.cwd()  # before devices are opened: some vendors' libraries change it
         # Identifies the hardware; a dry run touches none, so it has a separate key.
-        profile = assembly.hardware.hardware_key
+        profile = assembly.hardware.key
         self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
@@ -191,20 +182,17 @@ class Session:
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
         root = self.options.output or data_root()
-        roots = marker_roots(root if self.earlier is None else self.earlier.root)
+        root = root if self.earlier is None else self.earlier.root
+        root = root.absolute()  # some vendors' libraries change the folder
         for text in () if self.earlier is None else self.earlier.warnings:
             self._warn(text)
         with ExitStack() as stack:
             stack.enter_context(stop_on_signals(self.stop_flag))
-            if not self.assembly.virtual_time:
-                what = f"a run of {self.assembly.sequence.name}"
-                self._hold = stack.enter_context(
-                    lock_devices(self.assembly.hardware, roots, what, self._warn)
-                )
-            hardware, key = self.assembly.hardware, self._profile_key
-            make_safe_after_crash(hardware, roots, key, self.stop_flag, self._observers)
+            hardware, what = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
+            self._hold = stack.enter_context(lock_devices(hardware, what, self._warn, self.stop_flag))
+            make_safe_after_crash(hardware, self._profile_key, self.stop_flag, self._observers)
             if not self.scan_run.shots:  # its process died between the last shot and the end of the run
-                _, writer = self._begin(roots[0])
+                _, writer = self._begin(root)
                 writer.finish("complete")
                 return open_run(writer.run_dir)
             warnings = [str(problem) for problem in check(self, runs=True).warnings]
@@ -215,7 +203,7 @@ class Session:
             gc.unfreeze()  # left by an earlier run in this process
             gc.collect()
             gc.freeze()  # loaded modules stay: searching them for garbage would take 0.1 s of a shot
-            return self._run(lab, roots, warnings)
+            return self._run(lab, root, warnings)
 
     def build_lab(self, point: Point | None = None) -> Lab:
         """Construct the object of every role with the run's clock; no device is opened.
@@ -230,13 +218,13 @@ class Session:
         """Compile the kernels of a lab; see :func:`labseq.session.lab.warm`."""
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
-    def _run(self, lab: Lab, roots: Sequence[Path], warnings: Sequence[str]) -> Run:
-        record, writer = self._begin(roots[0])
+    def _run(self, lab: Lab, root: Path, warnings: Sequence[str]) -> Run:
+        record, writer = self._begin(root)
         for text in dict.fromkeys([*warnings, *self.assembly.hardware.host.notes]):
             self._warn(text)
         error: BaseException | None = None
         try:
-            self._take_shots(lab, roots, writer, record)
+            self._take_shots(lab, writer, record)
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down()
@@ -248,13 +236,13 @@ class Session:
             error = DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
         self._finish(writer, record, error)
         if not unsafe:
-            self._try(clear_active, roots, self._profile_key)
+            self._try(clear_active, self._profile_key, self.assembly.hardware.identities)
         self._observers.end()
         if error is not None:
             raise error
         return open_run(writer.run_dir)
 
-    def _take_shots(self, lab: Lab, roots: Sequence[Path], writer: RunWriter, record: RunRecord) -> None:
+    def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
         first = self.scan_run.first
         changes = {address: change["value"] for address, change in record.overrides.items()}
@@ -269,7 +257,9 @@ class Session:
             parameters={**changes, **first.parameters},
             watchdog=Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG),
         )
-        mark_active(roots, self._profile_key, writer.run_dir)
+        hardware = self.assembly.hardware.identities
+        with nullcontext() if hardware else suppress(RecordingError):
+            mark_active(self._profile_key, hardware, writer.run_dir)
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))

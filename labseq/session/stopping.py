@@ -9,7 +9,7 @@ from labseq.config.find import find_profile
 from labseq.errors import ConfigError, Problem
 from labseq.files import Process, write_file
 from labseq.plain import dumps
-from labseq.recording import data_root, marker_roots, runs_in_progress
+from labseq.recording import runs_in_progress
 from labseq.recording.folders import STOP_FILE, find_run
 from labseq.recording.run_file import read_owner, read_state
 
@@ -37,7 +37,7 @@ def running_here(profile: str | None = None) -> list[Path]:
     Raises:
         ConfigError: There is no such profile.
     """
-    found = runs_in_progress(marker_roots(data_root()))
+    found = runs_in_progress()
     if profile is not None:
         path = str(find_profile(profile, Path()).resolve())
         found = {folder: key for folder, key in found.items() if key in {path, f"{path} (dry run)"}}

@@ -103,6 +103,10 @@ class AndorSettings(CameraSettings):
             isolated_crop=self.isolated_crop,
         )
 
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        return () if self.camera == SIMULATED else (f"Andor camera {self.serial or '(the only one)'}",)
+
     @model_validator(mode="after")
     def _gain_is_allowed(self) -> Self:
         if self.em_gain > HIGH_GAIN and not self.allow_high_gain:

@@ -7,7 +7,15 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import Duration, FilePath, PositiveDuration, Settings, clean, setting_error
+from labseq.plugin import (
+    Duration,
+    FilePath,
+    PositiveDuration,
+    Settings,
+    clean,
+    port_identities,
+    setting_error,
+)
 
 SIMULATED: Final = "simulated"
 
@@ -50,6 +58,10 @@ class TcpLeaderSettings(LeaderSettings):
         default=False, description="whether other computers may connect, with the token"
     )
 
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        return (f"TCP port {self.port}",) if self.port else ()
+
     @model_validator(mode="after")
     def _check_host(self) -> Self:
         if not self.allow_remote and not _is_loopback(self.host):
@@ -68,6 +80,10 @@ class SerialLeaderSettings(LeaderSettings):
         description="the port: `/dev/ttyUSB0`, `COM3`, or a URL of pyserial"
     )
     baud_rate: int = Field(default=115200, ge=1, description="bits per second")
+
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        return port_identities(self.port)
 
 
 def _is_loopback(host: str) -> bool:

@@ -73,3 +73,7 @@ class GenicamSettings(IndustrialCameraSettings):
         default=0.5, description="time without a packet after which an incomplete frame is abandoned (GigE)"
     )
     faults: FaultSettings = Field(default=FaultSettings(), description="failures of the simulated camera")
+
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        return () if self.camera == SIMULATED else (f"GenICam camera {self.camera or '(the only one)'}",)

@@ -42,6 +42,10 @@ class PylonSettings(IndustrialCameraSettings):
         default=None, description="bytes of a network packet (GigE); none: as the camera is set"
     )
 
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        return () if self.camera == SIMULATED else (f"Basler camera {self.camera or '(the only one)'}",)
+
     @model_validator(mode="after")
     def _one_gain(self) -> Self:
         if self.gain is not None and self.gain_raw is not None:

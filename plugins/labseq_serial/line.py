@@ -18,7 +18,6 @@ from labseq.plugin import (
     format_quantity,
     is_write_timeout,
     open_port,
-    ports_here,
     ports_text,
     wait_for,
 )
@@ -159,11 +158,7 @@ def _find(usb: UsbSettings, device: str) -> str:
     """The port of an adapter."""
     wanted = {"vid": usb.vid, "pid": usb.pid, "serial_number": usb.serial}
     given = {key: value for key, value in wanted.items() if value is not None}
-    fits = [
-        port
-        for port in ports_here()
-        if all(getattr(port, key, None) == value for key, value in given.items())
-    ]
+    fits = usb.ports()
     if len(fits) == 1:
         return fits[0].device
     described = ", ".join(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final, Literal, Self, TypeAlias
+from typing import Any, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -17,6 +17,8 @@ from labseq.plugin import (
     closest,
     is_network_port,
     one_of,
+    port_identities,
+    ports_here,
     setting_error,
 )
 from labseq_serial.patterns import Sent, Template, compiled, example_of
@@ -239,6 +241,12 @@ class UsbSettings(Settings):
     pid: int | None = Field(default=None, ge=0, le=0xFFFF, description="product's number, as 0x6001")
     serial: Text | None = Field(default=None, description="serial number")
 
+    def ports(self) -> list[Any]:
+        """The ports of this computer whose adapter fits."""
+        wanted = {"vid": self.vid, "pid": self.pid, "serial_number": self.serial}
+        given = {key: value for key, value in wanted.items() if value is not None}
+        return [port for port in ports_here() if all(getattr(port, k, None) == v for k, v in given.items())]
+
     @model_validator(mode="after")
     def _check_any(self) -> Self:
         if self.vid is None and self.pid is None and self.serial is None:
@@ -315,6 +323,14 @@ class SerialSettings(Settings):
         if not _can_be(text, self.encoding):
             return f"'{clean(text)}' is not {self.encoding}; expected another 'encoding', or other characters"
         return ""
+
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        if self.usb is None:
+            return () if self.port in (None, SIMULATED) else port_identities(self.port)
+        fits = self.usb.ports()
+        found = port_identities(fits[0].device) if len(fits) == 1 else ()
+        return (f"USB adapter {self.usb.model_dump(exclude_none=True)}", *found)
 
     @model_validator(mode="after")
     def _check_port(self) -> Self:

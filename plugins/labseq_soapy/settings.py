@@ -77,6 +77,11 @@ class SoapySettings(Settings):
         """Whether the radio is a simulated one; its arguments may follow after a comma."""
         return self.device.partition(",")[0] == "simulated"
 
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        arguments = sorted(part.strip() for part in self.device.split(","))
+        return () if self.is_simulated else (f"radio {','.join(arguments)}",)
+
     @model_validator(mode="after")
     def _check_simulated_radio(self) -> Self:
         if self.is_simulated:

@@ -66,6 +66,11 @@ class SpcmSettings(Settings):
                 raise ValueError(f"the card's clock has a gap {gap}; expected a rate outside of it")
         return rate_hz
 
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        serial = (f"Spectrum card {self.serial}",) if self.serial else ()
+        return () if self.card == "simulated" else (f"Spectrum {self.card}", *serial)
+
     @model_validator(mode="after")
     def _check_channels_and_rate(self) -> Self:
         if self.row_channel == self.column_channel:

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import AfterValidator, Field, model_validator
 
-from labseq.plugin import Duration, Settings, setting_error
+from labseq.plugin import Duration, Settings, port_identities, setting_error
 from labseq_ttl.protocol import CHANNELS
 
 SIMULATED: Final = "simulated"
@@ -112,6 +112,11 @@ class TtlSettings(Settings):
     def is_simulated(self) -> bool:
         """Whether there is no box."""
         return self.port == SIMULATED
+
+    def identities(self) -> tuple[str, ...]:
+        """What only one process can use of it."""
+        number = () if self.serial_number is None else (f"timing box {self.serial_number}",)
+        return () if self.is_simulated else (*port_identities(self.port), *number)
 
     @model_validator(mode="after")
     def _check_start(self) -> Self:

@@ -137,11 +137,11 @@ def test_a_run_is_resumed(stopped: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from labseq.files import write_file
-    from labseq.recording import mark_active, marker_roots
+    from labseq.recording import mark_active
     from labseq.recording.run_file import encode_state
 
     write_file(stopped / "STATE", encode_state("running"))
-    mark_active(marker_roots(Path("data")), "lab", stopped)
+    mark_active("lab", [], stopped)
     code, out, err = call(capsys, "stop")
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith(f"{stopped} (process ")

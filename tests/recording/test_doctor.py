@@ -247,8 +247,7 @@ def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
     assert examine(run_dir).in_progress == [run_dir]
     rewrite_state(run_dir, state="complete")
     before[run_dir / "STATE"] = (run_dir / "STATE").read_bytes()
-    mark_active([root], "lab", run_dir)  # its devices are not safe yet
-    before |= {path: path.read_bytes() for path in (root / ".active").iterdir()}
+    mark_active("lab", [], run_dir)  # its devices are not safe yet
     assert examine(root).in_progress == [run_dir]
     assert examine(run_dir).in_progress == [run_dir]
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
@@ -279,24 +278,21 @@ def test_a_run_that_somebody_goes_on_with_is_not_touched(run_dir: Path) -> None:
 def test_marks_of_runs_that_left_hardware_unsafe_stay(run_dir: Path) -> None:
     root = run_dir.parents[1]
     code = "import sys; from pathlib import Path; from labseq.recording import mark_active as m; "
-    code += "m([Path(sys.argv[1])], 'lab', Path(sys.argv[2]))"
-    subprocess.run([sys.executable, "-c", code, root, run_dir], check=True)
+    code += "m('lab', [], Path(sys.argv[1]))"
+    subprocess.run([sys.executable, "-c", code, run_dir], check=True)
     (found,) = examine(root).findings
-    assert (found.what, found.left) == ("a run died here without making its hardware safe", True)
+    assert (found.what, found.left) == ("a run died without making its hardware safe", True)
     assert "'labseq safe lab'" in found.done
     assert found.where.exists()
 
 
-def test_claims_and_half_written_marks_are_moved_away(run_dir: Path) -> None:
+def test_claims_are_moved_away(run_dir: Path) -> None:
     root = run_dir.parents[1]
-    claim, part = run_dir.parent / ".0007.claim", root / ".active" / "lab.json.part"
+    claim = run_dir.parent / ".0007.claim"
     claim.mkdir()
-    part.parent.mkdir()
-    part.touch()
     assert examine(root).findings == []  # somebody may be at it
-    for path in (claim, part):
-        os.utime(path, (LONG_AGO, LONG_AGO))
-    assert [name for _, name in reported(examine(root))] == [".0007.claim", "lab.json.part"]
+    os.utime(claim, (LONG_AGO, LONG_AGO))
+    assert [name for _, name in reported(examine(root))] == [".0007.claim"]
     assert examine(root).findings == []
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
+import time
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,10 @@ import pytest
 
 import labseq
 from labseq.errors import DeviceError
-from labseq.recording import lock_files, marker_roots
+from labseq.files import HANG_S, Lock, Process
+from labseq.guard import StopFlag
+from labseq.plugin import port_identities
+from labseq.recording import find_dead_run, lock_file, mark_active
 from labseq.session.profile import resolve_profile
 from labseq.session.safe import check_devices, lock_devices, make_profile_safe
 from labseq.testing.fakes import RecordingObserver
@@ -40,14 +46,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write("mine")
 
 
-def write(shutter: str) -> None:
-    own = f"plugin_folders: [plugins]\ndevices: {{shutter: {{use: {shutter}}}}}\n"
-    Path("p.yaml").write_text(PROFILE + own, encoding="utf-8")
+def write(shutter: str, profile: str = "p.yaml") -> None:
+    own = f"plugin_folders: [{Path('plugins').absolute()}]\ndevices: {{shutter: {{use: {shutter}}}}}\n"
+    Path(profile).write_text(PROFILE + own, encoding="utf-8")
 
 
 @pytest.fixture
 def held() -> Generator[None]:
-    with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "the run x", pytest.fail):
+    with lock_devices(resolve_profile("./p.yaml"), "the run x", pytest.fail):
         yield
 
 
@@ -58,7 +64,7 @@ def run(observer: RecordingObserver | None = None, **options: Any) -> labseq.Run
 
 def test_a_second_run_is_refused_with_the_name_of_the_first(held: None) -> None:
     with pytest.raises(
-        DeviceError, match=r"bench: its devices are in use by the run x \(process \d+ on .*\)"
+        DeviceError, match=r"bench: shutter is in use by the run x \(process \d+ on .*\)"
     ) as e:
         run(output="elsewhere")
     assert "labseq stop" in str(e.value)
@@ -67,14 +73,14 @@ def test_a_second_run_is_refused_with_the_name_of_the_first(held: None) -> None:
 
 def test_the_devices_are_free_after_a_run_and_after_one_that_failed() -> None:
     run()
-    with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
+    with lock_devices(resolve_profile("./p.yaml"), "me", pytest.fail):
         pass
     Path("plugins/mine.py").write_text(
         OWN_DEVICE.replace("open(self): pass", "open(self): 1 / 0"), encoding="utf-8"
     )
     with pytest.raises(DeviceError):
         run()
-    with lock_devices(resolve_profile("./p.yaml"), marker_roots(Path("data")), "me", pytest.fail):
+    with lock_devices(resolve_profile("./p.yaml"), "me", pytest.fail):
         pass
 
 
@@ -94,7 +100,7 @@ def test_a_run_locks_its_devices_with_its_name() -> None:
 
 
 def test_devices_are_not_tested_while_they_are_in_use(held: None) -> None:
-    with pytest.raises(DeviceError, match="bench: its devices are in use by the run x"):
+    with pytest.raises(DeviceError, match="bench: shutter is in use by the run x"):
         check_devices("./p.yaml")
     assert check_devices("./p.yaml", dry_run="fast").devices  # it touches none
     assert not Path("data").exists()
@@ -103,7 +109,104 @@ def test_devices_are_not_tested_while_they_are_in_use(held: None) -> None:
 def test_devices_are_made_safe_even_while_they_are_in_use(held: None) -> None:
     seen = RecordingObserver()
     assert not make_profile_safe("./p.yaml", observer=seen).failures
-    assert [v["text"][:39] for v in seen.of("warning")] == ["its devices are in use by the run x (pr"]
+    (warning,) = (v["text"] for v in seen.of("warning"))
+    assert warning.startswith(f"shutter is in use by the run x (process {os.getpid()} on ")
+    assert warning.endswith("; it is made safe all the same ('labseq safe --end' ends that process first)")
+
+
+HOLD = """
+import signal, sys
+from pathlib import Path
+from labseq.files import Lock
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+lock = Lock(Path(sys.argv[1]), "the run x")
+assert lock.take() is None
+print("held", flush=True)
+input()
+"""
+
+
+@pytest.mark.parametrize("end", [False, True])
+def test_a_process_that_hangs_or_is_to_end_is_ended_before_its_devices_are_made_safe(
+    end: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labseq.session.safe.END_S", 0.1)
+    seen, file = RecordingObserver(), lock_file(*resolve_profile("./p.yaml").identities)
+    command = [sys.executable, "-c", HOLD, str(file)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        silent_ns = time.monotonic_ns() - int(1e9 * (HANG_S + 10))
+        if not end:
+            os.utime(file.with_name(f"{file.name}.holder"), ns=(silent_ns, silent_ns))
+        assert not make_profile_safe("./p.yaml", observer=seen, end=end).failures
+        assert child.wait(10.0) != 0
+    (warning,) = (v["text"] for v in seen.of("warning"))
+    assert warning.startswith(f"shutter is in use by the run x (process {child.pid} on ")
+    assert ("which has not answered for 40 s" in warning) is not end
+    assert warning.endswith("; that process is ended first")
+
+
+def test_a_process_that_uses_devices_gives_signs_of_life(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq.guard.BEAT_S", 0.0)
+    stop, other = StopFlag(), Lock(lock_file(*resolve_profile("./p.yaml").identities), "other")
+    with lock_devices(resolve_profile("./p.yaml"), "the run x", pytest.fail, stop):
+        long_ago = time.monotonic_ns() - 3600 * 10**9
+        os.utime(f"{other.path}.holder", ns=(long_ago, long_ago))
+        holder = other.take()
+        assert holder is not None
+        assert holder.hangs
+        stop.check()
+        holder = other.take()
+        assert holder is not None
+        assert not holder.hangs
+
+
+IDENTIFIED = """
+class Settings(labseq.plugin.Settings):
+    card: str = "A"
+
+    def identities(self):
+        return [f"card {self.card}"]
+
+
+class Mine:"""
+
+
+def test_locks_and_markers_follow_the_hardware_not_the_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = OWN_DEVICE.replace("class Mine:", IDENTIFIED).replace('("mine", Mine)', '("mine", Mine, Settings)')
+    Path("plugins/mine.py").write_text(text, encoding="utf-8")
+    Path("copies").mkdir()
+    write("mine", "copies/copy.yaml")
+    write("mine, card: B", "copies/other.yaml")
+    with lock_devices(resolve_profile("./p.yaml"), "the run x", pytest.fail):
+        monkeypatch.setenv("LABSEQ_STATE", str(tmp_path / "elsewhere"))
+        monkeypatch.setenv("LABSEQ_DATA", str(tmp_path / "other data"))
+        with pytest.raises(DeviceError, match=r"bench: shutter \(card A\) is in use by the run x \(process"):
+            check_devices("copies/copy.yaml")
+        assert all(device.ok for device in check_devices("copies/other.yaml").devices)
+    run_dir = tmp_path / "run"
+    mark_active(str(Path("p.yaml").resolve()), ["card A"], run_dir)
+    monkeypatch.setattr(Process, "is_running", False)
+    report = check_devices("copies/copy.yaml")
+    (warning,) = report.warnings
+    assert warning.startswith(
+        f"the last run on these devices ({run_dir}) died; 'labseq safe copies/copy.yaml'"
+    )
+    assert not make_profile_safe("copies/other.yaml").failures
+    assert find_dead_run("copies/copy.yaml", ["card A"]) == run_dir
+    assert not make_profile_safe("copies/copy.yaml").failures
+    assert find_dead_run("copies/copy.yaml", ["card A"]) is None
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no links to ports")
+def test_a_link_to_a_port_is_the_port(tmp_path: Path) -> None:
+    (tmp_path / "ttyUSB0").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyUSB0")
+    link, port = (port_identities(str(tmp_path / name)) for name in ("by-id", "ttyUSB0"))
+    assert set(link) & set(port) == {str(tmp_path / "ttyUSB0")}
 
 
 def test_simulated_devices_and_dry_runs_are_not_locked(held: None) -> None:
@@ -120,12 +223,9 @@ def test_a_folder_without_locks_is_a_warning(monkeypatch: pytest.MonkeyPatch) ->
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    Path("data").mkdir()
     seen = RecordingObserver()
     assert run(seen).status == "complete"
-    texts = [values["text"] for values in seen.of("warning")]
-    folder = lock_files(marker_roots(Path("data")), "x")[0].parent
-    assert texts[0].startswith(
-        f"the folder {folder} does not support file locks: nothing keeps a run on another"
-    )
-    assert "no file could be locked: nothing keeps another run from the same devices" in texts
+    (warning,) = (v["text"] for v in seen.of("warning") if "lock" in v["text"])
+    file = lock_file(*resolve_profile("./p.yaml").identities)
+    reason = "No locks available"
+    assert warning == f"{file} cannot be locked: {reason}: nothing keeps another process from shutter"

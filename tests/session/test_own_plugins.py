@@ -7,6 +7,7 @@ import pytest
 
 import labseq
 from labseq.errors import InvalidPlanError, PlanError
+from labseq.files import devices_root
 from labseq.testing.fakes import RecordingObserver
 
 from .whole_runs import ROOT, run
@@ -141,4 +142,4 @@ def test_a_plugin_that_changes_the_folder_does_no_harm(tmp_path, monkeypatch):
     with labseq.Session.open(path.name, profile="own.yaml", shots=1, output="here") as session:
         assert session.run().path.is_relative_to(tmp_path / "here")
     assert Path.cwd() != tmp_path
-    assert list((tmp_path / "here" / ".active").iterdir()) == []
+    assert list(devices_root().glob("*.json")) == []

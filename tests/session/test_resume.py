@@ -240,4 +240,4 @@ def test_a_run_may_have_been_put_elsewhere(stopped: Path, tmp_path: Path) -> Non
     assert resumed(moved).path == moved
     assert labseq.open_run(moved).status == "complete"
     assert labseq.open_run(stopped).status == "stopped"
-    assert {path.name for path in moved.parent.iterdir()} == {"my run", ".active"}
+    assert {path.name for path in moved.parent.iterdir()} == {"my run"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,7 +12,8 @@ import pytest
 import labseq
 from labseq.cli.entry import main
 from labseq.errors import ConfigError
-from labseq.recording import find_dead_run, mark_active, marker_roots
+from labseq.files import devices_root
+from labseq.recording import find_dead_run, mark_active
 from labseq.session.safe import SafeStateReport, check_devices, make_each_safe, make_profile_safe
 from labseq.testing.fakes import RecordingObserver, fake_lab
 from tests.hostile import HOSTILE
@@ -144,23 +146,23 @@ def test_without_the_simulation_nothing_virtual_can_be_made_safe() -> None:
     assert set(outcome.refused) == {"mobile_tweezers", "camera", "static_tweezers", "simulation"}
 
 
-def marked_as_dead() -> tuple[tuple[Path, ...], str]:
-    """Markers of a run on the profile that another computer has not ended."""
-    roots, key = marker_roots(Path("data")), str(Path("p.yaml").resolve())
-    mark_active(roots, key, Path("data/run"))
-    for marker in (path for root in roots for path in (root / ".active").iterdir()):
-        marker.write_text("{}", encoding="utf-8")
-    assert find_dead_run(roots, key) is not None
-    return roots, key
+def marked_as_dead() -> tuple[str, list[str]]:
+    """Profile and devices of a run that died."""
+    key = str(Path("p.yaml").resolve())
+    mark_active(key, [], Path("data/run"))
+    for marker in devices_root().glob("*.json"):
+        marker.write_text(json.dumps({**json.loads(marker.read_text("utf-8")), "boot": "another"}), "utf-8")
+    assert find_dead_run(key, []) is not None
+    return key, []
 
 
 def test_a_run_that_died_is_forgotten_once_all_is_safe() -> None:
     write("{use: mine}")
-    roots, key = marked_as_dead()
+    dead = marked_as_dead()
     secured("profile.devices.shutter.use=mine")
-    assert find_dead_run(roots, key) is not None  # another device may have been named in its place
+    assert find_dead_run(*dead) is not None  # another device may have been named in its place
     secured()
-    assert find_dead_run(roots, key) is None
+    assert find_dead_run(*dead) is None
 
 
 @pytest.mark.parametrize(
@@ -178,10 +180,10 @@ def test_a_run_that_died_is_remembered_until_all_devices_are_safe(
     plugin: tuple[str, str], profile: str, problem: str
 ) -> None:
     write("{use: mine}", *plugin, profile=profile)
-    roots, key = marked_as_dead()
+    dead = marked_as_dead()
     outcome, _ = secured()
     assert problem in f"{outcome.attempted.get('shutter')} {outcome.problems}"
-    assert find_dead_run(roots, key) is not None
+    assert find_dead_run(*dead) is not None
 
 
 SEQUENCE = """
@@ -198,7 +200,7 @@ shot:
 def test_a_run_makes_safe_what_it_can_before_anything_of_it_can_fail() -> None:
     write("{use: mine}", f"{INIT}pass", INIT_FAILS)
     Path("s.yaml").write_text(SEQUENCE, encoding="utf-8")
-    roots, key = marked_as_dead()
+    dead = marked_as_dead()
     seen = RecordingObserver()
     with (
         labseq.Session.open("s.yaml", output="elsewhere", observer=seen) as session,
@@ -208,8 +210,8 @@ def test_a_run_makes_safe_what_it_can_before_anything_of_it_can_fail() -> None:
     assert [t["device"] for t in seen.of("safe_state") if t["ok"]] == [
         "mobile_tweezers", "camera", "static_tweezers"
     ]  # fmt: skip
-    assert find_dead_run(roots, key) is not None
+    assert find_dead_run(*dead) is not None
     write("{use: mine}")
     with labseq.Session.open("s.yaml", output="elsewhere", observer=seen) as session:
         session.run()
-    assert find_dead_run(marker_roots(Path("elsewhere")), key) is None
+    assert find_dead_run(*dead) is None

@@ -11,7 +11,7 @@ import pytest
 import labseq
 from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.files import write_file
-from labseq.recording import mark_active, marker_roots
+from labseq.recording import mark_active
 from labseq.recording.run_file import encode_state
 from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text
 from labseq.testing.fakes import RecordingObserver
@@ -84,7 +84,7 @@ def test_of_several_runs_one_must_be_named(data: Path) -> None:
     runs = [interrupted(write(data.parent), "shot_started", 1) for _ in range(2)]
     for run_dir in runs:
         write_file(run_dir / "STATE", encode_state("running"))
-        mark_active(marker_roots(data), f"profile of {run_dir}", run_dir)
+        mark_active(f"profile of {run_dir}", [], run_dir)
     with pytest.raises(ConfigError, match=r"2 runs are in progress; expected one of .*, "):
         find_running()
     assert find_running(runs[1]) == runs[1]

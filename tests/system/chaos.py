@@ -242,6 +242,7 @@ class Bench:
             **os.environ,
             "LABSEQ_DATA": str(self.data),
             "LABSEQ_STATE": str(self.folder / "state"),
+            "LABSEQ_LOCKS": str(self.folder / "devices"),
             "CHAOS_FOLDER": str(self.folder),
             "GIT_DIR": os.devnull,  # edits of the code while this runs are no change of a run
         }
