@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 import time
+import traceback
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -161,7 +163,7 @@ def plan_timeline(
     """The timeline of one step, see :func:`plan_timelines`; ``number`` is its index in the shot."""
 
     def entries() -> list[TimelineEntry]:
-        with _named(number, name):
+        with _named(number, name, step):
             found = list(step.plan_timeline(context or lab.step_context))
             if other := [one for one in found if not isinstance(one, TimelineEntry)]:  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(f"plan_timeline() gave {other[0]!r}; expected TimelineEntry objects")
@@ -171,19 +173,28 @@ def plan_timeline(
 
 
 def _run_step(step: Step, number: int, name: str, shot: RunningShot) -> None:
-    with _named(number, name):
+    with _named(number, name, step):
         step.run(shot)
 
 
 @contextmanager
-def _named(number: int, name: str) -> Generator[None]:
-    """Add the name of the step to errors that are not labseq's own."""
+def _named(number: int, name: str, step: Step) -> Generator[None]:
+    """Add the name of the step, and the line of its code, to errors that are not labseq's own."""
     try:
         yield
     except LabseqError:
         raise
     except BaseException as error:
-        raise LabseqError(f"step {number} ({name}) raised {format_error(error)}") from error
+        text = f"step {number} ({name}) raised {format_error(error)}{_line(error, step)}"
+        raise LabseqError(text) from error
+
+
+def _line(error: BaseException, step: Step) -> str:
+    """The last line of the step's own file that an error came through, as " (FILE:LINE)"; "" if none."""
+    file = getattr(sys.modules.get(type(step).__module__), "__file__", None)
+    frames = traceback.walk_tb(vars(BaseException)["__traceback__"].__get__(error))
+    lines = [line for frame, line in frames if frame.f_code.co_filename == file]
+    return f" ({file}:{lines[-1]})" if lines else ""
 
 
 class ShotSink(Protocol):

@@ -1,5 +1,6 @@
 """Whole runs on fakes: order of calls, what is recorded, retries, changes between shots."""
 
+import re
 import threading
 from types import SimpleNamespace
 
@@ -240,6 +241,21 @@ def test_a_timeline_that_is_none_is_named(answer):
             return None
 
     with pytest.raises(LabseqError, match=r"step 0 \(mine\) raised (Type|Attribute)Error"):
+        Rig(steps=(("mine", Broken()),))
+
+
+def test_an_error_of_a_step_names_the_line_of_its_code():
+    class Broken:
+        needs_image = takes_image = False
+
+        def plan_timeline(self, context):
+            return context.durtion
+
+        def run(self, shot):
+            return None
+
+    line = Broken.plan_timeline.__code__.co_firstlineno + 1
+    with pytest.raises(LabseqError, match=re.escape(f"'durtion' ({__file__}:{line})") + "$"):
         Rig(steps=(("mine", Broken()),))
 
 

@@ -168,6 +168,13 @@ class WaitsInRealTime(Driver):
         time.sleep(min(duration_s, 1e-3))
 
 
+class WaitsForAClockThatItDoesNotMove(Driver):
+    def wait(self, duration_s: float) -> None:
+        until_s = self._clock.now() + duration_s
+        while self._clock.now() < until_s:
+            self._clock.check()
+
+
 class DriverCountsOnFromTheLastSeries(Driver):
     def _start(self, series: Series) -> None:
         self.series, self.n_fired = series, self.n_taken

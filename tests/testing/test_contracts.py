@@ -185,6 +185,18 @@ def test_a_hang_is_reported_with_its_time_limit() -> None:
         broken_hardware.Suite().test_keeps_timeouts(polls)
 
 
+def test_a_driver_that_hangs_is_waited_for_once() -> None:
+    class Impatient(CameraContract):
+        max_wait_s: ClassVar[float] = 0.15
+
+    hangs: Any = broken_cameras.WaitsForAClockThatItDoesNotMove
+    text = r"its work has not returned after 0.15 s, and 0 s passed on context.clock during work that takes"
+    with pytest.raises(ContractViolation, match=text):
+        Impatient().test_works(hangs)
+    with pytest.raises(pytest.skip.Exception, match=r"cannot continue: promise: .* used as in a shot"):
+        Impatient().test_gives_a_frame(hangs)
+
+
 def test_an_empty_program_may_be_refused() -> None:
     class WantsTones(RecordingMobileTweezers):
         def prepare(self, program: ToneProgram) -> float:
