@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.messages import visible
+from labseq.messages import clean, visible
 from labseq.recording import Run, data_root, open_run
 from labseq.recording.folders import RUN_FILE, find_run
 
@@ -34,7 +34,7 @@ def existing_run(path: Path) -> Path:
         raise ConfigError(str(error)) from error
     except OSError as error:
         reason = str(error.strerror or error).lower()
-        raise ConfigError(Problem(f"the folder cannot be read: {reason}", visible(str(path)))) from error
+        raise ConfigError(Problem(f"the folder cannot be read: {reason}", clean(str(path)))) from error
 
 
 def named_run(name: str, root: Path) -> Path:
