@@ -7,7 +7,7 @@ import math
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -22,7 +22,6 @@ from labseq.roles import Detector, Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
-from labseq.session.assembly import Assembly
 from labseq.session.lab import WARM_S
 from labseq.session.planning import changed_settings
 from labseq.session.scan import Point
@@ -34,8 +33,10 @@ if TYPE_CHECKING:
 
 N_LOADINGS: Final = 200
 """Maximum number of random loadings for which the planner is run."""
+N_LOADINGS_ELSEWHERE: Final = 20
+"""The same for later points of a scan; windows are judged by a quarter of it at least."""
 MAX_WAIT_S: Final = 2.0
-"""Time after which no further loading is tried, in seconds of real time."""
+"""Time after which no further loading is tried, in seconds of real time; of all others together the same."""
 PAPERS_LOADING: Final = 0.75
 """Loading probability if the profile has no simulation that reports it."""
 SURVIVAL: Final = 0.98
@@ -59,6 +60,7 @@ class _Points:
     guard: Guard
     problems: dict[str, Problem] = field(default_factory=dict[str, Problem])
     warnings: dict[str, Problem] = field(default_factory=dict[str, Problem])
+    rehearsals: dict[tuple[object, ...], list[Rehearsal]] = field(default_factory=dict[Any, Any])
     _labs: dict[tuple[int, int], tuple[Point, Lab]] = field(default_factory=dict[Any, Any])
     _timelines: dict[tuple[int, ...], tuple[Point, Timeline]] = field(default_factory=dict[Any, Any])
     _detectors: list[Detector] = field(default_factory=list[Detector])
@@ -70,9 +72,13 @@ class _Points:
             self._labs[key] = point, self.session.build_lab(point)
         return self._labs[key][1]
 
-    def labs(self) -> list[tuple[Point, Lab]]:
-        """The devices of all points so far, each with the first of its points."""
-        return [*self._labs.values()]
+    def rehearsal_key(self, point: Point) -> tuple[object, ...]:
+        """Points with the same key have the same moves: the last windows do not change what is planned."""
+        return id(self.lab(point)), *[*_windows(point.steps).values()][:-1]
+
+    def rehearsed(self, point: Point) -> dict[int, Rehearsal]:
+        """Step number -> the planner's results for each rearrangement of a point."""
+        return dict(zip(_windows(point.steps), self.rehearsals[self.rehearsal_key(point)], strict=True))
 
     def timeline(self, point: Point) -> Timeline:
         """Name and bars of each step."""
@@ -235,18 +241,18 @@ def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, 
         return {"": Problem(f"check_devices() of step '{name}' returned no mapping")}
 
 
-def _timeout_warnings(assembly: Assembly, timeline: Timeline) -> list[Problem]:
+def _timeout_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
     """Warnings about steps that may take longer than the timeout of their policy."""
-    problems: list[Problem] = []
-    for spec, policy, (_, bars) in zip(assembly.sequence.shot, assembly.policy.steps, timeline, strict=True):
+    assembly = points.session.assembly
+    each = zip(assembly.sequence.shot, assembly.policy.steps, points.timeline(point), strict=True)
+    for number, (spec, policy, (_, bars)) in enumerate(each):
         longest_s = sum(bar.duration_s for bar in bars)
         if longest_s > policy.timeout_s:
             longest = format_quantity(longest_s, "time")
             what = f"the step takes up to {longest}, longer than its timeout of "
             what += format_quantity(policy.timeout_s, "time")
             place = (*spec.policy_loc, "timeout")
-            problems.append(assembly.document.problem(place, what, f"more than {longest}"))
-    return problems
+            yield number, point.document.problem(place, what, f"more than {longest}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,21 +332,19 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
     try:
         first = assembly.first_point
         lab = points.lab(first)
-        each = [first, *session.scan_run.each()]
+        each = _numbered(session)
         for ask in (points.ask_steps, points.ask_timing, points.ask_devices):
-            for point in each:
+            for point in each.values():
                 ask(point)
             points.raise_problems()
-        rehearsals, warnings = _rehearsed(points, runs)
+        _rehearse_all(points, each.values(), runs)
         points.raise_problems()
         run_s = _run_s(session, points)
-        timeline = points.timeline(first)
+        timeline, rehearsals = points.timeline(first), points.rehearsed(first)
     finally:
         guard.end()
-    warnings += _judgement_warnings(session, [*rehearsals])
-    warnings += _parallelism_warnings(session, each)
-    warnings += _deadline_warnings(session, lab, timeline)
-    warnings += [*_timeout_warnings(assembly, timeline), *points.warnings.values()]
+    warnings = _warnings(points, each) + _judgement_warnings(session, [*rehearsals])
+    warnings += points.warnings.values()
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         timeline,
@@ -374,23 +378,69 @@ def _windows(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
     return {number: windows_s for number, windows_s in windows.items() if windows_s}
 
 
-def _rehearsed(points: _Points, runs: bool) -> tuple[dict[int, Rehearsal], list[Problem]]:
-    """Rehearse the moves at every point with devices of its own: the results at the first, and warnings."""
-    session, rehearsals, warnings = points.session, dict[int, Rehearsal](), list[Problem]()
-    for n, (point, lab) in enumerate(points.labs()):
-        windows = _windows(point.steps)
+def _numbered(session: Session) -> dict[int, Point]:
+    """Number -> each point of the run, that of the check first; adaptive: a number -> each corner."""
+    run, first = session.scan_run, session.assembly.first_point
+    if run.is_adaptive:
+        return dict(enumerate([first, *run.each()]))
+    return {
+        0: first,
+        **dict(zip(dict.fromkeys(run.points[shot] for shot in run.shots), run.each(), strict=True)),
+    }
+
+
+def _warnings(points: _Points, each: Mapping[int, Point]) -> list[Problem]:
+    """What is allowed but probably not intended, once, with the points of the scan where it is so."""
+    found: dict[Any, tuple[Problem, list[int]]] = {}
+    for judge in (_window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings):
+        for n, point in each.items():
+            for key, problem in judge(points, point):
+                found.setdefault((judge, key), (problem, []))[1].append(n)
+    texts: list[Problem] = []
+    for problem, numbers in found.values():
+        if len(numbers) < len(each) and not points.session.scan_run.is_adaptive:
+            at = f"at {_listed(numbers)} of the scan"
+            problem = replace(problem, hint=f"{problem.hint}; {at}" if problem.hint else at)
+        texts.append(problem)
+    return texts
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    """For example "points 0 to 2, 4" for 0, 1, 2 and 4."""
+    runs: list[list[int]] = []
+    for n in sorted(numbers):
+        if runs and n == runs[-1][-1] + 1:
+            runs[-1].append(n)
+        else:
+            runs.append([n])
+    parts = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
+    return ("points " if len(runs) > 1 or len(runs[0]) > 1 else "point ") + ", ".join(parts)
+
+
+def _rehearse_all(points: _Points, each: Iterable[Point], runs: bool) -> None:
+    """Rehearse the moves at every point that differs from those before it."""
+    session = points.session
+    distinct: dict[tuple[object, ...], Point] = {}
+    for point in each:
+        distinct.setdefault(points.rehearsal_key(point), point)
+    wait_s, asked = MAX_WAIT_S / max(1, len(distinct) - 1), set[int]()
+    for n, (key, point) in enumerate(distinct.items()):
+        windows, lab = _windows(point.steps), points.lab(point)
+        points.rehearsals[key] = []
         if not windows:
             continue
-        session.warm(lab, devices=runs and n == 0)
-        found, plans, failure = _rehearse(points.guard, lab, [*windows.values()], 1 if n else N_LOADINGS)
-        points.ask_tweezers(point, lab, plans)
+        if id(lab) not in asked:
+            session.warm(lab, devices=runs and n == 0)
+        deadline = time.monotonic() + (wait_s if n else MAX_WAIT_S)
+        n_loadings = N_LOADINGS_ELSEWHERE if n else N_LOADINGS
+        found, plans, failure = _rehearse(points.guard, lab, [*windows.values()], n_loadings, deadline)
+        points.rehearsals[key] = found
+        if id(lab) not in asked:
+            points.ask_tweezers(point, lab, plans if n == 0 else plans[:1])
+            asked.add(id(lab))
         if failure is not None:
             what, hint = failure.what, failure.hint and f"{failure.hint} {_plan_options(session, point)}"
             points.add(point.document, (*session.assembly.sequence.planner.loc, "use"), what, hint=hint)
-        elif n == 0:
-            rehearsals = dict(zip(windows, found, strict=True))
-            warnings += _window_warnings(session, windows, rehearsals)
-    return rehearsals, list(dict.fromkeys(warnings))
 
 
 def _plan_options(session: Session, point: Point) -> str:
@@ -404,7 +454,7 @@ def _plan_options(session: Session, point: Point) -> str:
 
 
 def _rehearse(
-    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int
+    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int, deadline: float
 ) -> tuple[list[Rehearsal], list[Plan], Problem | None]:
     """Plan for random loadings; the seed of each is its number, as in `labseq plan random:... --seed N`.
 
@@ -416,10 +466,9 @@ def _rehearse(
         loading = lab.simulation.loading_probability
     if loading is None:
         loading = PAPERS_LOADING
-    deadline = time.monotonic() + MAX_WAIT_S
     shots: list[list[tuple[Plan, PlanReport]]] = []
     failure: Problem | None = None
-    while len(shots) < n_loadings and time.monotonic() < deadline and failure is None:
+    while len(shots) < n_loadings and failure is None and (not shots or time.monotonic() < deadline):
         seed, cycles = len(shots), list[tuple[Plan, PlanReport]]()
         try:
             for cycle in _first_cycles(guard, lab, windows, loading, seed):
@@ -471,30 +520,27 @@ def _summary(reports: Sequence[PlanReport]) -> Rehearsal:
     return Rehearsal(len(reports), sum(report.meets_target for report in reports), durations, firsts)
 
 
-def _window_warnings(
-    session: Session, windows: Mapping[int, Sequence[float]], rehearsals: Mapping[int, Rehearsal]
-) -> list[Problem]:
-    document, sequence = session.assembly.document, session.assembly.sequence
-    problems: list[Problem] = []
+def _window_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
+    document, shot = point.document, points.session.assembly.sequence.shot
+    windows, rehearsals = _windows(point.steps), points.rehearsed(point)
+    if min((one.n_loadings for one in rehearsals.values()), default=0) < N_LOADINGS_ELSEWHERE // 4:
+        return
     for number, rehearsal in rehearsals.items():
-        loc = (*sequence.shot[number].loc, "window")
+        loc = (*shot[number].loc, "window")
         first, shortest = windows[number][0], min(windows[number])
         n_fit = int(np.count_nonzero(rehearsal.duration_s <= first + 1e-9))
         enough = format_quantity(float(np.quantile(rehearsal.duration_s, 0.95)), "time")
         if 2 * n_fit < rehearsal.n_loadings:
             what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
-            share = f"{n_fit} of {rehearsal.n_loadings} fit"
-            problems.append(
-                document.problem(loc, f"{what} ({share})", f"about {enough}, enough for 95 % of the plans")
-            )
+            what += f" ({n_fit} of {rehearsal.n_loadings} fit)"
+            yield number, document.problem(loc, what, f"about {enough}, enough for 95 % of the plans")
         elif shortest < np.median(rehearsal.first_batch_s):
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
-            problems.append(document.problem(loc, what, "more than the overheads of a cycle and a batch"))
+            yield number, document.problem(loc, what, "more than the overheads of a cycle and a batch")
     loaded = next(iter(rehearsals.values()))
     if loaded.n_filled < 0.9 * loaded.n_loadings:
         what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings have enough atoms for the target"
-        problems.append(document.problem(("target",), what, "a smaller target, or better loading"))
-    return problems
+        yield -1, document.problem(("target",), what, "a smaller target, or better loading")
 
 
 def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:
@@ -510,40 +556,35 @@ def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list
     return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
 
 
-def _parallelism_warnings(session: Session, points: Iterable[Point]) -> list[Problem]:
-    problems: dict[str, Problem] = {}
-    for point in points:
-        asked = getattr(point.planner.settings, "degree_of_parallelism", None)
-        limit = point.hardware.profile.motion.max_tweezers
-        if isinstance(asked, int) and asked > limit:
-            loc = (*session.assembly.sequence.planner.loc, "degree_of_parallelism")
-            what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
-            problems.setdefault(what, point.document.problem(loc, f"{what}; at most {limit} are used"))
-    return [*problems.values()]
+def _parallelism_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
+    asked = getattr(point.planner.settings, "degree_of_parallelism", None)
+    limit = point.hardware.profile.motion.max_tweezers
+    if isinstance(asked, int) and asked > limit:
+        loc = (*points.session.assembly.sequence.planner.loc, "degree_of_parallelism")
+        what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
+        yield 0, point.document.problem(loc, f"{what}; at most {limit} are used")
 
 
-def _deadline_warnings(session: Session, lab: Lab, timeline: Timeline) -> list[Problem]:
+def _deadline_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
     """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
-    problems: list[Problem] = []
-    steps = [step for _, step in session.assembly.steps]
-    waits = [bool(getattr(step, "signal", "")) for step in steps]
-    for number, step in enumerate(steps):
+    timeline, lab = points.timeline(point), points.lab(point)
+    waits = [bool(getattr(step, "signal", "")) for _, step in point.steps]
+    for number, (_, step) in enumerate(point.steps):
         if not waits[number]:
             continue
         try:
             name, leader = find_leader(dict(lab.hardware()), step.device)
         except ConfigError:  # no wait for a signal: another step's own attribute
             continue
-        until = next((n for n in range(number + 1, len(steps)) if waits[n]), None)
+        until = next((n for n in range(number + 1, len(waits)) if waits[n]), None)
         longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
         if longest_s > leader.deadline_s:
             longest = format_quantity(longest_s, "time")
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
-            loc = (*session.assembly.sequence.shot[number].loc, "for")
+            loc = (*points.session.assembly.sequence.shot[number].loc, "for")
             hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
-            problems.append(session.assembly.document.problem(loc, what, hint=hint))
-    return problems
+            yield number, point.document.problem(loc, what, hint=hint)
 
 
 def _shot_bytes(session: Session, lab: Lab, timeline: Timeline) -> int | None:

@@ -85,6 +85,35 @@ def test_a_run_gives_the_warnings_of_the_check_once(tmp_path: Path):
     assert events.index(warning) < events.index("shot_started")
 
 
+@pytest.mark.parametrize(
+    ("scan", "message", "line_of"),
+    [
+        (
+            "shot.2.rearrange.window: [60 ms, 10 ms, 12 ms, 70 ms, 1 ms]",
+            "; at points 1, 2, 4 of the scan",
+            "scan:",
+        ),
+        (
+            "shot.1.image.exposure: [5 ms, 45 ms, 50 ms, 60 ms]",
+            "its timeout of 40 ms; expected more than 50 ms",
+            "timeout:",
+        ),
+        ("planner.degree_of_parallelism: [7, 40]", "at most 20 are used; at point 1 of the scan", "scan:"),
+        ("profile.mobile_tweezers.speed: [130 um/ms, 1 um/ms]", "(0 of 20 fit)", "- rearrange:"),
+    ],
+)
+def test_a_warning_is_given_once_for_a_scan(tmp_path: Path, scan: str, message: str, line_of: str):
+    text = COMPACT.read_text("utf-8").replace("shots: 20\n", "")
+    image = "- image: {exposure: 45 ms}\n"
+    assert image in text
+    text = text.replace(image, "- image: {exposure: 5 ms}\n    policy: {timeout: 40 ms}\n", 1)
+    text += f"scan: {{{scan}}}\n"
+    (tmp_path / "s.yaml").write_text(text, "utf-8")
+    (warning,) = check(labseq.Session.open(tmp_path / "s.yaml")).warnings
+    assert message in str(warning)
+    assert line_of in text.splitlines()[warning.line - 1]
+
+
 def test_a_rearrangement_is_rehearsed_where_the_one_before_it_ends():
     def repair(window: str) -> tuple[Problem, ...]:
         sort, image = "{rearrange: {cycles: 2}}", "{image: {}}"
