@@ -82,7 +82,7 @@ def kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[
 def helper_kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[F], F]:
     """Like :func:`kernel`, for a function that only kernels call: nothing to load if they are in the cache.
 
-    Python may call it, too; the first call then takes a few milliseconds longer.
+    Python may call it, too; the first call then compiles it, or loads it from the cache.
     """
     return _decorator(signature, fused, is_helper=True)
 
