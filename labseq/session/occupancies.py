@@ -83,7 +83,7 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
         what = something_else(path) or "there is no such file"
         names = [name for name in files_in(path.parent, (".npy", ".txt", ".h5")) if name != path.name]
         hint = did_you_mean(path.name, names)
-        raise ConfigError(Problem(what, visible(str(path)), expected=FORMS, hint=hint))
+        raise ConfigError(Problem(what, clean(str(path)), expected=FORMS, hint=hint))
     if match:
         return _shot(path, match[2])
     label = visible(str(path))
@@ -218,7 +218,7 @@ def _read(path: Path) -> bytes:
             return file.read(MAX_BYTES + 1)
     except OSError as error:
         what = f"it cannot be read: {error.strerror}"
-        raise ConfigError(Problem(what, visible(str(path)), expected=FORMS)) from error
+        raise ConfigError(Problem(what, clean(str(path)), expected=FORMS)) from error
 
 
 def _size_limit() -> str:
