@@ -19,7 +19,7 @@ from hypothesis import settings
 
 from labseq.files import cache_root
 
-# A busy computer is no failure, and what passed once passes again; ``poe fuzz`` looks for new examples.
+# A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
 settings.register_profile("labseq", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None)
 settings.load_profile("labseq")

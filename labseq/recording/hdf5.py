@@ -181,12 +181,13 @@ _MAX_RATIO: Final = 64
 _SMALL: Final = 1 << 24
 
 
-def check_contents(file: Any, n_bytes: int) -> None:
+def check_contents(file: Any, n_bytes: int, only: str = "") -> None:
     """Refuse what leads out of a file, and what declares more data than the file can hold.
 
     Args:
         file: The file, opened; nothing but its structure is read.
         n_bytes: Its size.
+        only: The one dataset that is read, such as "/entry/detection/occupancy"; "" for all.
 
     Raises:
         ValueError: It has links to other files, an object twice, data in other files, unknown filters,
@@ -201,6 +202,8 @@ def check_contents(file: Any, n_bytes: int) -> None:
             place = f"{where}/{name.decode('utf-8', 'backslashreplace')}"
             if n_objects > MAX_OBJECTS or place.count("/") > MAX_DEPTH:
                 raise ValueError(f"it has more than {MAX_OBJECTS} objects, or groups too deep, up to {place}")
+            if only and not f"{only}/".startswith(f"{place}/"):
+                continue
             kind = group.links.get_info(name).type
             if kind == h5l.TYPE_SOFT and group.links.get_val(name).startswith(b"/entry/camera/"):
                 continue

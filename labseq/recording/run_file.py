@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 import labseq
 from labseq.errors import RecordingError
 from labseq.files import Process, read_file
+from labseq.messages import clean
 from labseq.model import RunRecord, ShotRecord, TargetPattern
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, parse_object, to_plain
@@ -47,6 +48,7 @@ class OtherFormatError(RecordingError):
 
 def check_version(path: Path, found: str, known: str) -> None:
     """Raise for a file whose format has another major version."""
+    found = clean(found)
     major = found.partition(".")[0]
     if not major.isdecimal():
         raise RecordingError(
@@ -105,6 +107,9 @@ def read_run(folder: Path) -> dict[str, Any]:
     wrong += [name for name in _DICTS_IN_RUN if not isinstance(record.get(name) or {}, dict)]
     if not wrong and not 0 <= record["n_shots"] < _MAX_INT:
         wrong = ["n_shots"]
+    changes: dict[str, Any] = record.get("overrides") or {}
+    if not wrong and not all(isinstance(one, dict) and "written" in one for one in changes.values()):
+        wrong = ["overrides"]
     if wrong:
         raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; restore it from a backup")
     return record

@@ -257,8 +257,12 @@ def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Generator[Any]:
+def opened(path: Path, only: str = "") -> Generator[Any]:
     """Open a shot's file to read its group ``/entry``; what fails within reports the file as damaged.
+
+    Args:
+        path: The file.
+        only: The one dataset that will be read; "" for any.
 
     Raises:
         RecordingError: It is missing, damaged, or of another format.
@@ -273,7 +277,7 @@ def opened(path: Path) -> Generator[Any]:
             if file.attrs.get("format") != schema.FORMAT:
                 raise RecordingError(path, "is not a shot's file of labseq")
             check_version(path, str(file.attrs.get("format_version")), schema.FORMAT_VERSION)
-            check_contents(file, path.stat().st_size)
+            check_contents(file, path.stat().st_size, only)
             yield cast("Any", file["entry"])
     except RecordingError:
         raise

@@ -1,0 +1,33 @@
+"""A few hundred damaged files of ``poe fuzz``, always the same ones."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+if sys.platform == "win32":
+    pytest.skip("signals limit the time", allow_module_level=True)
+
+from tests.fuzz.cases import Templates
+from tests.fuzz.run import read_one
+
+N_FILES = {"calibration": 60, "plan": 60, "queue": 30, "run.json": 40, "index": 5, "shot": 5, "run": 2}
+
+
+@pytest.fixture(scope="module")
+def templates(tmp_path_factory: pytest.TempPathFactory) -> Templates:
+    return Templates(tmp_path_factory.mktemp("templates"))
+
+
+@pytest.mark.parametrize("kind", [*N_FILES])
+def test_a_damaged_file_is_refused_or_read(
+    kind: str, templates: Templates, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LABSEQ_DATA", "")
+    for number in range(N_FILES[kind]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        error = read_one(kind, number, 18, templates, folder)
+        assert not error, f"poe fuzz --seed 18 --only {kind} {number}: {error}"
