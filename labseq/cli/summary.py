@@ -189,12 +189,24 @@ def _numbers(shots: Sequence[int]) -> str:
     return ", ".join(str(shot) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
 
 
+_ENDS: Final = frozenset({"shot_finished", "shot_repeated"})
+"""Events at the end of an attempt at a shot."""
+
+
 def _wall_time(run: Run) -> str:
-    """Time on the computer's clock from the start of the run to the end of its last shot."""
-    ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
-    try:
-        start = datetime.fromisoformat(str(run.record["t_start_utc"]))
-        duration = max(datetime.fromisoformat(text) for text in ends if text) - start
-    except (KeyError, ValueError, TypeError):  # no shots, or a damaged index
-        return "-"
-    return f"{format_quantity(duration.total_seconds(), 'time')} on the computer's clock"
+    """Real time until the end of the last shot; of a resumed run, of all its parts together."""
+    times_s = [line.get("t_s") for line in run.events if line.get("event") in _ENDS]
+    total_s, last_s = 0.0, 0.0
+    for t_s in times_s:
+        if isinstance(t_s, int | float):
+            total_s += t_s - last_s if t_s >= last_s else t_s  # each process begins at 0
+            last_s = t_s
+    if not any(times_s):  # the log is lost: the clock may have been set meanwhile
+        ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
+        try:
+            start = datetime.fromisoformat(str(run.record["t_start_utc"]))
+            last = max(datetime.fromisoformat(text) for text in ends if text)
+        except (KeyError, ValueError, TypeError):  # no shots, or a damaged index
+            return "-"
+        total_s = (last - start).total_seconds()
+    return f"{format_quantity(total_s, 'time')} on the computer's clock"

@@ -161,7 +161,9 @@ class Run:
 
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
-        """The event log: dicts with ``t_utc``, ``event`` and ``values``; read from the file each time.
+        """The event log, read from the file each time: dicts with ``t_utc``, ``t_s``, ``event``, ``values``.
+
+        ``t_s`` is the time since the process began or resumed the run, in seconds; no clock moves it.
 
         Raises:
             RecordingError: The file cannot be read.

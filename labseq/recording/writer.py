@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import shutil
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -48,6 +49,7 @@ class RunWriter:
         self._events = LineLog(run_dir / folders.EVENTS_FILE)
         self._events_lock = threading.Lock()
         self._n_events_lost = 0
+        self._began_s = time.monotonic()
         self._before: dict[str, Any] | None = None  # run.json, if another process began the run
         self._kept: frozenset[str] = frozenset()
 
@@ -175,6 +177,7 @@ class RunWriter:
         """
         line: dict[str, Any] = {
             "t_utc": datetime.now(UTC).isoformat(timespec="microseconds"),
+            "t_s": round(time.monotonic() - self._began_s, 6),  # whatever happens to the clock
             "event": name,
             "values": values,
         }

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from labseq.cli.run import run_sequence
+from labseq.cli.summary import summary_lines
 from labseq.console.output import discard_unwritten
 from labseq.errors import ConfigError, DeviceError, Problem, RecordingError, StopRequested
-from labseq.recording import RunWriter
+from labseq.recording import RunWriter, open_run
 from labseq.session.options import Options
 
 NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction": None}
@@ -235,3 +236,13 @@ def test_what_is_printed_late_does_not_follow_the_answer() -> None:
     assert done.stdout == "the answer\n"
     assert "said at the end" in done.stderr
     assert "buffered by the C library" in done.stderr
+
+
+def test_a_clock_that_is_set_changes_no_duration(perform: Any) -> None:
+    session, *_ = perform(as_json=False)
+    assert session.run_dir is not None
+    times_s = [(10.0, "2026-11-20"), (70.0, "2026-11-19"), (5.0, "2027-01-01")]  # resumed before the last
+    lines = [{"t_utc": f"{day}T10:00:00+00:00", "t_s": t, "event": "shot_finished"} for t, day in times_s]
+    text = "".join(f"{json.dumps(line)}\n" for line in lines)
+    (session.run_dir / "events.jsonl").write_text(text, encoding="utf-8")
+    assert "wall time         75 s on the computer's clock" in summary_lines(open_run(session.run_dir))
