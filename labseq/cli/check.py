@@ -25,7 +25,7 @@ from labseq.recording import data_root
 from labseq.sequencer.policies import StepPolicy
 from labseq.session.assembly import Assembly, Search
 from labseq.session.check import CheckReport, Rehearsal, check
-from labseq.session.chosen import DryRun
+from labseq.session.chosen import HARDWARE_KINDS, DryRun
 from labseq.session.session import Session
 from labseq.units import format_quantity
 
@@ -278,10 +278,17 @@ def _limits(assembly: Assembly) -> list[tuple[str, str]]:
     tones = f"{motion.max_row_tones} x {motion.max_column_tones} tones"
     dop = assembly.planner.dump().get("degree_of_parallelism")
     uses = f"; the planner uses {min(dop, motion.max_tweezers)}" if dop else ""
+    hardware = assembly.hardware.chosen.items()
+    real = [role for role, one in hardware if one.entry.kind in HARDWARE_KINDS and not one.virtual_time]
     waits = (("device call", timeouts.call), ("safe state", timeouts.safe_state), ("plan", timeouts.plan))
     return [
         *(("window", text) for text in _windows(assembly.resolved)),
         ("mobile tweezers", f"{motion.max_tweezers} on at once, {tones}{uses}"),
+        *(
+            [("not opened", f"{', '.join(real)}: limits that only the hardware knows are not checked")]
+            if real
+            else []
+        ),
         ("attempts", f"at most {spec.attempts} per shot"),
         *(("policy", text) for text in policy_texts(assembly)),
         ("timeouts", ", ".join(f"{what} {format_quantity(value, 'time')}" for what, value in waits)),

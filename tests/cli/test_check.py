@@ -2,9 +2,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.check import BAR_WIDTH, lines_table, timeline_table
+from labseq.cli.check import BAR_WIDTH, check_sequence, lines_table, timeline_table
 from labseq.model import TimedBy, TimelineEntry
 
 SEQUENCE = str(Path(__file__).parents[2] / "sequences" / "compact_225.yaml")
@@ -30,6 +31,14 @@ def test_a_line_is_drawn_where_it_is_on() -> None:
         "mot               0      0 s",
     ]
     assert lines_table({}, 1.0, "#") == []
+
+
+def test_a_check_names_the_devices_that_it_did_not_ask(capsys: pytest.CaptureFixture[str]) -> None:
+    check_sequence(Path(SEQUENCE), "lab", [], "off", as_json=False)
+    row = "not opened       camera, static_tweezers, mobile_tweezers, shutter: limits that only the"
+    assert row in capsys.readouterr().out
+    check_sequence(Path(SEQUENCE), "lab", [], "full", as_json=False)
+    assert "not opened" not in capsys.readouterr().out
 
 
 def test_timeline_table() -> None:
