@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.errors import InvalidPlanError, PlanError
+from labseq.errors import ConfigError, InvalidPlanError, PlanError
 from labseq.files import devices_root
 from labseq.testing.fakes import RecordingObserver
 
@@ -38,6 +38,15 @@ class OneByOne:
 @labseq.plugin.hookimpl
 def labseq_register(registry):
     registry.planner("mine", OneByOne)
+"""
+
+HAS_STARTED = """
+RUNNING = []
+
+
+@labseq.plugin.hookimpl
+def labseq_run_started(run):
+    RUNNING.append(run)
 """
 
 SEQUENCE = """
@@ -79,7 +88,8 @@ def test_a_planner_in_the_users_own_folder_runs(tmp_path):
     ],
 )
 def test_a_wrong_plan_is_stopped_before_anything_plays(tmp_path, batches, rule):
-    code = THIRD_PARTY.replace("from_batches(batches)", f"from_batches({batches}[:1])")
+    wrong = f"from_batches({batches}[:1] if RUNNING else batches)"  # the rehearsal finds nothing
+    code = THIRD_PARTY.replace("from_batches(batches)", wrong) + HAS_STARTED
     seen = RecordingObserver()
     with pytest.raises(InvalidPlanError) as caught:
         run(tmp_path, with_plugin(tmp_path, code), seed=1, observer=seen)
@@ -101,10 +111,10 @@ def test_a_wrong_plan_is_stopped_before_anything_plays(tmp_path, batches, rule):
         (
             "now, batches =",
             "raise KeyError('typo')\n        now, batches =",
-            PlanError,
+            ConfigError,
             "raised KeyError: 'typo'",
         ),
-        ("return labseq.Plan.from_batches(batches)", "return batches", PlanError, "expected a Plan"),
+        ("return labseq.Plan.from_batches(batches)", "return batches", ConfigError, "expected a Plan"),
         (
             "    def plan(",
             "    def warm(self):\n        raise SystemExit(0)\n\n    def plan(",
