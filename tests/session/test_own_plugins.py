@@ -114,7 +114,12 @@ def test_a_wrong_plan_is_stopped_before_anything_plays(tmp_path, batches, rule):
             ConfigError,
             "raised KeyError: 'typo'",
         ),
-        ("return labseq.Plan.from_batches(batches)", "return batches", ConfigError, "expected a Plan"),
+        (
+            "return labseq.Plan.from_batches(batches)",
+            "return batches",
+            ConfigError,
+            r"'shape': a Plan \(labseq.plugin.Plan.from_batches makes one\) was expected, list came",
+        ),
         (
             "    def plan(",
             "    def warm(self):\n        raise SystemExit(0)\n\n    def plan(",
