@@ -18,6 +18,7 @@ from typing import Any, Final, cast
 import labseq
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_file, whole_file
+from labseq.messages import visible
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts, same_grid
 from labseq.plain import parse_object
 from labseq.units import format_quantity
@@ -117,7 +118,7 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
 def damaged(path: Path, why: str) -> ConfigError:
     """The error for a damaged file."""
     hint = "restore it from a backup, or move it to another folder"
-    return ConfigError(Problem(f"this file is damaged: {why}", str(path), hint=hint))
+    return ConfigError(Problem(f"this file is damaged: {visible(why)}", str(path), hint=hint))
 
 
 ACTIVE_FILE: Final = "active.json"
