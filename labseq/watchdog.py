@@ -252,6 +252,10 @@ def error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}"[:MAX_TEXT] if text else type(error).__name__
 
 
+_AT_WORK: Final = list[subprocess.Popen[bytes]]()
+"""Watchdogs that outlive their runs."""
+
+
 class Watchdog:
     """The run's side: starts the watchdog, tells it of the devices, and sends the heartbeat.
 
@@ -310,8 +314,11 @@ class Watchdog:
                     process.stdin.write(b'{"end": true}\n')
                 with suppress(OSError, ValueError):
                     process.stdin.close()
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(END_S)
+                if self._devices:  # it is at work, and needs the ports that this process still holds
+                    _AT_WORK.append(process)
+                else:
+                    with suppress(subprocess.TimeoutExpired):
+                        process.wait(END_S)
 
     def notes(self) -> list[str]:
         """What went wrong since the last call, for the user."""
