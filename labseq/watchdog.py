@@ -252,10 +252,6 @@ def error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}"[:MAX_TEXT] if text else type(error).__name__
 
 
-_AT_WORK: Final = list[subprocess.Popen[bytes]]()
-"""Watchdogs that outlive their runs."""
-
-
 class Watchdog:
     """The run's side: starts the watchdog, tells it of the devices, and sends the heartbeat.
 
@@ -315,7 +311,7 @@ class Watchdog:
                 with suppress(OSError, ValueError):
                     process.stdin.close()
                 if self._devices:  # it is at work, and needs the ports that this process still holds
-                    _AT_WORK.append(process)
+                    process.returncode = 0  # nobody waits for it
                 else:
                     with suppress(subprocess.TimeoutExpired):
                         process.wait(END_S)
