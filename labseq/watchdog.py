@@ -252,6 +252,18 @@ def error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}"[:MAX_TEXT] if text else type(error).__name__
 
 
+def watchdog_lines(run_dir: Path) -> list[str]:
+    """What the watchdog of a run did, a line for each device; damaged lines of its log are left out."""
+    lines: list[str] = []
+    with suppress(OSError):
+        for text in (run_dir / WATCHDOG_LOG).read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError, TypeError, KeyError):
+                row = json.loads(text)
+                what = f"off after {1e3 * row['after_s']:.0f} ms" if row["ok"] else "NOT switched off"
+                lines.append(f"{row['device']} {what}, because the run {row['cause']}: {row['text']}")
+    return lines
+
+
 class Watchdog:
     """The run's side: starts the watchdog, tells it of the devices, and sends the heartbeat.
 

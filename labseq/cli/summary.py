@@ -25,6 +25,7 @@ from labseq.plain import to_plain
 from labseq.recording import Run
 from labseq.recording.best import best_point
 from labseq.units import format_quantity
+from labseq.watchdog import watchdog_lines
 
 MAX_ROWS: Final = 40
 """Maximum number of rows of a table; of a longer one the first and the last are shown."""
@@ -52,6 +53,7 @@ def summary_lines(run: Run) -> list[str]:
         *(_atom_rows(run) if run.target.is_none else statistics_rows(statistics)),
         ("wall time", _wall_time(run)),
     ]
+    rows += [("watchdog", clean(line)) for line in watchdog_lines(run.path)]
     if run.n_damaged_lines:
         rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
     resume = (

@@ -24,7 +24,7 @@ from labseq.errors import (
 from labseq.files import Holder, Lock, Process, make_shared
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
-from labseq.messages import format_error
+from labseq.messages import clean, format_error
 from labseq.recording import clear_active, find_dead_run, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer.clock import RealClock, VirtualClock
@@ -32,6 +32,7 @@ from labseq.sequencer.lab import Timeouts, attempt, in_safe_order, method_of
 from labseq.session.chosen import HARDWARE_KINDS, DryRun, check_dry_run, load_plugins
 from labseq.session.lab import WARM_S, construct, timeouts_of
 from labseq.session.profile import ResolvedProfile, choose_plugins, resolve_profile
+from labseq.watchdog import watchdog_lines
 
 
 @contextmanager
@@ -263,6 +264,8 @@ def make_safe_after_crash(hardware: ResolvedProfile, key: str, stop: StopFlag, o
         return
     text = f"the last run on these devices ({dead}) died; they are made safe first"
     observer.event("warning", {"text": text})
+    for line in watchdog_lines(dead):
+        observer.event("warning", {"text": f"its watchdog: {clean(line)}"})
     failures = make_profile_devices_safe(hardware, stop, observer).failures
     if failures:
         raise failures[0]

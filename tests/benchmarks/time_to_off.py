@@ -1,7 +1,7 @@
 """Times from the death or hang of a process to its outputs being off, by device and cause.
 
 A shutter on a serial line and a timing box, each simulated in a process of its own that logs when it was
-switched off. `python tests/benchmarks/time_to_off.py --repeats 200 --load 2` takes 30 minutes.
+switched off. `python tests/benchmarks/time_to_off.py --repeats 200 --load 2` takes some 10 minutes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main() -> None:
         times: dict[str, list[float]] = {"shutter": [], "lines": []}
         with tempfile.TemporaryDirectory() as folder, outputs(Path(folder)) as devices:
             for _ in range(options.repeats):
-                for name, time_s in devices.times_to_off(Path(folder), cause).items():
+                for name, time_s in devices.times_to_off(cause).items():
                     times[name].append(1e3 * time_s)
         for name, found in times.items():
             found.sort()

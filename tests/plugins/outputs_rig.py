@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -27,23 +26,27 @@ from labseq.testing.fakes import FakeClock
 from labseq.watchdog import Watchdog
 from tests.plugins.labseq_serial_rig import settings
 
-folder = Path(sys.argv[1])
-context = Context("lines", clock=FakeClock(), lines=SPECS)
-shutter = SerialDevice(settings(port=str(folder / "port")), Context("shutter", clock=FakeClock()))
-lines = ttl_lines(TtlSettings(port=str(folder / "box")), context)
-dog = Watchdog("the run", folder / "watchdog.jsonl")
-for order, (name, device) in enumerate({"shutter": shutter, "lines": lines}.items()):
-    device.open()
-    found = device.emergency()
-    dog.add(name, order, found.script, dict(found.arguments))
-print(*dog.notes(), flush=True)
-for line in sys.stdin:
+def drive(folder, cause):
+    clock = FakeClock()
+    shutter = SerialDevice(settings(port=str(folder / "port")), Context("shutter", clock=clock))
+    lines = ttl_lines(TtlSettings(port=str(folder / "box")), Context("lines", clock=clock, lines=SPECS))
+    dog = Watchdog("the run", folder / "watchdog.jsonl")
+    for order, (name, device) in enumerate({"shutter": shutter, "lines": lines}.items()):
+        device.open()
+        found = device.emergency()
+        dog.add(name, order, found.script, dict(found.arguments))
     shutter.command("open")
     lines._opened().set_lines(4)
-    print("on", flush=True)
+    print("on", *dog.notes(), flush=True)
     sys.stdin.readline()
     print(time.monotonic(), flush=True)
-    exec(sys.argv[2])
+    exec(cause)
+
+for cause in sys.stdin:
+    if child := os.fork():
+        os.waitpid(child, 0)
+    else:
+        drive(Path(sys.argv[1]), cause)
 """
 CAUSES: Final = {
     "kill -9": "os.kill(os.getpid(), signal.SIGKILL)",
@@ -68,11 +71,33 @@ class TtlCounterpart(Counterpart):
 
 
 class Outputs:
-    """The two devices."""
+    """The two devices, and a process that has a child drive them."""
 
-    def __init__(self, shutter: Counterpart, lines: Counterpart) -> None:
-        self._shutter = shutter
-        self._lines = lines
+    def __init__(self, folder: Path, shutter: Counterpart, lines: Counterpart) -> None:
+        self._folder, self._shutter, self._lines = folder, shutter, lines
+        root = str(Path(__file__).parents[2])
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", DRIVING, str(folder)],
+            cwd=root,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": root},
+        )
+
+    def _ask(self, line: str) -> str:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        return self._process.stdout.readline()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.communicate()
 
     def off_since(self) -> dict[str, float | None]:
         """Device -> None while it is on, else when it went off."""
@@ -83,49 +108,29 @@ class Outputs:
             "lines": None if on else since_s,
         }
 
-    def times_to_off(self, folder: Path, cause: str) -> dict[str, float]:
-        """Have a process turn both on and end or hang; how long each stays on, in seconds.
-
-        The log of the watchdog is in the folder.
-        """
-        (folder / "watchdog.jsonl").unlink(missing_ok=True)
-        command = [sys.executable, "-c", DRIVING, str(folder), CAUSES[cause]]
-        root = str(Path(__file__).parents[2])
-        process = subprocess.Popen(
-            command,
-            cwd=root,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": root},
-        )
-        assert process.stdin is not None
-        assert process.stdout is not None
-        try:
-            assert process.stdout.readline() == "\n", "the watchdog has something to say"
-            process.stdin.write("\n")
-            process.stdin.flush()
-            assert process.stdout.readline() == "on\n"
-            assert set(self.off_since().values()) == {None}
-            process.stdin.write("\n")
-            process.stdin.flush()
-            begun_s = float(process.stdout.readline())
-            deadline_s = time.monotonic() + 20.0
-            while len(log_rows(folder)) < 2 and time.monotonic() < deadline_s:
-                time.sleep(5e-3)
-            off = self.off_since()
-            return {name: time_s - begun_s for name, time_s in off.items() if time_s is not None}
-        finally:
-            process.send_signal(signal.SIGKILL)
-            process.communicate()
+    def times_to_off(self, cause: str) -> dict[str, float]:
+        """Have a process turn both on and end or hang; how long each stays on, in seconds."""
+        (self._folder / "watchdog.jsonl").unlink(missing_ok=True)
+        assert self._ask(CAUSES[cause]) == "on\n"
+        assert set(self.off_since().values()) == {None}
+        begun_s = float(self._ask(""))
+        deadline_s = time.monotonic() + 20.0
+        while len(log_rows(self._folder)) < 2 and time.monotonic() < deadline_s:
+            time.sleep(5e-3)
+        return {name: since_s - begun_s for name, since_s in self.off_since().items() if since_s is not None}
 
 
 @contextmanager
-def outputs(folder: Path) -> Generator[Outputs]:
-    """A shutter and a timing box."""
+def outputs(folder: Path, *, driven: bool = True) -> Generator[Outputs]:
+    """A shutter and a timing box, driven by a process unless somebody else does."""
     with Counterpart(folder) as shutter, TtlCounterpart(folder) as lines:
-        yield Outputs(shutter, lines)
+        devices = Outputs(folder, shutter, lines)
+        if not driven:
+            devices.close()
+        try:
+            yield devices
+        finally:
+            devices.close()
 
 
 def log_rows(folder: Path) -> list[dict[str, object]]:

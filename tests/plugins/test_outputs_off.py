@@ -4,30 +4,64 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
+import textwrap
 from collections.abc import Callable, Generator
 from importlib import reload
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from labseq.drivers import serial_emergency as script
 
-from .labseq_serial_rig import Counterpart, opened
+from .labseq_serial_rig import PROFILE as INSTRUMENT, Counterpart, opened
+from .labseq_soapy_rig import until
 from .outputs_rig import log_rows, outputs
+from .small_run import PROFILE, SEQUENCE
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
 
 
-@pytest.mark.parametrize("cause", ["kill -9", "C call"])
-def test_outputs_go_off(tmp_path: Path, cause: str) -> None:
+def test_outputs_go_off_when_a_c_call_does_not_return(tmp_path: Path) -> None:
     with outputs(tmp_path) as devices:
-        assert {*devices.times_to_off(tmp_path, cause)} == {"shutter", "lines"}
-        texts = {row["device"]: row["text"] for row in log_rows(tmp_path)}
-        assert texts == {
-            "shutter": f"sent 'FREQ 1.000000', 'CLOSE' to {tmp_path / 'port'}",
-            "lines": f"sent '!' to {tmp_path / 'box'}",
-        }
+        assert {*devices.times_to_off("C call")} == {"shutter", "lines"}
+        assert {row["cause"] for row in log_rows(tmp_path)} == {"hung"}
+
+
+def test_a_run_that_is_killed_leaves_instrument_and_lines_off(tmp_path: Path) -> None:
+    """From the command line to the connectors; `labseq show` and the next run report it."""
+    channels = {"light": {"channel": 4, "on": ["load", "image", "idle"]}}
+    profile = PROFILE.replace("STATIC", "{use: virtual}").replace("MOBILE", "{use: virtual}")
+    profile += f"devices:\n  shutter:\n    use: serial\n    port: {tmp_path / 'port'}\n    on_open: [open]\n"
+    profile += textwrap.indent(INSTRUMENT.lstrip("\n"), "  ")
+    profile += f"lines: {json.dumps({'use': 'ttl', 'port': str(tmp_path / 'box'), 'channels': channels})}\n"
+    (tmp_path / "p.yaml").write_text(profile, encoding="utf-8")
+    (tmp_path / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
+    command = [sys.executable, "-m", "labseq", "run", "s.yaml", "--output", "runs", "--shots"]
+    with outputs(tmp_path, driven=False) as devices:
+        run = subprocess.Popen([*command, "1000"], cwd=tmp_path, stdout=subprocess.DEVNULL)
+        try:
+            until(lambda: run.poll() is not None or {*devices.off_since().values()} == {None})
+            assert run.poll() is None
+        finally:
+            run.kill()
+            run.wait()
+        folder = next(tmp_path.glob("runs/*/0001_small"))
+        until(lambda: len(log_rows(folder)) == 2)
+        assert None not in devices.off_since().values()
+        options: dict[str, Any] = {"cwd": tmp_path, "capture_output": True, "text": True}
+        shown = subprocess.run(
+            [sys.executable, "-m", "labseq", "show", str(folder)], check=False, **options
+        ).stdout
+        because = r"off after \d+ ms, because the run died: sent"
+        shown = " ".join(shown.split())
+        assert re.search(rf"shutter {because} 'FREQ 1.000000', 'CLOSE' to", shown)
+        assert re.search(rf"lines {because} '!' to", shown)
+        done = subprocess.run([*command, "1"], check=False, **options)
+        printed = " ".join((done.stderr + done.stdout).split())
+        assert re.search(rf"its watchdog: lines {because} '!' to", printed)
 
 
 @pytest.fixture
