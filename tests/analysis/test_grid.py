@@ -52,7 +52,7 @@ def test_the_grid_is_that_of_the_recorded_profile(tmp_path: Path) -> None:
     assert grid_of(run_at(tmp_path, {}, lattice="square")).lattice == "square"
 
 
-@pytest.mark.parametrize("odd", [None, 3, {"profile": 3}, {"profile": {"grid": []}}])
+@pytest.mark.parametrize("odd", [None, {"profile": 3}, {"profile": {"grid": []}}])
 def test_a_record_that_tells_nothing_has_a_grid_and_no_sites(tmp_path: Path, odd: Any) -> None:
     run = run_at(tmp_path, odd, grid_spacing_m=None)
     assert grid_of(run).shape == (2, 3)
