@@ -392,13 +392,16 @@ def _numbered(session: Session) -> dict[int, Point]:
 def _warnings(points: _Points, each: Mapping[int, Point]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
     found: dict[Any, tuple[Problem, list[int]]] = {}
+    is_adaptive = points.session.scan_run.is_adaptive
     for judge in (_window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings):
         for n, point in each.items():
+            if n and is_adaptive and judge is _window_warnings:
+                continue  # the search is there to find out about the corners
             for key, problem in judge(points, point):
                 found.setdefault((judge, key), (problem, []))[1].append(n)
     texts: list[Problem] = []
     for problem, numbers in found.values():
-        if len(numbers) < len(each) and not points.session.scan_run.is_adaptive:
+        if len(numbers) < len(each) and not is_adaptive:
             at = f"at {_listed(numbers)} of the scan"
             problem = replace(problem, hint=f"{problem.hint}; {at}" if problem.hint else at)
         texts.append(problem)
