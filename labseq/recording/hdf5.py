@@ -187,7 +187,7 @@ def check_contents(file: Any, n_bytes: int, only: str = "") -> None:
     Args:
         file: The file, opened; nothing but its structure is read.
         n_bytes: Its size.
-        only: The one dataset that is read, such as "/entry/detection/occupancy"; "" for all.
+        only: The one dataset or group that is read, such as "/entry/detection"; "" for all.
 
     Raises:
         ValueError: It has links to other files, an object twice, data in other files, unknown filters,
@@ -202,7 +202,7 @@ def check_contents(file: Any, n_bytes: int, only: str = "") -> None:
             place = f"{where}/{name.decode('utf-8', 'backslashreplace')}"
             if n_objects > MAX_OBJECTS or place.count("/") > MAX_DEPTH:
                 raise ValueError(f"it has more than {MAX_OBJECTS} objects, or groups too deep, up to {place}")
-            if only and not f"{only}/".startswith(f"{place}/"):
+            if only and not (f"{only}/".startswith(f"{place}/") or place.startswith(f"{only}/")):
                 continue
             kind = group.links.get_info(name).type
             if kind == h5l.TYPE_SOFT and group.links.get_val(name).startswith(b"/entry/camera/"):

@@ -87,7 +87,11 @@ class Shot:
     @property
     def occupancies(self) -> NDArray[np.bool_]:
         """The detected occupancies, bool (n_images, n_rows, n_cols)."""
-        return self._of_each_image("occupancy", np.bool_)
+        if self._load is not load_content:  # it may have read the file before
+            return self._of_each_image("occupancy", np.bool_)
+        from labseq.recording.shot_file import read_occupancies
+
+        return read_occupancies(self.file)[1].astype(np.bool_)
 
     @property
     def summary(self) -> ShotSummary:

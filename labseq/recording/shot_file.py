@@ -220,7 +220,7 @@ def read_content(path: Path) -> ShotContent:
 
 def read_occupancies(path: Path) -> tuple[list[tuple[int, int, str]], NDArray[np.uint8]]:
     """Read step, cycle and name of each image of a shot's file, and uint8 (n_images, n_rows, n_cols)."""
-    with opened(path) as entry:
+    with opened(path, "/entry/detection") as entry:
         rows = entry["detection/images"][()]
         names = zip(rows["step"].tolist(), rows["cycle"].tolist(), rows["name"], strict=True)
         return [(step, cycle, name.decode()) for step, cycle, name in names], entry["detection/occupancy"][()]
@@ -262,7 +262,7 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
 
     Args:
         path: The file.
-        only: The one dataset that will be read; "" for any.
+        only: The one dataset or group that will be read; "" for any.
 
     Raises:
         RecordingError: It is missing, damaged, or of another format.

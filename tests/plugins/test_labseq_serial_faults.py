@@ -278,7 +278,7 @@ def test_whatever_comes_is_a_value_or_an_error(counterpart: Counterpart, noise: 
 
 
 def test_another_process_sends_the_commands_of_the_safe_state(counterpart: Counterpart) -> None:
-    with opened(counterpart.port) as synth:
+    with opened(counterpart.port, timeout="500 ms") as synth:
         synth.command("open")
         emergency = synth.emergency()
     assert emergency is not None

@@ -67,7 +67,7 @@ def test_a_plain_process_switches_the_radio_off(
         fail(labseq, pid)
         if fail is kill_both:
             until(lambda: not script._runs(pid, job[1]["started"]))
-            assert not Ring(tmp_path).is_playing
+            until(lambda: not Ring(tmp_path).is_playing)
             assert Ring(tmp_path).is_transmitting, "no samples, but the leakage of its local oscillator"
         done: Done = outside.off()["radio"]
         assert done.text == text

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,7 @@ def test_a_shot_file_that_leads_elsewhere_is_refused_by_reader_doctor_and_export
 ) -> None:
     secret, path = tmp_path / "secret", run_dir / "shots" / "shot_000001.h5"
     secret.write_bytes(SECRET)
+    seen = read_occupancies(path)[1]
     with h5py.File(path, "r+", libver=("earliest", "v110")) as file:
         plant(file, secret)
     with pytest.raises(RecordingError) as caught:
@@ -120,9 +122,8 @@ def test_a_shot_file_that_leads_elsewhere_is_refused_by_reader_doctor_and_export
     assert str(caught.value).startswith(f"{path}: is damaged: ")
     assert str(caught.value).endswith("; restore it from a backup")
     assert what in str(caught.value)
-    if plant not in (wrong_kind, deep_json):
-        with pytest.raises(RecordingError):
-            read_occupancies(path)
+    with suppress(RecordingError):  # unless what it reads is as it was
+        np.testing.assert_array_equal(read_occupancies(path)[1], seen)
     believe(run_dir, path)  # as if labseq had written it
     left_out = export_run(open_run(run_dir), "archive", tmp_path / "run.h5", frames=True)
     assert [what in reason for reason in left_out] == [True]
