@@ -470,27 +470,33 @@ def _rehearse(
     if loading is None:
         loading = PAPERS_LOADING
     shots: list[list[tuple[Plan, PlanReport]]] = []
+    cycles: list[tuple[Plan, PlanReport]] = []
+
+    def plan() -> None:
+        """All in one guarded call, because handing each plan over to a thread takes longer than planning."""
+        while len(shots) < n_loadings and (not shots or time.monotonic() < deadline):
+            cycles.clear()
+            for cycle in _first_cycles(lab, windows, loading, len(shots)):
+                cycles.append(cycle)  # noqa: PERF402 - those before a failure are kept
+            shots.append([*cycles])
+
     failure: Problem | None = None
-    while len(shots) < n_loadings and failure is None and (not shots or time.monotonic() < deadline):
-        seed, cycles = len(shots), list[tuple[Plan, PlanReport]]()
-        try:
-            for cycle in _first_cycles(guard, lab, windows, loading, seed):
-                cycles.append(cycle)  # those before a failure are kept
-            shots.append(cycles)
-        except StopRequested:
-            raise
-        except LabseqError as error:
-            drawn = f"random:{lab.grid.n_rows}x{lab.grid.n_cols}@{loading:g}"
-            what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
-            # only the first plan is made for the loading itself
-            failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
+    try:
+        guard.call("planner", lab.timeouts.plan_s + max(0.0, deadline - time.monotonic()), plan)
+    except StopRequested:
+        raise
+    except LabseqError as error:
+        drawn, seed = f"random:{lab.grid.n_rows}x{lab.grid.n_cols}@{loading:g}", len(shots)
+        what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
+        # only the first plan is made for the loading itself
+        failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
     plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
     found = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
     return found, plans, failure
 
 
 def _first_cycles(
-    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
+    lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
 ) -> Iterator[tuple[Plan, PlanReport]]:
     """Plan and report of the first cycle of each rearrangement, which begins where the one before ends."""
     rng = np.random.default_rng(seed)
@@ -502,7 +508,7 @@ def _first_cycles(
 
     for number, windows_s in enumerate(windows):
         for cycle, window_s in enumerate(windows_s):
-            plan = guard.call("planner", lab.timeouts.plan_s, lab.planner.plan, occupancy.copy(), lab.target)
+            plan = lab.planner.plan(occupancy.copy(), lab.target)
             report = checked(plan)
             if cycle == 0:
                 yield plan, report
