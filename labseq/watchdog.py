@@ -1,6 +1,6 @@
 """The watchdog: a small process that switches the outputs off when the run that uses them dies or hangs.
 
-A run starts it before it opens its devices, tells it how each is switched off (``Emergency``), and sends a
+A run starts it before it opens its devices, passes on how each is switched off (``Emergency``), and sends a
 heartbeat. The watchdog needs the standard library alone: it must start fast, stay small, and work when
 nothing else does. Messages are lines of JSON on its standard input; an empty line is a heartbeat; the end
 of the input without ``end`` is the death of the run.
@@ -42,8 +42,8 @@ HANGS_S: Final = 1.0
 """How long after that it counts as hanging."""
 ANSWER_S: Final = 5.0
 """How long a run waits for an answer of the watchdog."""
-END_S: Final = 7.0
-"""How long a run waits for the end of the watchdog, which may have to switch devices off."""
+END_S: Final = 1.0
+"""How long a run waits for the end of a watchdog that has nothing left to do."""
 MAX_TEXT: Final = 500
 """Length at which texts of errors are cut."""
 
@@ -87,16 +87,16 @@ class _Device:
         if prepare := getattr(self._module, "prepare", None):
             prepare(**arguments)
 
-    def off(self, report: Callable[[str, str], None], again_s: float) -> None:
-        """Switch the device off, and try again for so long if that fails."""
-        deadline = time.monotonic() + again_s
+    def off(self, report: Callable[[str, str], None]) -> None:
+        """Switch the device off, and try again for a while if that fails."""
+        deadline = time.monotonic() + TRY_AGAIN_S
         while True:
             try:
                 done = self._off(**self._arguments)
                 return report(str(done), "")
             except BaseException as error:  # noqa: BLE001 - whatever it raises, it is tried again
                 if time.monotonic() > deadline:
-                    return report("", error_text(error))
+                    return report("", _format_error(error))
             time.sleep(NEXT_S)
 
 
@@ -155,16 +155,14 @@ class _Process:
             try:
                 device = _Device(order["order"], order["script"], order["arguments"])
             except BaseException as error:  # noqa: BLE001 - the scripts of drivers may raise anything
-                self._answer(error_text(error))
+                self._answer(_format_error(error))
             else:
                 self._devices[order["device"]] = device
                 self._answer("")
         elif "forget" in order:
             self._devices.pop(order["forget"], None)
-        elif self._devices:  # the end, and some devices could not be made safe
-            self._switch_off("could not make its devices safe", time.monotonic(), 0.0)
-            return False
-        else:
+        else:  # the end; devices that are left could not be made safe
+            self._switch_off("could not make its devices safe", time.monotonic())
             return False
         return True
 
@@ -192,16 +190,15 @@ class _Process:
             while time.monotonic() < deadline and not self._is_orphan():
                 time.sleep(0.002)
 
-    def _switch_off(self, cause: str, since_s: float, again_s: float | None = None) -> None:
+    def _switch_off(self, cause: str, since_s: float) -> None:
         """Switch every device off, in the order of the safe state; none waits long for another."""
-        again_s = TRY_AGAIN_S if again_s is None else again_s
         threads: dict[str, threading.Thread] = {}
         for name, device in sorted(self._devices.items(), key=lambda item: item[1].order):
 
             def report(done: str, failure: str, name: str = name) -> None:
                 self._report(cause, name, done, failure, time.monotonic() - since_s)
 
-            threads[name] = threading.Thread(target=device.off, args=[report, again_s], daemon=True)
+            threads[name] = threading.Thread(target=device.off, args=[report], daemon=True)
             threads[name].start()
             threads[name].join(NEXT_S)
         deadline = time.monotonic() + TRY_AGAIN_S + HANGS_S
@@ -217,7 +214,7 @@ class _Process:
             "cause": cause,
             "device": name,
             "ok": not failure,
-            "text": (failure or done)[:MAX_TEXT],
+            "text": "".join(c if c.isprintable() else " " for c in (failure or done)[:MAX_TEXT]),
             "after_s": round(after_s, 4),
         }
         if self._log is not None:
@@ -243,7 +240,7 @@ def _threads(pid: int) -> tuple[str, float]:
     return "", -1.0
 
 
-def error_text(error: BaseException) -> str:
+def _format_error(error: BaseException) -> str:
     """An exception as one short line, even if its own text cannot be had."""
     try:
         text = " ".join(str(error)[: 2 * MAX_TEXT].split())
@@ -265,7 +262,7 @@ def watchdog_lines(run_dir: Path) -> list[str]:
 
 
 class Watchdog:
-    """The run's side: starts the watchdog, tells it of the devices, and sends the heartbeat.
+    """The run's side: starts the watchdog, reports the devices to it, and sends the heartbeat.
 
     A watchdog that dies is started again. Nothing here raises: a run without a watchdog is a run
     with a warning.
@@ -313,7 +310,7 @@ class Watchdog:
                     self._send({"forget": name})
 
     def end(self) -> None:
-        """End it; it then switches off the devices that it was not told to forget. Legal at any time."""
+        """End it; it then switches off the devices that it was not asked to forget. Legal at any time."""
         self._ended.set()
         with self._sending:
             process, self._process = self._process, None
@@ -337,7 +334,7 @@ class Watchdog:
         return notes
 
     def _launch(self) -> None:
-        """Start the process, and tell it all it must know."""
+        """Start the process, and send it the devices that are open."""
         flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(
             subprocess, "CREATE_NEW_PROCESS_GROUP", 0
         )
@@ -374,7 +371,7 @@ class Watchdog:
         except queue.Empty:
             failure = "it does not answer"
         except (TypeError, ValueError) as error:
-            failure = error_text(error)
+            failure = _format_error(error)
         if failure:
             name = message.get("device")
             self._note(f"cannot switch off '{name}': {failure}" if name else failure)

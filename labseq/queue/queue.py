@@ -268,7 +268,7 @@ def _read(file: Path) -> Entry | None:
 
 
 def _check(entry: Entry, file: Path) -> None:
-    """Check what the types do not tell.
+    """Check what the types leave open.
 
     Raises:
         ValueError: It is not as :meth:`Queue.add` writes it.
