@@ -40,19 +40,8 @@ from .damages import (
     rewrite_state,
     shot_of_another_run,
     torn_events,
-    write_whole_run,
 )
 from .records import make_run, make_shot
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_whole_run(tmp_path_factory.mktemp("made"))
-
-
-@pytest.fixture
-def run_dir(template: Path, tmp_path: Path) -> Path:
-    return copied(template, tmp_path / "data")
 
 
 @pytest.mark.parametrize("plant", [*MENDED, *LOST], ids=lambda plant: plant.__name__)

@@ -20,20 +20,10 @@ from labseq.recording.doctor import examine
 from labseq.recording.export import export_run
 from labseq.recording.shot_file import read_content, read_occupancies
 
-from .damages import N_SHOTS, copied, edit_index, write_whole_run
+from .damages import N_SHOTS, edit_index
 
 on_posix = pytest.mark.skipif(os.name != "posix", reason="pipes and devices")
 SECRET = b"root:x:0:0"
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_whole_run(tmp_path_factory.mktemp("made"))
-
-
-@pytest.fixture
-def run_dir(template: Path, tmp_path: Path) -> Path:
-    return copied(template, tmp_path / "data")
 
 
 def huge(file: Any, secret: Path) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
-import hashlib
 import json
 import os
 import random
@@ -30,11 +29,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 import labseq
 
-N_SHOTS: Final = 12
+from .resumable import SHOTS, check_committed, sequence_of, table
+
 LONGEST_S: Final = 120.0
 """A command that takes longer hangs."""
 
@@ -151,37 +149,6 @@ plugin_folders: [plugins]
 timeouts: {call: 3 s, safe_state: 2 s, plan: 3 s}
 """
 
-SEQUENCE: Final = """
-labseq: 1
-name: chaos
-profile: chaos
-seed: 7
-target: {pattern: compact, rows: 6, cols: 6}
-planner: {use: chaos}
-SHOTS
-shot:
-  - load: {duration: 500 ms}
-  - image: {exposure: 45 ms}
-  - rearrange: {cycles: 2, window: 60 ms, exposure: 45 ms}
-  - image: {exposure: 45 ms}
-"""
-
-SHOTS: Final = {
-    "run": f"shots: {N_SHOTS}",
-    "scan": """scan:
-  planner.degree_of_parallelism: [2, 6]
-  profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]
-repeats: 3
-order: shuffled""",
-    "climb": """scan:
-  use: climb
-  over:
-    planner.degree_of_parallelism: {from: 2, to: 9}
-    profile.mobile_tweezers.pick_up: {from: 20 us, to: 400 us}
-  maximise: filling_fraction
-  points: 6
-repeats: 2""",
-}
 JOBS: Final = {
     "run": ["run", "run.yaml"],
     "scan": ["run", "scan.yaml"],
@@ -234,7 +201,7 @@ class Bench:
         (self.folder / "plugins").mkdir()
         (self.folder / "on").mkdir()
         files = {"plugins/chaos.py": PLUGIN, "emergency.py": EMERGENCY, "chaos.yaml": PROFILE}
-        files |= {f"{job}.yaml": SEQUENCE.replace("SHOTS", shots) for job, shots in SHOTS.items()}
+        files |= {f"{job}.yaml": sequence_of(job, profile="chaos", planner="chaos") for job in SHOTS}
         for name, text in files.items():
             (self.folder / name).write_text(text, encoding="utf-8")
         self.data = (self.disk or self.folder) / "data"
@@ -314,54 +281,14 @@ class Bench:
         subprocess.run(["mount", "-o", f"remount,{options}", str(self.disk)], check=True)
 
 
-def table(run_dir: Path) -> list[Any]:
-    """What the shots of a run say, apart from times."""
-    names = ("shot", "status", "success", "filling_fraction", "n_batches", "n_atom_moves", "parameters")
-    return [
-        (
-            [shot.row[name] for name in names],
-            hashlib.sha256(shot.occupancies.tobytes()).hexdigest(),
-            [hashlib.sha256(plan.moves.tobytes()).hexdigest() for plan in shot.plans],
-        )
-        for shot in labseq.open_run(run_dir).shots
-    ]
-
-
 def result(bench: Bench, job: str) -> Any:
     """What a finished job left: the tables of its runs, or the values of its calibration."""
     if job != "calibration":
         return sorted(
-            [table(folder) for folder in bench.runs()], key=repr
+            [table(labseq.open_run(folder)) for folder in bench.runs()], key=repr
         )  # a clock that is set changes names
     found = sorted(bench.folder.glob("calibrations/**/thresholds-*.json"))
     return json.loads(found[-1].read_text(encoding="utf-8"))["values"]
-
-
-def check_committed(run_dir: Path) -> None:
-    """Every shot in the index is there once and reads back whole."""
-    index = run_dir / "index.jsonl"
-    lines = index.read_bytes().split(b"\n")[:-1] if index.exists() else []
-    rows = [row for line in lines if (row := parsed(line)) is not None and row.get("counts")]
-    run = labseq.open_run(run_dir)
-    shots = [row["shot"] for row in rows]
-    if len(set(shots)) != len(shots) or len(run.shots) != len(rows):
-        raise BrokenPromiseError(
-            f"{run_dir}: the index has shots {shots}, the run {[s.index for s in run.shots]}"
-        )
-    for row, shot in zip(sorted(rows, key=lambda row: row["shot"]), run.shots, strict=True):
-        if hashlib.sha256((run_dir / row["file"]).read_bytes()).hexdigest() != row["sha256"]:
-            raise BrokenPromiseError(f"{run_dir}: the file of shot {row['shot']} has changed")
-        shot.verify()
-        if len(shot.occupancies) != row["n_images"] or not np.isin(shot.occupancies, (0, 1)).all():
-            raise BrokenPromiseError(f"{run_dir}: shot {row['shot']} is not whole")
-
-
-def parsed(line: bytes) -> dict[str, Any] | None:
-    """A line of the index; None for one that a killed process left unfinished."""
-    try:
-        return json.loads(line)
-    except ValueError:
-        return None
 
 
 def check_after_end(bench: Bench, process: subprocess.Popen[str], text: str) -> None:
@@ -372,7 +299,7 @@ def check_after_end(bench: Bench, process: subprocess.Popen[str], text: str) -> 
     if on:
         raise BrokenPromiseError(f"still on after exit code {process.returncode}: {', '.join(on)}\n{text}")
     for run_dir in bench.runs():
-        check_committed(run_dir)
+        check_committed(run_dir, may_be_torn=True)
 
 
 Fault = Callable[[Bench, subprocess.Popen[str], random.Random], None]

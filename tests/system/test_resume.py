@@ -1,77 +1,30 @@
 """kill -9 at random moments, then ``labseq resume``: the run ends as if nothing had happened."""
 
-import hashlib
 import json
 import os
 import random
 import subprocess
 
-import numpy as np
 import pytest
 
 import labseq
+
+from .resumable import N_SHOTS, NAMES, check_committed, sequence_of, table as table_of
 
 pytestmark = pytest.mark.system
 
 N_KILLS = int(os.environ.get("LABSEQ_KILLS", "2"))
 
-SEQUENCE = """
-labseq: 1
-name: scanned run
-profile: watched
-seed: 7
-target: {pattern: compact, rows: 6, cols: 6}
-planner: {use: psca}
-SCAN
-shot:
-  - load: {duration: 500 ms}
-  - image: {exposure: 45 ms}
-  - rearrange: {cycles: 2, window: 60 ms, exposure: 45 ms}
-  - image: {exposure: 45 ms}
-"""
-SCANS = [
-    """scan:
-  planner.degree_of_parallelism: [2, 6]
-  profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]
-repeats: 3
-order: shuffled""",
-    """scan:
-  use: climb
-  over:
-    planner.degree_of_parallelism: {from: 2, to: 9}
-    profile.mobile_tweezers.pick_up: {from: 20 us, to: 400 us}
-  maximise: filling_fraction
-  points: 6
-repeats: 2""",
-]
-N_SHOTS = 12
 N_READS = 3 * N_SHOTS
 """Images of a run at least."""
-NAMES = (
-    "shot",
-    "attempt",
-    "status",
-    "success",
-    "filling_fraction",
-    "n_batches",
-    "n_atom_moves",
-    "parameters",
-)
 
 
 def table(run):
-    return [
-        (
-            [shot.row[name] for name in NAMES],
-            shot.occupancies.tobytes(),
-            [plan.moves.tobytes() for plan in shot.plans],
-        )
-        for shot in run.shots
-    ]
+    return table_of(run, (*NAMES, "attempt"))
 
 
 def write_scan(bench, index):
-    text = SEQUENCE.replace("SCAN", SCANS[index])
+    text = sequence_of(["scan", "climb"][index], profile="watched")
     (bench.folder / "sequence.yaml").write_text(text, encoding="utf-8")
     bench.environment["GIT_DIR"] = os.devnull  # edits of the code while the tests run are no change here
 
@@ -95,21 +48,6 @@ def whole(bench, index=0):
     return WHOLE[index]
 
 
-def check_committed(run_dir):
-    """Every shot in the index of a run that was killed opens and reads back whole."""
-    index_file = run_dir / "index.jsonl"
-    lines = index_file.read_bytes().split(b"\n")[:-1] if index_file.exists() else []  # a torn line has no end
-    run = labseq.open_run(run_dir)
-    assert run.status == "failed"
-    rows = [row for row in map(json.loads, lines) if row["counts"]]
-    assert len(run.shots) == len(rows)
-    for row, shot in zip(sorted(rows, key=lambda row: row["shot"]), run.shots, strict=True):
-        assert hashlib.sha256((run_dir / row["file"]).read_bytes()).hexdigest() == row["sha256"]
-        assert shot.frames.shape[0] == len(shot.occupancies) == row["n_images"]
-        assert shot.frames.dtype == np.uint16
-        assert [plan.n_batches for plan in shot.plans] == [c.plan.n_batches for c in shot.cycles]
-
-
 @pytest.mark.parametrize("trial", range(N_KILLS))
 def test_a_run_that_is_killed_and_resumed_is_the_whole_run(bench, trial):
     write_scan(bench, trial % 2)
@@ -124,6 +62,7 @@ def test_a_run_that_is_killed_and_resumed_is_the_whole_run(bench, trial):
         process.kill()
         process.communicate()
         check_committed(bench.run_dir())
+        assert labseq.open_run(bench.run_dir()).status == "failed"
         command = ["resume", str(bench.run_dir())]
     done = bench.run(*command)
     assert done.returncode == 0, done.stderr
