@@ -1,4 +1,4 @@
-"""Files that survive a crash, the folders where labseq keeps things, processes, and locks.
+"""Files that survive a crash, and the folders where labseq keeps things.
 
 :func:`whole_file` and :func:`write_file` are the one way to write a whole file, :class:`LineLog` the one way
 to append to a file.
@@ -7,28 +7,16 @@ to append to a file.
 from __future__ import annotations
 
 import errno
-import json
 import os
-import platform
-import signal
 import stat
-import sys
-import time
-import warnings
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
-from functools import cache
 from io import BufferedReader
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, Any, Final
 
 from labseq.errors import RecordingError
 from labseq.plain import dumps, parse_object
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 
 @contextmanager
@@ -370,6 +358,10 @@ def devices_root() -> Path:
     return Path(system) / "labseq"
 
 
+FOR_ALL: Final = 0o666
+"""Mode of files that every user may change, whatever this user's umask is."""
+
+
 def make_shared(folder: Path) -> None:
     """Make a folder in which every user may make files, and delete only their own.
 
@@ -392,238 +384,8 @@ def write_shared(path: Path, data: bytes) -> None:
     try:
         with whole_file(path) as file:
             file.write(data)
-        path.chmod(_FOR_ALL)
+        path.chmod(FOR_ALL)
     except PermissionError:
         with path.open("r+b", buffering=0) as file:
             file.write(data)
             file.truncate()
-
-
-@dataclass(frozen=True, slots=True)
-class Process:
-    """A process, identified by its id and its start, because ids are used again.
-
-    Attributes:
-        pid: Process id.
-        started: When it started: on Linux in seconds since the computer did, which no change of the
-            clock moves, elsewhere since 1970; 0 if that is unknown.
-        host: The computer that it runs on.
-        boot: Which start of the computer; "" if unknown.
-    """
-
-    pid: int
-    started: float
-    host: str
-    boot: str = ""
-
-    @classmethod
-    def current(cls) -> Process:
-        """This process."""
-        return cls(os.getpid(), _start_time(os.getpid()) or 0.0, platform.node(), _boot_id())
-
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any]) -> Process | None:
-        """A process from the result of ``dataclasses.asdict``; None for any other value."""
-        pid, started = values.get("pid"), values.get("started", 0.0)
-        if type(pid) is not int or pid <= 0 or type(started) not in (int, float):
-            return None
-        return cls(pid, float(started), str(values.get("host") or ""), str(values.get("boot") or ""))
-
-    @property
-    def is_here(self) -> bool:
-        """Whether it belongs to this computer, so that :attr:`is_running` can be known."""
-        return self.host == platform.node()
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it still runs; only known on its own computer."""
-        if self.boot and self.boot != _boot_id():
-            return False
-        started = _start_time(self.pid)
-        if started is None:
-            return False
-        return not (self.started and started) or abs(started - self.started) < _SAME_START_S
-
-    def end(self, grace_s: float) -> bool:
-        """End it: SIGTERM, and SIGKILL if it has not ended within the grace time.
-
-        Returns:
-            Whether it has ended.
-
-        Raises:
-            OSError: It belongs to another user.
-        """
-        for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
-            deadline_s = time.monotonic() + grace_s
-            with suppress(ProcessLookupError):
-                if self.is_running:
-                    os.kill(self.pid, number)
-            while self.is_running and time.monotonic() < deadline_s:
-                time.sleep(0.02)
-        return not self.is_running
-
-
-_SAME_START_S: Final = 0.02 if sys.platform == "linux" else 2.0
-"""Elsewhere a correction of the clock may move the start time of a process."""
-
-
-@cache
-def _boot_id() -> str:
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    except OSError:
-        return ""
-
-
-def _start_time(pid: int) -> float | None:
-    """When a process started, see :class:`Process`; None without such a process, 0 if hidden."""
-    if sys.platform == "linux":
-        return _start_since_boot(pid)
-    import psutil  # takes 0.03 s to import
-
-    try:
-        process = psutil.Process(pid)
-        return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
-    except psutil.AccessDenied:
-        return 0.0
-    except (psutil.NoSuchProcess, OverflowError):
-        return None
-
-
-def _start_since_boot(pid: int) -> float | None:
-    """The same on Linux, by proc(5), whose times do not follow the clock."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
-        return None if fields[0] in "ZXx" else int(fields[19]) / os.sysconf("SC_CLK_TCK")
-    except (OSError, IndexError, ValueError):
-        try:
-            os.kill(pid, 0)
-        except PermissionError:  # it is hidden
-            return 0.0
-        except (OSError, OverflowError):
-            return None
-        return 0.0
-
-
-_NO_LOCKS: Final = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
-_FOR_ALL: Final = 0o666
-"""Other users may lock the same file, whatever this user's umask is."""
-
-
-HANG_S: Final = 30.0
-"""A process that has given no sign of life for so long hangs."""
-
-
-@dataclass(frozen=True, slots=True)
-class Holder:
-    """The process that holds a lock.
-
-    Attributes:
-        what: Its purpose, for example "the run data/2026-01-02/0001_compact"; "" if unknown.
-        process: The process; None if unknown.
-        since_utc: Since when, ISO 8601, UTC.
-        silent_s: Time since its last sign of life; 0 if it gives none.
-    """
-
-    what: str = ""
-    process: Process | None = None
-    since_utc: str = ""
-    silent_s: float = 0.0
-
-    @property
-    def hangs(self) -> bool:
-        """Whether it has given no sign of life for too long."""
-        return self.silent_s > HANG_S
-
-    def __str__(self) -> str:
-        if self.process is None:
-            return "an unknown process"
-        process = f"process {self.process.pid} on {self.process.host}"
-        return f"{self.what} ({process}, since {_local(self.since_utc)})"
-
-
-class Lock:
-    """A lock of the operating system on a file; it is released when its process ends, even if killed.
-
-    ``<file>.holder`` next to the file describes the process that holds it. The time of that file, on the
-    system's monotonic clock, is its last sign of life.
-
-    Args:
-        path: The file; it and its folder are made if they do not exist, and stay.
-        what: Purpose of the lock, shown to other processes.
-    """
-
-    def __init__(self, path: Path, what: str) -> None:
-        self.path = path
-        self._lock: BaseFileLock | None = None
-        self._about = path.with_name(f"{path.name}.holder")
-        self._holder = Holder(what, Process.current(), datetime.now(UTC).isoformat(timespec="seconds"))
-
-    def take(self) -> Holder | None:
-        """Take the lock if it is free.
-
-        Returns:
-            None, or the holder if it is not free.
-
-        Raises:
-            OSError: The file cannot be made; or its folder has no locks, see :func:`knows_no_locks`.
-        """
-        from filelock import FileLock, SoftFileLock, Timeout  # takes 0.05 s to import
-
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        lock: Any = FileLock(self.path, timeout=0, mode=_FOR_ALL, thread_local=False)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # filelock warns where it falls back to a lock file
-                lock.acquire()
-        except Timeout:
-            return self._other()
-        except NotImplementedError as error:
-            raise OSError(errno.ENOSYS, str(error)) from error
-        if isinstance(lock, SoftFileLock):  # a lock file would outlive its holder
-            lock.release()
-            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
-        self._lock = lock
-        self.describe(self._holder.what)
-        return None
-
-    def describe(self, what: str) -> None:
-        """Write the purpose of the lock to the file of its holder, if possible."""
-        self._holder = replace(self._holder, what=what)
-        values = {"what": what, "since_utc": self._holder.since_utc, **asdict(Process.current())}
-        with suppress(OSError):
-            write_shared(self._about, json.dumps(values).encode())
-        self.beat()
-
-    def beat(self) -> None:
-        """Give a sign of life."""
-        with suppress(OSError):
-            os.utime(self._about, ns=(time.monotonic_ns(), time.monotonic_ns()))
-
-    def release(self) -> None:
-        """Free the lock; legal at any time."""
-        if self._lock is not None:
-            with suppress(OSError):
-                self._about.unlink(missing_ok=True)
-            self._lock.release()
-            self._lock = None
-
-    def _other(self) -> Holder:
-        try:
-            values = parse_object(read_file(self._about)) or {}
-            silent_s = max(0.0, time.monotonic() - self._about.stat().st_mtime)
-            return Holder(str(values["what"]), Process.from_plain(values), str(values["since_utc"]), silent_s)
-        except (RecordingError, OSError, KeyError):
-            return Holder()
-
-
-def knows_no_locks(error: OSError) -> bool:
-    """Whether a lock failed because its folder, perhaps on a network, does not support locks."""
-    return error.errno in _NO_LOCKS
-
-
-def _local(time_utc: str) -> str:
-    try:
-        return f"{datetime.fromisoformat(time_utc).astimezone():%Y-%m-%d %H:%M:%S}"
-    except ValueError:
-        return time_utc

@@ -36,7 +36,7 @@ from labseq.errors import (
     UnknownPluginError,
     one_of,
 )
-from labseq.files import Process, cache_root, state_root
+from labseq.files import cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
 from labseq.kernel import const, helper_kernel, kernel
@@ -90,6 +90,7 @@ from labseq.motion import (
     warm_rendering,
 )
 from labseq.motion.tones import site_time_s
+from labseq.processes import Process
 from labseq.recording import Run, open_run
 from labseq.registry import Registry
 from labseq.roles import (

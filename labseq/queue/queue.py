@@ -20,9 +20,10 @@ from pydantic import TypeAdapter, ValidationError
 from labseq.config.document import StoredText
 from labseq.config.find import find_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
-from labseq.files import Holder, Lock, Process, explained, read_file, write_file
+from labseq.files import explained, read_file, write_file
 from labseq.messages import visible
 from labseq.plain import dumps, parse_object
+from labseq.processes import Holder, Lock, Process
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.run_file import read_state
 from labseq.roles import RunObserver

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from labseq.errors import RecordingError
-from labseq.files import Process, devices_root, explained, read_file, sync_folder, write_shared
+from labseq.files import devices_root, explained, read_file, sync_folder, write_shared
 from labseq.plain import dumps, parse_object
+from labseq.processes import Process
 from labseq.recording.folders import slug
 
 _MARKER: Final = ".json"

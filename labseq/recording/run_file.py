@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import RecordingError
-from labseq.files import Process, read_file
+from labseq.files import read_file
 from labseq.messages import clean
 from labseq.model import RunRecord, ShotRecord, TargetPattern
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, parse_object, to_plain
+from labseq.processes import Process
 from labseq.recording import schema
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, SHOTS_FOLDER, STATE_FILE
 

@@ -12,8 +12,8 @@ from typing import Any, cast
 import labseq
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import Lock, knows_no_locks
 from labseq.messages import format_error
+from labseq.processes import Lock, knows_no_locks
 from labseq.recording import Run
 from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Self, cast
 
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import LineLog, Lock, explained, knows_no_locks
+from labseq.files import LineLog, explained
 from labseq.guard import StopFlag
 from labseq.messages import visible
 from labseq.model import RunRecord
 from labseq.plain import dumps
+from labseq.processes import Lock, knows_no_locks
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, find_run
 from labseq.recording.points import SCANNER

@@ -21,10 +21,11 @@ from labseq.errors import (
     RecordingError,
     StopRequested,
 )
-from labseq.files import Holder, Lock, Process, make_shared
+from labseq.files import make_shared
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
 from labseq.messages import clean, format_error
+from labseq.processes import Holder, Lock, Process
 from labseq.recording import clear_active, find_dead_run, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, offers
 from labseq.sequencer.clock import RealClock, VirtualClock

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from labseq.config.find import find_profile
 from labseq.errors import ConfigError, Problem
-from labseq.files import Process, write_file
+from labseq.files import write_file
 from labseq.plain import dumps
+from labseq.processes import Process
 from labseq.recording import runs_in_progress
 from labseq.recording.folders import STOP_FILE, find_run
 from labseq.recording.run_file import read_owner, read_state

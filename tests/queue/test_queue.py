@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from labseq.errors import ConfigError, RecordingError
-from labseq.files import Process
+from labseq.processes import Process
 from labseq.queue.queue import Entry, Queue
 from labseq.session.options import Options
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from labseq.errors import ConfigError, RecordingError, StopRequested
-from labseq.files import Process
+from labseq.processes import Process
 from labseq.queue.queue import Opening, Queue, QueueRun
 from labseq.recording import open_run
 from labseq.session.session import Session

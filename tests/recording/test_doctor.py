@@ -245,7 +245,7 @@ def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
 LOCK = """
 import sys
 from pathlib import Path
-from labseq.files import Lock
+from labseq.processes import Lock
 lock = Lock(Path(sys.argv[1]), "labseq resume")
 assert lock.take() is None
 print("taken", flush=True)

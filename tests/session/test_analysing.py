@@ -12,7 +12,7 @@ import pytest
 import labseq
 from labseq.builtin.analyses import SurvivalAnalysis
 from labseq.errors import ConfigError
-from labseq.files import Lock
+from labseq.processes import Lock
 from labseq.recording.results import results_file
 from labseq.roles import Analysis, RecordedShot
 from labseq.session import observers

@@ -15,9 +15,9 @@ import pytest
 
 import labseq
 from labseq.errors import DeviceError
-from labseq.files import HANG_S, Lock, Process
 from labseq.guard import StopFlag
 from labseq.plugin import port_identities
+from labseq.processes import HANG_S, Lock, Process
 from labseq.recording import find_dead_run, lock_file, mark_active
 from labseq.session.profile import resolve_profile
 from labseq.session.safe import check_devices, lock_devices, make_profile_safe
@@ -117,7 +117,7 @@ def test_devices_are_made_safe_even_while_they_are_in_use(held: None) -> None:
 HOLD = """
 import signal, sys
 from pathlib import Path
-from labseq.files import Lock
+from labseq.processes import Lock
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 lock = Lock(Path(sys.argv[1]), "the run x")
 assert lock.take() is None
