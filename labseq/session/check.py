@@ -11,19 +11,19 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from labseq.config.document import Document
-from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, StopRequested, one_of
+from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, one_of
 from labseq.guard import Guard
-from labseq.model import COMPUTER, Frame, Plan, PlanReport, TimelineEntry
-from labseq.motion import check_plan, fitting_batches, tone_program
+from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
+from labseq.motion import tone_program
 from labseq.roles import Detector, Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
 from labseq.session.lab import WARM_S
 from labseq.session.planning import changed_settings
+from labseq.session.rehearsal import Rehearsal, rehearse, windows_of
 from labseq.session.scan import Point
 from labseq.units import format_quantity
 
@@ -37,12 +37,6 @@ N_LOADINGS_ELSEWHERE: Final = 20
 """The same for later points of a scan; windows are judged by a quarter of it at least."""
 MAX_WAIT_S: Final = 2.0
 """Time after which no further loading is tried, in seconds of real time; of all others together the same."""
-PAPERS_LOADING: Final = 0.75
-"""Loading probability if the profile has no simulation that reports it."""
-SURVIVAL: Final = 0.98
-"""Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
-N_PROGRAMS: Final = 5
-"""Number of plans whose tones are computed."""
 SHOT_OVERHEAD_BYTES: Final = 60_000
 """Approximate size of a shot file without images, in bytes."""
 BYTES_PER_SITE: Final = 13
@@ -74,11 +68,11 @@ class _Points:
 
     def rehearsal_key(self, point: Point) -> tuple[object, ...]:
         """Points with the same key have the same moves: the last windows do not change what is planned."""
-        return id(self.lab(point)), *[*_windows(point.steps).values()][:-1]
+        return id(self.lab(point)), *[*windows_of(point.steps).values()][:-1]
 
     def rehearsed(self, point: Point) -> dict[int, Rehearsal]:
         """Step number -> the planner's results for each rearrangement of a point."""
-        return dict(zip(_windows(point.steps), self.rehearsals[self.rehearsal_key(point)], strict=True))
+        return dict(zip(windows_of(point.steps), self.rehearsals[self.rehearsal_key(point)], strict=True))
 
     def timeline(self, point: Point) -> Timeline:
         """Name and bars of each step."""
@@ -256,23 +250,6 @@ def _timeout_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Prob
 
 
 @dataclass(frozen=True, slots=True)
-class Rehearsal:
-    """The planner's results for random loadings.
-
-    Attributes:
-        n_loadings: Number of loadings.
-        n_filled: Number of loadings with enough atoms and a plan that fills the target.
-        duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
-        first_batch_s: float64 (n_loadings,), the same for its first batch.
-    """
-
-    n_loadings: int
-    n_filled: int
-    duration_s: NDArray[np.float64]
-    first_batch_s: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
 class CheckReport:
     """Timeline, duration, disk space and warnings of a run, before it starts.
 
@@ -372,12 +349,6 @@ def _run_s(session: Session, points: _Points) -> tuple[float, float]:
     )
 
 
-def _windows(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
-    """Step number -> window per cycle, of each rearrangement."""
-    windows = {number: getattr(step, "windows_s", ()) for number, (_, step) in enumerate(steps)}
-    return {number: windows_s for number, windows_s in windows.items() if windows_s}
-
-
 def _numbered(session: Session) -> dict[int, Point]:
     """Number -> each point of the run, that of the check first; adaptive: a number -> each corner."""
     run, first = session.scan_run, session.assembly.first_point
@@ -428,7 +399,7 @@ def _rehearse_all(points: _Points, each: Iterable[Point], runs: bool) -> None:
         distinct.setdefault(points.rehearsal_key(point), point)
     wait_s, asked = MAX_WAIT_S / max(1, len(distinct) - 1), set[int]()
     for n, (key, point) in enumerate(distinct.items()):
-        windows, lab = _windows(point.steps), points.lab(point)
+        windows, lab = windows_of(point.steps), points.lab(point)
         points.rehearsals[key] = []
         if not windows:
             continue
@@ -436,7 +407,7 @@ def _rehearse_all(points: _Points, each: Iterable[Point], runs: bool) -> None:
             session.warm(lab, devices=runs and n == 0)
         deadline = time.monotonic() + (wait_s if n else MAX_WAIT_S)
         n_loadings = N_LOADINGS_ELSEWHERE if n else N_LOADINGS
-        found, plans, failure = _rehearse(points.guard, lab, [*windows.values()], n_loadings, deadline)
+        found, plans, failure = rehearse(points.guard, lab, [*windows.values()], n_loadings, deadline)
         points.rehearsals[key] = found
         if id(lab) not in asked:
             points.ask_tweezers(point, lab, plans if n == 0 else plans[:1])
@@ -456,82 +427,9 @@ def _plan_options(session: Session, point: Point) -> str:
     return shlex.join(options)
 
 
-def _rehearse(
-    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int, deadline: float
-) -> tuple[list[Rehearsal], list[Plan], Problem | None]:
-    """Plan for random loadings; the seed of each is its number, as in `labseq plan random:... --seed N`.
-
-    Returns:
-        The results of each rearrangement, some of the plans, and the planner's failure.
-    """
-    loading = None
-    if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
-        loading = lab.simulation.loading_probability
-    if loading is None:
-        loading = PAPERS_LOADING
-    shots: list[list[tuple[Plan, PlanReport]]] = []
-    cycles: list[tuple[Plan, PlanReport]] = []
-
-    def plan() -> None:
-        """All in one guarded call, because handing each plan over to a thread takes longer than planning."""
-        while len(shots) < n_loadings and (not shots or time.monotonic() < deadline):
-            cycles.clear()
-            for cycle in _first_cycles(lab, windows, loading, len(shots)):
-                cycles.append(cycle)  # noqa: PERF402 - those before a failure are kept
-            shots.append([*cycles])
-
-    failure: Problem | None = None
-    try:
-        guard.call("planner", lab.timeouts.plan_s + max(0.0, deadline - time.monotonic()), plan)
-    except StopRequested:
-        raise
-    except LabseqError as error:
-        drawn, seed = f"random:{lab.grid.n_rows}x{lab.grid.n_cols}@{loading:g}", len(shots)
-        what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
-        # only the first plan is made for the loading itself
-        failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
-    plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
-    found = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
-    return found, plans, failure
-
-
-def _first_cycles(
-    lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
-) -> Iterator[tuple[Plan, PlanReport]]:
-    """Plan and report of the first cycle of each rearrangement, which begins where the one before ends."""
-    rng = np.random.default_rng(seed)
-    occupancy = rng.random(lab.grid.shape) < loading
-
-    def checked(plan: Plan) -> PlanReport:
-        dop, name = lab.degree_of_parallelism, lab.planner_name
-        return check_plan(plan, occupancy, lab.target, dop, lab.grid, lab.motion, name)
-
-    for number, windows_s in enumerate(windows):
-        for cycle, window_s in enumerate(windows_s):
-            plan = lab.planner.plan(occupancy.copy(), lab.target)
-            report = checked(plan)
-            if cycle == 0:
-                yield plan, report
-            if number == len(windows) - 1:
-                break
-            n_played = fitting_batches(report, plan, window_s)
-            after = report if n_played == plan.n_batches else checked(plan.first(n_played))
-            occupancy = after.predicted & (rng.random(lab.grid.shape) < SURVIVAL)
-            if lab.target.is_met_by(occupancy):
-                break
-
-
-def _summary(reports: Sequence[PlanReport]) -> Rehearsal:
-    durations = np.array([report.duration_s for report in reports])
-    firsts = np.array(
-        [float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0 for report in reports]
-    )
-    return Rehearsal(len(reports), sum(report.meets_target for report in reports), durations, firsts)
-
-
 def _window_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
     document, shot = point.document, points.session.assembly.sequence.shot
-    windows, rehearsals = _windows(point.steps), points.rehearsed(point)
+    windows, rehearsals = windows_of(point.steps), points.rehearsed(point)
     if min((one.n_loadings for one in rehearsals.values()), default=0) < N_LOADINGS_ELSEWHERE // 4:
         return
     for number, rehearsal in rehearsals.items():

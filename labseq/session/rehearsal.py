@@ -1,0 +1,121 @@
+"""Plans for random loadings, as the rearrangements of a shot would ask for them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.errors import LabseqError, Problem, StopRequested
+from labseq.guard import Guard
+from labseq.model import Plan, PlanReport
+from labseq.motion import check_plan, fitting_batches
+from labseq.roles import Step, offers
+from labseq.sequencer.lab import Lab
+
+PAPERS_LOADING: Final = 0.75
+"""Loading probability if the profile has no simulation that reports it."""
+SURVIVAL: Final = 0.98
+"""Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
+N_PROGRAMS: Final = 5
+"""Number of plans whose tones are computed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """The planner's results for random loadings.
+
+    Attributes:
+        n_loadings: Number of loadings.
+        n_filled: Number of loadings with enough atoms and a plan that fills the target.
+        duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
+        first_batch_s: float64 (n_loadings,), the same for its first batch.
+    """
+
+    n_loadings: int
+    n_filled: int
+    duration_s: NDArray[np.float64]
+    first_batch_s: NDArray[np.float64]
+
+
+def windows_of(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
+    """Step number -> window per cycle, of each rearrangement."""
+    windows = {number: getattr(step, "windows_s", ()) for number, (_, step) in enumerate(steps)}
+    return {number: windows_s for number, windows_s in windows.items() if windows_s}
+
+
+def rehearse(
+    guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int, deadline: float
+) -> tuple[list[Rehearsal], list[Plan], Problem | None]:
+    """Plan for random loadings; the seed of each is its number, as in `labseq plan random:... --seed N`.
+
+    Returns:
+        The results of each rearrangement, some of the plans, and the planner's failure.
+    """
+    loading = None
+    if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
+        loading = lab.simulation.loading_probability
+    if loading is None:
+        loading = PAPERS_LOADING
+    shots: list[list[tuple[Plan, PlanReport]]] = []
+    cycles: list[tuple[Plan, PlanReport]] = []
+
+    def plan() -> None:
+        """All in one guarded call, because handing each plan over to a thread takes longer than planning."""
+        while len(shots) < n_loadings and (not shots or time.monotonic() < deadline):
+            cycles.clear()
+            for cycle in _first_cycles(lab, windows, loading, len(shots)):
+                cycles.append(cycle)  # noqa: PERF402 - those before a failure are kept
+            shots.append([*cycles])
+
+    failure: Problem | None = None
+    try:
+        guard.call("planner", lab.timeouts.plan_s + max(0.0, deadline - time.monotonic()), plan)
+    except StopRequested:
+        raise
+    except LabseqError as error:
+        drawn, seed = f"random:{lab.grid.n_rows}x{lab.grid.n_cols}@{loading:g}", len(shots)
+        what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
+        # only the first plan is made for the loading itself
+        failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
+    plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
+    found = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
+    return found, plans, failure
+
+
+def _first_cycles(
+    lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
+) -> Iterator[tuple[Plan, PlanReport]]:
+    """Plan and report of the first cycle of each rearrangement, which begins where the one before ends."""
+    rng = np.random.default_rng(seed)
+    occupancy = rng.random(lab.grid.shape) < loading
+
+    def checked(plan: Plan) -> PlanReport:
+        dop, name = lab.degree_of_parallelism, lab.planner_name
+        return check_plan(plan, occupancy, lab.target, dop, lab.grid, lab.motion, name)
+
+    for number, windows_s in enumerate(windows):
+        for cycle, window_s in enumerate(windows_s):
+            plan = lab.planner.plan(occupancy.copy(), lab.target)
+            report = checked(plan)
+            if cycle == 0:
+                yield plan, report
+            if number == len(windows) - 1:
+                break
+            n_played = fitting_batches(report, plan, window_s)
+            after = report if n_played == plan.n_batches else checked(plan.first(n_played))
+            occupancy = after.predicted & (rng.random(lab.grid.shape) < SURVIVAL)
+            if lab.target.is_met_by(occupancy):
+                break
+
+
+def _summary(reports: Sequence[PlanReport]) -> Rehearsal:
+    durations = np.array([report.duration_s for report in reports])
+    firsts = np.array(
+        [float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0 for report in reports]
+    )
+    return Rehearsal(len(reports), sum(report.meets_target for report in reports), durations, firsts)
