@@ -21,8 +21,6 @@ from typing import Any, Final
 from labseq.errors import RecordingError
 from labseq.files import (
     LineLog,
-    Lock,
-    Process,
     explained,
     lines_in,
     open_ordinary,
@@ -31,6 +29,7 @@ from labseq.files import (
     write_file,
 )
 from labseq.plain import dumps, parse_object
+from labseq.processes import Lock, Process
 from labseq.recording import folders
 from labseq.recording.markers import Marker, markers
 from labseq.recording.run_file import (
