@@ -1,13 +1,15 @@
 """``poe fuzz``: many damaged files; none may end a command otherwise than with an error that names it.
 
-Each file is read in a process that is limited in time and memory. A failure prints what repeats it: the
-kind, the seed and the number of the file, and the file is kept.
+Each file is read in a process that is limited in time and memory. The system ends it at its limit, even in
+a loop of a C library. A failure prints what repeats it: the kind, the seed and the number of the file, and
+the file is kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import io
 import os
 import random
@@ -29,6 +31,10 @@ LIMIT_S: Final = 5.0
 """Longest time of the processor for a file; a file for which a process waits has ten times as long."""
 MEMORY: Final = 1 << 30
 BATCH: Final = 20
+_TIMERS: Final = {
+    signal.SIGPROF: (signal.ITIMER_PROF, LIMIT_S),
+    signal.SIGALRM: (signal.ITIMER_REAL, 10 * LIMIT_S),
+}
 
 
 def main() -> int:
@@ -37,99 +43,121 @@ def main() -> int:
     parser.add_argument("--files", type=int, default=20_000)
     parser.add_argument("--runs", type=int, default=2_000)
     parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[k for k in KINDS if k != "run"])
     parser.add_argument("--only", nargs=2, metavar=("KIND", "NUMBER"), help="repeat one")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "labseq-fuzz")
     arguments = parser.parse_args()
-    shutil.rmtree(arguments.keep, ignore_errors=True)
-    arguments.keep.mkdir(parents=True)
-    os.environ["LABSEQ_STATE"] = str(arguments.keep / "state")
-    templates = Templates(arguments.keep)
-    kinds = [kind for kind in KINDS if kind != "run"]
-    cases = [(kinds[n % len(kinds)], n) for n in range(arguments.files)]
+    cases = [(arguments.kinds[n % len(arguments.kinds)], n) for n in range(arguments.files)]
     cases += [("run", n) for n in range(arguments.runs)]
     if arguments.only:
         cases = [(arguments.only[0], int(arguments.only[1]))]
-    for kind in KINDS:  # imports take place here, once
-        read_one(kind, -1, 0, templates, Path(tempfile.mkdtemp(dir=arguments.keep)))
-    failures: Counter[str] = Counter()
-    slowest: dict[str, float] = {}
-    while cases:
-        batch, cases = cases[:BATCH], cases[BATCH:]
-        left = _in_a_child(batch, arguments, templates, failures, slowest)
-        cases = left + cases
-    counts = Counter(KINDS[n % len(kinds)] for n in range(arguments.files)) + Counter({"run": arguments.runs})
-    print(f"\n{'kind':12} {'files':>6} {'failures':>8} {'slowest':>8}")
-    for kind in KINDS:
-        print(f"{kind:12} {counts[kind]:6} {failures[kind]:8} {slowest.get(kind, 0.0):6.2f} s")
-    print(f"seed {arguments.seed}")
-    return 1 if failures else 0
+    shutil.rmtree(arguments.keep, ignore_errors=True)
+    os.environ["LABSEQ_STATE"] = str(arguments.keep / "state")
+    results = Results(arguments.keep, arguments.seed)
+    results.read(cases)
+    results.print()
+    return 1 if results.failures else 0
 
 
-def _in_a_child(
-    batch: list[tuple[str, int]],
-    arguments: argparse.Namespace,
-    templates: Templates,
-    failures: Counter[str],
-    slowest: dict[str, float],
-) -> list[tuple[str, int]]:
-    """Read a batch in a process of its own; returns what is left if a file ended that process."""
-    receive, send = os.pipe()
-    sys.stdout.flush()
-    if (pid := os.fork()) == 0:
-        os.close(receive)
-        with os.fdopen(send, "w", buffering=1) as report:
-            _read_batch(batch, arguments, templates, report)
-        os._exit(0)
-    os.close(send)
-    with os.fdopen(receive) as report:
-        lines = report.read().splitlines()
-    _, status = os.waitpid(pid, 0)
-    for line in lines:
-        kind, number, seconds, *error = line.split(" ", 3)
-        slowest[kind] = max(slowest.get(kind, 0.0), float(seconds))
-        if error:
-            failures[kind] += 1
-            print(f"{kind} {number}: {error[0]}")
-            print(f"  repeat: poe fuzz --seed {arguments.seed} --only {kind} {number}")
-    if status == 0:
-        return []
-    kind, number = batch[len(lines)]
-    failures[kind] += 1
-    print(
-        f"{kind} {number}: ended the process ({os.waitstatus_to_exitcode(status)}), --seed {arguments.seed}"
-    )
-    return batch[len(lines) + 1 :]
+class Results:
+    """Reads damaged files, each in a process of limited time and memory, and counts what happens.
 
+    Args:
+        folder: Gets the files that did harm.
+        seed: Of all random numbers.
+    """
 
-def _read_batch(batch: list[tuple[str, int]], arguments: Any, templates: Templates, report: Any) -> None:
-    limit = _address_space() + MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    for kind, number in batch:
-        folder = Path(tempfile.mkdtemp(dir=arguments.keep))
-        start_s = time.perf_counter()
-        error = read_one(kind, number, arguments.seed, templates, folder)
-        if error:
-            folder.rename(arguments.keep / f"{kind}_{number}")
-        else:
-            shutil.rmtree(folder)
-        report.write(f"{kind} {number} {time.perf_counter() - start_s:.3f}{error and f' {error}'}\n")
+    def __init__(self, folder: Path, seed: int) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.failures: list[tuple[str, str]] = []
+        self._folder, self._seed = folder, seed
+        self._templates = Templates(folder)
+        self._counts: Counter[str] = Counter()
+        self._slowest: dict[str, float] = {}
+        self._peak: dict[str, int] = {}
+
+    def read(self, cases: list[tuple[str, int]]) -> None:
+        """Read the files with these kinds and numbers."""
+        for kind in {kind for kind, _ in cases}:  # imports take place here, once
+            read_one(kind, -1, 0, self._templates, self._new_folder(kind, -1))
+        while cases:
+            kind = cases[0][0]
+            batch = [one for one in cases[:BATCH] if one[0] == kind or kind != "run"]
+            cases = self._in_a_child(batch) + cases[len(batch) :]
+
+    def print(self) -> None:
+        """Print the table."""
+        print(f"\n{'kind':12} {'files':>6} {'failures':>8} {'slowest':>9} {'memory':>8}")
+        failures = Counter(kind for kind, _ in self.failures)
+        for kind in self._counts:
+            slowest, peak = self._slowest.get(kind, 0.0), self._peak.get(kind, 0) / 1024
+            print(f"{kind:12} {self._counts[kind]:6} {failures[kind]:8} {slowest:7.2f} s {peak:5.0f} MB")
+        print(f"seed {self._seed}")
+
+    def _in_a_child(self, batch: list[tuple[str, int]]) -> list[tuple[str, int]]:
+        """Read a batch in a process of its own; returns what is left if a file ended that process."""
+        receive, send = os.pipe()
+        sys.stdout.flush()
+        if (pid := os.fork()) == 0:
+            os.close(receive)
+            with os.fdopen(send, "w", buffering=1) as report:
+                self._read_batch(batch, report)
+            os._exit(0)
+        os.close(send)
+        with os.fdopen(receive) as report:
+            lines = report.read().splitlines()
+        _, status = os.waitpid(pid, 0)
+        for line in lines:
+            kind, number, seconds, memory, *error = line.split(" ", 4)
+            self._counts[kind] += 1
+            self._slowest[kind] = max(self._slowest.get(kind, 0.0), float(seconds))
+            self._peak[kind] = max(self._peak.get(kind, 0), int(memory))
+            if error:
+                self._fail(kind, int(number), error[0])
+        if status == 0:
+            return []
+        kind, number = batch[len(lines)]
+        self._counts[kind] += 1
+        ended_by = os.WTERMSIG(status)
+        what = "a hang" if ended_by in _TIMERS else "a crash"
+        self._fail(kind, number, f"{what}: it ended the process ({signal.Signals(ended_by).name})")
+        return batch[len(lines) + 1 :]
+
+    def _fail(self, kind: str, number: int, error: str) -> None:
+        self.failures.append((kind, error))
+        print(f"{kind} {number}: {error}")
+        print(f"  repeat: poe fuzz --seed {self._seed} --only {kind} {number}", flush=True)
+
+    def _new_folder(self, kind: str, number: int) -> Path:
+        folder = self._folder / f"{kind}_{number}"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        return folder
+
+    def _read_batch(self, batch: list[tuple[str, int]], report: Any) -> None:
+        limit = _address_space() + MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        for one in _TIMERS:
+            signal.signal(one, signal.SIG_DFL)  # no handler of Python is called in a loop of C
+            faulthandler.register(one, chain=True)  # prints where it is; then the system ends the process
+        for kind, number in batch:
+            folder = self._new_folder(kind, number)
+            start_s = time.perf_counter()
+            for timer, limit_s in _TIMERS.values():
+                signal.setitimer(timer, limit_s)
+            error = read_one(kind, number, self._seed, self._templates, folder)
+            for timer, _ in _TIMERS.values():
+                signal.setitimer(timer, 0.0)
+            if not error:
+                shutil.rmtree(folder)
+            took_s, memory = time.perf_counter() - start_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            report.write(f"{kind} {number} {took_s:.3f} {memory}{error and f' {error}'}\n")
 
 
 def read_one(kind: str, number: int, seed: int, templates: Templates, folder: Path) -> str:
-    """Read a file within the limit of time; returns what went wrong, or ""."""
+    """Read a file; returns what went wrong, or ""."""
     case = make_case(kind, random.Random(f"{seed}/{kind}/{number}"), templates, folder)
     os.environ["LABSEQ_DATA"] = str(folder)
-
-    def too_slow(*_: object) -> None:
-        raise TimeoutError(f"it takes longer than {LIMIT_S:g} s")
-
-    timers = {
-        signal.SIGALRM: (signal.ITIMER_REAL, 10 * LIMIT_S),
-        signal.SIGPROF: (signal.ITIMER_PROF, LIMIT_S),
-    }
-    before = {one: signal.signal(one, too_slow) for one in timers}
-    for timer, limit_s in timers.values():
-        signal.setitimer(timer, limit_s)
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             case.read()
@@ -140,10 +168,6 @@ def read_one(kind: str, number: int, seed: int, templates: Templates, folder: Pa
     except BaseException as error:  # noqa: BLE001 - every kind is a failure
         place = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {str(error)[:100]!r} in {place.filename}:{place.lineno}"
-    finally:
-        for one, (timer, _) in timers.items():
-            signal.setitimer(timer, 0.0)
-            signal.signal(one, before[one])
     return ""
 
 

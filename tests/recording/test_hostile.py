@@ -78,9 +78,18 @@ def wrong_kind(file: Any, secret: Path) -> None:
     file["entry"].attrs["status"] = 5
 
 
+def text_of_any_length(file: Any, secret: Path) -> None:
+    del file["entry/readings"]
+    file["entry/readings"] = "{}"
+
+
+def attribute_of_any_length(file: Any, secret: Path) -> None:
+    file["entry"].attrs["status"] = "complete"
+
+
 def deep_json(file: Any, secret: Path) -> None:
     del file["entry/readings"]
-    file["entry"].create_dataset("readings", data="[" * 500 + "]" * 500, dtype=h5py.string_dtype())
+    file["entry"].create_dataset("readings", data=np.bytes_(b"[" * 500 + b"]" * 500))
 
 
 @pytest.mark.parametrize(
@@ -95,6 +104,8 @@ def deep_json(file: Any, secret: Path) -> None:
         (filtered, "/entry/target/fill has the filter 512, which labseq does not use"),
         (cycle, "is in the file twice"),
         (wrong_kind, "'status' is int; expected text"),
+        (text_of_any_length, "/entry/readings is a text of variable length, which labseq does not use"),
+        (attribute_of_any_length, "the attribute 'status' is a text of variable length"),
         (deep_json, "it is nested too deep"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
@@ -122,6 +133,16 @@ def test_a_shot_file_that_leads_elsewhere_is_refused_by_reader_doctor_and_export
     (finding,) = examine(run_dir).findings
     assert finding.what.startswith("no line in the index, and is damaged: ")
     assert (run_dir / "quarantine" / path.name).exists()
+
+
+def test_the_export_reads_no_attribute_that_labseq_does_not_write(run_dir: Path, tmp_path: Path) -> None:
+    path = run_dir / "shots" / "shot_000001.h5"
+    with h5py.File(path, "r+", libver=("earliest", "v110")) as file:
+        file["entry/detection/occupancy"].attrs["mine"] = ["{}"]
+    believe(run_dir, path)
+    (left_out,) = export_run(open_run(run_dir), "archive", tmp_path / "run.h5", frames=True)
+    what = "the attribute 'mine' is a text of variable length, which labseq does not use"
+    assert left_out == f"{path}: is damaged: {what}; restore it from a backup"
 
 
 def believe(run_dir: Path, path: Path) -> None:
