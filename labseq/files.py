@@ -11,9 +11,8 @@ import os
 import stat
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
-from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, BinaryIO, Final, Literal
 
 from labseq.errors import RecordingError
 from labseq.plain import dumps, parse_object
@@ -118,15 +117,15 @@ MAX_LINE: Final = 16 << 20
 """Longest line of a file of JSON lines, in bytes."""
 
 
-def open_ordinary(path: Path) -> BufferedReader:
-    """Open a file to read it.
+def open_ordinary(path: Path, mode: Literal["rb", "ab"] = "rb") -> BinaryIO:
+    """Open a file to read it, or to add to it.
 
     Raises:
-        OSError: It cannot be read, or is a pipe or a device, which could block for ever.
+        OSError: It cannot be opened, or is a pipe or a device, which could block for ever.
     """
-    if not stat.S_ISREG(path.stat().st_mode):
+    if (mode == "rb" or path.exists()) and not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "this is not an ordinary file")
-    return path.open("rb")
+    return path.open(mode)
 
 
 def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:
@@ -146,14 +145,15 @@ def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:
         raise RecordingError(path, f"cannot be read: {reason}; check the disk") from error
 
 
-def lines_in(path: Path) -> Generator[bytes]:
-    r"""The lines of a file with their ends; the last one may lack its "\n".
+def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
+    r"""The lines of a file from a byte on, with their ends; the last one may lack its "\n".
 
     Raises:
         RecordingError: It cannot be read, or a line is too long.
     """
     try:
         with open_ordinary(path) as file:
+            file.seek(start)
             while line := file.readline(MAX_LINE + 1):
                 if len(line) > MAX_LINE:
                     what = f"has a line longer than {MAX_LINE >> 20} MiB; restore it from a backup"
@@ -212,16 +212,6 @@ def _write_all(file: IO[bytes], data: bytes | memoryview) -> None:
         rest = rest[os.write(file.fileno(), rest) :]
 
 
-def whole_lines(data: bytes) -> bytes:
-    r"""The data without an unfinished last line.
-
-    Example:
-        >>> whole_lines(b'{"a": 1}\n{"b"')
-        b'{"a": 1}\n'
-    """
-    return data[: data.rfind(b"\n") + 1]
-
-
 def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
     """Read a file of JSON lines, even if it is damaged.
 
@@ -256,17 +246,12 @@ class NewLines:
         Raises:
             RecordingError: The file cannot be read.
         """
-        try:
-            with self._path.open("rb") as file:
-                file.seek(self._at)
-                data = whole_lines(file.read())
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise RecordingError(self._path, f"cannot be read: {error.strerror}; check the disk") from error
-        self._at += len(data)
-        rows = (parse_object(line) for line in data.splitlines())
-        return [row for row in rows if row is not None]
+        rows: list[dict[str, Any]] = []
+        for line in lines_in(self._path, self._at) if self._path.exists() else ():
+            if line.endswith(b"\n"):
+                self._at += len(line)
+                rows += [row] if (row := parse_object(line)) is not None else []
+        return rows
 
 
 PROFILES: Final = "hardware_profiles"

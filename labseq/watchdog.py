@@ -251,11 +251,13 @@ def _format_error(error: BaseException) -> str:
 
 def watchdog_lines(run_dir: Path) -> list[str]:
     """What the watchdog of a run did, a line for each device; damaged lines of its log are left out."""
+    from labseq.errors import RecordingError
+    from labseq.files import read_lines  # not in the watchdog itself, which imports little
+
     lines: list[str] = []
-    with suppress(OSError):
-        for text in (run_dir / WATCHDOG_LOG).read_text(encoding="utf-8", errors="replace").splitlines():
+    with suppress(RecordingError):
+        for row in read_lines(run_dir / WATCHDOG_LOG)[0]:
             with suppress(ValueError, TypeError, KeyError):
-                row = json.loads(text)
                 what = f"off after {1e3 * row['after_s']:.0f} ms" if row["ok"] else "NOT switched off"
                 lines.append(f"{row['device']} {what}, because the run {row['cause']}: {row['text']}")
     return lines

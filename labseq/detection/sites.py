@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveInt, field_validator
 
 from labseq.errors import ConfigError, DeviceError, LimitError
+from labseq.files import open_ordinary
 from labseq.model import Frame, SiteGrid
 from labseq.model.arrays import read_only
 from labseq.roles import Context
@@ -25,6 +27,10 @@ Thresholds: TypeAlias = float | FilePath | tuple[tuple[float, ...], ...]
 """One number for all sites, one for each, or the path of a .npy file with one for each."""
 
 COLUMNS: Final = ("row", "col", "y", "x")
+
+UNREADABLE: Final = (OSError, ValueError, TypeError, MemoryError, OverflowError)
+"""What :func:`read_npy` raises for a file that it cannot read."""
+_MAX_BYTES: Final = 1 << 26
 
 
 class SiteSettings(Settings):
@@ -159,7 +165,7 @@ def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
     """
     try:
         positions = read_npy(path) if path.suffix == ".npy" else _table(path, shape)
-    except (OSError, ValueError, TypeError, csv.Error) as error:
+    except (*UNREADABLE, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(
             f"the sites cannot be read from '{path}': {reason}; expected a .npy file of floats "
@@ -175,14 +181,21 @@ def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
 
 
 def read_npy(path: Path) -> Floats:
-    """Read the numbers of a .npy file; raises ``OSError``, ``ValueError`` or ``TypeError``."""
-    with path.open("rb") as file:
-        return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+    """Read the numbers of a .npy file; raises one of :data:`UNREADABLE`."""
+    return np.lib.format.read_array(io.BytesIO(_data_in(path)), allow_pickle=False).astype(np.float64)
+
+
+def _data_in(path: Path) -> bytes:
+    with open_ordinary(path) as file:
+        data = file.read(_MAX_BYTES + 1)
+    if len(data) > _MAX_BYTES:
+        raise ValueError(f"it is larger than {_MAX_BYTES >> 20} MiB")
+    return data
 
 
 def _table(path: Path, shape: tuple[int, int]) -> Floats:
     positions = np.full((*shape, 2), np.nan)
-    with path.open(newline="", encoding="utf-8-sig") as file:
+    with io.TextIOWrapper(io.BytesIO(_data_in(path)), encoding="utf-8-sig", newline="") as file:
         table = csv.DictReader(file, skipinitialspace=True)
         missing = [name for name in COLUMNS if name not in (table.fieldnames or ())]
         if missing:

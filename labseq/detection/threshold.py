@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
 from labseq.detection.sites import (
+    UNREADABLE,
     SiteSettings,
     Thresholds,
     checked_image,
@@ -133,7 +134,7 @@ def site_thresholds(threshold: Thresholds, shape: tuple[int, int]) -> NDArray[np
 def _load(path: Path) -> NDArray[np.float64]:
     try:
         return read_npy(path)
-    except (OSError, ValueError, TypeError) as error:
+    except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(
             f"the detector's thresholds cannot be read from '{path}': {reason}; "

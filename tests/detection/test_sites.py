@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -204,7 +205,14 @@ def test_files_that_cannot_be_read_are_named(make: Maker, setting: str, tmp_path
     np.save(tmp_path / "objects.npy", np.array([{}], object), allow_pickle=True)
     (tmp_path / "text.npy").write_text("row")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
-    for name in ("objects.npy", "text.npy", "bytes.csv", "none.npy"):
+    with suppress(OSError):  # Windows needs rights for it
+        (tmp_path / "zero.npy").symlink_to("/dev/zero")
+    header = {"descr": "<f8", "fortran_order": False, "shape": (2**57,)}
+    with (tmp_path / "huge.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+    with (tmp_path / "long.csv").open("wb") as file:
+        file.truncate(1 << 40)
+    for name in ("objects.npy", "text.npy", "bytes.csv", "none.npy", "zero.npy", "huge.npy", "long.csv"):
         with pytest.raises(ConfigError, match=name):
             make(**{setting: tmp_path / name})
 

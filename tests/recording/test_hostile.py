@@ -16,9 +16,12 @@ import pytest
 
 from labseq.errors import RecordingError
 from labseq.recording import open_run
+from labseq.recording.columns import columns_of
 from labseq.recording.doctor import examine
 from labseq.recording.export import export_run
+from labseq.recording.reader import Follower
 from labseq.recording.shot_file import read_content, read_occupancies
+from labseq.watchdog import WATCHDOG_LOG, watchdog_lines
 
 from .damages import N_SHOTS, edit_index
 
@@ -180,22 +183,39 @@ def test_a_line_of_the_index_that_leads_elsewhere_is_no_shot(run_dir: Path, chan
     }
 
 
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
 @on_posix
-@pytest.mark.parametrize("name", ["run.json", "index.jsonl", "STATE", "shots/shot_000001.h5", "events.jsonl"])
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["fifo", "link"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("run.json", "index.jsonl", "STATE", "events.jsonl", "skipped.jsonl"),
+        *("shots/shot_000001.h5", "analysis/fits.jsonl"),
+    ],
+)
+@pytest.mark.parametrize("make", [pipe, device])
 def test_pipes_and_devices_are_refused_without_waiting(
     run_dir: Path, name: str, make: Callable[[Path], None]
 ) -> None:
     path = run_dir / name
-    path.unlink()
+    path.parent.mkdir(exist_ok=True)
+    path.unlink(missing_ok=True)
     make(path)
+    make(run_dir / WATCHDOG_LOG)
+    assert watchdog_lines(run_dir) == []
     findings = examine(run_dir, dry_run=True).findings
     assert any(one.where in (path, run_dir) for one in findings), findings
     try:
         run = open_run(run_dir)
         for shot in run.shots:
             _ = shot.occupancies
-        _ = run.events
+        _ = run.events, columns_of(run), Follower(run_dir).new()
     except RecordingError as error:
         assert str(run_dir) in str(error)
         what = "run.json is gone" if name == "run.json" else "this is not an ordinary file"
