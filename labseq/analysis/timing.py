@@ -18,7 +18,7 @@ from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.recording import Run, Shot
 
 ORDER: Final = (
-    *("load", "expose", "read_out", "detect", "plan", "check"),
+    *("load", "arm", "expose", "read_out", "detect", "plan", "check"),
     *("tones", "render", "upload", "prepare", "play", "move", "write"),
 )
 """The stages of a shot in order; unknown ones come last."""

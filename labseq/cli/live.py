@@ -338,7 +338,7 @@ def _bars(
     return rows
 
 
-STAGES: Final = ("expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
+STAGES: Final = ("arm", "expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
 """The stages that are shown, in order; a shot may have others."""
 
 

@@ -118,7 +118,7 @@ class CameraDriver(Camera):
         """End acquisition, close the shutter, EM gain to 1; called in any state between open and close."""
 
     def _end(self) -> None:
-        """End a series because another one begins at once; without an override like ``_stop``."""
+        """End a series, EM gain to 1; the shutter may stay open. Without an override like ``_stop``."""
         self._stop()
 
     def open(self) -> None:
@@ -159,6 +159,12 @@ class CameraDriver(Camera):
             DeviceError: Not open, or a trigger that it does not have.
         """
         self._arm(n_frames, exposure_s, trigger, self.facts.em_gain)
+
+    def disarm(self) -> None:
+        """End the series, EM gain to 1; frames not yet read are dropped."""
+        if self._series is not None:
+            self._forget()
+            self._end()
 
     def trigger(self) -> None:
         """Start the next exposure of the series; returns at once.
@@ -230,9 +236,7 @@ class CameraDriver(Camera):
         if trigger not in facts.triggers:
             text = f"it has no {trigger} trigger; expected {one_of(facts.triggers)}"
             raise DeviceError(self._name, text)
-        if self._series is not None:
-            self._forget()
-            self._end()
+        self.disarm()
         series = Series(n_frames, exposure_s, trigger, em_gain)
         try:
             self._start(series)
@@ -356,7 +360,14 @@ class SimulatedSensor:
         self._frames: deque[tuple[float, Frame]] = deque()
         self.clear()
 
-    def arm(self, series: Series, mode: SensorMode, readout_s: float, period_s: float | None = None) -> None:
+    def arm(
+        self,
+        series: Series,
+        mode: SensorMode,
+        readout_s: float,
+        period_s: float | None = None,
+        arm_s: float = 0.0,
+    ) -> None:
         """Get ready for a series; frames not yet taken are dropped.
 
         Args:
@@ -366,7 +377,9 @@ class SimulatedSensor:
             readout_s: From the end of an exposure until its frame can be read, in seconds.
             period_s: With the internal trigger, from one exposure to the next, in seconds; shorter than
                 both together where they overlap.
+            arm_s: Time that this takes, in seconds.
         """
+        self._clock.sleep(arm_s)
         with self._lock:
             self._frames.clear()
             self._series, self._mode, self._readout_s = series, mode, readout_s

@@ -33,6 +33,11 @@ class CameraSettings(Settings):
         default=1, description="pixels of the sensor per pixel of a frame, along each axis"
     )
     max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure")
+    arming_time: Duration = Field(
+        default=0.0,
+        description="time from arming for a series until it can be triggered, for budgets; simulated "
+        "cameras take so long",
+    )
 
     @property
     def mode(self) -> SensorMode:
@@ -85,6 +90,11 @@ class IndustrialCameraSettings(CameraSettings):
         default=5e-3,
         description="time from the end of an exposure until its frame can be read, for budgets; the "
         "simulated camera takes so long",
+    )
+    arming_time: Duration = Field(
+        default=40e-3,
+        description="time from arming for a series until it can be triggered, for budgets; simulated "
+        "cameras take so long",
     )
     trigger_line: str = Field(
         default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"

@@ -47,6 +47,7 @@ class CameraFacts:
         em_gain: Mean gain of the EM register in an exposure; 1 for a camera without one.
         triggers: What may start its exposures: "software", "internal", "external".
         min_exposure_s: Shortest exposure, in seconds; 0 if not known.
+        arm_s: Time that arming for a series takes, in seconds; 0 if not known.
     """
 
     readout_s: float = 0.0
@@ -55,6 +56,7 @@ class CameraFacts:
     em_gain: float = 1.0
     triggers: tuple[str, ...] = ("software",)
     min_exposure_s: float = 0.0
+    arm_s: float = 0.0
 
     def check_exposure(self, exposure_s: float, camera: str = "camera") -> None:
         """Refuse an exposure that the camera cannot make.

@@ -113,7 +113,13 @@ class Camera(Hardware):
 
     @abstractmethod
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once."""
+        """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once.
+
+        A shot arms once for all its images with the same exposure time, as many as it may need at most.
+        """
+
+    def disarm(self) -> None:
+        """End the series, EM gain to 1: other light may reach the camera now; legal in any state."""
 
     @abstractmethod
     def trigger(self) -> None:

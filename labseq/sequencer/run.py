@@ -351,7 +351,7 @@ class Sequencer:
             self._emit("warning", {"text": text})
         record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
-        shot = RunningShot(self.lab, self.guard, record, self._emit)
+        shot = RunningShot(self.lab, self.guard, record, self._emit, self._timelines)
         failure: LabseqError | None = None
         then: Then | None = None
         try:
@@ -400,10 +400,11 @@ class Sequencer:
         shot.poll()
         shot.check_interlocks()
         images = unique_names([name for name, _ in self._steps])
-        for number, ((name, step), entries) in enumerate(zip(self._steps, self._timelines, strict=True)):
+        for number, (name, step) in enumerate(self._steps):
             self._stop.check()
-            with shot.of_step(number, name, self._policy.of_step(number), entries, images[number]):
+            with shot.of_step(number, name, self._policy.of_step(number), images[number]):
                 self._run_step(shot, number, name, step)
+        shot.series.end()
         shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
         shot.record_truth()
 
@@ -422,6 +423,7 @@ class Sequencer:
                     raise
                 del images[n_before:]  # image n must be the same one in every shot
                 self._recover()
+                shot.series.forget()
                 self._states.to(State.SHOT)
                 self._emit("step_repeated", {"shot": shot.index, "step": number, "error": str(error)})
             else:

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
@@ -25,9 +26,10 @@ from labseq.model import (
 )
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.roles import Device, ReportsSignals, StepContext, offers
+from labseq.sequencer.images import CameraSeries
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
-from labseq.sequencer.lines import line_program, margin_s, trigger_line
+from labseq.sequencer.lines import line_program, margin_s
 from labseq.sequencer.policies import StepPolicy
 from labseq.units import format_quantity
 
@@ -129,6 +131,8 @@ class Stages:
 
 P = ParamSpec("P")
 T = TypeVar("T")
+EARLY_S = 1e-6
+"""A frame may be there so much earlier than its exposure should end, because of rounding."""
 
 
 class RunningShot:
@@ -139,9 +143,17 @@ class RunningShot:
         guard: Runs every call into them.
         record: Filled while the shot runs, so that nothing is lost if it fails.
         emit: Receives every event: name and values.
+        timelines: The timeline of each step.
     """
 
-    def __init__(self, lab: Lab, guard: Guard, record: ShotRecord, emit: Emit) -> None:
+    def __init__(
+        self,
+        lab: Lab,
+        guard: Guard,
+        record: ShotRecord,
+        emit: Emit,
+        timelines: Sequence[Sequence[TimelineEntry]] = (),
+    ) -> None:
         self.lab = lab
         self.record = record
         self.index = record.shot_index
@@ -167,6 +179,9 @@ class RunningShot:
         self.stages = Stages(lab, record, emit)
         self.start_s = self.stages.start_s
         self.leaders = LeaderAnswers(lab, guard, record, emit)
+        self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
+        self._timelines = timelines
+        self._fired_s = 0.0
         self._guard = guard
         self._emit = emit
 
@@ -186,16 +201,16 @@ class RunningShot:
         number: int,
         name: str,
         policy: StepPolicy,
-        entries: Sequence[TimelineEntry] = (),
         images: str = "",
     ) -> Generator[None]:
         """Context manager around a step: the stages, images and failures within belong to it.
+
+        The length of its timeline, if it has one, is its budget.
 
         Args:
             number: Its index.
             name: Its name.
             policy: Its policy.
-            entries: Its timeline, whose length is its budget; without a length it has none.
             images: Beginning of the names of its images; by default its name.
 
         Raises:
@@ -203,11 +218,15 @@ class RunningShot:
         """
         self.in_step, self._image_name, self._kept = True, images or name, None
         self.stages.begin_step(number, name, policy)
+        self.series.begin_step(number)
         start_s, host_start_s = self.elapsed_s, time.perf_counter()
+        entries = self._timelines[number] if self._timelines else ()
         planned_s = sum(entry.duration_s for entry in entries)
-        # a timeline leaves out the detection
-        detection_s = self.lab.budgets.get("detect", 0.0) * sum(entry.n_images for entry in entries)
-        with self.stage(f"{STEP}{number}_{name}", planned_s + detection_s if planned_s else math.nan):
+        arms = any(entry.n_images and not self.series.is_ready(entry.exposure_s) for entry in entries)
+        # a timeline leaves out the arming and the detection
+        more_s = self.lab.budgets.get("detect", 0.0) * sum(entry.n_images for entry in entries)
+        more_s += self.series.arm_s if arms else 0.0
+        with self.stage(f"{STEP}{number}_{name}", planned_s + more_s if planned_s else math.nan):
             yield
             durations = self._kept or (planned_s, self.elapsed_s - start_s)
             timed_by = ", ".join(dict.fromkeys(entry.timed_by.name for entry in entries))
@@ -287,6 +306,7 @@ class RunningShot:
         program = line_program(self.lab.line_specs, kind, duration_s)
         self.call("lines", timeout_s, lines.compile, program)
         self.call("lines", timeout_s, lines.arm)
+        self._fired_s = self.clock.now()
         self.call("lines", timeout_s, lines.fire)
         fired_s = self.clock.now()  # after the call, which takes a moment
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
@@ -358,11 +378,12 @@ class RunningShot:
         """Take a frame; the stage "read_out" begins at the end of the exposure."""
         camera, specs, timeout_s = self.lab.camera, self.lab.line_specs, self.call_timeout_s
         limit_s, readout_s = timeout_s + exposure_s, self.lab.step_context.camera.readout_s
-        by_line = trigger_line(specs, "camera") is not None
+        if not self.series.is_ready(exposure_s):
+            with self.stage("arm", self.series.arm_s, cycle):
+                self.series.arm(exposure_s)
         with self.stage("expose", exposure_s + readout_s + margin_s(specs, "image"), cycle):
-            self.call("camera", timeout_s, camera.arm, 1, exposure_s, "external" if by_line else "software")
             with self.lines_on("image", exposure_s):
-                if not by_line:
+                if not self.series.by_line:
                     self.call("camera", limit_s, camera.trigger)
                 end_s, host_start_s = self.elapsed_s + exposure_s, time.perf_counter()
                 frame = self.call("camera", limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
@@ -370,7 +391,19 @@ class RunningShot:
                 late_s = max(0.0, self.elapsed_s - end_s)
                 waited_s = 0.0 if self.clock.virtual else exposure_s
                 self.stage_done("read_out", late_s, max(0.0, host_s - waited_s), readout_s, cycle)
+                self._check_order(exposure_s)
+            self.series.taken()
         return frame
+
+    def _check_order(self, exposure_s: float) -> None:
+        """Refuse a frame that is there before its own exposure can be over: of a trigger too many."""
+        early_s = self._fired_s + exposure_s - self.clock.now()
+        if self.series.by_line and early_s > EARLY_S:
+            text = (
+                f"a frame came {format_quantity(early_s, 'time')} before its exposure was over, so an earlier"
+            )
+            text += " pulse at the camera's trigger input started it; look at that line for a second edge"
+            raise DeviceError("camera", text)
 
     def judge(self) -> None:
         """Judge the shot on the image just taken; called by the ``image`` step alone."""

@@ -87,6 +87,7 @@ class AndorCamera(CameraDriver):
         self._shutter = "none"
         self._shutter_times_ms = (0, 0)
         self._shutter_open_at_s = 0.0
+        self._set_for: tuple[str, int, float] | None = None
         self._exposure_s = math.nan
         self._n_fetched: int | None = None
 
@@ -95,7 +96,8 @@ class AndorCamera(CameraDriver):
         """Limits of the camera; the read-out time is an estimate before ``open()``, then the SDK's value."""
         shape = self._settings.frame_shape(self._sensor_shape)
         gain = float(self._settings.em_gain)
-        return CameraFacts(self._readout_s, self._max_exposure_s, shape, gain, self._triggers)
+        arm_s = self._settings.arming_time
+        return CameraFacts(self._readout_s, self._max_exposure_s, shape, gain, self._triggers, arm_s=arm_s)
 
     def warm(self) -> None:
         """Import pylablib, which takes seconds."""
@@ -121,6 +123,7 @@ class AndorCamera(CameraDriver):
         self._sdk = sdk = Sdk(self._name, andor, self.library.folder)
         sdk.connect(indices, settings.serial, settings.fan)
         self._reported = set_up(sdk, settings, self._name)
+        self._set_for = None
         height, width = self._reported["sensor_shape"]
         self._sensor_shape = (height, width)
         self._shutter = "none"
@@ -188,13 +191,7 @@ class AndorCamera(CameraDriver):
     def _start(self, series: Series) -> None:
         sdk = self._opened()
         with sdk.selected() as lib:
-            sdk.camera.set_trigger_mode(TRIGGERS[series.trigger][0])
-            if series.trigger == "software":  # works only in the mode "run till abort"
-                sdk.camera.setup_cont_mode(0)
-            else:
-                sdk.camera.setup_kinetic_mode(series.n_frames)
-            lib.SetExposureTime(series.exposure_s)
-            exposure_s = _without_rounding(float(lib.GetAcquisitionTimings()[0]), series.exposure_s)
+            exposure_s = self._set_series(sdk, lib, series)
         if exposure_s > MAX_LENGTHENING * series.exposure_s:
             requested, shortest = (format_quantity(s, "time") for s in (series.exposure_s, exposure_s))
             hint = "with frame transfer it cannot be shorter than the read-out"
@@ -205,7 +202,23 @@ class AndorCamera(CameraDriver):
         with sdk.selected() as lib:
             lib.PrepareAcquisition()
             lib.StartAcquisition()
-        self._exposure_s, self._n_fetched = exposure_s, 0
+        self._n_fetched = 0
+
+    def _set_series(self, sdk: Sdk, lib: Any, series: Series) -> float:
+        """Set trigger and times, unless they are set already; returns the exposure that the camera makes."""
+        n_frames = 0 if series.trigger == "software" else series.n_frames
+        wanted = series.trigger, n_frames, series.exposure_s
+        if wanted != self._set_for:
+            self._set_for = None
+            sdk.camera.set_trigger_mode(TRIGGERS[series.trigger][0])
+            if series.trigger == "software":  # works only in the mode "run till abort"
+                sdk.camera.setup_cont_mode(0)
+            else:
+                sdk.camera.setup_kinetic_mode(n_frames)
+            lib.SetExposureTime(series.exposure_s)
+            exposure_s = float(lib.GetAcquisitionTimings()[0])
+            self._set_for, self._exposure_s = wanted, _without_rounding(exposure_s, series.exposure_s)
+        return self._exposure_s
 
     def _set_em_gain(self, sdk: Sdk, em_gain: float) -> None:
         if self._reported["em_gain_range"] is not None:
@@ -290,8 +303,8 @@ class AndorCamera(CameraDriver):
         return ExposureResult(number - 1, image, exposure_s=self._exposure_s, device_time_s=time_s)
 
     def _end(self) -> None:
-        """Abort; the shutter stays open, and the next series sets the gain."""
-        self._attempt(_cancel_wait, _abort)
+        """Abort, gain off; the shutter stays open."""
+        self._attempt(_cancel_wait, _abort, self._turn_gain_off)
 
     def _stop(self) -> None:
         self._attempt(_cancel_wait, _abort, self._turn_gain_off, self._close_shutter)

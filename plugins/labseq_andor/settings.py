@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from labseq.plugin import CameraSettings, CoolingSettings, Frequency, PositiveDuration
+from labseq.plugin import CameraSettings, CoolingSettings, Duration, Frequency, PositiveDuration
 from labseq_andor.heads import IXON_897, Head, known_head, readout_s
 
 SIMULATED: Final = "simulated"
@@ -33,6 +33,11 @@ class AndorSettings(CameraSettings):
     )
     sdk: str = Field(
         default="", description="file of Andor's library; empty: where Andor's installer puts it"
+    )
+    arming_time: Duration = Field(
+        default=5.5e-3,
+        description="time from arming for a series until it can be triggered, for budgets; simulated "
+        "cameras take so long",
     )
     em_gain: PositiveInt = Field(
         default=1, le=1000, description="mean gain of the EM register during exposures; 1: none"

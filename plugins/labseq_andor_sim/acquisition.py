@@ -74,8 +74,10 @@ class Acquisition:
         hangs: Set when fetching a frame hangs.
     """
 
-    def __init__(self, sensor: SimulatedSensor, timing: Timing, clock: Clock, faults: Faults) -> None:
-        self._sensor, self._timing = sensor, timing
+    def __init__(
+        self, sensor: SimulatedSensor, timing: Timing, clock: Clock, faults: Faults, arm_s: float = 0.0
+    ) -> None:
+        self._sensor, self._timing, self._arm_s = sensor, timing, arm_s
         self._clock, self._faults = clock, faults
         self._arrived = threading.Condition()
         self.hangs = threading.Event()
@@ -109,7 +111,7 @@ class Acquisition:
         require(timing.optics.reads_images, Code.INVALID_MODE)
         self._empty_buffer()
         series = Series(timing.n_frames, timing.exposure_s, KINDS[timing.trigger], mode.em_gain or 1.0)
-        self._sensor.arm(series, mode, timing.readout_s, timing.kinetic_s)
+        self._sensor.arm(series, mode, timing.readout_s, timing.kinetic_s, self._arm_s)
         self._n_left = timing.n_frames
         self.is_acquiring, self._fault, self._is_cancelled = True, Code.SUCCESS, False
         self._started_s = self._busy_until_s = self._clock.now()

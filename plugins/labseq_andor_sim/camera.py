@@ -40,6 +40,7 @@ class SimulatedCamera:
 
     Args:
         sensor_shape: (height, width) of the simulation's sensor.
+        arm_s: Time that ``StartAcquisition`` takes, in seconds.
 
     Attributes:
         faults: Failures to simulate.
@@ -54,7 +55,13 @@ class SimulatedCamera:
     }
 
     def __init__(
-        self, world: Simulation, clock: Clock, head: Head, sensor_shape: tuple[int, int], serial: int = SERIAL
+        self,
+        world: Simulation,
+        clock: Clock,
+        head: Head,
+        sensor_shape: tuple[int, int],
+        serial: int = SERIAL,
+        arm_s: float = 0.0,
     ) -> None:
         self.faults = Faults()
         self.sensor = SimulatedSensor(world, clock)
@@ -64,7 +71,7 @@ class SimulatedCamera:
         self.amplifiers = Amplifiers(head)
         self.optics = Optics(sensor_shape, clock)
         self.timing = Timing(self.optics, self.amplifiers)
-        self.acquisition = Acquisition(self.sensor, self.timing, clock, self.faults)
+        self.acquisition = Acquisition(self.sensor, self.timing, clock, self.faults, arm_s)
         self._is_initialized = False
         self._resettable = (self.amplifiers, self.optics, self.timing, self.acquisition)
         functions: dict[str, Function] = {}

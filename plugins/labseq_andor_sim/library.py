@@ -53,7 +53,7 @@ class SimulatedAndorLibrary(AndorLibrary):
         self.head: Head = simulated_head(settings, shape)
         self.sensor_shape = shape
         self.folder = ""
-        self.camera = SimulatedCamera(world, context.clock, self.head, shape)
+        self.camera = SimulatedCamera(world, context.clock, self.head, shape, arm_s=settings.arming_time)
         self.others: list[SimulatedCamera] = []
         self._settings = settings
         self._world = world

@@ -77,6 +77,11 @@ class Acquisition:
                 camera.start()
             self._start = start
 
+    @property
+    def is_running(self) -> bool:
+        """Whether the camera is already waiting for triggers, or exposes."""
+        return self._start is not None
+
     def fire(self) -> None:
         """Start an exposure."""
         with self._link.doing("trigger it") as camera:

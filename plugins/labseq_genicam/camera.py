@@ -41,7 +41,12 @@ class GenicamCamera(CameraDriver):
         longest_s = min(longest_s, self._settings.max_exposure)
         triggers = ("software", "internal", "external")
         return CameraFacts(
-            self._settings.readout, longest_s, shape, triggers=triggers, min_exposure_s=shortest_s
+            self._settings.readout,
+            longest_s,
+            shape,
+            triggers=triggers,
+            min_exposure_s=shortest_s,
+            arm_s=self._settings.arming_time,
         )
 
     def warm(self) -> None:

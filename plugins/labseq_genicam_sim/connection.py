@@ -47,6 +47,7 @@ class SimulatedConnection(CameraConnection):
         self._is_wired = trigger_line(context.lines, "camera") is not None
         self._mode = settings.mode
         self._readout_s = settings.readout
+        self._arm_s = settings.arming_time
         self._late_s = settings.faults.late_by
         self._ignores_triggers = settings.faults.ignores_triggers
         self._made: deque[Frame | None] = deque()
@@ -91,7 +92,9 @@ class SimulatedConnection(CameraConnection):
         """Get ready for a series, before the camera starts."""
         self.clear()
         self._series, self._acquisition = series, acquisition
-        self._sensor.arm(series, self._mode, self._readout_s, None if math.isnan(period_s) else period_s)
+        arm_s = 0.0 if acquisition.is_running else self._arm_s
+        own_period_s = None if math.isnan(period_s) else period_s
+        self._sensor.arm(series, self._mode, self._readout_s, own_period_s, arm_s)
         if series.trigger == "external":
             self._world.wire("camera", self._on_edge)
 

@@ -37,7 +37,9 @@ class PylonCamera(CameraDriver):
         """Read-out time and longest exposure of the settings; shape of the frames as soon as it is known."""
         shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
         triggers = ("software", "internal", "external")
-        return CameraFacts(self._settings.readout, self._settings.max_exposure, shape, triggers=triggers)
+        settings = self._settings
+        times = settings.readout, settings.max_exposure
+        return CameraFacts(*times, shape, triggers=triggers, arm_s=settings.arming_time)
 
     def warm(self) -> None:
         """Import pylon, which takes seconds."""

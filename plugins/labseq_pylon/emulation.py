@@ -103,7 +103,7 @@ class EmulatedCamera(CameraConnection):
         node = nodes.get("exposure", "ExposureTimeAbs")
         own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
         node.SetValue(node.Min if self._clock.virtual else own_us)
-        self._sensor.arm(series, self._mode, self._readout_s)
+        self._sensor.arm(series, self._mode, self._readout_s, arm_s=self._settings.arming_time)
 
     def fire(self, acquisition: Acquisition) -> None:
         """Expose on the session's clock, write the picture to the next file, and trigger the camera."""

@@ -113,7 +113,9 @@ class VirtualCamera(CameraDriver):
         """Read-out time (less for a part of the sensor), longest exposure, shape of the frames, EM gain."""
         em_gain = 1.0 if self._settings.em_gain is None else self._settings.em_gain
         triggers = ("software", "internal", "external") if self._is_wired else ("software", "internal")
-        return CameraFacts(self._readout_s, self._settings.max_exposure, self._frame_shape, em_gain, triggers)
+        times = self._readout_s, self._settings.max_exposure
+        arm_s = self._settings.arming_time
+        return CameraFacts(*times, self._frame_shape, em_gain, triggers, arm_s=arm_s)
 
     def warm(self) -> None:
         """Compute what all frames have in common, and compile or load their kernels."""
@@ -158,7 +160,7 @@ class VirtualCamera(CameraDriver):
 
     def _start(self, series: Series) -> None:
         self._current = self._mode_of(series)
-        self._sensor.arm(series, self._current, self._readout_s)
+        self._sensor.arm(series, self._current, self._readout_s, arm_s=self._settings.arming_time)
         self._is_internal = series.trigger == "internal"
         self._pending.clear()
         self._n_seen = 0

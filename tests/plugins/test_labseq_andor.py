@@ -91,16 +91,36 @@ def test_sensor_and_read_out_of_a_known_model_are_known_before_it_is_opened() ->
 def test_em_gain_is_on_in_a_series_only() -> None:
     with rig(em_gain=800, allow_high_gain=True) as lab:
         assert (lab.camera.facts.em_gain, lab.sim.amplifiers.em_gain) == (800, 0)
-        lab.take(1)
-        assert lab.world.modes[-1].em_gain == 800
-        lab.camera.safe_state()
-        assert lab.sim.amplifiers.em_gain == 0
+        for end in (lab.camera.disarm, lab.camera.safe_state):
+            lab.take(1)
+            assert lab.world.modes[-1].em_gain == lab.sim.amplifiers.em_gain == 800
+            end()
+            assert lab.sim.amplifiers.em_gain == 0
         lab.camera.self_test()
         assert lab.world.modes[-1].em_gain == 1
     with rig(amplifier="conventional", readout_rate="1 MHz") as lab:
         lab.take(1)
         assert lab.camera.describe()["readout_rate_hz"] == pytest.approx(1e6)
     assert lab.world.modes[0].em_gain == 1
+
+
+def test_a_series_like_the_last_sets_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_for: list[tuple[Any, ...]] = []
+    with rig(em_gain=50) as lab:
+        camera = lab.camera._opened().camera
+        for name in ("set_trigger_mode", "setup_cont_mode", "setup_kinetic_mode"):
+            call = getattr(camera, name)
+            monkeypatch.setattr(camera, name, lambda *given, call=call: (set_for.append(given), call(*given)))
+        for exposure_s in (0.01, 0.01, 0.02, 0.02):
+            assert lab.take(2, exposure_s)[-1].exposure_s == pytest.approx(exposure_s)
+        assert set_for == [("software",), (0,)] * 2
+        lab.take(2, 0.02, "external")
+        assert set_for[-2:] == [("ext",), (2,)]
+        lab.camera.close()
+        lab.camera.open()
+        lab.take(1, 0.02)
+        assert set_for[4:] == [("ext",), (2,)]  # of the camera as it was before
+        assert lab.sim.timing.exposure_s == pytest.approx(0.02)
 
 
 def test_it_works_in_real_time_and_while_it_acquires_its_temperature_is_unknown() -> None:

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from labseq import ConfigError, Run, Session
-from labseq.errors import DeviceTimeoutError, StopRequested
+from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.plugin import Context
 from labseq.roles import Trigger
 from labseq.testing import CameraContract
@@ -56,6 +56,21 @@ def test_frames_come_in_order_and_pixel_for_pixel(driver: str, trigger: Trigger)
         assert [frame.number for frame in frames] == list(range(8))
         assert np.diff([frame.t_start_s for frame in frames]) == pytest.approx(period_s)
         assert_shown(frames, lab)
+
+
+def test_it_takes_its_time_to_arm(driver: str) -> None:
+    with opened_rig(driver, arming_time="30 ms") as lab:
+        assert lab.camera.facts.arm_s == pytest.approx(0.03)
+        lab.clock.sleep(1.0)
+        starts_s = [lab.clock.now()]
+        for _ in range(2):
+            lab.camera.arm(2, 0.01, "software")
+            lab.camera.disarm()
+            starts_s.append(lab.clock.now())
+        again_s = 0.0 if driver == "genicam" else 0.03  # it goes on waiting for triggers
+        assert np.diff(starts_s) == pytest.approx([0.03, again_s])
+        with pytest.raises(DeviceError, match="not armed"):
+            lab.camera.trigger()
 
 
 def test_frames_that_wait_to_be_read_keep_their_order(driver: str) -> None:
@@ -173,8 +188,11 @@ def test_a_dry_run_with_a_real_cameras_profile_sees_what_the_virtual_camera_sees
 
     done = run(str(profile), dry_run="full")
     assert done.simulated
+    camera = done.record["devices"]["camera"]
     virtual = run(
-        "virtual", f"profile.camera.readout={done.record['devices']['camera'].get('readout_s', 5e-3)} s"
+        "virtual",
+        f"profile.camera.readout={camera.get('readout_s', 5e-3)} s",
+        f"profile.camera.arming_time={camera['arming_time']} s",
     )
     for shot, expected in zip(done.shots, virtual.shots, strict=True):
         np.testing.assert_array_equal(shot.occupancies, expected.occupancies)

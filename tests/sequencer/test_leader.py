@@ -119,7 +119,7 @@ def test_a_second_wait_in_the_shot_reports_first_that_the_first_part_is_ready() 
     assert made.record().readings["leader.answer"] == ["ready", "ready"]
     names = made.lab.calls.names("leader", "camera")
     after_the_image = names[names.index("camera.read") + 1 :]
-    assert after_the_image[:3] == ["leader.report", "leader.wait_for", "camera.arm"]
+    assert after_the_image[:3] == ["leader.report", "leader.wait_for", "camera.trigger"]
 
 
 def test_each_attempt_waits_for_atoms_of_its_own() -> None:

@@ -211,12 +211,14 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("trigger() without arm() raises DeviceError")
     def test_refuses_trigger_without_arm(self, factory: Factory[Camera]) -> None:
-        """Also after safe_state(), which ends the series."""
+        """Also after safe_state() and, if the driver has it, disarm(), which end the series."""
         with self.opened(factory) as (camera, _):
             refusal(DeviceError, "trigger() after open()", camera.trigger)
-            camera.arm(1, self.exposure_s, "software")
-            camera.safe_state()
-            refusal(DeviceError, "trigger() after safe_state()", camera.trigger)
+            for name in [*(["disarm"] if offers(camera, "disarm") else []), "safe_state"]:
+                camera.arm(2, self.exposure_s, "software")
+                getattr(camera, name)()
+                getattr(camera, name)()
+                refusal(DeviceError, f"trigger() after {name}()", camera.trigger)
 
 
 def triggers_of(camera: Camera) -> tuple[str, ...]:

@@ -265,6 +265,11 @@ class RecordingCamera(RecordingHardware):
         self.reset()
         self._n_left, self._exposure_s = n_frames, exposure_s
 
+    def disarm(self) -> None:
+        """End the series."""
+        self.use("disarm")
+        self.reset()
+
     def trigger(self) -> None:
         """Take the next frame; it can be read at the end of its exposure."""
         self.use("trigger")

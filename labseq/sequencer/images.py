@@ -1,0 +1,95 @@
+"""The camera's series: armed once for the images of a shot that are alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from labseq.model import TimelineEntry
+from labseq.model.lines import IDLE
+from labseq.roles import offers
+from labseq.sequencer.lab import Lab
+from labseq.sequencer.lines import blinding_lines, trigger_line
+
+
+class CameraSeries:
+    """Arms the camera for as many images of a shot as have the same exposure time.
+
+    A camera with EM gain is disarmed wherever light may be on that harms it, because it clears its sensor
+    through the EM register between exposures as well.
+
+    Args:
+        lab: The devices.
+        timelines: The timeline of each step of the shot; without one, each image is armed for on its own.
+        call: Calls the camera within the time limit of a call.
+
+    Attributes:
+        by_line: Whether a line of the timing box triggers the camera.
+        arm_s: Time that arming takes, in seconds.
+    """
+
+    def __init__(
+        self, lab: Lab, timelines: Sequence[Sequence[TimelineEntry]], call: Callable[..., Any]
+    ) -> None:
+        facts = lab.step_context.camera
+        self.by_line = trigger_line(lab.line_specs, "camera") is not None
+        self._camera, self._specs, self._call, self._timelines = lab.camera, lab.line_specs, call, timelines
+        self.arm_s = facts.arm_s
+        self._has_gain = facts.em_gain > 1.0
+        self._is_lit_between = self._has_gain and bool(blinding_lines(lab.line_specs, IDLE))
+        self._is_armed, self._n_left, self._exposure_s = False, 0, math.nan
+        self._step = self._n_taken = 0
+
+    def begin_step(self, number: int) -> None:
+        """Begin a step: disarm the camera if light of this step may harm it."""
+        self._step, self._n_taken = number, 0
+        if any(self._may_blind(entry) for entry in self._entries(number)):
+            self.end()
+
+    def is_ready(self, exposure_s: float) -> bool:
+        """Whether the camera is armed for an image."""
+        return self._n_left > 0 and exposure_s == self._exposure_s
+
+    def arm(self, exposure_s: float) -> None:
+        """Arm for an image and those like it that follow."""
+        n_frames = 1 if self._is_lit_between else max(1, sum(self._alike(exposure_s)))
+        self._n_left, self._is_armed = 0, True
+        self._call(self._camera.arm, n_frames, exposure_s, "external" if self.by_line else "software")
+        self._n_left, self._exposure_s = n_frames, exposure_s
+
+    def taken(self) -> None:
+        """Count an image."""
+        self._n_left, self._n_taken = self._n_left - 1, self._n_taken + 1
+        if self._is_lit_between:
+            self.end()
+
+    def end(self) -> None:
+        """Disarm the camera, if it is armed and its driver can."""
+        if self._is_armed and offers(self._camera, "disarm"):
+            self._call(self._camera.disarm)
+        self.forget()
+
+    def forget(self) -> None:
+        """The camera was made safe, and the step begins again."""
+        self._is_armed, self._n_left, self._n_taken = False, 0, 0
+
+    def _entries(self, number: int) -> Sequence[TimelineEntry]:
+        return self._timelines[number] if number < len(self._timelines) else ()
+
+    def _alike(self, exposure_s: float) -> Iterator[int]:
+        """Numbers of the images to come, as long as they are alike and no light may harm the camera."""
+        n_before = self._n_taken
+        for number in range(self._step, len(self._timelines)):
+            for entry in self._timelines[number]:
+                skipped = min(n_before, entry.n_images)
+                n_before -= skipped
+                if self._may_blind(entry) or (entry.n_images > skipped and entry.exposure_s != exposure_s):
+                    return
+                yield entry.n_images - skipped
+
+    def _may_blind(self, entry: TimelineEntry) -> bool:
+        if not self._has_gain:
+            return False
+        # a step without a kind may command a light, or wait for another system that does
+        return not entry.kind or bool(blinding_lines(self._specs, entry.kind))
