@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import re
 import struct
 from collections.abc import Container, Mapping, Sequence
 from functools import cache
@@ -184,6 +185,9 @@ _MAX_RATIO: Final = 64
 _SMALL: Final = 1 << 24
 
 
+_HEAP: Final = re.compile(rb"GCOL\x01\x00\x00\x00")
+
+
 def check_heaps(path: Path) -> None:
     """Refuse a file whose texts libhdf5 (1.14) would read for ever.
 
@@ -196,8 +200,7 @@ def check_heaps(path: Path) -> None:
         OSError: The file cannot be read, or is not an ordinary one.
     """
     with open_ordinary(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        start = -1
-        while (start := data.find(b"GCOL\x01\x00\x00\x00", start + 1)) >= 0:
+        for start in (match.start() for match in _HEAP.finditer(data)):  # faster than find() of an mmap
             end = start + int.from_bytes(data[start + 8 : start + 16], "little")
             at = start + 16
             while at + 16 <= end <= len(data):
