@@ -29,8 +29,6 @@ from labseq.messages import error_text, format_error
 P = ParamSpec("P")
 T = TypeVar("T")
 
-BEAT_S: Final = 1.0
-"""How often a process that uses devices gives a sign of life."""
 POLL_S: Final = 0.05
 """How often a waiting thread looks for a stop request; on Windows, Ctrl-C does not wake a waiting thread."""
 GRACE_S: Final = 1.0
@@ -52,30 +50,12 @@ class StopFlag:
         self._event = threading.Event()
         self._n_holds = 0
         self.signal_number = 2
-        self._beat: Callable[[], object] | None = None
-        self._last_beat_s = -math.inf
 
     def request(self, signal_number: int = 2) -> None:
         """Ask the run to stop; safe to call from a signal handler."""
         if not self._event.is_set():
             self.signal_number = signal_number
         self._event.set()
-
-    @contextmanager
-    def beating(self, beat: Callable[[], object]) -> Generator[None]:
-        """Call ``beat`` once a second within the block while this process waits or looks for requests."""
-        self._beat = beat
-        try:
-            yield
-        finally:
-            self._beat = None
-
-    def alive(self) -> None:
-        """Give a sign of life if it is time; whatever waits calls this."""
-        now_s = time.monotonic()
-        if self._beat is not None and now_s - self._last_beat_s > BEAT_S:
-            self._last_beat_s = now_s
-            self._beat()
 
     @contextmanager
     def held(self) -> Generator[None]:
@@ -93,7 +73,6 @@ class StopFlag:
 
     def check(self) -> None:
         """Raise ``StopRequested`` if the run was asked to stop."""
-        self.alive()
         if self._event.is_set() and not self._n_holds:
             raise StopRequested(self.signal_number)
 
@@ -102,7 +81,6 @@ class StopFlag:
         deadline_s = time.monotonic() + duration_s
         self.check()
         while (left_s := deadline_s - time.monotonic()) > 0:
-            self.alive()
             if self._n_holds:
                 time.sleep(min(left_s, POLL_S))
             elif self._event.wait(min(left_s, POLL_S)):
@@ -295,7 +273,6 @@ class Guard:
         worker.submit(call)
         deadline = time.monotonic() + timeout_s
         while not call.done.wait(min(POLL_S, max(0.0, deadline - time.monotonic()))):
-            self._stop.alive()
             if grace_s < math.inf and self._stop.is_set:
                 call.done.wait(grace_s)
                 if not call.done.is_set():

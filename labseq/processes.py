@@ -134,8 +134,8 @@ def _start_since_boot(pid: int) -> float | None:
 
 _NO_LOCKS: Final = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
 
-HANG_S: Final = 30.0
-"""A process that has given no sign of life for so long hangs."""
+HANG_S: Final = 5.0
+"""A process that has given no sign of life for so long hangs; those that use devices give two a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +158,11 @@ class Holder:
     def hangs(self) -> bool:
         """Whether it has given no sign of life for too long."""
         return self.silent_s > HANG_S
+
+    @property
+    def is_running(self) -> bool:
+        """Whether its process still runs."""
+        return self.process is not None and self.process.is_running
 
     def __str__(self) -> str:
         if self.process is None:
@@ -201,7 +206,7 @@ class Lock:
                 warnings.simplefilter("ignore")  # filelock warns where it falls back to a lock file
                 lock.acquire()
         except Timeout:
-            return self._other()
+            return self.holder() or Holder()
         except NotImplementedError as error:
             raise OSError(errno.ENOSYS, str(error)) from error
         if isinstance(lock, SoftFileLock):  # a lock file would outlive its holder
@@ -228,17 +233,21 @@ class Lock:
         """Free the lock; legal at any time."""
         if self._lock is not None:
             with suppress(OSError):
-                self._about.unlink(missing_ok=True)
+                try:
+                    self._about.unlink(missing_ok=True)
+                except PermissionError:  # another user's: its folder lets only that user delete it
+                    write_shared(self._about, b"")
             self._lock.release()
             self._lock = None
 
-    def _other(self) -> Holder:
+    def holder(self) -> Holder | None:
+        """The process that holds the lock, or died holding it; None if there is none or it is unknown."""
         try:
             values = parse_object(read_file(self._about)) or {}
             silent_s = max(0.0, time.monotonic() - self._about.stat().st_mtime)
             return Holder(str(values["what"]), Process.from_plain(values), str(values["since_utc"]), silent_s)
         except (RecordingError, OSError, KeyError):
-            return Holder()
+            return None
 
 
 def knows_no_locks(error: OSError) -> bool:

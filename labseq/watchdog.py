@@ -109,8 +109,8 @@ class _Process:
         self._log: Path | None = None
         self._what = "the run"
         self._parent = os.getppid()
+        self._hangs = Hanging(self._parent)
         self._beat_s = time.monotonic()
-        self._cpu_s = -1.0
 
     def watch(self) -> None:
         """Watch until the run ends, dies or hangs."""
@@ -170,15 +170,6 @@ class _Process:
         with suppress(OSError):
             os.write(1, json.dumps({"failure": failure}).encode() + b"\n")
 
-    def _hangs(self, silent_s: float) -> bool:
-        """Whether a run without a heartbeat hangs, and does not just wait for a disk or for the processor."""
-        states, cpu_s = _threads(self._parent)
-        if "D" in states and "T" not in states:
-            return silent_s > DISK_S
-        starved = "R" in states and cpu_s == self._cpu_s
-        self._cpu_s = cpu_s
-        return not starved
-
     def _end_run(self) -> None:
         """End a run that hangs, so that its ports and cards are free."""
         for name, wait_s in (("SIGTERM", TERM_S), ("SIGKILL", 2 * TERM_S)):
@@ -225,6 +216,23 @@ class _Process:
         )
         with suppress(OSError):
             os.write(2, f"labseq-watchdog: {self._what} {cause}; {name} {what}\n".encode("utf-8", "replace"))
+
+
+class Hanging:
+    """Tells whether a process without a heartbeat hangs, or just waits for a disk or for the processor."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._cpu_s = -1.0
+
+    def __call__(self, silent_s: float) -> bool:
+        """Whether it hangs; to be asked again and again."""
+        states, cpu_s = _threads(self._pid)
+        if "D" in states and "T" not in states:
+            return silent_s > DISK_S
+        starved = "R" in states and cpu_s == self._cpu_s
+        self._cpu_s = cpu_s
+        return not starved
 
 
 def _threads(pid: int) -> tuple[str, float]:
@@ -282,15 +290,10 @@ class Watchdog:
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._sending = threading.RLock()
         self._ended = threading.Event()
-
-    def start(self) -> None:
-        """Start it, unless it runs already; returns once it is ready."""
-        if self._process is None:
-            self._launch()
-            threading.Thread(target=self._beat, name="labseq heartbeat", daemon=True).start()
+        self._is_started = False
 
     def add(self, name: str, order: int, script: Path, arguments: object) -> None:
-        """Have it switch a device off after the death of this process.
+        """Have it switch a device off after the death of this process; the first one starts it.
 
         Args:
             name: The device.
@@ -298,7 +301,10 @@ class Watchdog:
             script: See ``Emergency``.
             arguments: See ``Emergency``.
         """
-        self.start()
+        if not self._is_started:
+            self._is_started = True
+            self._launch()
+            threading.Thread(target=self._beat, name="labseq heartbeat", daemon=True).start()
         device = {"device": name, "order": order, "script": str(script), "arguments": arguments}
         with self._sending:
             self._devices[name] = device

@@ -163,10 +163,10 @@ os._exit(0)
     ],
 )
 def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, cpu_s, silent_s, hangs):
-    process = watchdog._Process()
-    process._cpu_s = 1.0
+    is_hanging = watchdog.Hanging(0)
+    is_hanging._cpu_s = 1.0
     monkeypatch.setattr(watchdog, "_threads", lambda pid: (states, cpu_s))
-    assert process._hangs(silent_s) is hangs
+    assert is_hanging(silent_s) is hangs
 
 
 def test_without_a_watchdog_there_is_a_warning(monkeypatch, tmp_path):
@@ -179,10 +179,12 @@ def test_without_a_watchdog_there_is_a_warning(monkeypatch, tmp_path):
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="memory as Linux reports it")
 def test_the_watchdog_is_small(tmp_path):
+    (tmp_path / "emergency.py").write_text(EMERGENCY, encoding="utf-8")
     dog = Watchdog()
-    dog.start()
+    dog.add("lines", 0, tmp_path / "emergency.py", {"name": str(tmp_path / "lines")})
     assert dog._process is not None
     text = Path(f"/proc/{dog._process.pid}/status").read_text()
     resident = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS"))
+    dog.forget(["lines"])
     dog.end()
     assert resident < 20_000  # kB

@@ -384,12 +384,25 @@ def safe(
     end: Annotated[
         bool, typer.Option("--end", help="First end any process that uses the devices, even if it answers.")
     ] = False,
+    wait: Annotated[
+        bool,
+        typer.Option(
+            "--stand-by",
+            help="Wait, and do so with each device whose process dies without having made it safe, or hangs "
+            "for 5 s; until Ctrl-C.",
+        ),
+    ] = False,
     overrides: Overrides = None,
     _plugins: Plugins = None,
 ) -> None:
     """Open every device of a profile, bring it to its safe state, and close it."""
-    from labseq.cli.devices import secure_profile
+    from labseq.cli.devices import secure_profile, stand_by_for
 
+    if wait and end:
+        raise typer.BadParameter("--stand-by leaves processes that answer alone; leave out --end")
+    if wait:
+        stand_by_for(profile, overrides or ())
+        return
     raise typer.Exit(secure_profile(profile, overrides or (), end=end))
 
 

@@ -17,7 +17,9 @@ from labseq.kernel import announcing
 from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.session.chosen import DryRun, load_plugins
-from labseq.session.safe import CheckedDevice, DevicesReport, check_devices, make_profile_safe
+from labseq.session.devices import CheckedDevice, DevicesReport, check_devices
+from labseq.session.safe import make_profile_safe
+from labseq.session.stand_by import stand_by
 from labseq.units import format_quantity
 
 _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")
@@ -115,6 +117,11 @@ def secure_profile(profile: str, overrides: Sequence[str], *, end: bool = False)
     return ConfigError.exit_code if secured.refused or secured.problems else 0
 
 
+def stand_by_for(profile: str, overrides: Sequence[str]) -> None:
+    """Stand by for a profile's devices until Ctrl-C; print what happens."""
+    stand_by(profile, overrides, _Lines())
+
+
 class _Lines:
     """Implements ``RunObserver`` with a line per device."""
 
@@ -124,6 +131,8 @@ class _Lines:
             say(f"{values['device']:<20} {state}")
         elif name == "closed" and not values["ok"]:
             say(f"{values['device']:<20} could not be closed: {values['error']}")
+        elif name == "stand_by":
+            say(values["text"])
         elif name == "warning":
             say(f"warning: {values['text']}")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 from labseq.errors import DeviceError, LabseqError
 from labseq.guard import Guard
@@ -25,6 +26,7 @@ from labseq.roles import (
     Clock,
     Detector,
     Device,
+    Emergency,
     Hardware,
     Lines,
     MobileTweezers,
@@ -35,6 +37,7 @@ from labseq.roles import (
     offers,
 )
 from labseq.sequencer.lines import blinding_lines
+from labseq.watchdog import Watchdog
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +151,10 @@ class Lab:
         return in_safe_order(dict(self.hardware()))
 
 
-def in_safe_order(devices: Mapping[str, Hardware]) -> Iterator[tuple[str, Hardware]]:
+T = TypeVar("T")
+
+
+def in_safe_order(devices: Mapping[str, T]) -> Iterator[tuple[str, T]]:
     """Name and device, in the order of the safe state.
 
     Mobile tweezers ramp down first, then devices, lines and camera, static tweezers last; missing devices are
@@ -194,13 +200,41 @@ def _each(
 
 def attempt(guard: Guard, name: str, timeout_s: float, part: object, method: str) -> LabseqError | None:
     """Call a method of a device even if the run is asked to stop; returns why it failed, or None."""
+    act = partial(guard.call_despite_stop, name, timeout_s, method_of(part, method))
+    return failure_of(name, f"{method}()", act)
+
+
+def failure_of(name: str, what: str, act: Callable[[], object]) -> LabseqError | None:
+    """Do something with a device; returns why it failed, or None."""
     try:
-        guard.call_despite_stop(name, timeout_s, method_of(part, method))
+        act()
     except LabseqError as failure:
         return failure
     except BaseException as failure:  # noqa: BLE001 - Ctrl-C where it has no handler: the others come first
-        return DeviceError(name, f"{method}() was interrupted by {format_error(failure)}")
+        return DeviceError(name, f"{what} was interrupted by {format_error(failure)}")
     return None
+
+
+def open_device(
+    guard: Guard, name: str, device: Hardware, timeout_s: float, watchdog: Watchdog, order: int
+) -> None:
+    """Open a device, even if the run is asked to stop; the watchdog learns how it is switched off.
+
+    A slow ``open()`` must end first: its last actions would undo the safe state.
+
+    Raises:
+        LabseqError: It cannot be opened, or ``emergency()`` fails.
+    """
+    guard.call_despite_stop(name, timeout_s, method_of(device, "open"))
+    if not offers(device, "emergency"):
+        return
+
+    def emergency() -> Emergency | None:
+        found = device.emergency()
+        return None if found is None else Emergency(found.script, dict(found.arguments))
+
+    if (found := guard.call_despite_stop(name, timeout_s, emergency)) is not None:
+        watchdog.add(name, order, found.script, found.arguments)
 
 
 def method_of(part: object, method: str) -> Callable[[], Any]:

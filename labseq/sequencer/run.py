@@ -20,8 +20,8 @@ from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
-from labseq.roles import Hardware, RunObserver, Step, StepContext, offers
-from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of
+from labseq.roles import RunObserver, Step, StepContext, offers
+from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of, open_device
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import RunningShot, Stages
@@ -99,13 +99,7 @@ def open_devices(
     for name, part in lab.hardware():
         if name in names:
             stop.check()
-            if has_emergency(part):
-                watchdog.start()
-            # A slow open() must end first: its last actions would undo the safe state.
-            guard.call_despite_stop(name, timeout_s, method_of(part, "open"))
-            emergency = guard.call(name, timeout_s, part.emergency) if has_emergency(part) else None
-            if emergency is not None:
-                watchdog.add(name, order[name], emergency.script, dict(emergency.arguments))
+            open_device(guard, name, part, timeout_s, watchdog, order[name])
     for text in watchdog.notes():
         emit("warning", {"text": text})
     if "static_tweezers" in names:
@@ -118,11 +112,6 @@ def open_devices(
         if longest_s > 0:
             emit("settling", {"device": name, "timeout_s": longest_s})
             guard.call(name, longest_s + DRIVER_MARGIN_S, device.settle)
-
-
-def has_emergency(device: Hardware) -> bool:
-    """Whether another process can switch a device off."""
-    return getattr(type(device), "emergency", Hardware.emergency) is not Hardware.emergency
 
 
 def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:

@@ -27,11 +27,12 @@ from labseq.session.awaited import AwaitedResults
 from labseq.session.check import check
 from labseq.session.chosen import DryRun
 from labseq.session.lab import build_lab, clock_for, warm
+from labseq.session.locks import lock_devices
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
 from labseq.session.policies import Checks, ShotHooks
 from labseq.session.provenance import copies, ending, run_record
-from labseq.session.safe import lock_devices, make_safe_after_crash
+from labseq.session.safe import make_safe_after_crash
 from labseq.session.scan import Point
 from labseq.session.scan_run import scan_run_of
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
@@ -189,7 +190,7 @@ class Session:
         with ExitStack() as stack:
             stack.enter_context(stop_on_signals(self.stop_flag))
             hardware, what = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
-            self._hold = stack.enter_context(lock_devices(hardware, what, self._warn, self.stop_flag))
+            self._hold = stack.enter_context(lock_devices(hardware, what, self._warn))
             make_safe_after_crash(hardware, self._profile_key, self.stop_flag, self._observers)
             if not self.scan_run.shots:  # its process died between the last shot and the end of the run
                 _, writer = self._begin(root)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from labseq.errors import StopRequested
-from labseq.session.safe import CheckedDevice, DevicesReport
+from labseq.session.devices import CheckedDevice, DevicesReport
 
 PROFILE = """labseq: 1
 name: bench

@@ -23,7 +23,7 @@ from labseq.config.yaml_nodes import compose
 from labseq.plugin import Context
 from labseq.recording import Run
 from labseq.session.check import check
-from labseq.session.safe import check_devices
+from labseq.session.devices import check_devices
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 

@@ -12,7 +12,7 @@ from labseq.errors import ConfigError, DeviceTimeoutError, StopRequested
 from labseq.guard import StopFlag
 from labseq.roles import Context
 from labseq.sequencer.lab import Timeouts
-from labseq.session.safe import N_READINGS, CheckedDevice, check_devices, check_each_device
+from labseq.session.devices import N_READINGS, CheckedDevice, check_devices, check_each_device
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation
 
 from .small_runs import PROFILE

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,7 +16,8 @@ from labseq.cli.entry import main
 from labseq.errors import ConfigError
 from labseq.files import devices_root
 from labseq.recording import find_dead_run, mark_active
-from labseq.session.safe import SafeStateReport, check_devices, make_each_safe, make_profile_safe
+from labseq.session.devices import check_devices
+from labseq.session.safe import SafeStateReport, make_each_safe, make_profile_safe
 from labseq.testing.fakes import RecordingObserver, fake_lab
 from tests.hostile import HOSTILE
 
@@ -116,6 +119,49 @@ def test_no_error_of_a_device_keeps_the_others_from_being_made_safe(
     assert leaving.value.code == 3
     found = capsys.readouterr()
     assert "\x1b" not in found.out + found.err
+
+
+EMERGENCY = """
+import pathlib
+
+def off(name):
+    pathlib.Path(name).unlink()
+    return "closed"
+"""
+STAYS = """
+import time
+from pathlib import Path
+import labseq
+
+
+def stay():
+    Path("reached").touch()
+    time.sleep(60)
+
+
+"""
+GUARDED = """class Mine:
+    def emergency(self):
+        return labseq.plugin.Emergency(Path("emergency.py").absolute(), {"name": str(Path("on").absolute())})
+
+"""
+
+
+@pytest.mark.parametrize(("command", "method"), [("devices", "describe"), ("safe", "safe_state")])
+def test_a_command_that_opens_devices_and_is_killed_leaves_them_off(command: str, method: str) -> None:
+    Path("emergency.py").write_text(EMERGENCY, encoding="utf-8")
+    write("{use: mine}", f"def {method}(self):", f"def {method}(self):\n        stay()\n       ")
+    plugin = Path("plugins/mine.py")
+    text = plugin.read_text("utf-8").replace("def open(self): pass", "def open(self): Path('on').touch()")
+    plugin.write_text(text.replace("import labseq\n", STAYS, 1).replace("class Mine:", GUARDED), "utf-8")
+    labseq = [sys.executable, "-m", "labseq", command, "./p.yaml"]
+    with subprocess.Popen(labseq, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not Path("reached").exists():
+            assert process.poll() is None, process.communicate()
+        process.kill()
+        _, said = process.communicate(timeout=20.0)  # until the watchdog has ended, too
+    assert not Path("on").exists()
+    assert f"labseq-watchdog: labseq {command} died; shutter is off after " in said
 
 
 def test_a_simulation_or_a_screen_that_fails_keeps_no_device_from_being_made_safe() -> None:

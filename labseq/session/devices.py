@@ -1,0 +1,200 @@
+"""`labseq devices`: open each device of a profile, identify and test it, make it safe, close it."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from labseq.config.addresses import profile_overrides
+from labseq.errors import DeviceError, LabseqError, StopRequested
+from labseq.guard import Guard, StopFlag, stop_on_signals
+from labseq.kernel import load_kernels
+from labseq.messages import format_error
+from labseq.recording import find_dead_run
+from labseq.roles import Hardware, Simulation, offers
+from labseq.sequencer.clock import RealClock, VirtualClock
+from labseq.sequencer.lab import Timeouts, attempt, method_of, open_device
+from labseq.session.chosen import DryRun, check_dry_run
+from labseq.session.lab import WARM_S, timeouts_of
+from labseq.session.locks import lock_devices
+from labseq.session.profile import resolve_profile
+from labseq.session.safe import construct_hardware
+from labseq.watchdog import Watchdog
+
+N_READINGS: Final = 5
+"""Number of ``describe()`` calls for the latency of a device, which is the median of their times."""
+
+_OPENING: Final = {"static_tweezers": 0, "camera": 1, "mobile_tweezers": 3}
+"""Place in the order of opening; devices that are not listed have 2."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedDevice:
+    """The result of checking one device.
+
+    Attributes:
+        name: Its role, or its name in the profile.
+        described: The device's own description; empty if the check failed before it.
+        tested: Whether it passed its self test; False also if it has none.
+        latency_s: Time of a ``describe()``, from the call to the answer; None if the check failed before it.
+        constructed: Whether its plugin could construct it; if not, ``failure`` says why.
+        failure: Why it could not be opened, identified or tested, or what interrupted that; or None.
+        unsafe: Why it is not in its safe state, or None.
+        unclosed: Why it could not be closed, or None.
+    """
+
+    name: str
+    described: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    tested: bool = False
+    latency_s: float | None = None
+    constructed: bool = True
+    failure: LabseqError | None = None
+    unsafe: LabseqError | None = None
+    unclosed: LabseqError | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything worked."""
+        return self.failure is None and self.unsafe is None and self.unclosed is None
+
+
+@dataclass(frozen=True, slots=True)
+class DevicesReport:
+    """The result of checking the devices of a profile.
+
+    Attributes:
+        devices: The checked devices in order, then those that could not be constructed.
+        plugins: Name of a device -> its plugin, as after ``use:`` in the profile.
+        warnings: Notes for the user that are not errors.
+        stopped: The request to stop that ended the check, or None.
+    """
+
+    devices: Sequence[CheckedDevice]
+    plugins: Mapping[str, str]
+    warnings: Sequence[str] = ()
+    stopped: StopRequested | None = None
+
+
+def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun = "off") -> DevicesReport:
+    """Open each device of a profile in turn, identify and test it, make it safe and close it.
+
+    One that fails or hangs never keeps the others from being tried. After Ctrl-C the
+    current device is made safe and closed, and no other is opened.
+
+    Args:
+        profile: Name or path of the profile.
+        overrides: ``"profile.address=value"`` strings, as given to ``--set``.
+        dry_run: "off", "full" or "fast".
+
+    Raises:
+        ConfigError: The profile has an error; no device was touched.
+        DeviceError: Another process uses the same real devices; none was touched.
+    """
+    check_dry_run(dry_run)
+    hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
+    stop = StopFlag()
+    is_virtual = dry_run != "off" or hardware.virtual_time
+    clock = VirtualClock(stop) if is_virtual else RealClock(stop)
+    warnings = [*hardware.warnings]
+    with ExitStack() as stack:
+        stack.enter_context(lock_devices(hardware, "labseq devices", warnings.append))
+        if (dead := find_dead_run(hardware.key, hardware.identities)) is not None and dry_run == "off":
+            text = (
+                f"the last run on these devices ({dead}) died; 'labseq safe {profile}' makes all of them safe"
+            )
+            warnings.append(text)
+        stack.enter_context(stop_on_signals(stop))
+        made, refused = construct_hardware(hardware, clock)
+        simulation = made.pop("simulation", None)
+        in_order = sorted(made.items(), key=lambda item: _OPENING.get(item[0], 2))
+        devices = check_each_device(
+            in_order, timeouts_of(hardware.profile), stop, simulation, warnings.append
+        )
+    devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
+    plugins = {name: chosen.entry.name for name, chosen in hardware.chosen.items()}
+    stopped = StopRequested(stop.signal_number) if stop.is_set else None
+    return DevicesReport(devices, plugins, [*warnings, *hardware.host.notes], stopped)
+
+
+def check_each_device(
+    devices: Iterable[tuple[str, Hardware]],
+    timeouts: Timeouts,
+    stop: StopFlag,
+    simulation: Simulation | None = None,
+    warn: Callable[[str], object] = str,
+) -> list[CheckedDevice]:
+    """Open, identify, test, make safe and close one device after the other.
+
+    The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
+
+    Args:
+        devices: Name and device, in the order of opening.
+        timeouts: How long each call may take.
+        stop: The request to stop: the current device is made safe and closed, the others are not opened.
+        simulation: The simulation that virtual devices act on: opened before them, closed after them.
+        warn: Receives what goes wrong with the watchdog.
+
+    Returns:
+        Those that were tried, the simulation first.
+    """
+    guard, watchdog = Guard(stop), Watchdog("labseq devices")
+    tried: list[CheckedDevice] = []
+    if simulation is not None and not stop.is_set:
+        tried.append(_examined(guard, "simulation", simulation, timeouts, watchdog))
+    try:
+        for name, device in devices:
+            if stop.is_set:
+                break
+            try:
+                found = _examined(guard, name, device, timeouts, watchdog)
+            finally:
+                with stop.held():
+                    unsafe = attempt(guard, name, timeouts.safe_state_s, device, "safe_state")
+                    unclosed = attempt(guard, name, timeouts.safe_state_s, device, "close")
+                    if unsafe is None:
+                        watchdog.forget([name])
+            tried.append(replace(found, unsafe=unsafe, unclosed=unclosed))
+    finally:
+        watchdog.end()
+        for text in watchdog.notes():
+            warn(text)
+        if simulation is not None and tried:
+            with stop.held():
+                unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation, "close")
+            tried[0] = replace(tried[0], unclosed=unclosed)
+        guard.end()
+    return tried
+
+
+def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts, watchdog: Watchdog) -> CheckedDevice:
+    """Open, identify and test a device; stops at the first failure."""
+    found = CheckedDevice(name)
+    try:
+        if name != "simulation" and offers(device, "warm"):
+            guard.call(name, WARM_S, device.warm)
+            load_kernels()  # else a self test might have to compile within its timeout
+        open_device(guard, name, device, timeouts.call_s, watchdog, 0)
+        described: Any = guard.call(name, timeouts.call_s, method_of(device, "describe"))
+        if not isinstance(described, Mapping):
+            text = f"describe() gave a {type(described).__name__}; expected a mapping"
+            raise DeviceError(name, text)
+        found = replace(found, described=described)
+        if offers(device, "self_test"):
+            guard.call(name, timeouts.call_s, device.self_test)
+            found = replace(found, tested=True)
+        readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
+        return replace(found, latency_s=statistics.median(readings_s))
+    except LabseqError as failure:
+        return replace(found, failure=failure)
+    except Exception as failure:  # noqa: BLE001 - of the driver's class
+        return replace(found, failure=DeviceError(name, format_error(failure)))
+
+
+def _reading_s(guard: Guard, name: str, device: Hardware | Simulation, timeout_s: float) -> float:
+    start_s = time.perf_counter()
+    guard.call(name, timeout_s, device.describe)
+    return time.perf_counter() - start_s

@@ -1,0 +1,135 @@
+"""Locks of the devices of a profile: one process at a time uses them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Final
+
+from labseq.errors import DeviceError
+from labseq.files import make_shared
+from labseq.processes import Holder, Lock, Process
+from labseq.recording import lock_file
+from labseq.session.profile import ResolvedProfile
+
+BEAT_S: Final = 0.5
+"""How often a process that uses devices gives a sign of life."""
+END_S: Final = 10.0
+"""How long a process may take to make its devices safe after SIGTERM, before it is killed."""
+HUNG_END_S: Final = 0.5
+"""The same for one that hangs: it cannot obey SIGTERM."""
+
+
+@contextmanager
+def lock_devices(
+    hardware: ResolvedProfile,
+    what: str,
+    warn: Callable[[str], object],
+    *,
+    blocked: Callable[[str, Holder], bool] | None = None,
+) -> Generator[Callable[[str], None]]:
+    """Lock a profile's devices against other processes within the block.
+
+    A lock ends with its process, also if that is killed. Simulated devices are not locked.
+
+    Args:
+        hardware: The profile.
+        what: The use of the devices, shown to other users while they are locked.
+        warn: Receives a warning if nothing keeps others from a device.
+        blocked: Called with device and holder if another process has locked it; returns whether to try
+            again. Without it that is an error.
+
+    Yields:
+        A function that changes this description of their use.
+
+    Raises:
+        DeviceError: Another process holds a device; names both.
+    """
+    locks: list[Lock] = []
+    with ExitStack() as stack:
+        for identity, role in hardware.identities.items():
+            device = named(role, identity)
+            lock = Lock(lock_file(identity), what)
+            while True:
+                try:
+                    make_shared(lock.path.parent)
+                    holder = lock.take()
+                except OSError as error:
+                    text = f"{lock.path} cannot be locked: {error.strerror or error}"
+                    warn(f"{text}: nothing keeps another process from {device}")
+                    break
+                if holder is None:
+                    stack.callback(lock.release)
+                    locks.append(lock)
+                    break
+                if blocked is None:
+                    text = f"{device} is in use by {holder}"
+                    advice = "wait for its end, or end a run with 'labseq stop'"
+                    raise DeviceError(hardware.profile.name, f"{text}; {advice}")
+                if not blocked(device, holder):
+                    break
+
+        def describe(text: str) -> None:
+            for lock in locks:
+                lock.describe(text)
+
+        stack.enter_context(_beating(locks))
+        yield describe
+
+
+@contextmanager
+def _beating(locks: Sequence[Lock]) -> Generator[None]:
+    """Give signs of life in a thread: it stands still only with the interpreter."""
+    ended = threading.Event()
+
+    def beat() -> None:
+        while not ended.wait(BEAT_S):
+            for lock in locks:
+                lock.beat()
+
+    if locks:
+        threading.Thread(target=beat, name="labseq locks", daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+
+
+def named(role: str, identity: str) -> str:
+    """A device with what identifies it, for the user."""
+    return role if identity.startswith(f"{role} ") else f"{role} ({identity})"
+
+
+class EndsHolders:
+    """Ends processes that use devices if they hang, or if that was asked for.
+
+    Args:
+        warn: Receives what is done.
+        end: Whether to end processes that do not hang, too.
+    """
+
+    def __init__(self, warn: Callable[[str], object], *, end: bool) -> None:
+        self._warn = warn
+        self._end = end
+        self._seen: set[Process | None] = set()
+
+    def __call__(self, device: str, holder: Holder) -> bool:
+        """Whether the process has ended; once for each process."""
+        if holder.process in self._seen:
+            return False
+        self._seen.add(holder.process)
+        text = f"{device} is in use by {holder}"
+        if holder.process is None or not (holder.hangs or self._end):
+            self._warn(f"{text}; it is made safe all the same ('labseq safe --end' ends that process first)")
+            return False
+        silent = f", which has not answered for {holder.silent_s:.0f} s"
+        self._warn(f"{text}{silent if holder.hangs else ''}; that process is ended first")
+        try:
+            has_ended = holder.process.end(HUNG_END_S if holder.hangs else END_S)
+        except OSError as error:
+            self._warn(f"process {holder.process.pid} cannot be ended: {error.strerror}")
+            return False
+        if not has_ended:
+            self._warn(f"process {holder.process.pid} did not end")
+        return has_ended
