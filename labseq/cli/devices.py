@@ -119,7 +119,7 @@ def secure_profile(profile: str, overrides: Sequence[str], *, end: bool = False)
 
 def stand_by_for(profile: str, overrides: Sequence[str]) -> None:
     """Stand by for a profile's devices until Ctrl-C; print what happens."""
-    stand_by(profile, overrides, _Lines())
+    stand_by(profile, overrides, _Lines(), say)
 
 
 class _Lines:
@@ -131,8 +131,6 @@ class _Lines:
             say(f"{values['device']:<20} {state}")
         elif name == "closed" and not values["ok"]:
             say(f"{values['device']:<20} could not be closed: {values['error']}")
-        elif name == "stand_by":
-            say(values["text"])
         elif name == "warning":
             say(f"warning: {values['text']}")
 

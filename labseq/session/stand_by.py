@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -28,7 +28,12 @@ FIRST_S: Final = 0.5
 """Head start of the watchdog of a run, which is faster and may still be there."""
 
 
-def stand_by(profile: str, overrides: Sequence[str] = (), observer: RunObserver | None = None) -> None:
+def stand_by(
+    profile: str,
+    overrides: Sequence[str] = (),
+    observer: RunObserver | None = None,
+    tell: Callable[[str], object] = str,
+) -> None:
     """Make devices safe when a process that uses them dies without having done so, or hangs; until Ctrl-C.
 
     The locks of the devices say which process that is; devices that other processes use are left alone.
@@ -36,7 +41,8 @@ def stand_by(profile: str, overrides: Sequence[str] = (), observer: RunObserver 
     Args:
         profile: Name or path of the profile.
         overrides: ``"profile.address=value"`` strings, as given to ``--set``.
-        observer: Receives what happens as warnings, and each device's outcome.
+        observer: Receives each device's outcome, and warnings.
+        tell: Receives the devices at the beginning, then each process that died or hangs.
 
     Raises:
         ConfigError: The profile has an error, or names no device that is locked while it is in use.
@@ -52,20 +58,15 @@ def stand_by(profile: str, overrides: Sequence[str] = (), observer: RunObserver 
     devices = ", ".join(named(role, identity) for identity, role in identities.items())
     look = _Look(identities)
     with stop_on_signals(stop), suppress(StopRequested):
-        _tell(observer, f"standing by for {devices}; Ctrl-C ends this")
+        tell(f"standing by for {devices}; Ctrl-C ends this")
         while True:
             stop.wait(LOOK_S)
             for holder, roles in look.new_troubles():
                 why = f"has not answered for {holder.silent_s:.0f} s" if holder.is_running else "died"
-                _tell(observer, f"{datetime.now():%Y-%m-%d %H:%M:%S} {holder} {why}")
+                tell(f"{datetime.now():%Y-%m-%d %H:%M:%S} {holder} {why}")
                 stop.wait(FIRST_S)
                 for role in roles:
                     _secure(hardware, role, stop, look, observer)
-
-
-def _tell(observer: RunObserver | None, text: str) -> None:
-    if observer is not None:
-        observer.event("stand_by", {"text": text})
 
 
 def _secure(

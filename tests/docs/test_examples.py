@@ -80,6 +80,7 @@ NOT_RUN = {
     "docs/how-to/stop-and-safe.md": [
         "no run is in progress; tests/session/test_stopping.py stops one",
         "takes two processes; tests/session/test_holding.py has them",
+        "waits until Ctrl-C; tests/session/test_holding.py stands by",
     ],
     "docs/how-to/timing-box.md": ["writes to a real board", "needs a real board"],
     "docs/how-to/update.md": ["fetches another version"],
