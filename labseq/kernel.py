@@ -480,12 +480,20 @@ _CLEANED: set[Path] = set()
 
 
 def _delete_unused(folder: Path) -> None:
-    """Delete files that no process has loaded for long, once per process."""
+    """Delete files that no process has loaded for long, once per process.
+
+    A clock that is ahead deletes none: the age of a file is at most that against the last one loaded.
+    """
     if folder in _CLEANED:
         return
     _CLEANED.add(folder)
-    too_old = time.time() - UNUSED_DAYS * 86400
+    used_s: dict[Path, float] = {}
     for path in folder.iterdir():
         with suppress(OSError):  # another process may be deleting it too
-            if path.is_file() and path.stat().st_mtime < too_old:
+            if path.is_file():
+                used_s[path] = path.stat().st_mtime
+    too_old = min(time.time(), max(used_s.values(), default=0.0)) - UNUSED_DAYS * 86400
+    for path, last_s in used_s.items():
+        if last_s < too_old:
+            with suppress(OSError):
                 path.unlink()

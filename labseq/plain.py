@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from collections.abc import Mapping, Set as AbstractSet
-from datetime import date, time
+from datetime import UTC, date, datetime, time as time_of_day
 from enum import Enum
 from pathlib import PurePath
 from typing import Any, Final, cast
@@ -27,6 +28,16 @@ def to_plain(value: Any) -> Any:
         {'1': 0.5, 'b': [None, [0, 1]]}
     """
     return _plain(value, ())
+
+
+def now() -> datetime:
+    """The computer's clock; it may be set at any time, so that durations need a monotonic one."""
+    return datetime.fromtimestamp(time.time(), UTC)
+
+
+def now_utc(timespec: str = "microseconds") -> str:
+    """The same as text for time stamps, ISO 8601, UTC."""
+    return now().isoformat(timespec=timespec)
 
 
 def dumps(value: Any, *, indent: int | None = None) -> str:
@@ -82,7 +93,7 @@ def _plain_container(value: Any, parents: tuple[int, ...]) -> Any:
         return [_plain(item, parents) for item in sorted(cast("AbstractSet[Any]", value), key=_repr)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {item.name: _plain(getattr(value, item.name), parents) for item in dataclasses.fields(value)}
-    if isinstance(value, date | time):
+    if isinstance(value, date | time_of_day):
         return value.isoformat()
     return _repr(value)
 

@@ -13,14 +13,14 @@ import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.errors import RecordingError
 from labseq.files import FOR_ALL, read_file, write_shared
-from labseq.plain import parse_object
+from labseq.plain import now_utc, parse_object
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -186,7 +186,7 @@ class Lock:
         self.path = path
         self._lock: BaseFileLock | None = None
         self._about = path.with_name(f"{path.name}.holder")
-        self._holder = Holder(what, Process.current(), datetime.now(UTC).isoformat(timespec="seconds"))
+        self._holder = Holder(what, Process.current(), now_utc("seconds"))
 
     def take(self) -> Holder | None:
         """Take the lock if it is free.

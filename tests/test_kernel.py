@@ -255,6 +255,18 @@ def test_kernels_unused_for_long_are_deleted(package: Package, cache: Path) -> N
     assert not (root / "old").exists()
 
 
+def test_a_clock_that_is_ahead_deletes_no_kernels(
+    package: Package, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package.load()
+    before = {*(cache / "kernels").iterdir()}
+    now_s = time.time()
+    monkeypatch.setattr(time, "time", lambda: now_s + 365 * 86400)
+    monkeypatch.setattr(labseq.kernel, "_CLEANED", set())
+    labseq.kernel._delete_unused(cache / "kernels")
+    assert {*(cache / "kernels").iterdir()} == before
+
+
 def test_a_function_of_a_notebook_is_cached_by_its_code(cache: Path) -> None:
     for factor in (2, 3):
         scope: dict[str, Any] = {"kernel": kernel}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import datetime
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ ORDER: Final = (
 )
 """The stages of a shot in order; unknown ones come last."""
 WRITE: Final = "write"
-"""Name of the stage of writing: from the end of a shot to the event that reports it as written."""
+"""Name of the stage of writing: encoding a shot, and writing its file and its line in the index."""
 
 Quantiles = tuple[float, float]
 
@@ -145,19 +144,12 @@ def _writing_budget_s(run: Run) -> float:
 
 
 def writing_s(run: Run) -> list[float]:
-    """The time to write each attempt at a shot, in seconds of wall time.
-
-    Attempts during which the clock was set back, or that are not in the event log, are left out.
-    """
-    ends = {(shot.index, shot.attempt): shot.row.get("t_end_utc") for shot in (*run.shots, *run.attempts)}
+    """The time to write each attempt at a shot that is in the event log, in seconds."""
     found: list[float] = []
     for event in run.events:
-        if event.get("event") in {"shot_finished", "shot_repeated"}:
-            with suppress(KeyError, TypeError, ValueError):  # a damaged line
-                shot: Mapping[str, Any] = event["values"]["shot"]
-                end = datetime.fromisoformat(str(ends[shot["shot_index"], shot["attempt"]]))
-                found.append((datetime.fromisoformat(event["t_utc"]) - end).total_seconds())
-    return [s for s in found if s >= 0]
+        with suppress(KeyError, TypeError, ValueError, OverflowError):  # another event, or a damaged line
+            found.append(float(event["values"]["write_s"]))
+    return found
 
 
 def quantiles(values: Sequence[float] | NDArray[np.float64]) -> Quantiles:

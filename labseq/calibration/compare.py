@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from labseq.calibration.store import DECIDING, figure_of
 from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationEntry
+from labseq.plain import now
 from labseq.units import format_quantity
 
 _UNITS: Final = ("hz", "m", "px", "rad", "s")
@@ -99,9 +100,14 @@ def _of_figure(name: str, before: float, after: float) -> Difference:
 _DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
 
 
-def age_s(entry: CalibrationEntry) -> float:
-    """Time since a calibration was made, in seconds."""
-    return (datetime.now(UTC) - datetime.fromisoformat(entry.taken_utc)).total_seconds()
+_MAX_SKEW_S: Final = 60.0
+"""The clocks of two computers may differ by so much."""
+
+
+def age_s(entry: CalibrationEntry) -> float | None:
+    """Time since a calibration was made, in seconds; None if this computer's clock is behind that time."""
+    age_s = (now() - datetime.fromisoformat(entry.taken_utc)).total_seconds()
+    return None if age_s < -_MAX_SKEW_S else max(0.0, age_s)
 
 
 def quantity(value: float | None, name: str) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,6 +29,7 @@ from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean, install_hint
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid
 from labseq.pictures.figures import can_draw, encode_figure
+from labseq.plain import now_utc
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
 from labseq.session.chosen import DryRun
@@ -128,7 +128,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         quality=result.quality,
         grid=grid_facts(hardware.grid),
         origin={**_origin(method, request, hardware, run), **result.origin},
-        taken_utc=_now() if run is None else str(run.record["t_start_utc"]),
+        taken_utc=now_utc("seconds") if run is None else str(run.record["t_start_utc"]),
     )
     store = store_of(document, spec, request.dry_run)
     before, (picture, warnings) = _in_use(store, entry), _picture(result)
@@ -266,7 +266,3 @@ def _picture(result: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
     if not can_draw():
         return None, (f"there is no picture: matplotlib is not installed ({install_hint('plot')})",)
     return encode_figure(result.draw, dpi=PICTURE_DPI), ()
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")

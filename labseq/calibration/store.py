@@ -20,7 +20,7 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_file, whole_file
 from labseq.messages import visible
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts, same_grid
-from labseq.plain import parse_object
+from labseq.plain import now_utc, parse_object
 from labseq.units import format_quantity
 
 FORMAT: Final = "labseq-calibration"
@@ -388,7 +388,7 @@ class Store:
         if not force and (reason := self.why_worse(entry)):
             what = f"{entry.kind} {entry.id} is worse than the one in use: {reason}"
             raise ConfigError(Problem(what, hint="use it nevertheless with --force"))
-        self._activate(Activation(entry.kind, entry.id, stored.path.name, _utc_now()))
+        self._activate(Activation(entry.kind, entry.id, stored.path.name, now_utc("seconds")))
 
     def use_none(self, kind: CalibrationKind) -> None:
         """Use no calibration of a kind from now on.
@@ -396,7 +396,7 @@ class Store:
         Raises:
             ConfigError: The folder cannot be written to.
         """
-        self._activate(Activation(kind, "", "", _utc_now()))
+        self._activate(Activation(kind, "", "", now_utc("seconds")))
 
     def why_worse(self, entry: CalibrationEntry) -> str:
         """Why an entry must not replace the one in use; "" if it may. A damaged one is always replaced."""
@@ -462,7 +462,3 @@ class Store:
             what = f"calibrations cannot be stored there: {error.strerror or error}"
             hint = "name another folder with the profile's key 'calibrations'"
             raise ConfigError(Problem(what, str(self.folder), hint=hint)) from error
-
-
-def _utc_now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")

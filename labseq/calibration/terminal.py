@@ -72,7 +72,7 @@ def show_calibration(wanted: str, profile: str, dry_run: DryRun, *, as_json: boo
         *columns(
             [
                 ("calibration", f"{entry.kind} {entry.id}"),
-                ("taken", f"{_time_text(entry.taken_utc)}, {age_text(age_s(entry))} ago"),
+                ("taken", f"{_time_text(entry.taken_utc)}, {age_text(age_s(entry), ' ago')}"),
                 ("in use", "yes" if _is_used(stored, used) else "no"),
                 ("grid", grid_text(entry.grid)),
                 ("file", str(stored.path)),

@@ -202,7 +202,7 @@ def _subject(assembly: Assembly) -> list[tuple[str, str]]:
         *([] if target.is_none else [("target", f"{target.name}, {sites}")]),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
         *(
-            ("calibration", f"{one.kind} {one.id}, {age_text(age_s(one))} old, {quality_text(one)}")
+            ("calibration", f"{one.kind} {one.id}, {age_text(age_s(one), ' old')}, {quality_text(one)}")
             for one in assembly.hardware.calibrations.values()
         ),
         *(("scan", text) for text in _scanned(assembly)),

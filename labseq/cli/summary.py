@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from datetime import datetime
 from typing import Any, Final
 
 from labseq.analysis.scanned import (
@@ -24,6 +23,7 @@ from labseq.model.estimate import mean
 from labseq.plain import to_plain
 from labseq.recording import Run
 from labseq.recording.best import best_point
+from labseq.recording.run_file import RunTime
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
 
@@ -196,19 +196,10 @@ _ENDS: Final = frozenset({"shot_finished", "shot_repeated"})
 
 
 def _wall_time(run: Run) -> str:
-    """Real time until the end of the last shot; of a resumed run, of all its parts together."""
-    times_s = [line.get("t_s") for line in run.events if line.get("event") in _ENDS]
-    total_s, last_s = 0.0, 0.0
-    for t_s in times_s:
-        if isinstance(t_s, int | float):
-            total_s += t_s - last_s if t_s >= last_s else t_s  # each process begins at 0
-            last_s = t_s
-    if not any(times_s):  # the log is lost: the clock may have been set meanwhile
-        ends = [str(shot.row.get("t_end_utc") or "") for shot in (*run.shots, *run.attempts)]
-        try:
-            start = datetime.fromisoformat(str(run.record["t_start_utc"]))
-            last = max(datetime.fromisoformat(text) for text in ends if text)
-        except (KeyError, ValueError, TypeError):  # no shots, or a damaged index
-            return "-"
-        total_s = (last - start).total_seconds()
-    return f"{format_quantity(total_s, 'time')} on the computer's clock"
+    """Time until the end of the last shot; of a resumed run, of all its parts together."""
+    time, until_s = RunTime(), math.nan
+    for line in run.events:
+        time.advance(line.get("t_s"))
+        if line.get("event") in _ENDS and time.total_s:  # 0 only in a damaged log
+            until_s = time.total_s
+    return "-" if math.isnan(until_s) else f"{format_quantity(until_s, 'time')} on the computer's clock"

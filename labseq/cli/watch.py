@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, TextIO
 
@@ -21,7 +20,7 @@ from labseq.files import NewLines
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 from labseq.recording import Run, Shot, open_run
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
-from labseq.recording.run_file import is_index_row, read_state
+from labseq.recording.run_file import RunTime, is_index_row, read_state
 from labseq.roles import RunObserver
 
 POLL_S: Final = 0.5
@@ -72,20 +71,21 @@ class EventReader:
 
     Args:
         run: The run, as it was when it was opened.
-        clock: Seconds since 1970.
+        clock: Monotonic clock in seconds.
     """
 
-    def __init__(self, run: Run, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, run: Run, clock: Callable[[], float] = time.monotonic) -> None:
         self._folder = run.path
         self._clock = clock
         self._events, self._index = NewLines(run.path / EVENTS_FILE), NewLines(run.path / INDEX_FILE)
         self._record = record_of(run)
         self._shots: dict[tuple[int, int], Shot] = {}
-        self._event_s = math.nan
+        self._time, self._read_s = RunTime(), math.nan
 
     def now(self) -> float:
-        """Time of the run in seconds: that of the current event, else that of the clock."""
-        return self._clock() if math.isnan(self._event_s) else self._event_s
+        """Time of the run in seconds: that of the current event, or since the last was read."""
+        waited_s = 0.0 if math.isnan(self._read_s) else self._clock() - self._read_s
+        return self._time.total_s + waited_s
 
     def is_over(self) -> bool:
         """Whether the run or its process has ended."""
@@ -98,15 +98,18 @@ class EventReader:
             RecordingError: The run can no longer be read.
         """
         lines = self._events.read()
+        if not lines:
+            return
+        self._read_s = math.nan
         for row in filter(is_index_row, self._index.read()):  # a shot is in the index before its event
             self._shots[row["shot"], row["attempt"]] = Shot(self._folder / row["file"], row)
         finished = [i for i, line in enumerate(lines) if line.get("event") in _OF_SHOTS]
         to_open = frozenset(finished[-_MAX_OPENED:])
         for i, line in enumerate(lines):
             with suppress(KeyError, TypeError, ValueError, AttributeError):  # a damaged line
-                self._event_s = datetime.fromisoformat(line["t_utc"]).timestamp()
+                self._time.advance(line.get("t_s"))
                 yield from self._events_of(line["event"], line["values"], with_content=i in to_open)
-        self._event_s = math.nan
+        self._read_s = self._clock()
 
     def _events_of(self, name: str, values: dict[str, Any], *, with_content: bool) -> Iterator[Event]:
         if name == "run_starting":

@@ -136,17 +136,19 @@ def clock_time(duration_s: float) -> str:
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
 
 
-def age_text(duration_s: float) -> str:
-    """Write an age in its largest unit.
+def age_text(duration_s: float | None, suffix: str = "") -> str:
+    """Write an age in its largest unit; None for one that the clock does not know.
 
     Example:
-        >>> age_text(90), age_text(3 * 3600), age_text(40 * 86_400)
-        ('1 minute', '3 hours', '40 days')
+        >>> age_text(90), age_text(3 * 3600, " old"), age_text(None, " old")
+        ('1 minute', '3 hours old', "ahead of this computer's clock")
     """
+    if duration_s is None:
+        return "ahead of this computer's clock"
     for unit, unit_s in (("day", 86_400), ("hour", 3600), ("minute", 60)):
         if duration_s >= unit_s:
-            return plural(int(duration_s // unit_s), unit)
-    return plural(max(0, int(duration_s)), "second")
+            return plural(int(duration_s // unit_s), unit) + suffix
+    return plural(int(duration_s), "second") + suffix
 
 
 def size_text(n_bytes: int) -> str:

@@ -22,7 +22,7 @@ from labseq.config.find import find_profile
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import explained, read_file, write_file
 from labseq.messages import visible
-from labseq.plain import dumps, parse_object
+from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Holder, Lock, Process
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.run_file import read_state
@@ -30,7 +30,6 @@ from labseq.roles import RunObserver
 from labseq.session.assembly import assemble
 from labseq.session.check import CheckReport, check
 from labseq.session.options import Options
-from labseq.session.provenance import now_utc
 from labseq.session.session import Session
 from labseq.text_files import MAX_BYTES, decode, read_bytes
 

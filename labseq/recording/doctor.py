@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,7 +27,7 @@ from labseq.files import (
     sync_folder,
     write_file,
 )
-from labseq.plain import dumps, parse_object
+from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Lock, Process
 from labseq.recording import folders
 from labseq.recording.markers import Marker, markers
@@ -478,7 +477,7 @@ def _move_away(what: str, path: Path, folder: Path) -> None:
 
 def _log_move(folder: Path, what: str, path: Path, goal: Path) -> None:
     log = LineLog(_quarantine_of(folder) / LOG_FILE)
-    t_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    t_utc = now_utc("seconds")
     log.append({"t_utc": t_utc, "what": what, "from": str(path), "to": str(goal)}, sync=True)
 
 

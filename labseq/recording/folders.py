@@ -29,6 +29,7 @@ LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
 
 _COUNTER = re.compile(r"\.?(\d{4,})[_.]")
+_DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _MAX_SLUG: Final = 60
 
 
@@ -95,6 +96,15 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
             finally:
                 with contextlib.suppress(OSError):
                     claim.rmdir()
+
+
+def later_day(run_dir: Path) -> str:
+    """The last day in the data folder that has runs, if it is after that of this run; else ""."""
+    own, root = run_dir.parent.name, run_dir.parent.parent
+    with contextlib.suppress(OSError):
+        days = [day.name for day in root.iterdir() if _DAY.fullmatch(day.name) and day.name > own]
+        return max((day for day in days if _counters(root / day)), default="")
+    return ""
 
 
 def _counters(day: Path, *, claims: bool = True) -> list[int]:

@@ -345,6 +345,23 @@ _NEEDED_IN_INDEX: Final = (
 _NOTHING: Final = object()
 
 
+class RunTime:
+    """The time that a run has taken, from the times in its event log, which no change of the clock moves.
+
+    Attributes:
+        total_s: Of all parts of the run together; the time between a part and its resuming is not counted.
+    """
+
+    def __init__(self) -> None:
+        self.total_s = self._last_s = 0.0
+
+    def advance(self, t_s: Any) -> None:
+        """Go on to a line of the event log; each part of the run begins at 0."""
+        if type(t_s) in (int, float) and 0 <= t_s < 1e12:
+            self.total_s += t_s - self._last_s if t_s >= self._last_s else t_s
+            self._last_s = t_s
+
+
 def is_index_row(row: Mapping[str, Any]) -> bool:
     """Whether a line of the index is complete; values that an older minor format lacks may be missing."""
     if not all(isinstance(row.get(name, _NOTHING), kind) for name, kind in _NEEDED_IN_INDEX):

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from labseq.errors import RecordingError
 from labseq.files import LineLog, explained, sync_folder, write_file
 from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
-from labseq.plain import dumps
+from labseq.plain import dumps, now_utc
 from labseq.recording import folders
 from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row, read_run
 
@@ -156,7 +156,7 @@ class RunWriter:
         Raises:
             RecordingError: The disk is full.
         """
-        t_utc = datetime.now(UTC).isoformat(timespec="microseconds")
+        t_utc = now_utc()
         log = LineLog(self.run_dir / folders.SKIPPED_FILE)
         log.append({"shots": list(shots), "why": why, "t_utc": t_utc}, sync=True)
         with explained(self.run_dir):
@@ -176,7 +176,7 @@ class RunWriter:
         A line that cannot be written is lost; the next line says how many were.
         """
         line: dict[str, Any] = {
-            "t_utc": datetime.now(UTC).isoformat(timespec="microseconds"),
+            "t_utc": now_utc(),
             "t_s": round(time.monotonic() - self._began_s, 6),  # whatever happens to the clock
             "event": name,
             "values": values,

@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from enum import Enum
 from functools import partial
 from types import MappingProxyType
@@ -20,6 +19,7 @@ from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
+from labseq.plain import now_utc
 from labseq.roles import RunObserver, Step, StepContext, offers
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of, open_device
 from labseq.sequencer.leader import Emit, LeaderAnswers
@@ -338,7 +338,7 @@ class Sequencer:
         self._states.to(State.SHOT)
         for text in self._watchdog.notes():
             self._emit("warning", {"text": text})
-        record = ShotRecord(index, attempt, self._seed, _utc_now(), parameters=self._parameters)
+        record = ShotRecord(index, attempt, self._seed, now_utc(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
         shot = RunningShot(self.lab, self.guard, record, self._emit, self._timelines)
         failure: LabseqError | None = None
@@ -362,7 +362,8 @@ class Sequencer:
         start_s = time.perf_counter()
         self._sink.write_shot(record)
         host_s = time.perf_counter() - start_s
-        self._emit("shot_repeated" if then == "repeat_shot" else "shot_finished", {"shot": record})
+        event = "shot_repeated" if then == "repeat_shot" else "shot_finished"
+        self._emit(event, {"shot": record, "write_s": host_s})
         self._states.to(State.IDLE)
         self._check_writing_time(shot.stages, host_s)
         return then, record.error
@@ -443,7 +444,7 @@ class Sequencer:
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status
         record.error = "" if error is None else format_error(error)
-        record.t_end_utc = _utc_now()
+        record.t_end_utc = now_utc()
 
     def _report(self, event: str, outcome: Outcome) -> None:
         for name, error in outcome.items():
@@ -454,7 +455,3 @@ class Sequencer:
 
     def _emit(self, name: str, values: Mapping[str, Any]) -> None:
         self._observer.event(name, values)
-
-
-def _utc_now() -> str:
-    return datetime.now(UTC).isoformat(timespec="microseconds")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,6 +12,7 @@ import labseq
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import format_error
+from labseq.plain import now_utc
 from labseq.processes import Lock, knows_no_locks
 from labseq.recording import Run
 from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
@@ -91,7 +91,7 @@ def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
         "plugin": entry.origin,
         "version": version,
         "labseq": labseq.__version__,
-        "t_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "t_utc": now_utc("seconds"),
     }
     return PreparedAnalysis(name, construct_one(chosen, context_of(run, name)), about)
 

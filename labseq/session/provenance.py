@@ -10,7 +10,6 @@ import platform
 import subprocess
 import sys
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +20,7 @@ from labseq.errors import StopRequested
 from labseq.messages import format_error
 from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
+from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
 from labseq.session.assembly import Assembly, Setting
 from labseq.session.options import NOT_SET
@@ -175,8 +175,3 @@ def plugins_of(assembly: Assembly) -> tuple[dict[str, str], ...]:
         for info in assembly.hardware.host.infos
         if info.name in origins
     )
-
-
-def now_utc() -> str:
-    """Wall time, ISO 8601."""
-    return datetime.now(UTC).isoformat(timespec="microseconds")

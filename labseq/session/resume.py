@@ -15,7 +15,7 @@ from labseq.files import LineLog, explained
 from labseq.guard import StopFlag
 from labseq.messages import visible
 from labseq.model import RunRecord
-from labseq.plain import dumps
+from labseq.plain import dumps, now_utc
 from labseq.processes import Lock, knows_no_locks
 from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, find_run
@@ -24,7 +24,7 @@ from labseq.recording.run_file import encode_run, read_owner, read_run, read_sta
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.options import Options
 from labseq.session.profile import RecordedSetup
-from labseq.session.provenance import now_utc, run_record
+from labseq.session.provenance import run_record
 from labseq.session.recorded import stored_text
 from labseq.session.scan_run import scan_run_of
 from labseq.text_files import decode, read_bytes

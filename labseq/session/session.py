@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
 from labseq.guard import Guard, StopFlag, stop_on_signals
-from labseq.messages import error_text
+from labseq.messages import error_text, visible
 from labseq.model import RunRecord, TimelineEntry
 from labseq.recording import Run, RunWriter, Shot, clear_active, data_root, mark_active, open_run
 from labseq.recording.best import best_point
+from labseq.recording.folders import later_day
 from labseq.recording.quantities import make_quantity
 from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
@@ -301,6 +302,11 @@ class Session:
             writer = earlier.reopen(record, next(iter(self.scan_run.shots), None))
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
+        if earlier is None and (day := later_day(writer.run_dir)):
+            text = (
+                f"{visible(str(root))} has runs of {day}: this run is listed before them; is the clock right?"
+            )
+            self._warn(text)
         self._hold(f"the run {writer.run_dir}")
         return record, writer
 

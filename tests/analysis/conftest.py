@@ -31,7 +31,7 @@ def write(tmp_path: Path) -> Write:
             path = writer.write_shot(one)
             assert path.is_file()
             values = {"shot_index": one.shot_index, "attempt": one.attempt}
-            writer.event("shot_finished", shot=values)
+            writer.event("shot_finished", shot=values, write_s=0.02)
         if status != "running":
             writer.finish(status)
         return open_run(writer.run_dir)

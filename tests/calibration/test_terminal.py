@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import time
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -211,3 +213,26 @@ def test_check_lists_what_is_in_use(store: Store, capfd: pytest.CaptureFixture[s
     check_sequence(Path("look.yaml"), None, (), "off", as_json=True)
     (entry,) = json.loads(capfd.readouterr().out)["calibrations"]
     assert (entry["kind"], entry["id"]) == ("overlay", stored.entry.id)
+
+
+@pytest.mark.parametrize(
+    ("taken_s_ago", "age", "check", "age_s"),
+    [
+        (3 * 86400.5, "3 days ago", "3 days old", 3 * 86400.5),
+        (-5.0, "0 seconds ago", "0 seconds old", 0.0),  # the clock of another computer
+        (-86400.0, *["ahead of this computer's clock"] * 2, None),
+    ],
+)
+def test_ages_by_a_clock_that_may_be_behind(
+    store: Store, capfd: Any, monkeypatch: Any, taken_s_ago: float, age: str, check: str, age_s: float | None
+) -> None:
+    stored = add(store)
+    store.use(stored, GRID)
+    now_s = datetime.fromisoformat(stored.entry.taken_utc).timestamp() + taken_s_ago
+    monkeypatch.setattr(time, "time", lambda: now_s)
+    assert f"2026-11-20 08:00 UTC, {age}\n" in call(capfd, "show", stored.entry.id)[1]
+    (listed,) = json.loads(call(capfd, "list", "--json")[1])["calibrations"]
+    assert listed["age_s"] == age_s
+    Path("look.yaml").write_text(SEQUENCE, "utf-8")
+    check_sequence(Path("look.yaml"), None, (), "off", as_json=False)
+    assert f"overlay {stored.entry.id}, {check}, error 20 nm\n" in capfd.readouterr().out

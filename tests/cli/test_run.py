@@ -51,6 +51,8 @@ class FakeSession:
         observer.event("run_starting", {"record": self.record, "run_dir": str(self.run_dir)})
         for shot in self.shots:
             writer.write_shot(shot)
+            line = {"t_s": 1.0 + shot.shot_index, "event": "shot_finished"}
+            writer._events.append(line, sync=False)
             observer.event("shot_finished", {"shot": shot})
         stopped = isinstance(self.error, StopRequested)
         writer.finish(

@@ -84,13 +84,18 @@ def test_ctrl_c_leaves_the_run_alone(watched: WatchedRun) -> None:
 
 
 def test_the_view_learns_what_the_runs_own_view_does(watched: WatchedRun) -> None:
+    """Its times are those of the run, in all its parts, whatever day it is."""
     watched.take(0)
-    reader = EventReader(open_run(watched.writer.run_dir), lambda: 1e10)
+    times_s, path = iter([0.0, 70.0, 5.0]), watched.writer.run_dir / "events.jsonl"  # resumed before the last
+    lines = [json.loads(line) | {"t_s": next(times_s)} for line in path.read_text("utf-8").splitlines()]
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
+    clock_s = iter([500.0, 500.0, 507.0])
+    reader = EventReader(open_run(watched.writer.run_dir), lambda: next(clock_s))
     tally = Tally(reader.now)
     for name, values in reader.read():
         tally.add(name, values)
     assert (tally.n_done, tally.n_defect_free, tally.n_seen, tally.n_shots) == (1, 1, 1, 3)
-    assert reader.now() == 1e10
+    assert (reader.now(), reader.now()) == (75.0, 82.0)  # of the last event, and 7 s later
     assert not reader.is_over()
     assert [*reader.read()] == []
 

@@ -107,9 +107,11 @@ class Interrupting(RecordingObserver):
                 self.session.stop_flag.request()
 
 
-def interrupted(sequence: Path, event: str, n: int, seed: int = 5, **options: Any) -> Path:
+def interrupted(
+    sequence: Path, event: str, n: int, seed: int = 5, kind: type[Interrupting] = Interrupting, **options: Any
+) -> Path:
     """The folder of a run that was stopped at the n-th event, or came to its end before."""
-    observer = Interrupting(event, n)
+    observer = kind(event, n)
     output = sequence.parent / "data"
     with labseq.Session.open(sequence, seed=seed, output=output, observer=observer, **options) as session:
         observer.session = session

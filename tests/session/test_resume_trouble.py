@@ -4,19 +4,36 @@ from __future__ import annotations
 
 import errno
 import os
-from datetime import UTC, datetime, timedelta
+import re
+import time
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import labseq
+from labseq.analysis.timing import writing_s
+from labseq.cli.live import Tally
+from labseq.cli.summary import summary_lines
+from labseq.cli.watch import EventReader
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
 from labseq.session import provenance as recording_of
 from labseq.testing.fakes import RecordingObserver
 
-from .small_runs import Wholes, interrupted, no_git, resumed, stopped, stopped_home, table, wholes, write
+from .small_runs import (
+    Interrupting,
+    Wholes,
+    interrupted,
+    no_git,
+    resumed,
+    stopped,
+    stopped_home,
+    table,
+    wholes,
+    write,
+)
 
 __all__ = ["no_git", "stopped", "stopped_home", "wholes"]
 
@@ -86,25 +103,74 @@ def test_a_folder_that_forbids_writing_is_explained(stopped: Path) -> None:
         stopped.chmod(0o700)
 
 
-def test_a_clock_that_was_set_back_changes_nothing(
-    stopped: Path, wholes: Wholes, monkeypatch: pytest.MonkeyPatch
+DAY_S, YEAR_S = 86400, 31536000
+
+
+def recorded(run: labseq.Run) -> list[Any]:
+    """All that the index and the files of shots hold, apart from time stamps and measured durations."""
+    stamped = {"t_start_utc", "t_end_utc", "sha256", "bytes", "stage_s"}
+    rows = [{name: row[name] for name in row.keys() - stamped} for row in (shot.row for shot in run.shots)]
+    return [*table(run), *rows]
+
+
+@pytest.mark.parametrize(("during_s", "before_s"), [(-DAY_S, 0), (YEAR_S, -DAY_S)])
+def test_a_clock_that_is_set_changes_nothing_but_time_stamps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during_s: int, before_s: int, undisturbed: labseq.Run
 ) -> None:
-    class Yesterday(datetime):
-        @classmethod
-        def now(cls, tz: Any = None) -> Any:
-            return datetime.now(UTC) - timedelta(days=1)
+    """During a run, and before it is resumed."""
+    wall_s, ahead_s = time.time, [0]
+    monkeypatch.setattr(time, "time", lambda: wall_s() + ahead_s[0])
 
-    from labseq.recording import writer
-    from labseq.sequencer import run as sequencing
+    class SettingClock(Interrupting):
+        def event(self, name: str, values: Any) -> None:
+            if (name, values.get("shot")) == ("shot_started", 1):
+                ahead_s[0] = during_s
+            super().event(name, values)
 
-    for module in (recording_of, writer, sequencing):
-        monkeypatch.setattr(module, "datetime", Yesterday)
-    run = resumed(stopped)
-    monkeypatch.undo()
-    assert [shot.index for shot in run.shots] == list(range(6))
-    assert run.shots[3].row["t_start_utc"] < run.shots[2].row["t_start_utc"]
-    assert run.record["resumed"][0]["t_utc"] < run.record["t_start_utc"]
-    assert table(run) == wholes("no scan")
+    run_dir = interrupted(write(tmp_path), "shot_started", 4, kind=SettingClock)
+    ahead_s[0] = before_s
+    run = resumed(run_dir)
+    starts = [datetime.fromisoformat(shot.row["t_start_utc"]).timestamp() for shot in run.shots]
+    assert [round((t_s - starts[0]) / DAY_S) for t_s in starts] == [
+        round(s / DAY_S) for s in (0, 0, during_s, *[before_s] * 3)
+    ]
+    assert recorded(run) == recorded(undisturbed)
+    assert max(writing_s(run)) < DAY_S / 2
+    stamped = ("run ", "wall time ", "resumed ", "warning")
+    shown, expected = (
+        [line for line in summary_lines(each) if not line.startswith(stamped)] for each in (run, undisturbed)
+    )
+    assert shown == expected
+    (wall_time,) = (line for line in summary_lines(run) if line.startswith("wall time "))
+    assert re.fullmatch(r"wall time +[\d.]+ m?s on the computer's clock", wall_time)
+    reader = EventReader(run)
+    tally = Tally(reader.now)
+    for name, values in reader.read():
+        tally.add(name, values)
+    assert 0 <= reader.now() < DAY_S / 2
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GIT_DIR", os.devnull)
+        return resumed(interrupted(write(tmp_path_factory.mktemp("run")), "shot_started", 4))
+
+
+def test_a_run_on_an_earlier_day_than_others_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, sequence = RecordingObserver(), write(tmp_path)
+    monkeypatch.setattr(time, "time", lambda: 1.7e9)
+    for day, number in (("2099-01-01", 3), ("2099-01-02", 0)):
+        (tmp_path / "data" / day / f"{number:04}_x").mkdir(parents=True)
+    (tmp_path / "data" / "2099-01-03").mkdir()  # without runs
+    options: Any = {"seed": 5, "shots": 1, "output": tmp_path / "data", "observer": seen}
+    for _ in range(2):
+        with labseq.Session.open(sequence, **options) as session:
+            session.run()
+    texts = [values["text"] for values in seen.of("warning")]
+    text = f"{tmp_path / 'data'} has runs of 2099-01-02: this run is listed before them; is the clock right?"
+    assert texts == [text] * 2
+    assert [path.name[:4] for path in sorted((tmp_path / "data").glob("2023-11-1*/*"))] == ["0001", "0002"]
 
 
 def test_long_and_foreign_names(tmp_path: Path) -> None:

@@ -457,7 +457,22 @@ def trial(bench: Bench, job: str, chance: random.Random, expected: Any) -> None:
         if (command := next_command(bench, job)) is None:
             break
         bench.run(*command)
+    check_in_the_end(bench, job, expected)
+
+
+def check_in_the_end(bench: Bench, job: str, expected: Any) -> None:
+    """What must hold of a job that was got to its end."""
+    if (command := next_command(bench, job)) is not None:
+        raise BrokenPromiseError(f"not done, however often: {command}")
     bench.run("doctor")
+    report = bench.run("doctor", "--dry-run", "--json")
+    if json.loads(report)["findings"]:
+        raise BrokenPromiseError(f"the doctor leaves damage: {report}")
+    for run_dir in bench.runs():
+        check_committed(run_dir)
+        run = labseq.open_run(run_dir)
+        for shot in (*run.shots, *run.attempts):
+            shot.verify()
     if result(bench, job) != expected:
         raise BrokenPromiseError("the result differs from that of the undisturbed job")
     if on := bench.is_on():
