@@ -321,7 +321,7 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
     finally:
         guard.end()
     warnings = _warnings(points, each) + _judgement_warnings(session, [*rehearsals])
-    warnings += points.warnings.values()
+    warnings += [*points.warnings.values(), *_light_warnings(session, lab)]
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         timeline,
@@ -448,6 +448,26 @@ def _window_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Probl
     if loaded.n_filled < 0.9 * loaded.n_loadings:
         what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings have enough atoms for the target"
         yield -1, document.problem(("target",), what, "a smaller target, or better loading")
+
+
+def _light_warnings(session: Session, lab: Lab) -> Iterator[Problem]:
+    """Imaging light that nothing switches, and light that might harm the camera and is not declared."""
+    hardware = session.assembly.hardware
+    document, lines, gain = hardware.document, hardware.profile.lines, lab.step_context.camera.em_gain
+    takes_image = any(step.takes_image for _, step in session.assembly.steps)
+    others_may = any(step.device_setting or getattr(step, "signal", "") for _, step in session.assembly.steps)
+    is_lit = others_may or any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
+    if takes_image and not is_lit and hardware.chosen["camera"].identities("camera"):
+        what = "nothing of this profile switches the imaging light"
+        hint = "a line for it, with `on: [image]`, under `lines`; see docs/how-to/lines.md"
+        yield document.problem(("camera", "use"), what, hint=hint)
+    for name, channel in {} if lines is None or gain <= 1 else lines.channels.items():
+        is_light = not (channel.triggers or channel.turns_off or "image" in channel.on)
+        if is_light and channel.on and "blinding" not in channel.model_fields_set:
+            kinds = ", ".join(f"`{kind}`" for kind in channel.on)
+            what = f"'{name}' is on during {kinds}, and the camera has an EM gain of {gain:g}"
+            expected = "`blinding: true` if its light could reach the camera, else `blinding: false`"
+            yield document.problem(("lines", "channels", name), what, expected)
 
 
 def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:

@@ -132,15 +132,15 @@ class Acquisition:
         """Expose; refused during an exposure, or a read-out that cannot overlap with the next exposure."""
         require(self._timing.trigger == SOFTWARE and self._timing.runs_till_abort, Code.INVALID_MODE)
         require(self.is_acquiring, Code.IDLE)
-        require(not self._is_busy, Code.ERROR_CODES)
+        require(not self._is_busy(self._clock.now()), Code.ERROR_CODES)
         self._expose()
 
-    def pulse(self) -> bool:
-        """An edge at the trigger input, now; False if it started no exposure, since it came too soon."""
+    def pulse(self, t_s: float) -> bool:
+        """An edge at the trigger input; False if it started no exposure, since it came too soon."""
         is_armed = self.is_acquiring and self._timing.trigger == EXTERNAL and self._n_left > 0
-        if not is_armed or self._is_busy:
+        if not is_armed or self._is_busy(t_s):
             return False
-        self._expose()
+        self._expose(t_s)
         return True
 
     @implements("GetStatus", outputs=1)
@@ -220,17 +220,16 @@ class Acquisition:
                 return
             self._arrive(self._coming.popleft()[1])
 
-    @property
-    def _is_busy(self) -> bool:
-        return self._clock.now() < self._busy_until_s - ROUNDING_S
+    def _is_busy(self, t_s: float) -> bool:
+        return t_s < self._busy_until_s - ROUNDING_S
 
-    def _expose(self) -> None:
+    def _expose(self, t_s: float | None = None) -> None:
         self._n_left -= 1
         if self._faults.missed_triggers > 0:
             self._faults.missed_triggers -= 1
             self._sensor.skip()
             return
-        frame = self._sensor.expose(self._faults.late_s)
+        frame = self._sensor.expose(self._faults.late_s, t_s)
         if frame is None:
             return
         end_s, readout_s = frame.t_start_s + self._timing.exposure_s, self._timing.readout_s

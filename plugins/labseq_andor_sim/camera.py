@@ -65,7 +65,7 @@ class SimulatedCamera:
     ) -> None:
         self.faults = Faults()
         self.sensor = SimulatedSensor(world, clock)
-        self.head = head
+        self.head, self._clock = head, clock
         self._serial = serial
         self.cooler = Cooler(clock, self.faults)
         self.amplifiers = Amplifiers(head)
@@ -110,9 +110,9 @@ class SimulatedCamera:
             return Code.ACQUIRING
         return Code.SUCCESS
 
-    def trigger(self) -> bool:
-        """An edge at the trigger input, now; False if it started no exposure."""
-        return self.acquisition.pulse()
+    def trigger(self, t_s: float | None = None) -> bool:
+        """An edge at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
+        return self.acquisition.pulse(self._clock.now() if t_s is None else t_s)
 
     @implements("GetCapabilities")
     def _get_capabilities(self, capabilities: Any) -> None:

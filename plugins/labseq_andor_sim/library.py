@@ -22,6 +22,7 @@ from labseq.plugin import (
     LabseqError,
     SensorMode,
     offers,
+    trigger_line,
     wait_for,
 )
 from labseq_andor_sim.acquisition import Acquisition
@@ -57,6 +58,7 @@ class SimulatedAndorLibrary(AndorLibrary):
         self.others: list[SimulatedCamera] = []
         self._settings = settings
         self._world = world
+        self._is_wired = trigger_line(context.lines, "camera") is not None
         self._sdk: SimulatedSdk | None = None
 
     def warm(self, em_gain: float) -> None:
@@ -73,6 +75,8 @@ class SimulatedAndorLibrary(AndorLibrary):
         bind(self._name, andor, "simulated", sdk)
         sdk.attach(self.camera, *self.others)
         self._sdk = sdk
+        if self._is_wired:
+            self._world.wire("camera", self.camera.trigger)
         return sdk.indices(self.camera, *self.others)
 
     def disconnect(self) -> None:

@@ -79,7 +79,7 @@ class PylonCamera(CameraDriver):
         acquisition.set_exposure(series.exposure_s)
         trigger = connection.trigger_of(series)
         acquisition.set_trigger(trigger, settings.trigger_line, settings.trigger_edge)
-        connection.arm(series, self._reported["pixel_format"])
+        connection.arm(series, self._reported["pixel_format"], acquisition)
         acquisition.start(series.n_frames)
 
     def _fire(self) -> None:

@@ -50,7 +50,7 @@ class CameraConnection:
         """What starts the camera's exposures in a series."""
         return series.trigger
 
-    def arm(self, series: Series, pixel_format: PixelFormat) -> None:
+    def arm(self, series: Series, pixel_format: PixelFormat, acquisition: Acquisition) -> None:
         """Called before a series starts."""
 
     def fire(self, acquisition: Acquisition) -> None:

@@ -23,7 +23,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Context, DeviceError, ExposureResult, Series, SimulatedSensor, Trigger, wait_for
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    ExposureResult,
+    Series,
+    SimulatedSensor,
+    Trigger,
+    trigger_line,
+    wait_for,
+)
 from labseq_pylon.acquisition import Acquisition
 from labseq_pylon.connection import EMULATION, CameraConnection
 from labseq_pylon.library import Nodes, Sdk
@@ -57,7 +66,8 @@ class EmulatedCamera(CameraConnection):
         self._nodes: Nodes | None = None
         self._bits = 16
         self._trigger: Trigger = "software"
-        self._n_exposed = self._n_due = 0
+        self._n_exposed = self._n_due = self._n_frames = 0
+        self._is_wired = trigger_line(context.lines, "camera") is not None
 
     def warm(self) -> None:
         """Compute what all frames have in common."""
@@ -84,10 +94,10 @@ class EmulatedCamera(CameraConnection):
         return self._shape
 
     def trigger_of(self, series: Series) -> Trigger:
-        """The internal trigger is made by software: the camera would not wait for its pictures."""
-        return "software" if series.trigger == "internal" else series.trigger
+        """The internal trigger and edges of lines are made by software, when there is a picture to take."""
+        return "external" if series.trigger == "external" and not self._is_wired else "software"
 
-    def arm(self, series: Series, pixel_format: PixelFormat) -> None:
+    def arm(self, series: Series, pixel_format: PixelFormat, acquisition: Acquisition) -> None:
         """Get ready for a series, before the camera is started.
 
         The camera's own exposure is as long as that of the series; on a virtual clock it is as short as
@@ -95,7 +105,7 @@ class EmulatedCamera(CameraConnection):
         """
         assert self._nodes is not None
         nodes, self._bits, self._trigger = self._nodes, BITS[pixel_format], series.trigger
-        self._n_exposed = self._n_due = 0
+        self._n_exposed, self._n_due, self._n_frames = 0, 0, series.n_frames
         for number in range(series.n_frames):
             self._path(number).touch()
         nodes.get("image file", "ImageFilename").SetValue(str(self._path(0).parent))
@@ -103,12 +113,16 @@ class EmulatedCamera(CameraConnection):
         node = nodes.get("exposure", "ExposureTimeAbs")
         own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
         node.SetValue(node.Min if self._clock.virtual else own_us)
+        if series.trigger == "external":
+            self._world.wire("camera", lambda t_s: self.fire(acquisition, t_s))
         self._sensor.arm(series, self._mode, self._readout_s, arm_s=self._settings.arming_time)
 
-    def fire(self, acquisition: Acquisition) -> None:
-        """Expose on the session's clock, write the picture to the next file, and trigger the camera."""
+    def fire(self, acquisition: Acquisition, t_s: float | None = None) -> None:
+        """Expose, now or at ``t_s`` of the clock, write the picture to the next file, and trigger it."""
+        if self._n_exposed == self._n_frames:
+            return
         acquisition.wait_until_ready()
-        frame = self._sensor.expose()
+        frame = self._sensor.expose(t_start_s=t_s)
         if frame is not None:
             self._path(self._n_exposed).write_bytes(tiff(self._picture(frame.image)))
             self._n_exposed += 1
@@ -116,7 +130,7 @@ class EmulatedCamera(CameraConnection):
 
     def wait(self, acquisition: Acquisition, timeout_s: float) -> ExposureResult | None:
         """Wait on the session's clock until the next frame is due, then in real time until it has come."""
-        if self._trigger == "external":  # no line is connected to the emulated camera
+        if self._trigger == "external" and not self._is_wired:
             return super().wait(acquisition, timeout_s)
         if self._trigger == "internal" and self._n_exposed == self._n_due:
             self.fire(acquisition)
@@ -132,6 +146,7 @@ class EmulatedCamera(CameraConnection):
 
     def clear(self) -> None:
         """Forget the series."""
+        self._n_frames = self._n_exposed
         self._sensor.clear()
 
     @contextmanager

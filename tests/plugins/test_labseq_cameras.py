@@ -125,6 +125,22 @@ def test_an_external_trigger_that_never_comes_is_a_timeout(driver: str) -> None:
         lab.clock.stop = type(lab.clock.stop)()
 
 
+def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure(driver: str) -> None:
+    with opened_rig(driver, is_wired=True) as lab:
+        for _ in range(2):
+            lab.camera.arm(2, 0.01, "external")
+            start_s = lab.clock.now()
+            lab.world.edge(start_s + 0.002)
+            lab.world.edge(start_s + 0.1)
+            frames = [lab.camera.read(1.0) for _ in range(2)]
+            assert [frame.t_start_s - start_s for frame in frames] == pytest.approx([0.002, 0.1])
+            assert lab.clock.now() - start_s == pytest.approx(0.11 + lab.camera.facts.readout_s)
+            assert_shown(frames, lab)
+            lab.world.edge(lab.clock.now())
+            assert_shown(frames, lab)
+            del lab.world.shown[:]
+
+
 def test_two_simulated_cameras_work_side_by_side(driver: str) -> None:
     with opened_rig(driver, sensor_shape=(64, 64)) as one, opened_rig(driver, sensor_shape=(32, 96)) as other:
         for lab in (one, other, one):

@@ -67,22 +67,6 @@ def test_on_a_real_clock_it_runs_freely_and_shows_no_more_than_was_armed() -> No
         assert_shown(lab.take(1), lab)
 
 
-def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure() -> None:
-    with rig(is_wired=True, readout="5 ms") as lab:
-        for _ in range(2):
-            lab.camera.arm(2, 0.01, "external")
-            start_s = lab.clock.now()
-            lab.world.edge(start_s + 0.002)
-            lab.world.edge(start_s + 0.1)
-            frames = [lab.camera.read(1.0) for _ in range(2)]
-            assert [frame.t_start_s - start_s for frame in frames] == pytest.approx([0.002, 0.1])
-            assert lab.clock.now() - start_s == pytest.approx(0.115)
-            assert_shown(frames, lab)
-            lab.world.edge(lab.clock.now())
-            assert_shown(frames, lab)
-            del lab.world.shown[:]
-
-
 @settings(max_examples=4)
 @given(sensor=sensors(tuple(name for name in FORMATS if name != "Mono14")))
 def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]) -> None:
