@@ -25,14 +25,22 @@ from labseq.files import read_file, whole_file
 from labseq.plain import plain_text
 from labseq.recording import folders, schema
 from labseq.recording.columns import columns_of
-from labseq.recording.hdf5 import link_name, load_filter, set_attributes
+from labseq.recording.hdf5 import (
+    check_attributes,
+    copy_attributes,
+    link_name,
+    load_filter,
+    read_attributes,
+    set_attributes,
+    text_array,
+)
 from labseq.recording.reader import Run
 from labseq.recording.shot import Shot
-from labseq.recording.shot_file import read_content
+from labseq.recording.shot_file import opened, read_content
 from labseq.recording.tables import facts_of
 
 FORMAT: Final = "labseq-archive"
-FORMAT_VERSION: Final = "3.0"
+FORMAT_VERSION: Final = "4.0"
 
 MAX_COPY: Final = 1 << 30
 """Largest file of the run's folder that is copied, in bytes."""
@@ -54,9 +62,12 @@ def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
     """
     left_out: list[str] = []
     with whole_file(path) as part, h5py.File(Path(part.name), "w", libver=schema.LIBRARY_VERSIONS) as file:
-        formats = {"format": FORMAT, "format_version": FORMAT_VERSION}
+        formats = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "archived_by": f"labseq {labseq.__version__}",
+        }
         set_attributes(file, {**facts_of(run), **formats, "NX_class": "NXroot", "default": "table"})
-        file.attrs["archived_by"] = f"labseq {labseq.__version__}"
         _write_table(file.create_group("table"), run)
         left_out += _write_files(file.create_group("run"), run.path)
         shots = _Shots(file.create_group("shots"), frames=frames)
@@ -70,15 +81,12 @@ def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
 
 
 def _write_table(group: h5py.Group, run: Run) -> None:
-    set_attributes(group, {"NX_class": "NXdata", "signal": "filling_fraction"})
-    group.attrs["axes"] = ["shot"]
+    set_attributes(group, {"NX_class": "NXdata", "signal": "filling_fraction", "axes": ["shot"]})
     names: list[str] = []
     for column in columns_of(run):
         names.append(link_name(column.name, names))
-        values, dtype = column.values, column.values.dtype
-        if dtype.kind == "O":
-            values, dtype = list(map(plain_text, values)), h5py.string_dtype()
-        dataset = group.create_dataset(names[-1], data=values, dtype=dtype)
+        values = text_array(column.values.tolist()) if column.values.dtype.kind == "O" else column.values
+        dataset = group.create_dataset(names[-1], data=values)
         set_attributes(dataset, {"units": column.units, "description": column.description})
 
 
@@ -104,7 +112,7 @@ def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
     if text is None:
         dataset = group.create_dataset(name, data=np.frombuffer(data, np.uint8))
     else:
-        dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype())
+        dataset = group.create_dataset(name, data=text_array(text))
     set_attributes(dataset, {"units": "", "description": "this file of the run's folder"})
 
 
@@ -123,25 +131,28 @@ class _Shots:
             RecordingError: Its frames are compressed and the package for it is missing.
         """
         read_content(shot.file)  # refuses what would lead out of the file
+        with opened(shot.file) as entry:
+            check_attributes(entry.file)
         with h5py.File(shot.file, "r", locking=False) as source:
             entry: Any = source["entry"]
             for camera in entry.get("camera", {}).values() if self._frames else ():
                 load_filter(shot.file, camera["frames"])
             made = self._group.create_group(shot.file.stem)
-            made.attrs.update(entry.attrs)
+            copy_attributes(entry, made)
             for name in entry:
                 if name in _SHARED:
                     self._share(entry[name], made, name)
                 elif self._frames or name != "images_view":
                     _copy(entry, made, name, frames=self._frames)
             if "images_view" not in made:
-                made.attrs["default"] = "detection"
+                del made.attrs["default"]
+                set_attributes(made, {"default": "detection"})
 
     def _share(self, source: Any, made: Any, name: str) -> None:
         content = {
             key: str(value[()]) if value.ndim == 0 else value[()].tobytes() for key, value in source.items()
         }
-        content |= {f"@{key}": str(value) for key, value in source.attrs.items()}
+        content |= {f"@{key}": repr(value) for key, value in read_attributes(source).items()}
         if self._shared.get(name, (None,))[0] != content:
             source.file.copy(source, made, name)
             self._shared[name] = content, made[name]
@@ -159,7 +170,7 @@ def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
     node = source[name]
     if isinstance(node, h5py.Group):
         group = made.create_group(name)
-        group.attrs.update(node.attrs)
+        copy_attributes(node, group)
         for inner in node.keys():  # noqa: SIM118 - the names in this group, all text
             _copy(node, group, inner, frames=frames)
         return
@@ -169,6 +180,6 @@ def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
     is_compressed = node.id.get_create_plist().get_nfilters() > 0
     if node.dtype.kind != "O" and (node.nbytes >= _WORTH_PACKING or is_compressed):
         chunks = (1, *node.shape[1:]) if is_image else True
-        made.create_dataset(name, data=node[()], chunks=chunks, **_PACKED).attrs.update(node.attrs)
+        copy_attributes(node, made.create_dataset(name, data=node[()], chunks=chunks, **_PACKED))
     else:
         source.file.copy(node, made, name)

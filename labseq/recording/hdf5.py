@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import mmap
-import re
-import struct
 from collections.abc import Container, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -17,30 +14,97 @@ from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t  # pyright: ignore[reportAttr
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.files import open_ordinary
 from labseq.messages import install_hint
 from labseq.plain import dumps, parse_value, plain_text, to_plain
 from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
 
-_STRING: Final = h5py.string_dtype()
-_STRING_TYPE: Final = h5t.py_create(_STRING, logical=True)
 _SCALAR: Final = h5s.create(h5s.SCALAR)
+_MAX_ATTRIBUTE: Final = 60_000
+"""Most bytes of an attribute's texts; HDF5 takes 64 KiB. Longer texts are cut."""
+
+
+def text_array(texts: str | Sequence[str], max_bytes: int = 1 << 31) -> NDArray[Any]:
+    """Texts as an array of bytes of one length, UTF-8; those longer than ``max_bytes`` are cut.
+
+    Texts of variable length would be in a part of the file that HDF5 reads for ever if it is damaged.
+    """
+    several = [texts] if isinstance(texts, str) else texts
+    data = [plain_text(text).encode() for text in several]
+    data = [
+        one if len(one) <= max_bytes else one[:max_bytes].decode(errors="ignore").encode() for one in data
+    ]
+    kind = h5py.string_dtype("utf-8", max(map(len, data), default=1) or 1)
+    return np.array(data[0] if isinstance(texts, str) else data, kind)
 
 
 def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
-    """Add new attributes to a group or dataset; characters that HDF5 cannot store are replaced."""
+    """Add new attributes to a group or dataset: numbers, texts and lists of texts."""
     for name, value in values.items():  # node.attrs[name] = value takes twice the time
-        if isinstance(value, str):
-            _add_text(node, name, np.array(plain_text(value), _STRING), _SCALAR)
-        elif isinstance(value, np.generic):
-            kind = h5t.py_create(value.dtype, logical=True)
-            h5a.create(node.id, name.encode(), kind, _SCALAR).write(np.asarray(value))
-        else:
-            node.attrs[name] = value
+        is_text = isinstance(value, str | list | tuple)
+        array = _text_attribute(value) if is_text else np.asarray(value)
+        _add(node, name, array)
 
 
-def _add_text(node: Any, name: str, text: Any, space: Any) -> None:
-    h5a.create(node.id, name.encode(), _STRING_TYPE, space).write(text)
+def _add(node: Any, name: str, array: NDArray[Any]) -> None:
+    kind = h5t.py_create(array.dtype, logical=True)
+    space = h5s.create_simple(array.shape) if array.shape else _SCALAR
+    h5a.create(node.id, name.encode(), kind, space).write(array, mtype=kind)
+
+
+def _text_attribute(texts: Any) -> NDArray[Any]:
+    return text_array(texts, _MAX_ATTRIBUTE // (1 if isinstance(texts, str) else max(1, len(texts))))
+
+
+def read_attribute(node: Any, name: str, default: Any = None) -> Any:
+    """Read an attribute: a number, a text or a list of texts; ``default`` where there is none.
+
+    Raises:
+        ValueError: It has a type that labseq does not use.
+    """
+    if not h5a.exists(node.id, name.encode()):
+        return default
+    array = _read(h5a.open(node.id, name.encode()))
+    if array.dtype.kind == "S":
+        return [text.decode() for text in array.tolist()] if array.shape else array.item().decode()
+    return array.tolist()
+
+
+def read_attributes(node: Any) -> dict[str, NDArray[Any]]:
+    """All attributes of a group or dataset, texts as bytes."""
+    opened = (h5a.open(node.id, index=i) for i in range(h5a.get_num_attrs(node.id)))
+    return {attribute.name.decode(): _read(attribute) for attribute in opened}
+
+
+def copy_attributes(source: Any, goal: Any) -> None:
+    """Copy the attributes of a group or dataset."""
+    for name, array in read_attributes(source).items():
+        _add(goal, name, array)
+
+
+def check_attributes(file: Any) -> None:
+    """Refuse attributes that cannot be read.
+
+    Raises:
+        ValueError: One has a type that labseq does not use.
+    """
+    names = ["/"]
+    file.visit(names.append)
+    for name in names:
+        read_attributes(file[name])
+
+
+def _read(attribute: Any) -> NDArray[Any]:
+    kind, place = (
+        attribute.get_type(),
+        f"the attribute '{attribute.name.decode('utf-8', 'backslashreplace')}'",
+    )
+    _check_type(kind, place)
+    n_bytes = math.prod(attribute.shape) * kind.get_size()
+    if n_bytes >= 1 << 16:
+        raise ValueError(f"{place} declares {n_bytes} bytes, more than an attribute can have")
+    array = np.empty(attribute.shape, attribute.dtype)
+    attribute.read(array, mtype=kind)
+    return array
 
 
 def write_fields(node: Any, fields: Sequence[Field], record: Any) -> None:
@@ -51,20 +115,16 @@ def write_fields(node: Any, fields: Sequence[Field], record: Any) -> None:
 def _attribute(field: Field, value: Any) -> Any:
     if field.dtype == "integer":
         return np.int64(value) if -(2**63) <= value < 2**63 else str(value)
-    if field.dtype == "texts":
-        return np.array(list(map(plain_text, value)), _STRING)
     return value if field.dtype == "text" else np.dtype(field.dtype).type(value)
 
 
 def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
     """Read attributes: attribute of the record -> plain value; those of a newer minor format are ignored."""
     found: dict[str, Any] = {}
-    for field in (field for field in fields if field.name in node.attrs):
-        value: Any = node.attrs[field.name]
-        if isinstance(value, np.generic):
-            value = value.item()
-        elif field.dtype == "texts":
-            value = tuple(value)
+    for field in fields:
+        value = read_attribute(node, field.name, found)
+        if value is found:
+            continue
         value = int(value) if field.dtype == "integer" else value
         if not isinstance(value, _KINDS[field.dtype]):
             raise TypeError(f"'{field.name}' is {type(value).__name__}; expected {field.dtype}")
@@ -72,15 +132,15 @@ def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
     return found
 
 
-_KINDS: Final = {"text": str, "texts": tuple, "integer": int, "int64": int, "bool": bool, "float64": float}
+_KINDS: Final = {"text": str, "integer": int, "int64": int, "bool": bool, "float64": float}
 
 
 def write_texts(group: Any, fields: Sequence[Field], record: Any) -> None:
     """Add a dataset of text or JSON for each field of a record."""
     for field in fields:
         value = field.value(record)
-        text = dumps(value) if field.dtype == "json" else plain_text(value)
-        dataset = group.create_dataset(field.name, data=text, dtype=_STRING)
+        text = dumps(value) if field.dtype == "json" else value
+        dataset = group.create_dataset(field.name, data=text_array(text))
         kind = "application/json" if field.dtype == "json" else "text/plain"
         set_attributes(dataset, {"content_type": kind, "units": "", "description": field.description})
 
@@ -102,8 +162,8 @@ def write_values(group: Any, values: Mapping[str, Any], units: Mapping[str, str]
         if _is_numeric(value):
             dataset = group.create_dataset(names[-1], data=value)
         else:
-            text = plain_text(value) if isinstance(value, str) else dumps(value)
-            dataset = group.create_dataset(names[-1], data=text, dtype=_STRING)
+            text = value if isinstance(value, str) else dumps(value)
+            dataset = group.create_dataset(names[-1], data=text_array(text))
             facts["content_type"] = "text/plain" if isinstance(value, str) else "application/json"
         set_attributes(dataset, facts)
 
@@ -119,12 +179,12 @@ def read_values(group: Any) -> dict[str, Any]:
     """Read what :func:`write_values` wrote."""
     found: dict[str, Any] = {}
     for dataset in group.values():
-        kind, value = dataset.attrs.get("content_type"), dataset[()]
+        kind, value = read_attribute(dataset, "content_type"), dataset[()]
         if kind is None:
             value = value.tolist()
         else:
             value = parse_value(value) if kind == "application/json" else value.decode()
-        found[str(dataset.attrs["address"])] = value
+        found[str(read_attribute(dataset, "address"))] = value
     return found
 
 
@@ -138,40 +198,28 @@ def write_array(group: Any, path: str, values: Any, units: str | None = None) ->
 
 def describe(dataset: Any, what: Dataset, units: str | None = None) -> None:
     """Add the attributes for the description, the unit and the axes of a dataset."""
-    set_attributes(
-        dataset, {"units": what.units if units is None else units, "description": what.description}
-    )
-    labels, space = _texts(what.axes)
-    _add_text(dataset, "DIMENSION_LABELS", labels, space)
-
-
-@cache
-def _texts(axes: str) -> tuple[Any, Any]:
-    names = np.array(axes.split(", "), _STRING)
-    return names, h5s.create_simple(names.shape)
+    units = what.units if units is None else units
+    set_attributes(dataset, {"units": units, "description": what.description, "dimensions": what.axes})
 
 
 def write_table(group: Any, table: Table, rows: NDArray[Any], name: str = "") -> None:
     """Add a table of the schema under ``name``, else the last part of its path."""
     dataset = group.create_dataset(name or table.path.rpartition("/")[2], data=rows)
-    of_columns = _of_known_columns(table) if table.columns else _of_columns(rows.dtype, table)
-    units, descriptions, space = of_columns
-    _add_text(dataset, "units", units, space)
-    _add_text(dataset, "descriptions", descriptions, space)
+    units, descriptions = _of_known_columns(table) if table.columns else _of_columns(rows.dtype, table)
+    _add(dataset, "units", units)
+    _add(dataset, "descriptions", descriptions)
     set_attributes(dataset, {"description": table.description})
 
 
 @cache  # the same for all shots
-def _of_known_columns(table: Table) -> tuple[Any, Any, Any]:
+def _of_known_columns(table: Table) -> tuple[NDArray[Any], NDArray[Any]]:
     return _of_columns(np.dtype([(column.name, "?") for column in table.columns]), table)
 
 
-def _of_columns(dtype: np.dtype[Any], table: Table) -> tuple[Any, Any, Any]:
-    """Units and descriptions of the columns as arrays of text, and their shape."""
-    units, descriptions = (
-        np.array(list(map(plain_text, texts)), _STRING) for texts in describe_columns(dtype, table)
-    )
-    return units, descriptions, h5s.create_simple(units.shape)
+def _of_columns(dtype: np.dtype[Any], table: Table) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Units and descriptions of the columns."""
+    units, descriptions = map(_text_attribute, describe_columns(dtype, table))
+    return units, descriptions
 
 
 MAX_OBJECTS: Final = 10_000
@@ -183,33 +231,6 @@ _FILTERS: Final = frozenset({1, 2, 3, 32000, 32001, 32004, 32008, 32015, 32026})
 _MAX_RATIO: Final = 64
 """By how much frames can be compressed."""
 _SMALL: Final = 1 << 24
-
-
-_HEAP: Final = re.compile(rb"GCOL\x01\x00\x00\x00")
-
-
-def check_heaps(path: Path) -> None:
-    """Refuse a file whose texts libhdf5 (1.14) would read for ever.
-
-    Texts of variable length are in "global heap collections" (HDF5 file format specification 3.0, III.E):
-    "GCOL", version 1, three zeros, size, and the objects, each with index, reference count, size and data.
-    Index 0 is free space, and if its size is damaged to 0, libhdf5 never comes to the next object.
-
-    Raises:
-        ValueError: A collection is damaged.
-        OSError: The file cannot be read, or is not an ordinary one.
-    """
-    with open_ordinary(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for start in (match.start() for match in _HEAP.finditer(data)):  # faster than find() of an mmap
-            end = start + int.from_bytes(data[start + 8 : start + 16], "little")
-            at = start + 16
-            while at + 16 <= end <= len(data):
-                index, n_bytes = struct.unpack_from("<H6xQ", data, at)
-                at += 16 + -(-n_bytes // 8) * 8 if index else n_bytes
-                if not index and n_bytes < 16:
-                    break
-            if not end - 16 < at <= end <= len(data):
-                raise ValueError(f"its texts are damaged at byte {at}")
 
 
 def check_contents(file: Any, n_bytes: int, only: str = "") -> None:
@@ -276,7 +297,11 @@ def _declared_bytes(dataset: Any, place: str, n_bytes: int) -> int:
 
 
 def _check_type(kind: Any, place: str) -> None:
-    """Refuse types that refer to other places or can repeat them: references, and sequences of any length."""
+    """Refuse types that labseq does not use.
+
+    References and sequences lead elsewhere in the file, or to the same place many times. Texts of variable
+    length are read by HDF5 without an end if the part of the file that holds them is damaged.
+    """
     if isinstance(kind, h5t.TypeCompoundID):
         for i in range(kind.get_nmembers()):
             _check_type(kind.get_member_type(i), place)
@@ -284,6 +309,8 @@ def _check_type(kind: Any, place: str) -> None:
         _check_type(kind.get_super(), place)
     elif not isinstance(kind, h5t.TypeIntegerID | h5t.TypeFloatID | h5t.TypeStringID | h5t.TypeEnumID):
         raise ValueError(f"{place} has a type that labseq does not use")  # noqa: TRY004 - of the file
+    elif isinstance(kind, h5t.TypeStringID) and kind.is_variable_str():
+        raise ValueError(f"{place} is a text of variable length, which labseq does not use")
 
 
 def link_name(name: str, taken: Container[str]) -> str:

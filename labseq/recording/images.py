@@ -63,13 +63,15 @@ def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, s
     Raises:
         RecordingError: No shot has them, or files are damaged.
     """
+    from labseq.recording.hdf5 import read_attribute  # h5py takes 0.1 s to import
+
     signals, thresholds, unit = list[Any](), list[Any](), ""
     for entry, index in _entries(shots, image):
         found = entry["detection"]
         if "signal" in found and "threshold" in found:
             signals.append(found["signal"][index])
             thresholds.append(found["threshold"][()])
-            unit = str(found["signal"].attrs["units"])
+            unit = str(read_attribute(found["signal"], "units"))
     if not signals:
         raise _nothing(shots, "signal of the detector", image)
     return np.array(signals), np.array(thresholds), unit

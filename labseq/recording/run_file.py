@@ -37,7 +37,8 @@ SHOT_FILE: Final = re.compile(SHOTS_FOLDER + r"/shot_\d{6,}(\.attempt_\d+)?(\.ta
 
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 
-_READ_BY: Final = {1: "labseq 0.1.0", 2: "the development version of labseq 0.2.0 that wrote it"}
+_DEVELOPED: Final = "the development version of labseq 0.2.0 that wrote it"
+_READ_BY: Final = {1: "labseq 0.1.0", 2: _DEVELOPED, 3: _DEVELOPED}
 """Older major version of the format -> the labseq that reads it."""
 _MAX_TEXT: Final = 80
 _MAX_DEPTH: Final = 4

@@ -35,11 +35,11 @@ from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.plain import plain_text
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "3.0"
+FORMAT_VERSION: Final = "4.0"
 """major.minor; a newer minor version only adds things, another major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
-RUN_FORMAT_VERSION: Final = "3.0"
+RUN_FORMAT_VERSION: Final = "4.0"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
 """HDF5 features that files may use; these are read by the most programs."""
@@ -70,7 +70,7 @@ class Field:
 
     Attributes:
         name: Name of the attribute, dataset or column in the file.
-        dtype: numpy's name of its type, "text" (UTF-8), "texts", "json", or "integer" (text beyond 64 bits).
+        dtype: numpy's name of its type, "text" (UTF-8), "json", or "integer" (text beyond 64 bits).
         description: What it is.
         source: Attribute of the record that it is read from, dotted, if it is not ``name``; or a
             function of the record.
@@ -208,7 +208,6 @@ RUN: Final = (
     Field("record_frames", "text", "which frames are kept: all, last or none"),
     Field("target", "text", "name of the target pattern", "target.name"),
     Field("lattice", "text", "lattice of the grid"),
-    Field("steps", "texts", "names of the steps of a shot, in order"),
     Field("grid_spacing_m", "float64", "spacing of the sites, in m"),
     Field("sequence_sha256", "text", "SHA-256 of the sequence file"),
     Field("profile_sha256", "text", "SHA-256 of the hardware profile"),
@@ -218,6 +217,7 @@ RUN: Final = (
 RUN_TEXTS: Final = (
     Field("sequence", "text", "the sequence file", "sequence_text"),
     Field("profile", "text", "the hardware profile", "profile_text"),
+    Field("steps", "json", "names of the steps of a shot, in order"),
     Field("resolved", "json", "every setting after defaults and overrides, SI"),
     Field(
         "overrides", "json", "what --set and other options changed: address -> value, SI; unit; as written"
@@ -587,7 +587,7 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
 EVERYWHERE: Final[Mapping[str, str]] = {
     "units": "unit of the numbers, SI, px, adu or the detector's, empty for none; of a table that of each "
     "column",
-    "DIMENSION_LABELS": "arrays only: name of each axis (`dims[0].label` in h5py)",
+    "dimensions": "arrays only: names of the axes",
     "description": "what the dataset is",
     "descriptions": "tables only: what each column is",
     "content_type": "texts only: application/json or text/plain",

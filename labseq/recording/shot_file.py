@@ -22,10 +22,10 @@ from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, StageTiming,
 from labseq.recording import schema
 from labseq.recording.hdf5 import (
     check_contents,
-    check_heaps,
     describe,
     link_name,
     load_filter,
+    read_attribute,
     read_fields,
     read_texts,
     read_values,
@@ -244,7 +244,7 @@ def iter_frames(path: Path) -> Generator[tuple[int, Frame]]:
             stack = group["frames"]
             load_filter(path, stack)
             values = schema.EXPOSURES.arguments(Frame, group["exposures"][()])
-            camera = str(group.attrs["name"])
+            camera = str(read_attribute(group, "name"))
             for i, (index, known) in enumerate(zip(group["image"][()], values, strict=True)):
                 image = stack[i]
                 image.flags.writeable = False
@@ -273,12 +273,11 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
     if not path.is_file():
         raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
     try:
-        check_heaps(path)
         # A finished file never changes, and locks fail on network folders.
         with h5py.File(path, "r", locking=False) as file:
-            if file.attrs.get("format") != schema.FORMAT:
+            if read_attribute(file, "format") != schema.FORMAT:
                 raise RecordingError(path, "is not a shot's file of labseq")
-            check_version(path, str(file.attrs.get("format_version")), schema.FORMAT_VERSION)
+            check_version(path, str(read_attribute(file, "format_version")), schema.FORMAT_VERSION)
             check_contents(file, path.stat().st_size, only)
             yield cast("Any", file["entry"])
     except RecordingError:
@@ -327,4 +326,6 @@ def _detector(group: Any) -> dict[str, Any]:
         for argument, name in (("thresholds", "threshold"), ("sites_px", "sites_px"))
         if name in group
     }
-    return found | ({"signal_unit": group["threshold"].attrs["units"]} if "threshold" in group else {})
+    return found | (
+        {"signal_unit": read_attribute(group["threshold"], "units")} if "threshold" in group else {}
+    )

@@ -172,7 +172,7 @@ def shot_of_another_run(run_dir: Path) -> None:
     path = run_dir / "shots" / "shot_000001.h5"
     lost_line(run_dir)
     with h5py.File(path, "r+") as file:
-        file["entry/run"].attrs["run_id"] = "2020-01-01/0001_other"
+        file["entry/run"].attrs["run_id"] = np.bytes_(b"2020-01-01/0001_other")
 
 
 def misnamed_shot(run_dir: Path) -> None:

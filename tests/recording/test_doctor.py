@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
@@ -139,7 +140,7 @@ def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> 
     assert later.name == "shot_000001.take_2.h5"
     with h5py.File(later, "r+") as file:
         run_id = json.loads((run_dir / "run.json").read_text("utf-8"))["run_id"]
-        file["entry/run"].attrs["run_id"] = run_id
+        file["entry/run"].attrs["run_id"] = np.bytes_(run_id.encode())
     rows = [json.loads(line) for line in (run_dir / "index.jsonl").read_bytes().splitlines()]
     rows[-1]["sha256"] = hashlib.sha256(later.read_bytes()).hexdigest()
     (run_dir / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
@@ -218,7 +219,7 @@ def test_a_run_file_that_cannot_be_read_is_left(run_dir: Path, content: bytes) -
 def test_a_shot_of_a_newer_labseq_is_left(run_dir: Path) -> None:
     lost_line(run_dir)
     with h5py.File(run_dir / "shots" / "shot_000001.h5", "r+") as file:
-        file.attrs["format_version"] = "4.0"
+        file.attrs["format_version"] = np.bytes_(b"5.0")
     (found,) = examine(run_dir).findings
     assert found.left
     assert "update labseq" in found.done

@@ -130,7 +130,7 @@ def test_an_archive_holds_what_the_files_hold(run: Run, tmp_path: Path, frames: 
                     np.testing.assert_array_equal(copy["images_view/frames"], entry["images_view/frames"])
                 else:
                     assert "images_view" not in copy
-                    assert copy.attrs["default"] == "detection"
+                    assert copy.attrs["default"] == b"detection"
 
 
 def test_an_archive_needs_nothing_else(run: Run, tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_an_archive_holds_the_files_of_the_run(run: Run, tmp_path: Path) -> None
         assert files["calibration_sites.json"][()].decode() == '{"kind": "sites", "µ": 1}\n'
         assert files["odd.bin"][()].tobytes() == b"\xff\0"
         assert files["analysis/fits.jsonl"][()] == b'{"shot": 0}\n'
-        assert archive.attrs["format"] == "labseq-archive"
+        assert archive.attrs["format"] == b"labseq-archive"
 
 
 def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_path: Path) -> None:

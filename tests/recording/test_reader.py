@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 
 from labseq.errors import RecordingError
@@ -171,30 +172,30 @@ def test_a_damaged_target_is_explained(run_dir: Path) -> None:
 
 
 def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
-    rewrite_json(run_dir / "run.json", format_version="3.9")  # a newer minor version only adds things
+    rewrite_json(run_dir / "run.json", format_version="4.9")  # a newer minor version only adds things
     open_run(run_dir)
-    rewrite_json(run_dir / "run.json", format_version="4.0")
+    rewrite_json(run_dir / "run.json", format_version="5.0")
     with pytest.raises(
-        RecordingError, match=r"has format version 4\.0, this labseq reads 3\.0; update labseq"
+        RecordingError, match=r"has format version 5\.0, this labseq reads 4\.0; update labseq"
     ):
         open_run(run_dir)
     rewrite_json(run_dir / "run.json", format_version="1.3")
-    with pytest.raises(RecordingError, match=r"format version 1\.3, .* 3\.0; use labseq 0\.1\.0 to read it"):
+    with pytest.raises(RecordingError, match=r"format version 1\.3, .* 4\.0; use labseq 0\.1\.0 to read it"):
         open_run(run_dir)
 
 
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"format_version": "4.0"}, r"has format version 4\.0, this labseq reads 3\.0; update labseq"),
-        ({"format_version": "x"}, "has the format version 'x'; expected one like 3.0"),
+        ({"format_version": "5.0"}, r"has format version 5\.0, this labseq reads 4\.0; update labseq"),
+        ({"format_version": "x"}, "has the format version 'x'; expected one like 4.0"),
         ({"format": "nexus"}, "is not a shot's file of labseq"),
     ],
 )
 def test_other_shot_files_are_refused(run_dir: Path, attributes: dict[str, str], message: str) -> None:
     shot = open_run(run_dir).shots[0]
     with h5py.File(shot.file, "r+") as file:
-        file.attrs.update(attributes)
+        file.attrs.update({name: np.bytes_(text.encode()) for name, text in attributes.items()})
     with pytest.raises(RecordingError, match=message):
         _ = shot.plans
     with pytest.raises(RecordingError, match="has changed since it was written"):

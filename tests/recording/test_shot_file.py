@@ -31,8 +31,8 @@ def default_plot(file: Any) -> Any:
     """Follow the chain of NeXus defaults, as silx, H5Web and NeXpy do."""
     node = file
     while "signal" not in node.attrs:
-        node = node[node.attrs["default"]]
-    assert node.attrs["NX_class"] == "NXdata"
+        node = node[node.attrs["default"].decode()]
+    assert node.attrs["NX_class"] == b"NXdata"
     return node
 
 
@@ -41,11 +41,11 @@ def test_viewers_open_the_frames() -> None:
     with opened(ShotEncoder(make_run(), "day/run").encode(shot)) as file:
         view = default_plot(file)
         assert view.name == "/entry/images_view"
-        signal = view[view.attrs["signal"]]
+        signal = view[view.attrs["signal"].decode()]
         assert signal.shape == (3, 6, 8)
-        assert list(view.attrs["axes"]) == ["t_s", ".", "."]
+        assert list(view.attrs["axes"]) == [b"t_s", b".", b"."]
         assert view["t_s"].shape == (3,)
-        assert signal.attrs["interpretation"] == "image"
+        assert signal.attrs["interpretation"] == b"image"
         np.testing.assert_array_equal(signal[1], shot.images[1].frame.image)  # pyright: ignore[reportOptionalMemberAccess]
 
 
@@ -79,7 +79,7 @@ def test_atom_events_are_kept_as_tables(tmp_path: Path) -> None:
     path.write_bytes(ShotEncoder(make_run(), "day/run").encode(shot))
     with h5py.File(path) as file:
         units: Any = file["entry/atom_events/flights"].attrs["units"]
-        assert list(units) == ["s", "", "m"]
+        assert list(units) == [b"s", b"", b"m"]
     atom_events = read_content(path).record.atom_events
     assert list(atom_events) == ["a_b", "flights"]
     assert atom_events["flights"].tobytes() == flights.tobytes()
@@ -108,7 +108,7 @@ def test_frames_of_several_cameras_and_sizes_have_groups_of_their_own() -> None:
             "a_b_2": [1],
             "日": [3],
         }
-        assert cameras["a_b_2"].attrs["name"] == "a/b"
+        assert cameras["a_b_2"].attrs["name"] == b"a/b"
         assert default_plot(file)["frames"].shape == (2, 6, 8)
 
 

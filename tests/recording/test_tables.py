@@ -39,6 +39,7 @@ def entries(run: Run) -> list[Any]:
             found.append(
                 {
                     **entry.attrs,
+                    "status": entry.attrs["status"].decode(),
                     "parameters": {name: value[()] for name, value in entry["parameters"].items()},
                     "readings": json.loads(entry["readings"][()]),
                     "occupancy": entry["detection/occupancy"][()],

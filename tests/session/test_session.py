@@ -74,9 +74,9 @@ def test_a_run_reads_back(tmp_path):
     assert "numpy" in done.record["provenance"]["packages"]
     assert not done.events[-1]["values"]["error"]
     with h5py.File(shot.file) as file:  # a viewer of HDF5 shows the frames
-        entry: Any = file[file.attrs["default"]]
-        view = entry[entry.attrs["default"]]
-        assert view[view.attrs["signal"]].shape[1:] == (512, 512)
+        entry: Any = file[file.attrs["default"].decode()]
+        view = entry[entry.attrs["default"].decode()]
+        assert view[view.attrs["signal"].decode()].shape[1:] == (512, 512)
 
 
 def test_values_can_be_set(tmp_path):
