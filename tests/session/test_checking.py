@@ -69,6 +69,31 @@ def test_what_runs_but_makes_little_sense_is_a_warning(override: str, message: s
     assert warning.source.startswith("--set") or not override.startswith("shot.2")
 
 
+IMAGING = "imaging: {channel: 4, on: [image]}"
+LINES = f"profile.lines={{use: virtual, channels: {{{IMAGING}, mot: {{channel: 3, on: [load]%s}}}}}}"
+REAL = "profile.camera={use: genicam, camera: 10.0.0.7, region: {y: 0, x: 0, height: 512, width: 512}}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "messages"),
+    [
+        (
+            [LINES % "", "profile.camera.em_gain=50"],
+            ["'mot' is on during `load`, and the camera has an EM gain of 50"],
+        ),
+        ([LINES % ", blinding: false", "profile.camera.em_gain=50"], []),
+        ([LINES % ""], []),
+        ([REAL], ["nothing of this profile switches the imaging light"]),
+        ([REAL, LINES % ""], []),
+        ([REAL, "shot=[{load: {}}]"], []),
+    ],
+)
+def test_light_that_nothing_switches_or_declares_is_a_warning(overrides: list[str], messages: list[str]):
+    warnings = [str(warning) for warning in checked(*overrides).warnings]
+    assert len(warnings) == len(messages)
+    assert all(message in warning for message, warning in zip(messages, warnings, strict=True))
+
+
 def test_a_run_gives_the_warnings_of_the_check_once(tmp_path: Path):
     class Seen:
         def event(self, name: str, values: Mapping[str, Any]) -> None:
