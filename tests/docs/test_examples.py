@@ -62,6 +62,7 @@ NOT_RUN = {
     ],
     "docs/how-to/export.md": ["installs packages"],
     "docs/how-to/fit.md": ["needs a run with releases"],
+    "docs/how-to/first-day.md": ["needs your own profile"],
     "docs/how-to/follow.md": [
         "a drawing",
         "waits for the leader below; tests/plugins/test_labseq_follow_session.py runs both",
