@@ -111,7 +111,7 @@ def explained(path: Path) -> Generator[None]:
         raise RecordingError(path, f"cannot be written: {reason}; {advice}") from error
 
 
-MAX_DOCUMENT: Final = 64 << 20
+MAX_DOCUMENT: Final = 16 << 20
 """Largest JSON document that is read, in bytes."""
 MAX_LINE: Final = 16 << 20
 """Longest line of a file of JSON lines, in bytes."""

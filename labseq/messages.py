@@ -5,9 +5,13 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
+from itertools import islice
 from typing import Any, Final
 
 _MAX_LENGTH: Final = 60
+_MAX_LISTED: Final = 50
+_MAX_NAMES: Final = 300
+"""Names that are compared with a wrong one, which takes 10 us each."""
 MAX_ERROR: Final = 2000
 """Maximum number of characters of an error's text that labseq shows, logs and records."""
 
@@ -100,14 +104,15 @@ def shown(value: Any, raw: str = "") -> str:
 
 
 def listing(names: Iterable[str]) -> str:
-    """The known names: "one of rows, cols"."""
+    """The known names: "one of rows, cols"; the first of very many."""
     known = list(names)
-    return ("one of " if len(known) > 1 else "") + ", ".join(known)
+    more = [f"and {len(known) - _MAX_LISTED} more"] if len(known) > _MAX_LISTED + 1 else []
+    return ("one of " if len(known) > 1 else "") + ", ".join(known[:_MAX_LISTED] + more if more else known)
 
 
 def closest(name: str, names: Iterable[str]) -> str:
     """The known name with the most similar spelling, ignoring case and dashes; "" if none is similar."""
-    folded = {known.lower().replace("-", "_"): known for known in names}
+    folded = {known.lower().replace("-", "_"): known for known in islice(names, _MAX_NAMES)}
     found = difflib.get_close_matches(name.lower().replace("-", "_")[:_MAX_LENGTH], folded, n=1)
     return folded[found[0]] if found else ""
 

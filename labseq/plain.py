@@ -128,7 +128,8 @@ def parse_value(data: bytes | str) -> Any:
         value = json.loads(data)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
-    if _is_too_deep(value):
+    opening = (b"[", b"{") if isinstance(data, bytes) else ("[", "{")
+    if sum(map(data.count, opening)) > _MAX_DEPTH and _is_too_deep(value):  # pyright: ignore[reportArgumentType]
         raise ValueError("it is nested too deep")
     return value
 

@@ -47,6 +47,8 @@ MAX_LENGTH: Final = 500
 """Maximum length of an expression, in characters."""
 MAX_PARTS: Final = 200
 """Maximum number of values, operators and functions in an expression."""
+MAX_PROBLEMS: Final = 60
+"""Wrong expressions that are looked at; not all of them are shown."""
 _MAX_POWER: Final = 12
 _MAX_EXPONENT: Final = 1000
 _EXACT: Final = 2**53  # from here on, whole numbers are kept as floats
@@ -417,6 +419,8 @@ class _Evaluator:
         """Compute all expressions with valid references."""
         references: dict[Loc, dict[str, Loc]] = {}
         for loc, node in self.nodes.items():
+            if len(self.problems) >= MAX_PROBLEMS:
+                return
             try:
                 references[loc] = self._references(str(node.value))
             except ExpressionError as error:

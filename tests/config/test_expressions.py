@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.config.document import Document
-from labseq.config.expressions import MAX_LENGTH, MAX_PARTS, POWERS
+from labseq.config.expressions import MAX_LENGTH, MAX_PARTS, MAX_PROBLEMS, POWERS
 from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
 from labseq.units import parse_any
@@ -125,6 +125,15 @@ def test_an_expression_that_refers_to_a_wrong_one_is_not_reported_as_well(wrong:
 def test_a_long_chain_ends() -> None:
     chain = "".join(f"v{i}: = v{i + 1}\n" for i in range(1500)) + "v1500: 7\n"
     assert value("= v0", chain) == 7
+
+
+def test_thousands_of_unknown_names_are_refused_without_comparing_all_of_them() -> None:
+    many = "".join(f"v{i}: = w{i}.x\n" for i in range(2500))
+    lines = refused("= 1", many).splitlines()
+    assert len(lines) == MAX_PROBLEMS
+    assert "expected one of variables, shot, v0, v1, v2, " in lines[0]
+    assert ", v46, v47, and 2453 more; " in lines[0]
+    assert max(map(len, lines)) < 500
 
 
 def test_the_place_in_an_option_is_its_character() -> None:

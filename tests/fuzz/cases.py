@@ -29,7 +29,7 @@ from labseq.session.assembly import assemble
 from labseq.session.options import Options
 from labseq.testing.fakes import fake_calibration
 from tests.config.mutations import PIECES
-from tests.recording.damages import LOST, MENDED, write_whole_run
+from tests.recording.damages import LOST, MENDED, lost_line, write_whole_run
 
 ROOT: Final = Path(__file__).parents[2]
 KINDS: Final = ("sequence", "profile", "calibration", "plan", "queue", "run.json", "index", "shot", "run")
@@ -119,11 +119,7 @@ def _run_case(kind: str, rng: random.Random, templates: Templates, folder: Path)
     run_dir = folder / "data" / templates.run_dir.parent.name / templates.run_dir.name
     shutil.copytree(templates.run_dir, run_dir)
     if kind == "run":
-        for plant in rng.sample([*MENDED, *LOST], rng.randint(1, 3)):
-            with suppress(OSError, IndexError, KeyError, ValueError):  # nothing is left to damage
-                plant(run_dir)
-        for path in rng.sample(sorted(p for p in run_dir.rglob("*") if p.is_file()), rng.randint(0, 3)):
-            path.write_bytes(damaged_bytes(rng, path.read_bytes()))
+        damage_run(rng, run_dir)
         return Case(run_dir, lambda: _read_run(run_dir, repair=True))
     path = {
         "run.json": run_dir / "run.json",
@@ -132,13 +128,34 @@ def _run_case(kind: str, rng: random.Random, templates: Templates, folder: Path)
     }[kind]
     if kind == "shot":
         damage_shot(rng, path)
-        (run_dir / "index.jsonl").write_bytes(b"")  # so that the doctor reads each file
+        lost_line(run_dir)  # so that the doctor reads the file
         return Case(path, lambda: _read_shot(path, run_dir))
     lines = path.read_bytes().split(b"\n") if kind == "index" else [path.read_bytes()]
     i = rng.randrange(len(lines))
     lines[i] = damaged_json(rng, lines[i] or b"{}")
     path.write_bytes(b"\n".join(lines))
     return Case(path, lambda: _read_run(run_dir))
+
+
+def damage_run(rng: random.Random, run_dir: Path) -> None:
+    """Damage a run in up to six places; one run of a hundred gets files of an absurd size."""
+    for plant in rng.sample([*MENDED, *LOST], rng.randint(1, 3)) + [swollen] * (rng.random() < 0.01):
+        with suppress(OSError, IndexError, KeyError, ValueError):  # nothing is left to damage
+            plant(run_dir)
+    files = sorted(path for path in run_dir.rglob("*") if path.is_file() and path.stat().st_size < 1 << 20)
+    for path in rng.sample(files, rng.randint(0, 3)):
+        path.write_bytes(damaged_bytes(rng, path.read_bytes()))
+
+
+def swollen(run_dir: Path) -> None:
+    """Files as large as a fault of a file system, or an ill will, can make them."""
+    for name in ("shots/shot_000002.h5", "shots/shot_000008.h5", "STATE", "skipped.jsonl"):
+        with (run_dir / name).open("ab") as file:
+            file.truncate(1 << 40)
+    run_file, index = run_dir / "run.json", run_dir / "index.jsonl"
+    run_file.write_bytes(run_file.read_bytes().rstrip()[:-1] + b', "x": [' + b"[]," * 20_000_000 + b"[]]}")
+    index.write_bytes(index.read_bytes() * 10_000)
+    (run_dir / "events.jsonl").write_bytes(b"x\n" * 1_000_000)
 
 
 def _read_run(run_dir: Path, *, repair: bool = False) -> None:

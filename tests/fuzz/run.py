@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import LabseqError
-from tests.fuzz.cases import KINDS, Templates, make_case
+from labseq.recording.doctor import Report, examine
+from tests.fuzz.cases import KINDS, Templates, damage_run, make_case
 
 LIMIT_S: Final = 5.0
 """Longest time of the processor for a file; a file for which a process waits has ten times as long."""
@@ -42,6 +43,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--files", type=int, default=20_000)
     parser.add_argument("--runs", type=int, default=2_000)
+    parser.add_argument(
+        "--doctor", type=int, default=0, help="damaged runs in one data folder for one doctor"
+    )
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=[k for k in KINDS if k != "run"])
     parser.add_argument("--only", nargs=2, metavar=("KIND", "NUMBER"), help="repeat one")
@@ -56,6 +60,8 @@ def main() -> int:
     results = Results(arguments.keep, arguments.seed)
     results.read(cases)
     results.print()
+    if arguments.doctor:
+        results.examine(arguments.doctor)
     return 1 if results.failures else 0
 
 
@@ -73,7 +79,7 @@ class Results:
         self._folder, self._seed = folder, seed
         self._templates = Templates(folder)
         self._counts: Counter[str] = Counter()
-        self._slowest: dict[str, float] = {}
+        self._slowest: dict[str, tuple[float, int]] = {}
         self._peak: dict[str, int] = {}
 
     def read(self, cases: list[tuple[str, int]]) -> None:
@@ -85,13 +91,29 @@ class Results:
             batch = [one for one in cases[:BATCH] if one[0] == kind or kind != "run"]
             cases = self._in_a_child(batch) + cases[len(batch) :]
 
+    def examine(self, n_runs: int) -> None:
+        """Let the doctor look at many damaged runs, repair them, and look again."""
+        data = self._new_folder("doctor", n_runs)
+        for number in range(n_runs):
+            run_dir = data / f"2026-11-{1 + number // 100:02}" / f"{number:04}_damaged"
+            shutil.copytree(self._templates.run_dir, run_dir)
+            damage_run(random.Random(f"{self._seed}/doctor/{number}"), run_dir)
+        sys.stdout.flush()
+        for what in ("dry run", "repair", "again"):
+            if (pid := os.fork()) == 0:
+                _examine(data, what)
+                os._exit(0)
+            if status := os.waitpid(pid, 0)[1]:
+                self._fail("doctor", n_runs, f"the {what} ended with {os.waitstatus_to_exitcode(status)}")
+
     def print(self) -> None:
         """Print the table."""
-        print(f"\n{'kind':12} {'files':>6} {'failures':>8} {'slowest':>9} {'memory':>8}")
+        print(f"\n{'kind':12} {'files':>6} {'failures':>8} {'slowest':>9} {'number':>7} {'memory':>8}")
         failures = Counter(kind for kind, _ in self.failures)
         for kind in self._counts:
-            slowest, peak = self._slowest.get(kind, 0.0), self._peak.get(kind, 0) / 1024
-            print(f"{kind:12} {self._counts[kind]:6} {failures[kind]:8} {slowest:7.2f} s {peak:5.0f} MB")
+            slowest_s, number = self._slowest.get(kind, (0.0, 0))
+            one = f"{kind:12} {self._counts[kind]:6} {failures[kind]:8} {slowest_s:7.2f} s {number:7}"
+            print(f"{one} {self._peak.get(kind, 0):5} MB")
         print(f"seed {self._seed}")
 
     def _in_a_child(self, batch: list[tuple[str, int]]) -> list[tuple[str, int]]:
@@ -110,7 +132,7 @@ class Results:
         for line in lines:
             kind, number, seconds, memory, *error = line.split(" ", 4)
             self._counts[kind] += 1
-            self._slowest[kind] = max(self._slowest.get(kind, 0.0), float(seconds))
+            self._slowest[kind] = max(self._slowest.get(kind, (0.0, 0)), (float(seconds), int(number)))
             self._peak[kind] = max(self._peak.get(kind, 0), int(memory))
             if error:
                 self._fail(kind, int(number), error[0])
@@ -135,8 +157,7 @@ class Results:
         return folder
 
     def _read_batch(self, batch: list[tuple[str, int]], report: Any) -> None:
-        limit = _address_space() + MEMORY
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        _limit_memory()
         for one in _TIMERS:
             signal.signal(one, signal.SIG_DFL)  # no handler of Python is called in a loop of C
             faulthandler.register(one, chain=True)  # prints where it is; then the system ends the process
@@ -150,8 +171,9 @@ class Results:
                 signal.setitimer(timer, 0.0)
             if not error:
                 shutil.rmtree(folder)
-            took_s, memory = time.perf_counter() - start_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            report.write(f"{kind} {number} {took_s:.3f} {memory}{error and f' {error}'}\n")
+            took = f"{time.perf_counter() - start_s:.3f} {_peak_mb():.0f}"
+            report.write(f"{kind} {number} {took}{error and f' {error}'}
+")
 
 
 def read_one(kind: str, number: int, seed: int, templates: Templates, folder: Path) -> str:
@@ -169,6 +191,37 @@ def read_one(kind: str, number: int, seed: int, templates: Templates, folder: Pa
         place = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {str(error)[:100]!r} in {place.filename}:{place.lineno}"
     return ""
+
+
+def _examine(data: Path, what: str) -> None:
+    """Let the doctor look at the folder, or repair its runs one by one; prints time and memory."""
+    _limit_memory()
+    start_s, slowest = time.perf_counter(), (0.0, "")
+    if what == "repair":
+        reports = list[Report]()
+        for run_dir in sorted(data.glob("*/*_damaged")):
+            began_s = time.perf_counter()
+            reports.append(examine(run_dir))
+            slowest = max(slowest, (time.perf_counter() - began_s, run_dir.name))
+    else:
+        reports = [examine(data, dry_run=True)]
+    findings = [one for report in reports for one in report.findings]
+    print(
+        f"doctor, {what}: {len(findings)} findings, {sum(one.left for one in findings)} left; "
+        f"{time.perf_counter() - start_s:.1f} s, slowest run {slowest[0]:.2f} s {slowest[1]}; "
+        f"{_peak_mb():.0f} MB",
+        flush=True,
+    )
+
+
+def _limit_memory() -> None:
+    limit = _address_space() + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _peak_mb() -> float:
+    """Most memory that this process has had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _address_space() -> int:

@@ -250,7 +250,7 @@ def test_a_huge_text_and_many_damaged_lines_take_seconds_and_little_memory(run_d
     assert finding.what == "has a line longer than 16 MiB"
     with (run_dir / "run.json").open("wb") as file:
         file.truncate(2**40)
-    with pytest.raises(RecordingError, match="is larger than 64 MiB; restore it from a backup"):
+    with pytest.raises(RecordingError, match="is larger than 16 MiB; restore it from a backup"):
         open_run(run_dir)
 
 
