@@ -431,6 +431,8 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
     for row, known, occupancy in zip(
         tables["cycles"], CYCLES.arguments(CycleRecord, tables["cycles"]), predicted, strict=True
     ):
+        if not 0 <= row["n_batches_played"] <= row["n_batches"]:
+            raise ValueError(f"{row['n_batches_played']} of {row['n_batches']} batches were played")
         own, batches = batches[: row["n_batches"]], batches[row["n_batches"] :]
         own_sites, sites = sites[: row["n_atom_moves"]], sites[row["n_atom_moves"] :]
         offsets = np.concatenate([[0], np.cumsum(own["n_atom_moves"])])

@@ -172,8 +172,7 @@ class Results:
             if not error:
                 shutil.rmtree(folder)
             took = f"{time.perf_counter() - start_s:.3f} {_peak_mb():.0f}"
-            report.write(f"{kind} {number} {took}{error and f' {error}'}
-")
+            report.write(f"{kind} {number} {took}{error and f' {error}'}\n")
 
 
 def read_one(kind: str, number: int, seed: int, templates: Templates, folder: Path) -> str:

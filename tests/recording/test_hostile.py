@@ -90,6 +90,12 @@ def attribute_of_any_length(file: Any, secret: Path) -> None:
     file["entry"].attrs["status"] = "complete"
 
 
+def more_batches_than_planned(file: Any, secret: Path) -> None:
+    cycles = file["entry/rearrangement/cycles"][()]
+    cycles["n_batches_played"] = 2**25
+    file["entry/rearrangement/cycles"][...] = cycles
+
+
 def deep_json(file: Any, secret: Path) -> None:
     del file["entry/readings"]
     file["entry"].create_dataset("readings", data=np.bytes_(b"[" * 500 + b"]" * 500))
@@ -109,6 +115,7 @@ def deep_json(file: Any, secret: Path) -> None:
         (wrong_kind, "'status' is int; expected text"),
         (text_of_any_length, "/entry/readings is a text of variable length, which labseq does not use"),
         (attribute_of_any_length, "the attribute 'status' is a text of variable length"),
+        (more_batches_than_planned, "33554432 of 3 batches were played"),
         (deep_json, "it is nested too deep"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
