@@ -5,12 +5,11 @@ in the middle of a shot. :func:`load_kernels` compiles the kernels of all import
 loads them from the user's cache; otherwise the first call of a kernel does. Several processes
 compile what the cache lacks. numba itself is imported only then.
 
-Python and other kernels use different machine code of a function: the former has a
-wrapper that converts arguments, the latter can be inlined. Each is made when something
-needs it, and kept in a file named after everything that it is compiled from: the function's
-bytecode, the constants that it names, the same of all kernels that it calls, the processor,
-numba's settings, and the versions of Python, numba and numpy. An edit anywhere therefore
-leads to a new file.
+What Python calls is kept as machine code, what other kernels call as bitcode for linking.
+Each is made when something needs it, and kept in a file named after everything that it is
+compiled from: the function's bytecode, the constants that it names, the same of all kernels
+that it calls, the processor, numba's settings, and the versions of Python, numba and numpy.
+An edit anywhere therefore leads to a new file.
 """
 
 from __future__ import annotations
@@ -35,6 +34,16 @@ import numpy as np
 
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.files import cache_root
+from labseq.machine_code import (
+    MachineCode,
+    calling,
+    compile_for_python,
+    environment,
+    load,
+    make_only_bitcode,
+    packed,
+    unpacked,
+)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -50,6 +59,7 @@ COMPILE_S: Final = 0.0042
 _INTERPRETED = threading.Event()
 _PENDING: dict[_Kernel, None] = {}  # neither compiled nor loaded yet
 _ANNOUNCE: list[Callable[[float], None]] = []
+_LOADING = threading.RLock()
 
 
 def const(dtype: str, ndim: int) -> str:
@@ -111,17 +121,6 @@ def announcing(announce: Callable[[float], None]) -> Generator[None]:
             _ANNOUNCE.remove(announce)
 
 
-def import_numba() -> None:
-    """Import numba in a thread, because other warming leaves a core idle meanwhile."""
-
-    def attempt() -> None:
-        with suppress(Exception):  # load_kernels will report it
-            _numba()
-
-    if not _INTERPRETED.is_set():
-        threading.Thread(target=attempt, name="import numba").start()
-
-
 def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
     """Compile the kernels of all modules imported so far, or load them from the cache.
 
@@ -136,11 +135,10 @@ def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
         return
     if not all(one.is_cached() for one in wanted if not one.is_helper):
         _compile_in_processes([one for one in wanted if not one.is_cached()], poll)
-    for one in wanted:
+    for one in [one for one in wanted if not one.is_helper]:
         poll()
         try:
-            if not one.is_helper:
-                one.load()
+            one.load()
         except Exception as error:
             _PENDING.pop(one, None)  # the next session may do without it
             reason = f"kernel '{one.function.__name__}' cannot be compiled: {type(error).__name__}: {error}"
@@ -159,7 +157,7 @@ def _numba() -> Any:
 
 
 def _is_interpreted() -> bool:
-    return _INTERPRETED.is_set() or _numba().config.DISABLE_JIT
+    return _INTERPRETED.is_set() or os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}
 
 
 class _Kernel:
@@ -171,8 +169,7 @@ class _Kernel:
         self.signatures = signatures
         self.is_helper = is_helper
         self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"} if fused else False}
-        self._dispatchers: dict[bool, Any] = {}
-        self._compiling: Any = None  # one of them, while it is compiled; it may call itself
+        self._dispatcher: Any = None  # for kernels that call it, and for itself while it is compiled
         self._call: Callable[..., Any] = self._first_call
         _PENDING[self] = None
 
@@ -180,7 +177,10 @@ class _Kernel:
         return self._call(*args)
 
     def _first_call(self, *args: Any) -> Any:
-        self._call = self.function if _is_interpreted() else self.dispatcher(for_python=True)
+        if _is_interpreted():
+            self._call = self.function
+        else:
+            self.load()
         return self._call(*args)
 
     def __reduce__(self) -> str:
@@ -189,33 +189,50 @@ class _Kernel:
     @property
     def _numba_type_(self) -> Any:
         """Numba asks for it when it compiles a call."""
-        return _numba().types.Dispatcher(self._compiling or self.dispatcher(for_python=False))
+        return _numba().types.Dispatcher(self._dispatcher or self.compile())
 
-    def load(self) -> None:
-        """Compile it or load it from the cache: for Python, or a helper for kernels."""
-        dispatcher = self.dispatcher(for_python=not self.is_helper)
-        if not self.is_helper:
-            self._call = dispatcher
-
-    def dispatcher(self, *, for_python: bool) -> Any:
-        """Numba's object that calls the machine code, or that lets kernels call it."""
+    def compile(self) -> Any:
+        """Compile it or load its bitcode from the cache: numba's object that lets kernels call it."""
         from numba.core.compiler_lock import global_compiler_lock
 
         with global_compiler_lock:
-            if for_python not in self._dispatchers:
-                options = self._options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": not for_python}
-                self._compiling = _numba().njit(**options)(self.function)
-                self._compiling._cache = _Cache(self, for_python)  # noqa: SLF001 - numba has no other way
+            if self._dispatcher is None:
+                options = self._options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+                self._dispatcher = _numba().njit(**options)(self.function)
+                self._dispatcher._cache = _Bitcode(self)  # noqa: SLF001 - numba has no other way
                 try:
                     for signature in self.signatures:
-                        self._compiling.compile(signature)
-                    self._compiling.disable_compile()
-                    self._dispatchers[for_python] = self._compiling
-                finally:
-                    self._compiling = None
-                if for_python != self.is_helper:
+                        self._dispatcher.compile(signature)
+                    self._dispatcher.disable_compile()
+                except BaseException:
+                    self._dispatcher = None
+                    raise
+                if self.is_helper:
                     _PENDING.pop(self, None)
-        return self._dispatchers[for_python]
+        return self._dispatcher
+
+    def load(self) -> None:
+        """Compile it or load its machine code from the cache, for Python."""
+        with _LOADING:
+            if self._call == self._first_call:
+                self._call = calling(self.function.__name__, [*map(self._load, range(len(self.signatures)))])
+                if not self.is_helper:
+                    _PENDING.pop(self, None)
+
+    def _load(self, number: int) -> tuple[MachineCode, Callable[..., Any]]:
+        path = self.path(number, "python")
+        with suppress(Exception):  # whatever is wrong with the cache, it can be compiled
+            return load(_read(path))
+        _announce_compiling(self)
+        code = compile_for_python(
+            [*self.compile().overloads.values()][number], is_only=len(self.signatures) == 1
+        )
+        _write(path, pickle.dumps(code))
+        return load(code)
+
+    def path(self, number: int, kind: str) -> Path:
+        """File in the cache of the signature of that number: of the kind "python" or "kernels"."""
+        return cache_root() / "kernels" / f"{self.function.__name__}-{self.digest}-{number}.{kind}"
 
     @property
     def module(self) -> str:
@@ -231,8 +248,8 @@ class _Kernel:
         return getattr(sys.modules.get(self.module), "__dict__", None) is self.function.__globals__
 
     def is_cached(self) -> bool:
-        cache = _Cache(self, not self.is_helper)
-        return all(cache.path(signature).is_file() for signature in self.signatures)
+        kind = "kernels" if self.is_helper else "python"
+        return all(self.path(number, kind).is_file() for number in range(len(self.signatures)))
 
     @cached_property
     def named(self) -> dict[str, Any]:
@@ -261,7 +278,7 @@ class _Kernel:
         reached = [self]
         for one in reached:
             reached += [callee for callee in one.callees if callee not in reached]
-        parts = [_environment(), self.source, *sorted(one.source for one in reached)]
+        parts = [environment(), self.source, *sorted(one.source for one in reached)]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
 
 
@@ -291,106 +308,58 @@ def _constant(name: str, value: object) -> str:
     return ""
 
 
-def _environment() -> str:
-    """Text of everything but its code that machine code depends on."""
-    from numba.core.registry import cpu_target
-
-    versions = (sys.version, _numba().__version__, np.__version__)
-    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    return repr((versions, settings, cast("Any", cpu_target).target_context.codegen().magic_tuple()))
-
-
-class _Cache:
-    """Keeps a kernel's machine code in files; numba's dispatcher uses it as its cache."""
+class _Bitcode:
+    """Keeps a kernel's bitcode in files; numba's dispatcher uses it as its cache."""
 
     cache_path = None
 
-    def __init__(self, owner: _Kernel, for_python: bool) -> None:
+    def __init__(self, owner: _Kernel) -> None:
         self._owner = owner
-        self._for_python = for_python
 
-    def path(self, signature: str) -> Path:
-        number, kind = self._owner.signatures.index(signature), "python" if self._for_python else "kernels"
-        name = f"{self._owner.function.__name__}-{self._owner.digest}-{number}.{kind}"
-        return cache_root() / "kernels" / name
+    def _path(self, signature: str) -> Path:
+        return self._owner.path(self._owner.signatures.index(signature), "kernels")
 
     def load_overload(self, signature: str, context: Any) -> Any:
-        """Numba's result of compiling, or None; unlike numba's own cache it imports nothing for compiling."""
-        from numba.core.compiler import CompileResult
-        from numba.core.runtime.nrt import rtsys
-
+        """Numba's result of compiling, or None."""
         with suppress(Exception):  # whatever is wrong with the cache, it can be compiled
-            path = self.path(signature)
-            data = path.read_bytes()
-            if hashlib.sha256(data[32:]).digest() == data[:32]:  # else a crash has truncated it
-                rtsys.initialize(context)
-                result = cast("Any", CompileResult)._rebuild(context, *pickle.loads(data[32:]))  # noqa: S301, SLF001
-                with suppress(OSError):
-                    os.utime(path)
-                return result
-        while _ANNOUNCE:
-            missing = {self._owner, *(other for other in list(_PENDING) if not other.is_cached())}
-            _ANNOUNCE.pop()(sum(other.compile_s for other in missing))
+            return unpacked(_read(self._path(signature)), context)
+        _announce_compiling(self._owner)
         return None
 
     def save_overload(self, signature: str, result: Any) -> None:
         """Write a file, unless that is impossible."""
         with suppress(Exception):
-            (name, kind, (code, bitcode)), *rest = result._reduce()  # noqa: SLF001
-            if (
-                self._for_python
-            ):  # kernels do not inline it, and its bitcode takes longer to read than the rest
-                bitcode = _stub(result.fndesc.llvm_cpython_wrapper_name)
-            data = _pickled(((name, kind, (code, bitcode)), *rest))
-            path = self.path(signature)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _delete_unused(path.parent)
-            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                file.write(hashlib.sha256(data).digest() + data)
-            try:
-                Path(file.name).replace(path)
-            except OSError:  # Windows: another process reads it
-                Path(file.name).unlink()
+            _write(self._path(signature), packed(result))
 
 
-def _stub(name: str) -> bytes:
-    """Bitcode that says only that a function is defined."""
-    from llvmlite import binding
-
-    return binding.parse_assembly(f'define void @"{name}"() {{ unreachable }}').as_bitcode()
-
-
-def _pickled(values: object) -> bytes:
-    from io import BytesIO
-
-    from numba.core.environment import Environment
-    from numba.core.serialize import NumbaPickler
-
-    class Pickler(NumbaPickler):
-        def reducer_override(self, obj: Any) -> Any:
-            if isinstance(obj, Environment):
-                return _unpickle_environment, (obj.globals.get("__name__"), obj.consts, obj.env_name)
-            return super().reducer_override(obj)
-
-    buffer = BytesIO()
-    Pickler(buffer, protocol=4).dump(values)
-    return buffer.getvalue()
+def _announce_compiling(kernel: _Kernel) -> None:
+    while _ANNOUNCE:
+        missing = {kernel, *(other for other in list(_PENDING) if not other.is_cached())}
+        _ANNOUNCE.pop()(sum(other.compile_s for other in missing))
 
 
-def _unpickle_environment(module: str, consts: list[object], name: str) -> Any:
-    """Constants of compiled code; its module is not imported, because compiled code needs nothing else of it.
+def _read(path: Path) -> Any:
+    """The object in a file of the cache."""
+    data = path.read_bytes()
+    if hashlib.sha256(data[32:]).digest() != data[:32]:
+        raise ValueError("truncated by a crash")
+    found = pickle.loads(data[32:])  # noqa: S301
+    with suppress(OSError):
+        os.utime(path)
+    return found
 
-    That saves 0.1 s for modules of numba itself.
-    """
-    from numba.core.environment import Environment, lookup_environment
 
-    known: Any = lookup_environment(name)
-    if known is None:
-        known = cast("Any", Environment)(getattr(sys.modules.get(module), "__dict__", {"__name__": module}))
-        known.consts[:] = consts
-        known.env_name = name
-        cast("Any", Environment)._memo[name] = known  # noqa: SLF001
-    return known
+def _write(path: Path, data: bytes) -> None:
+    """Write a file of the cache, unless that is impossible."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _delete_unused(path.parent)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(hashlib.sha256(data).digest() + data)
+        try:
+            Path(file.name).replace(path)
+        except OSError:  # Windows: another process reads it
+            Path(file.name).unlink()
 
 
 def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> None:
@@ -459,13 +428,14 @@ class _Worker:
 def serve() -> None:
     """Compile the kernels of each module that standard input names, one per line."""
     gc.disable()  # there are no cycles to speak of, and compiling takes a sixth less time
+    make_only_bitcode()
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # a module may print
     for line in sys.stdin:
         with suppress(Exception):
             importlib.import_module(line.strip())
             for one in [one for one in _PENDING if one.module == line.strip()]:
-                one.load()
+                one.compile() if one.is_helper else one.load()
         print("done", file=answer, flush=True)
 
 

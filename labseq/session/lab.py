@@ -12,7 +12,7 @@ from labseq.config.document import Document
 from labseq.config.profile import MotionSettings, ProfileSpec
 from labseq.errors import ConfigError, LabseqError, PlanError, Problem, one_of
 from labseq.guard import Guard, StopFlag
-from labseq.kernel import announcing, import_numba, load_kernels
+from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, offers
@@ -278,7 +278,6 @@ def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool 
         started_s.append(time.monotonic())
         observer.event("compiling", {"about_s": about_s})
 
-    import_numba()
     with announcing(announce):
         motion.warm()
         _warm_plugins(lab, stop_flag, devices)
