@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar, cast, get_args
@@ -64,6 +64,13 @@ class Settings(BaseModel):
         Empty if there is nothing to lock; None (default) if unknown: the profile's path stands for it then.
         """
         return None
+
+    def warnings(self) -> Iterable[tuple[Loc, str, str]]:
+        """Of a driver, for ``labseq check``: what is allowed but probably not intended.
+
+        For each the keys from these settings to the place, what is there, and what would be right.
+        """
+        return ()
 
 
 class NoSettings(Settings):

@@ -364,7 +364,8 @@ def _warnings(points: _Points, each: Mapping[int, Point]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
     found: dict[Any, tuple[Problem, list[int]]] = {}
     is_adaptive = points.session.scan_run.is_adaptive
-    for judge in (_window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings):
+    judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings, _device_warnings
+    for judge in judges:
         for n, point in each.items():
             if n and is_adaptive and judge is _window_warnings:
                 continue  # the search is there to find out about the corners
@@ -512,6 +513,17 @@ def _deadline_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Pro
             loc = (*points.session.assembly.sequence.shot[number].loc, "for")
             hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
             yield number, point.document.problem(loc, what, hint=hint)
+
+
+def _device_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:  # noqa: ARG001
+    """What the settings of the devices themselves warn of."""
+    n_found = 0
+    for chosen in point.hardware.chosen.values():
+        if chosen.settings is None or chosen.document is None:
+            continue
+        for loc, what, expected in chosen.settings.warnings():
+            yield n_found, chosen.document.problem((*chosen.loc, *loc), what, expected)
+            n_found += 1
 
 
 def _shot_bytes(session: Session, lab: Lab, timeline: Timeline) -> int | None:

@@ -92,7 +92,8 @@ class ChosenPlugin:
         is_placed = isinstance(error, ConfigError) and any(problem.source for problem in error.problems)
         if self.document is None or is_placed:
             return error
-        return self.document.error(self.loc, str(error))
+        within = error.setting if isinstance(error, LimitError) else ()
+        return self.document.error((*self.loc, *within), str(error))
 
 
 def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:

@@ -114,6 +114,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         devices = check_each_device(
             in_order, timeouts_of(hardware.profile), stop, simulation, warnings.append
         )
+    warnings += [f"{one.name}: {note}" for one in devices for note in one.described.get("notes", ())]
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
     plugins = {name: chosen.entry.name for name, chosen in hardware.chosen.items()}
     stopped = StopRequested(stop.signal_number) if stop.is_set else None

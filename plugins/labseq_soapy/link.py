@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -41,29 +41,36 @@ class Link:
         setup: The first message to the process.
         log: File for the output of the radio's module.
         environment: Environment of the process.
+        options: Of its command line.
 
     Attributes:
         pid: Number of the process.
         facts: What the radio reported; None until it is open.
-        status: "underflows": how often the radio has run out of samples; "dark": while the array was on.
+        status: How often the radio reported each error: "all" of them, those while the array was "lit".
     """
 
     def __init__(
-        self, name: str, clock: Clock, setup: Setup, log: Path, environment: Mapping[str, str]
+        self,
+        name: str,
+        clock: Clock,
+        setup: Setup,
+        log: Path,
+        environment: Mapping[str, str],
+        options: Sequence[str] = (),
     ) -> None:
         self._name, self._clock, self._setup, self._log = name, clock, setup, log
         self._news = threading.Condition()
         self._sending = threading.Lock()
         self._ended = ""
         self._n_done = self._n_tasks = 0
-        self.status: Mapping[str, int] = {"underflows": 0, "dark": 0}
+        self.status: Mapping[str, Mapping[str, int]] = {"all": {}, "lit": {}}
         self._received_s = time.monotonic()
         self._closing = threading.Event()
         self.facts: Facts | None = None
         self._environment = {key: value for key, value in environment.items() if os.environ.get(key) != value}
         with log.open("wb") as file:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "labseq_soapy_stream.streamer"],
+            self._process = subprocess.Popen(  # noqa: S603 - our own module
+                [sys.executable, "-P", "-m", "labseq_soapy_stream.streamer", *options],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,

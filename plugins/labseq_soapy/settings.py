@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from labseq.plugin import Duration, Frequency, FrequencyComb, Settings
+from labseq_soapy.radios import Bus, too_fast
 
 Channel: TypeAlias = Annotated[int, Field(ge=0, le=15)]
 Rate: TypeAlias = Annotated[Frequency, Field(gt=0)]
@@ -25,6 +27,9 @@ class SoapySettings(Settings):
         default="",
         description="arguments of its stream, for example the size of its buffers: `SoapySDRUtil --probe`",
     )
+    bus: Bus | None = Field(
+        default=None, description="its connection, for `labseq check`; none: the fastest that it has"
+    )
     row_channel: Channel = Field(default=0, description="output that drives the row axis")
     column_channel: Channel = Field(default=1, description="output that drives the column axis")
     sample_rate: Rate = Field(
@@ -38,6 +43,11 @@ class SoapySettings(Settings):
         default=None,
         description="centre of the radio's band, for both outputs; none: a third of a site from the tone "
         "in the middle, so that its leakage and the tones' images fall between the tweezers",
+    )
+    lo_offset: Frequency = Field(
+        default=0.0,
+        description="moves the local oscillator away from there, to outside the tones; radios that can do so "
+        "shift the samples back, for others the tones must fit into the sample rate with it",
     )
     row_frequency: FrequencyComb = Field(default=FrequencyComb(), description="tones of the rows")
     column_frequency: FrequencyComb = Field(default=FrequencyComb(), description="tones of the columns")
@@ -63,6 +73,15 @@ class SoapySettings(Settings):
         default=10e-3,
         description="duration of the ramps that turn the array on, and off in the safe state",
     )
+    max_underflows: Annotated[int, Field(ge=0)] = Field(
+        default=10,
+        description="how often the radio may run out of samples in a minute while the array is on; each time "
+        "the shot is repeated, above it the run ends",
+    )
+    max_lost_packets: Annotated[int, Field(ge=0)] = Field(
+        default=10,
+        description="the same for packets of samples that are lost or late on the way to the radio",
+    )
     on_exit: Literal["ramp_down", "hold"] = Field(
         default="ramp_down",
         description="the light when labseq is killed or hangs: ramped down, or held until labseq opens "
@@ -81,6 +100,13 @@ class SoapySettings(Settings):
         """What only one process can use of it."""
         arguments = sorted(part.strip() for part in self.device.split(","))
         return () if self.is_simulated else (f"radio {','.join(arguments)}",)
+
+    def warnings(self) -> Iterator[tuple[tuple[str, ...], str, str]]:
+        """A sample rate that the radio or its connection cannot keep up with."""
+        found = too_fast(self.device, self.bus, self.stream, self.sample_rate)
+        if found is not None:
+            why, most_hz = found
+            yield ("sample_rate",), why, f"a sample_rate up to {most_hz / 1e6:g} MHz"
 
     @model_validator(mode="after")
     def _check_simulated_radio(self) -> Self:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -33,6 +34,17 @@ LATENCY_S: Final = 30e-3
 
 Measured: 26 to 34 ms with the simulated radio, which buffers 20 ms. A real one says how much once open.
 """
+MINUTE_S: Final = 60.0
+FAULTS: Final = {
+    "ran out of samples": ("max_underflows", ("underflows",)),
+    "missed packets": ("max_lost_packets", ("sequence_errors", "late_packets")),
+}
+"""What the radio did -> the setting that limits it, the errors that it reports."""
+NO_CLOCK: Final = "it has no clock for a timed start: rows and columns may start some microseconds apart"
+ORDINARY: Final = (
+    "the streaming process has no real-time priority ({}): a busy computer may let the radio run out of "
+    "samples; under Linux add '@GROUP - rtprio 99' with your group to /etc/security/limits.conf, log in again"
+)
 
 
 def simulated_settings() -> dict[str, str] | None:
@@ -68,7 +80,8 @@ class SoapyStaticTweezers(StaticTweezers):
         self._calibrated = _calibrated(context)
         self._amplitudes: Amplitudes | None = None
         self._depth: float | None = 0.0  # None: a ramp was interrupted
-        self._dark = 0
+        self._seen: Mapping[str, int] = {}  # errors while the array was on
+        self._recent: deque[tuple[float, str]] = deque()  # what the radio did, when
         self._link: Link | None = None
         self._facts: Facts | None = None
         self._is_loaded = False
@@ -247,8 +260,18 @@ class SoapyStaticTweezers(StaticTweezers):
             "serial_number": self._facts.radio.get("serial", ""),
             "loop_samples": self._tones.loops[0].n_samples,
             "crest_factor": list(self._tones.crest_factor),
-            "underflows": self._link.status["underflows"],
+            "notes": self._notes(self._facts),
+            **self.poll(),
         }
+
+    def poll(self) -> Mapping[str, int]:
+        """How often the radio has reported each error since it was opened, recorded with each shot."""
+        counts = {} if self._link is None else self._link.status["all"]
+        return {key: counts.get(key, 0) for _, keys in FAULTS.values() for key in keys}
+
+    def _notes(self, facts: Facts) -> list[str]:
+        notes = [] if facts.starts_together else [NO_CLOCK]
+        return notes + ([ORDINARY.format(facts.ordinary)] if facts.ordinary else [])
 
     def _connect(self) -> Link:
         settings = self._settings
@@ -261,6 +284,7 @@ class SoapyStaticTweezers(StaticTweezers):
             channels=(settings.row_channel, settings.column_channel),
             rate_hz=settings.sample_rate,
             oscillator_hz=self._tones.oscillator_hz,
+            lo_offset_hz=settings.lo_offset,
             bandwidth_hz=settings.bandwidth,
             gain_db=(settings.row_gain, settings.column_gain),
             antenna=settings.antenna,
@@ -270,7 +294,8 @@ class SoapyStaticTweezers(StaticTweezers):
             hold=settings.on_exit == "hold",
             marker=str(marker),
         )
-        return Link(self._name, self._clock, setup, folder / f"{marker.stem}.log", environment)
+        options = [] if settings.is_simulated else ["--real-time"]
+        return Link(self._name, self._clock, setup, folder / f"{marker.stem}.log", environment, options)
 
     def _load(self, amplitudes: Amplitudes | None) -> None:
         loop = self._tones.samples(self._calibrated if amplitudes is None else amplitudes)
@@ -294,18 +319,30 @@ class SoapyStaticTweezers(StaticTweezers):
         return self._link
 
     def _checked(self) -> Link:
-        """The link, if its stream is alive and did not run dry since the last call."""
+        """The link, if its stream is alive, and undisturbed while the array was on since the last call."""
         link = self._opened()
         link.check()
-        dark, self._dark = link.status["dark"] - self._dark, link.status["dark"]
-        if dark:
-            text = f"the radio ran out of samples {dark} time(s) while the array was on: atoms may be lost"
-            raise TransientError(text, self._name)
+        counts = link.status["lit"]
+        new, self._seen = Counter(counts) - Counter(self._seen), counts
+        now_s = self._clock.now()
+        did = {what: sum(new[key] for key in keys) for what, (_, keys) in FAULTS.items()}
+        self._recent += [(now_s, what) for what, count in did.items() for _ in range(count)]
+        while self._recent and self._recent[0][0] < now_s - MINUTE_S:
+            self._recent.popleft()
+        for what, (setting, _) in FAULTS.items():
+            count = sum(one == what for _, one in self._recent)
+            if did[what] and count > (limit := getattr(self._settings, setting)):
+                text = f"the radio {what} {count} time(s) within a minute while the array was on"
+                raise DeviceError(self._name, f"{text}; {setting} allows {limit}")
+        if new:
+            texts = " and ".join(f"{what} {count} time(s)" for what, count in did.items() if count)
+            raise TransientError(f"the radio {texts} while the array was on: atoms may be lost", self._name)
         return link
 
     def _disconnect(self) -> None:
         link, self._link, self._facts = self._link, None, None
-        self._depth, self._dark, self._is_loaded, self._amplitudes = 0.0, 0, False, None
+        self._depth, self._seen, self._is_loaded, self._amplitudes = 0.0, {}, False, None
+        self._recent.clear()
         try:
             if link is not None:
                 link.close()

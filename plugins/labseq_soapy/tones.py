@@ -16,6 +16,7 @@ from labseq_soapy_stream.output import Samples
 from numpy.typing import NDArray
 
 from labseq.plugin import DeviceError, LimitError, format_quantity
+from labseq_soapy.radios import tunes_digitally
 from labseq_soapy.settings import SoapySettings
 
 Floats = NDArray[np.float64]
@@ -93,19 +94,19 @@ def clearance(tones_hz: Floats, oscillator_hz: float) -> float:
     return float(np.abs(spots[:, None] - tones_hz).min())
 
 
-def check_span(what: str, tones_hz: Floats, oscillator_hz: float, rate_hz: float) -> None:
-    """Refuse tones that are too far from the local oscillator for the sample rate.
+def check_span(what: str, tones_hz: Floats, zero_hz: float, rate_hz: float, setting: str) -> None:
+    """Refuse tones that are too far from the zero of the samples for the sample rate.
 
     Raises:
         LimitError: They are.
     """
-    farthest = float(np.abs(tones_hz - oscillator_hz).max())
+    farthest = float(np.abs(tones_hz - zero_hz).max())
     limit_hz = USABLE * rate_hz / 2
     if farthest > limit_hz:
-        came = f"{_mhz(farthest)} from the local oscillator at {_mhz(oscillator_hz)}"
+        came = f"{_mhz(farthest)} from the local oscillator at {_mhz(zero_hz)}"
         limit = f"{_mhz(limit_hz)}, half of {USABLE:.0%} of the sample rate of {_mhz(rate_hz)}"
         hint = f"choose a sample_rate above {_mhz(2 * farthest / USABLE)}, or another local_oscillator"
-        raise LimitError(f"{what}: the outermost tone", came, limit, hint)
+        raise LimitError(f"{what}: the outermost tone", came, limit, hint, setting=(setting,))
 
 
 def shortest_loop(what: str, offsets_hz: Floats, rate_hz: float, tolerance_hz: float) -> int:
@@ -219,7 +220,8 @@ class ArrayTones:
         loops: The tones on the grid of the loop; none before :meth:`tune`.
 
     Raises:
-        LimitError: The tones span more than 80 % of the sample rate, or no loop holds them all.
+        LimitError: The tones span more than 80 % of the sample rate, no loop holds them all, or the offset of
+            the local oscillator leaves it among the tones or moves them out of the radio's filters.
     """
 
     def __init__(self, name: str, settings: SoapySettings, shape: tuple[int, int]) -> None:
@@ -230,7 +232,9 @@ class ArrayTones:
         self.oscillator_hz = local_oscillator(self.tones_hz) if chosen is None else chosen
         self.crest_factor: tuple[float, ...] = ()
         self.loops: tuple[AxisLoop, ...] = ()
-        self._n_samples(settings.sample_rate, (self.oscillator_hz, self.oscillator_hz))
+        shift_hz = 0.0 if tunes_digitally(settings.device) else settings.lo_offset
+        self._check_offset()
+        self._n_samples(settings.sample_rate, [self.oscillator_hz + shift_hz] * 2)
 
     def tune(self, facts: Facts) -> None:
         """Fit the loops to the sample rate and local oscillators that the radio really has.
@@ -243,14 +247,15 @@ class ArrayTones:
         if abs(facts.rate_hz - wanted_hz) > RATE_ERROR * wanted_hz:
             text = f"the radio makes {facts.rate_hz:.10g} samples per second; expected {wanted_hz:.10g}"
             raise DeviceError(self._name, f"{text}: choose a sample_rate that it has")
+        expected_hz = self.oscillator_hz + self._settings.lo_offset
         for found_hz in facts.oscillator_hz:
-            if abs(found_hz - self.oscillator_hz) > TUNING_ERROR * wanted_hz:
+            if abs(found_hz - expected_hz) > TUNING_ERROR * wanted_hz:
                 text = f"the radio tuned its local oscillator to {found_hz:.10g} Hz"
-                raise DeviceError(self._name, f"{text}; expected {self.oscillator_hz:.10g} Hz: see its range")
-        n_samples = self._n_samples(facts.rate_hz, facts.oscillator_hz)
+                raise DeviceError(self._name, f"{text}; expected {expected_hz:.10g} Hz: see its range")
+        n_samples = self._n_samples(facts.rate_hz, facts.zero_hz)
         self.loops = tuple(
-            axis_loop(tones_hz - oscillator_hz, n_samples, facts.rate_hz)
-            for tones_hz, oscillator_hz in zip(self.tones_hz, facts.oscillator_hz, strict=True)
+            axis_loop(tones_hz - zero_hz, n_samples, facts.rate_hz)
+            for tones_hz, zero_hz in zip(self.tones_hz, facts.zero_hz, strict=True)
         )
 
     def samples(self, amplitudes: Amplitudes) -> Samples:
@@ -280,12 +285,29 @@ class ArrayTones:
         order = np.argsort([self._settings.row_channel, self._settings.column_channel])
         return np.stack([made[axis].view(np.float32) for axis in order])
 
-    def _n_samples(self, rate_hz: float, oscillators_hz: Sequence[float]) -> int:
+    def _check_offset(self) -> None:
+        """Refuse an offset that leaves the oscillator among the tones, or the tones outside the filters."""
+        offset_hz, bandwidth_hz = self._settings.lo_offset, self._settings.bandwidth
+        if not offset_hz:
+            return
+        all_hz = np.concatenate(self.tones_hz) - self.oscillator_hz
+        margin_hz = _least_spacing_hz(self.tones_hz) / 3
+        low_hz, high_hz = float(all_hz.min()) - margin_hz, float(all_hz.max()) + margin_hz
+        if low_hz < offset_hz < high_hz:
+            came = f"{_mhz(offset_hz)}, which leaves it among the tones"
+            limit = f"{_mhz(low_hz)} or less, or {_mhz(high_hz)} or more"
+            raise LimitError(f"{self._name}: lo_offset", came, limit, setting=("lo_offset",))
+        farthest_hz = float(np.abs(all_hz - offset_hz).max())
+        if bandwidth_hz is not None and farthest_hz > bandwidth_hz / 2:
+            what = f"{self._name}: the distance of the outermost tone from the local oscillator"
+            limit = f"{_mhz(bandwidth_hz / 2)}, half of the bandwidth"
+            raise LimitError(what, _mhz(farthest_hz), limit, setting=("bandwidth",))
+
+    def _n_samples(self, rate_hz: float, zeros_hz: Sequence[float]) -> int:
         offsets_hz: list[Floats] = []
-        for axis, tones_hz, oscillator_hz in zip(
-            ("row", "column"), self.tones_hz, oscillators_hz, strict=True
-        ):
-            check_span(f"{self._name}: {axis} tones", tones_hz, oscillator_hz, rate_hz)
-            offsets_hz.append(tones_hz - oscillator_hz)
+        for axis, tones_hz, zero_hz in zip(("row", "column"), self.tones_hz, zeros_hz, strict=True):
+            setting = "lo_offset" if self._settings.lo_offset else "sample_rate"
+            check_span(f"{self._name}: {axis} tones", tones_hz, zero_hz, rate_hz, setting)
+            offsets_hz.append(tones_hz - zero_hz)
         all_hz = np.unique(np.concatenate(offsets_hz))
         return shortest_loop(self._name, all_hz, rate_hz, self._settings.tone_tolerance)

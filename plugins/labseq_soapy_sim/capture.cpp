@@ -1,11 +1,14 @@
 // A software-defined radio that keeps what it is sent: the SoapySDR device "capture".
 //
 // It has transmit channels only, plays by the computer's clock from a buffer of finite length, and reports
-// an underflow when that ran dry. What it was sent stands in a file that others map into their memory
-// (struct Header, then a ring of samples for each channel); its faults are switched on there.
+// an underflow when that ran dry, and packets that were lost or late as the module for UHD does. What it was
+// sent stands in a file that others map into their memory (struct Header, then a ring of samples for each
+// channel); its faults are switched on there.
 //
 // Arguments: folder (where its files are), channels, buffer (s), patience (s: how long its clock waits for
-// samples that are late), speed (of its clock), coerce_rate (Hz), record (samples kept in files), fault=absent.
+// samples that are late), speed (of its clock), coerce_rate (Hz), record (samples kept in files), leakage (of
+// its local oscillators, part of full scale), time=0 (no hardware time), delay (s: of the first packet),
+// components=1 (no digital tuning), fault=absent.
 //
 // With record, the file "trace" gets a line for each change of the transmitters, also by later processes:
 // time in s (CLOCK_MONOTONIC), name, two numbers. A process that is killed leaves them as they are.
@@ -33,18 +36,24 @@
 
 namespace {
 
-constexpr uint64_t MAGIC = 0x3270616371657362ull;  // changes with the layout below
+constexpr uint64_t MAGIC = 0x3370616371657362ull;  // changes with the layout below
 constexpr size_t RING = 1u << 18;                  // samples of each channel
 constexpr size_t CHANNELS = 2;
 constexpr size_t MTU = 16384;
+constexpr double APART_S = 5e-6;  // by which channel 1 starts after channel 0 without a timed start
 
-enum Fault : uint64_t { UNDERFLOW_ONCE = 1, STREAM_ERROR = 2, MUTE_0 = 4, MUTE_1 = 8, STALL = 16 };
+enum Fault : uint64_t {
+    UNDERFLOW_ONCE = 1, STREAM_ERROR = 2, MUTE_0 = 4, MUTE_1 = 8, STALL = 16, LOST_ONCE = 32, LATE_ONCE = 64
+};
 
 struct Header {
     uint64_t magic, ring, sent, underflows, is_active, fault;
     uint64_t silent, silence;  // samples of silence up to now, and those of the last silence that is over
+    uint64_t sequence_errors, late_packets;
     double rate_hz, speed, patience_s, t0_s;  // sample n is played at t0 + n / (rate speed), CLOCK_MONOTONIC
-    double frequency_hz[CHANNELS], gain_db[CHANNELS];
+    double leakage;
+    double frequency_hz[CHANNELS], gain_db[CHANNELS];  // of the samples' zero; gain
+    double oscillator_hz[CHANNELS], start_s[CHANNELS];  // where it leaks; when its first sample was played
 };
 
 using Sample = uint64_t;  // two floats, never looked into
@@ -70,6 +79,7 @@ public:
     explicit Capture(const SoapySDR::Kwargs &args)
         : folder_(text(args, "folder", ".")), n_channels_(size_t(number(args, "channels", CHANNELS))),
           buffer_s_(number(args, "buffer", 0.05)), coerced_hz_(number(args, "coerce_rate", 0.0)),
+          delay_s_(number(args, "delay", 0.0)), has_time_(number(args, "time", 1.0) > 0.0), tunes_digitally_(number(args, "components", 2.0) > 1.0),
           n_record_(size_t(number(args, "record", 0.0))) {
         const std::string path = folder_ + "/ring";
         const size_t size = sizeof(Header) + CHANNELS * RING * sizeof(Sample);
@@ -88,6 +98,7 @@ public:
         header_->ring = RING;
         header_->speed = number(args, "speed", 1.0);
         header_->patience_s = number(args, "patience", 0.0);
+        header_->leakage = number(args, "leakage", 0.0);
         header_->magic = MAGIC;
         if (n_record_ > 0) trace_ = std::fopen((folder_ + "/trace").c_str(), "a");
         if (trace_) std::setvbuf(trace_, nullptr, _IOLBF, 4096);
@@ -112,14 +123,30 @@ public:
     std::vector<std::string> getStreamFormats(const int, const size_t) const override { return {SOAPY_SDR_CF32}; }
 
     void setSampleRate(const int, const size_t, const double rate) override {
-        header_->rate_hz = coerced_hz_ > 0.0 ? coerced_hz_ : rate;
+        header_->rate_hz = rate;
     }
     double getSampleRate(const int, const size_t) const override { return header_->rate_hz; }
 
-    void setFrequency(const int, const size_t channel, const double frequency, const SoapySDR::Kwargs &) override {
-        header_->frequency_hz[channel] = frequency;
+    // The library tunes by these components.
+    std::vector<std::string> listFrequencies(const int, const size_t) const override {
+        return tunes_digitally_ ? std::vector<std::string>{"RF", "BB"} : std::vector<std::string>{"RF"};
     }
-    double getFrequency(const int, const size_t channel) const override { return header_->frequency_hz[channel]; }
+    SoapySDR::RangeList getFrequencyRange(const int, const size_t, const std::string &name) const override {
+        return {name == "RF" ? SoapySDR::Range(1e6, 6e9) : SoapySDR::Range(-100e6, 100e6)};
+    }
+    void setFrequency(const int, const size_t channel, const std::string &name, const double frequency,
+                      const SoapySDR::Kwargs &) override {
+        const double shift = header_->frequency_hz[channel] - header_->oscillator_hz[channel];
+        if (name == "RF") header_->oscillator_hz[channel] = frequency;
+        header_->frequency_hz[channel] = header_->oscillator_hz[channel] + (name == "RF" ? shift : frequency);
+    }
+    double getFrequency(const int, const size_t channel, const std::string &name) const override {
+        const double oscillator = header_->oscillator_hz[channel];
+        return name == "RF" ? oscillator : header_->frequency_hz[channel] - oscillator;
+    }
+
+    bool hasHardwareTime(const std::string &) const override { return has_time_; }
+    long long getHardwareTime(const std::string &) const override { return (long long)(1e9 * (now_s() - zero_s_)); }
 
     void setGain(const int, const size_t channel, const double gain) override {
         const SoapySDR::Range range = getGainRange(SOAPY_SDR_TX, channel);
@@ -135,6 +162,7 @@ public:
         for (const size_t channel : channels)
             if (channel >= n_channels_) throw std::runtime_error("no such channel");
         channels_ = channels;
+        if (coerced_hz_ > 0.0) header_->rate_hz = coerced_hz_;  // as its clock is set for this number of channels
         for (const size_t channel : channels)
             if (n_record_ > 0)
                 records_.push_back(std::fopen((folder_ + "/channel" + std::to_string(channel)).c_str(), "wb"));
@@ -155,7 +183,6 @@ public:
         header_->sent = 0;
         header_->t0_s = now_s();
         header_->is_active = 1;
-        trace("play", header_->t0_s, clock_hz());
         return 0;
     }
 
@@ -165,12 +192,14 @@ public:
         return 0;
     }
 
-    int writeStream(SoapySDR::Stream *, const void *const *buffers, const size_t n, int &, const long long,
-                    const long timeout_us) override {
+    int writeStream(SoapySDR::Stream *, const void *const *buffers, const size_t n, int &flags,
+                    const long long time_ns, const long timeout_us) override {
         if (!header_->is_active || (header_->fault & STREAM_ERROR)) return SOAPY_SDR_STREAM_ERROR;
+        if (header_->sent == 0) start(flags & SOAPY_SDR_HAS_TIME, zero_s_ + 1e-9 * double(time_ns));
         const size_t buffer = size_t(std::max(1.0, buffer_s_ * header_->rate_hz));
         const size_t room = wait_for_room(std::min(std::min(n, MTU), buffer), 1e-6 * double(timeout_us));
         if (room == 0) return SOAPY_SDR_TIMEOUT;
+        if (drops(LOST_ONCE, header_->sequence_errors) || drops(LATE_ONCE, header_->late_packets)) return int(room);
         bool silent = true;
         for (size_t i = 0; i < channels_.size(); i++) {
             const Sample *samples = static_cast<const Sample *>(buffers[i]);
@@ -183,13 +212,36 @@ public:
         return int(room);
     }
 
-    int readStreamStatus(SoapySDR::Stream *, size_t &, int &, long long &, const long) override {
-        if (n_told_ == header_->underflows) return SOAPY_SDR_TIMEOUT;
-        n_told_++;
-        return SOAPY_SDR_UNDERFLOW;
+    int readStreamStatus(SoapySDR::Stream *, size_t &, int &, long long &, const long timeout_us) override {
+        const double deadline_s = now_s() + 1e-6 * double(timeout_us);
+        do {
+            if (n_told_[0] != header_->underflows) return n_told_[0]++, SOAPY_SDR_UNDERFLOW;
+            if (n_told_[1] != header_->sequence_errors) return n_told_[1]++, SOAPY_SDR_CORRUPTION;
+            if (n_told_[2] != header_->late_packets) return n_told_[2]++, SOAPY_SDR_TIME_ERROR;
+            if (timeout_us > 0) std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        } while (now_s() < deadline_s);
+        return SOAPY_SDR_TIMEOUT;
     }
 
 private:
+    // The channels start together at a time that is not over; otherwise each with its first packet.
+    void start(const bool timed, const double time_s) {
+        const bool late = timed && time_s <= now_s() + delay_s_;
+        header_->late_packets += late;
+        header_->t0_s = timed && !late ? time_s : now_s();
+        for (size_t channel = 0; channel < CHANNELS; channel++)
+            header_->start_s[channel] = header_->t0_s + (timed && !late ? 0.0 : double(channel) * APART_S);
+        trace("play", header_->t0_s, clock_hz());
+    }
+
+    // Whether a packet is lost: what follows is played earlier, and the phases of all tones jump.
+    bool drops(const Fault fault, uint64_t &count) {
+        if (!(header_->fault & fault)) return false;
+        header_->fault &= ~uint64_t(fault);
+        count++;
+        return true;
+    }
+
     void trace(const char *name, double first = 0.0, double second = 0.0) {
         if (trace_) std::fprintf(trace_, "%.6f %s %.6f %.6f\n", now_s(), name, first, second);
     }
@@ -199,15 +251,16 @@ private:
     // Samples that were played so far; an underflow, or a wait for late samples, sets the clock back.
     double played() {
         const double played = (now_s() - header_->t0_s) * clock_hz();
-        const double late_s = header_->sent > 0 ? (played - double(header_->sent)) / clock_hz() : 0.0;
+        if (header_->sent == 0) return 0.0;
+        const double late_s = (played - double(header_->sent)) / clock_hz();
         const bool forced = header_->fault & UNDERFLOW_ONCE;
-        if (late_s <= 0.0 && header_->sent > 0 && !forced) return played;
+        if (late_s <= 0.0 && !forced) return std::max(0.0, played);
         if (forced || late_s > header_->patience_s) {
             header_->underflows++;
             header_->fault &= ~uint64_t(UNDERFLOW_ONCE);
         }
         header_->t0_s = now_s() - double(header_->sent) / clock_hz();
-        if (header_->sent > 0) trace("play", header_->t0_s, clock_hz());
+        trace("play", header_->t0_s, clock_hz());
         return double(header_->sent);
     }
 
@@ -241,7 +294,8 @@ private:
 
     std::string folder_;
     size_t n_channels_;
-    double buffer_s_, coerced_hz_;
+    double buffer_s_, coerced_hz_, delay_s_, zero_s_ = now_s();
+    bool has_time_, tunes_digitally_;
     size_t n_record_;
     int file_ = -1;
     Header *header_ = nullptr;
@@ -249,7 +303,7 @@ private:
     std::vector<size_t> channels_;
     std::vector<std::FILE *> records_;
     std::FILE *trace_ = nullptr;
-    uint64_t n_told_ = 0;
+    uint64_t n_told_[3] = {};
 };
 
 SoapySDR::KwargsList find(const SoapySDR::Kwargs &args) {

@@ -22,7 +22,7 @@ class CapturedOutputs:
 
     Implements ``labseq.plugin.ToneSource``. Amplitudes are measured at the frequencies where the tones
     should be: a signal at another frequency, because the local oscillator or the sample rate is wrong,
-    makes no tweezers.
+    makes no tweezers; nor does the leakage of the oscillator, unless it is on a tone.
 
     Args:
         ring: The samples that the radio received.
@@ -36,7 +36,7 @@ class CapturedOutputs:
         self._changes: list[TweezerAmplitudes] = []
         self._last = tuple(np.zeros(len(tones)) for tones in tones_hz)
         self._underflows = int(ring["underflows"])
-        self._filters: dict[tuple[int, float, float], NDArray[np.complex128]] = {}
+        self._filters: dict[tuple[int, float, float, float], NDArray[np.complex128]] = {}
 
     def measure(self) -> None:
         """Record the amplitudes if they have changed; an underflow is recorded as darkness in between."""
@@ -70,13 +70,16 @@ class CapturedOutputs:
         return tuple(self._amplitudes(tones_hz, channel) for tones_hz, channel in self._axes)
 
     def _amplitudes(self, tones_hz: Floats, channel: int) -> Floats:
-        rate_hz, oscillator_hz = float(self._ring["rate_hz"]), float(self._ring["frequency_hz"][channel])
+        rate_hz, zero_hz = float(self._ring["rate_hz"]), float(self._ring["frequency_hz"][channel])
+        leaks_hz = float(self._ring["oscillator_hz"][channel])
         spacing_hz = float(np.diff(np.sort(tones_hz)).min()) if len(tones_hz) > 1 else rate_hz / 100
         n = int(np.clip(8 * rate_hz / spacing_hz, 2048, 1 << 16))
-        key = channel, rate_hz, oscillator_hz
+        key = channel, rate_hz, zero_hz, leaks_hz
         if key not in self._filters:
-            self._filters[key] = _least_squares(tones_hz - oscillator_hz, n, rate_hz)
-        samples = self._ring.latest(n)[channel]
+            is_apart = np.abs(tones_hz - leaks_hz).min() > rate_hz / n
+            known_hz = np.append(tones_hz, leaks_hz) if is_apart else tones_hz
+            self._filters[key] = _least_squares(known_hz - zero_hz, n, rate_hz)[: len(tones_hz)]
+        samples = self._ring.output(n)[channel]
         if len(samples) < n:
             return np.zeros(len(tones_hz))
         found = np.einsum("ij,j", self._filters[key], samples)  # BLAS would wake its threads for this

@@ -18,7 +18,7 @@ from labseq_soapy_sim.build import build_module
 from labseq_soapy_sim.outputs import CapturedOutputs
 from labseq_soapy_sim.ring import Ring
 
-DEFAULTS: Final[Mapping[str, str]] = {"speed": "0.1", "buffer": "0.002", "patience": "60"}
+DEFAULTS: Final[Mapping[str, str]] = {"speed": "0.1", "buffer": "0.002", "patience": "60", "leakage": "0.003"}
 """A tenth of real time costs a tenth of the work. On a busy computer samples sometimes come late: the
 radio's clock then waits for them, so that equal runs give equal atoms."""
 LEAST: Final[Mapping[str, float]] = {
@@ -28,6 +28,10 @@ LEAST: Final[Mapping[str, float]] = {
     "record": 0.0,
     "channels": 1.0,
     "coerce_rate": 0.0,
+    "leakage": 0.0,
+    "time": 0.0,
+    "delay": 0.0,
+    "components": 1.0,
 }
 """Arguments that are numbers, and their lowest values."""
 WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": ()}

@@ -10,21 +10,24 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-MAGIC: Final = 0x3270616371657362
+MAGIC: Final = 0x3370616371657362
 CHANNELS: Final = 2
 
-_COUNTS: Final = ("magic", "ring", "sent", "underflows", "is_active", "fault", "silent", "silence")
+_COUNTS: Final = (
+    *("magic", "ring", "sent", "underflows", "is_active", "fault", "silent", "silence"),
+    *("sequence_errors", "late_packets"),
+)
 _HEADER: Final = np.dtype(
     [
         *((name, np.uint64) for name in _COUNTS),
-        *((name, np.float64) for name in ("rate_hz", "speed", "max_wait_s", "t0_s")),
-        *((name, np.float64, CHANNELS) for name in ("frequency_hz", "gain_db")),
+        *((name, np.float64) for name in ("rate_hz", "speed", "max_wait_s", "t0_s", "leakage")),
+        *((name, np.float64, CHANNELS) for name in ("frequency_hz", "gain_db", "oscillator_hz", "start_s")),
     ]
 )
 
 
 class Fault(enum.IntFlag):
-    """Faults of the radio while they are set; the underflow happens once."""
+    """Faults of the radio while they are set; an underflow, and a lost or late packet, happen once."""
 
     NONE = 0
     UNDERFLOW = 1
@@ -32,6 +35,8 @@ class Fault(enum.IntFlag):
     MUTE_0 = 4
     MUTE_1 = 8
     STALL = 16
+    LOST_PACKET = 32
+    LATE_PACKET = 64
 
 
 def read_trace(folder: Path) -> list[tuple[float, str, float, float]]:
@@ -91,6 +96,14 @@ class Ring:
             found = self._samples[:, places]
             if int(self._header["sent"]) - end < size - n - (1 << 16):  # not overwritten meanwhile
                 return found
+
+    def output(self, n: int) -> NDArray[np.complex64]:
+        """As :meth:`latest`, with the leakage of the local oscillators."""
+        samples = self.latest(n)
+        offsets_hz = self._header["oscillator_hz"] - self._header["frequency_hz"]
+        times_s = np.arange(samples.shape[1]) / self._header["rate_hz"]
+        waves = np.exp(2j * np.pi * np.outer(offsets_hz, times_s))
+        return samples + (self._header["leakage"] * waves).astype(np.complex64)
 
     def _is_held(self) -> bool:
         import fcntl

@@ -13,7 +13,8 @@ labseq's first line is a :class:`Setup`; then come commands, each with a key ``d
 ==========  =====================================  ==============================================
 
 The process sends ``{"facts": ...}`` or ``{"failed": text}`` once, then ``{"status": ...}`` regularly,
-and ``{"ended": text}`` if it ends for another reason than ``end``.
+and ``{"ended": text}`` if it ends for another reason than ``end``. The status counts each error that a
+stream survives: ``{"all": {"underflows": 2}, "lit": {"underflows": 1}}``, "lit" while the array was on.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Setup:
         stream: Arguments of its stream.
         channels: Channel of the row axis and of the column axis.
         rate_hz: Sample rate.
-        oscillator_hz: Frequency of the local oscillators.
+        oscillator_hz: Frequency of the local oscillators, without their offset.
+        lo_offset_hz: Distance of the local oscillators from it.
         bandwidth_hz: Bandwidth of the analog filters; None: as the radio chooses.
         gain_db: Gain of each axis; None: the lowest.
         antenna: Name of the connector; "": as the radio chooses.
@@ -50,6 +52,7 @@ class Setup:
     channels: Sequence[int]
     rate_hz: float
     oscillator_hz: float
+    lo_offset_hz: float
     bandwidth_hz: float | None
     gain_db: Sequence[float | None]
     antenna: str
@@ -67,16 +70,22 @@ class Facts:
     Attributes:
         radio: Driver, hardware, serial number and the like.
         rate_hz: Sample rate.
-        oscillator_hz: Local oscillator of the row and the column channel.
-        gain_db: Gain of the row and the column channel.
+        zero_hz: Frequency at which constant samples are played, of the row and the column channel.
+        oscillator_hz: Their local oscillators.
+        gain_db: Their gains.
         buffered: Number of samples in its buffer when it takes no more.
+        starts_together: Whether both channels started at one time.
+        ordinary: Why the process has no real-time priority; "" if it has.
     """
 
     radio: Mapping[str, str]
     rate_hz: float
+    zero_hz: Sequence[float]
     oscillator_hz: Sequence[float]
     gain_db: Sequence[float]
     buffered: int = 0
+    starts_together: bool = True
+    ordinary: str = ""
 
 
 def send(pipe: int, message: Mapping[str, Any]) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import sys
+import time
+from collections import Counter
 from collections.abc import Sequence
-from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
+from ctypes import POINTER, byref, c_bool, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
 from functools import cache
 from typing import Any, Final
 
@@ -18,7 +20,11 @@ TX: Final = 0
 FORMAT: Final = b"CF32"
 TIMEOUT: Final = -1
 NOT_SUPPORTED: Final = -5
-UNDERFLOW: Final = -7
+ERRORS: Final = {-7: "underflows", -3: "sequence_errors", -6: "late_packets"}
+"""Errors that a stream survives: UNDERFLOW, CORRUPTION and TIME_ERROR -> key of the counts."""
+HAS_TIME: Final = 1 << 2
+START_S: Final = 0.1
+"""From setting the time of a start to the start."""
 
 _NAMES: Final = {
     "linux": ("libSoapySDR.so.0.8", "libSoapySDR.so"),
@@ -70,6 +76,10 @@ _SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
     "Device_setBandwidth": (c_int, (*_CHANNEL, c_double)),
     "Device_setFrequency": (c_int, (*_CHANNEL, c_double, POINTER(_Kwargs))),
     "Device_getFrequency": (c_double, _CHANNEL),
+    "Device_listFrequencies": (c_void_p, (*_CHANNEL, POINTER(c_size_t))),
+    "Device_getFrequencyComponent": (c_double, (*_CHANNEL, c_char_p)),
+    "Device_hasHardwareTime": (c_bool, (c_void_p, c_char_p)),
+    "Device_getHardwareTime": (c_longlong, (c_void_p, c_char_p)),
     "Device_setGain": (c_int, (*_CHANNEL, c_double)),
     "Device_getGain": (c_double, _CHANNEL),
     "Device_getGainRange": (_Range, _CHANNEL),
@@ -90,6 +100,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
     ),
     "Kwargs_fromString": (_Kwargs, (c_char_p,)),
     "Kwargs_clear": (None, (POINTER(_Kwargs),)),
+    "Strings_clear": (None, (POINTER(c_void_p), c_size_t)),
     "_errToStr": (c_char_p, (c_int,)),
     "_free": (None, (c_void_p,)),
 }
@@ -164,14 +175,41 @@ class Radio:
         return gains.minimum, gains.maximum
 
     def set(self, what: str, channel: int, value: float | str) -> None:
-        """Set "Antenna", "SampleRate", "Bandwidth", "Frequency" or "Gain" of a channel, in Hz or dB."""
+        """Set "Antenna", "SampleRate", "Bandwidth" or "Gain" of a channel, in Hz or dB."""
         plain = value.encode() if isinstance(value, str) else value
-        extra = (None,) if what == "Frequency" else ()
-        _call(f"set{what}", self._device, TX, channel, plain, *extra)
+        _call(f"set{what}", self._device, TX, channel, plain)
 
     def get(self, what: str, channel: int) -> float:
-        """Read a value of a channel back: "SampleRate", "Frequency" or "Gain"."""
+        """Read a value of a channel back: "SampleRate", "Frequency" (of the samples' zero) or "Gain"."""
         return float(_call(f"get{what}", self._device, TX, channel))
+
+    def tune(self, channel: int, frequency_hz: float, offset_hz: float) -> None:
+        """Tune the local oscillator to a frequency plus an offset.
+
+        If the radio can shift the samples digitally their zero stays at the frequency, else it shifts too.
+        """
+        if offset_hz and not self._tunes_digitally(channel):
+            frequency_hz, offset_hz = frequency_hz + offset_hz, 0.0
+        kwargs = library().SoapySDRKwargs_fromString(f"OFFSET={offset_hz!r}".encode() if offset_hz else b"")
+        try:
+            _call("setFrequency", self._device, TX, channel, frequency_hz, byref(kwargs))
+        finally:
+            library().SoapySDRKwargs_clear(byref(kwargs))
+
+    def oscillator_hz(self, channel: int) -> float:
+        """Frequency of the local oscillator, where it leaks."""
+        if self._tunes_digitally(channel):
+            return float(_call("getFrequencyComponent", self._device, TX, channel, b"RF"))
+        return self.get("Frequency", channel)
+
+    def _tunes_digitally(self, channel: int) -> bool:
+        n_names = c_size_t()
+        names = c_void_p(_call("listFrequencies", self._device, TX, channel, byref(n_names)))
+        try:
+            found = ctypes.cast(names, POINTER(c_char_p))[: n_names.value] if names else []
+            return {b"RF", b"BB"} <= {*found}
+        finally:
+            library().SoapySDRStrings_clear(byref(names), n_names)
 
     def set_clock_source(self, source: str) -> None:
         """Choose the reference of its clocks."""
@@ -206,10 +244,29 @@ class Stream:
         self._buffers = (c_void_p * n_channels)()
         self._flags, self._mask, self._time = c_int(0), c_size_t(0), c_longlong(0)
         self._knows_status = True
+        self._errors: Counter[str] = Counter()
+        self._starts_ns = 0
+        self.starts_together = False
 
     def activate(self) -> None:
-        """Start to play."""
+        """Let the first samples start to play: on all channels at one time, if the radio has a clock."""
         _call("activateStream", *self._place, 0, 0, 0)
+        self.starts_together = bool(_call("hasHardwareTime", self._place[0], b""))
+        if self.starts_together:
+            now_ns = _call("getHardwareTime", self._place[0], b"")
+            self._starts_ns = now_ns + round(START_S * 1e9)
+        self._activated_s = time.monotonic()
+
+    def check_start(self) -> None:
+        """Check that the first samples came in time; does not wait until they are played.
+
+        Raises:
+            SoapyError: They were late: the channels did not start together.
+        """
+        left_s = self._activated_s + START_S / 2 - time.monotonic()
+        if self.starts_together and self.errors(max(0.0, left_s))["late_packets"]:
+            text = f"its timed start came too late: the computer took more than {START_S:g} s"
+            raise SoapyError(f"{text}; try again, with fewer programs running")
 
     def write(self, samples: NDArray[np.float32], start: int, timeout_s: float) -> int:
         """Write samples to the stream.
@@ -228,30 +285,36 @@ class Stream:
         n_samples = samples.shape[1] // 2 - start
         for i, row in enumerate(samples):
             self._buffers[i] = row.ctypes.data + 8 * start
-        self._flags.value = 0
+        self._flags.value = HAS_TIME if self._starts_ns else 0
+        wait_us = round(timeout_s * 1e6)
         n_taken = self._library.SoapySDRDevice_writeStream(
-            *self._place, self._buffers, n_samples, byref(self._flags), 0, round(timeout_s * 1e6)
+            *self._place, self._buffers, n_samples, byref(self._flags), self._starts_ns, wait_us
         )
-        if n_taken >= 0 or n_taken in {TIMEOUT, UNDERFLOW}:
-            return max(0, n_taken)
-        raise _stream_error("writing to the stream", n_taken)
+        if n_taken > 0:
+            self._starts_ns = 0
+        elif n_taken in ERRORS:
+            self._errors[ERRORS[n_taken]] += 1
+        elif n_taken not in {0, TIMEOUT}:
+            raise _stream_error("writing to the stream", n_taken)
+        return max(0, n_taken)
 
-    def underflows(self) -> int:
-        """How often the radio reported since the last call that it ran out of samples."""
-        count = 0
+    def errors(self, timeout_s: float = 0.0) -> Counter[str]:
+        """How often the radio reported each of :data:`ERRORS` since the last call; waits for the first."""
         while self._knows_status:
             code = self._library.SoapySDRDevice_readStreamStatus(
-                *self._place, byref(self._mask), byref(self._flags), byref(self._time), 0
+                *self._place, byref(self._mask), byref(self._flags), byref(self._time), round(timeout_s * 1e6)
             )
-            if code == UNDERFLOW:
-                count += 1
+            if code in ERRORS:
+                self._errors[ERRORS[code]] += 1
+                timeout_s = 0.0
                 continue
             if code == NOT_SUPPORTED:
                 self._knows_status = False
             elif code < 0 and code != TIMEOUT:
                 raise _stream_error("the stream's status", code)
             break
-        return count
+        found, self._errors = self._errors, Counter()
+        return found
 
     def close(self) -> None:
         """Stop playing and close the stream."""
@@ -279,11 +342,11 @@ def open_radio(setup: Setup) -> Radio:
     return radio
 
 
-def set_up(radio: Radio, setup: Setup) -> Facts:
-    """Set up both channels, and read the values back.
+def set_up(radio: Radio, setup: Setup) -> Stream:
+    """Set up both channels and their stream.
 
     Raises:
-        SoapyError: The radio refuses something, or its channels have different rates.
+        SoapyError: The radio refuses something.
     """
     if setup.clock_source:
         radio.set_clock_source(setup.clock_source)
@@ -293,18 +356,28 @@ def set_up(radio: Radio, setup: Setup) -> Facts:
             radio.set("Bandwidth", channel, setup.bandwidth_hz)
         if setup.antenna:
             radio.set("Antenna", channel, setup.antenna)
-        radio.set("Frequency", channel, setup.oscillator_hz)
+        radio.tune(channel, setup.oscillator_hz, setup.lo_offset_hz)
         lowest, highest = radio.gain_range(channel)
         if gain_db is not None and not lowest <= gain_db <= highest:
             text = f"a gain of {gain_db:g} dB; channel {channel} has {lowest:g} to {highest:g} dB"
             raise SoapyError(text)
         radio.set("Gain", channel, lowest if gain_db is None else gain_db)
+    return radio.stream(sorted(setup.channels), setup.stream)
+
+
+def read_back(radio: Radio, setup: Setup) -> Facts:
+    """Read the values of both channels back, after the stream is set up: some radios change them then.
+
+    Raises:
+        SoapyError: Its channels have different rates.
+    """
     rates = [radio.get("SampleRate", channel) for channel in setup.channels]
     if rates[0] != rates[1]:
         raise SoapyError(f"its channels have different sample rates: {rates[0]:.10g} and {rates[1]:.10g} Hz")
     return Facts(
         radio=radio.identify(),
         rate_hz=rates[0],
-        oscillator_hz=[radio.get("Frequency", channel) for channel in setup.channels],
+        zero_hz=[radio.get("Frequency", channel) for channel in setup.channels],
+        oscillator_hz=[radio.oscillator_hz(channel) for channel in setup.channels],
         gain_db=[radio.get("Gain", channel) for channel in setup.channels],
     )

@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,13 +24,15 @@ import numpy as np
 
 from labseq_soapy_stream.messages import Setup, received, send
 from labseq_soapy_stream.output import BLOCK, Output, Samples
-from labseq_soapy_stream.soapysdr import SoapyError, Stream, open_radio, set_up
+from labseq_soapy_stream.soapysdr import SoapyError, Stream, open_radio, read_back, set_up
 
 STALL_S: Final = 2.0
 """A stream that takes no samples for so long is dead."""
 STATUS_S: Final = 0.2
 WRITE_S: Final = 0.1
 MARKER_S: Final = 0.1
+PRIORITY: Final = 10
+"""Real-time priority, of 1 to 99: above all ordinary processes, below the threads of a radio's module."""
 
 Message = Mapping[str, Any]
 
@@ -95,7 +98,7 @@ class Streamer:
         self._written = self._buffered = self._due = 0
         self._task: int | None = None
         self._settling = False
-        self._underflows = self._dark = 0
+        self._errors: Mapping[str, Counter[str]] = {"all": Counter(), "lit": Counter()}
         self._status_s = self._marker_s = 0.0
         self._parent = os.getppid()
         self._alone = self._leaving = False
@@ -111,6 +114,7 @@ class Streamer:
             if 2 * taken <= first:  # full, except for what it has played meanwhile
                 break
         self._buffered = self._written
+        self._stream.check_start()
         return self._buffered
 
     def run(self) -> None:
@@ -164,15 +168,15 @@ class Streamer:
             self._task = None
 
     def _check(self) -> None:
-        found = self._stream.underflows()
-        if found:
-            self._underflows += found
-            self._dark += found if self._output.depth > 0.0 else 0
+        found = self._stream.errors()
+        self._errors["all"].update(found)
+        if self._output.depth > 0.0:
+            self._errors["lit"].update(found)
         now_s = time.monotonic()
         if found or now_s - self._status_s > STATUS_S:
             self._status_s = now_s
             if not self._alone:
-                self._post({"status": {"underflows": self._underflows, "dark": self._dark}})
+                self._post({"status": {when: dict(counts) for when, counts in self._errors.items()}})
         if self._leaving:
             return
         if self._terminated:
@@ -210,7 +214,18 @@ def repeated(loop: Samples) -> Samples:
     return np.tile(loop, (1, -(-BLOCK // n)))
 
 
-def stream(commands: CommandReader, messages: StatusWriter) -> None:
+def raise_priority() -> str:
+    """Give this thread, and those that it starts, real-time priority; returns why not, or ""."""
+    if sys.platform != "linux":
+        return "this system is not Linux"
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError as error:
+        return (error.strerror or str(error)).lower()
+    return ""
+
+
+def stream(commands: CommandReader, messages: StatusWriter, ordinary: str) -> None:
     """Open the radio, stream, close it."""
     setup = commands.setup
     radio = open_radio(setup)
@@ -218,13 +233,14 @@ def stream(commands: CommandReader, messages: StatusWriter) -> None:
     with contextlib.suppress(OSError):
         opened.write_text(str(os.getpid()), "ascii")
     try:
-        facts = set_up(radio, setup)
-        samples = radio.stream(sorted(setup.channels), setup.stream)
+        samples = set_up(radio, setup)
+        facts = read_back(radio, setup)
         samples.activate()
         streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
         signal.signal(signal.SIGTERM, streamer.terminate)
-        messages.post({"facts": asdict(replace(facts, buffered=streamer.fill()))})
         try:
+            facts = replace(facts, starts_together=samples.starts_together, ordinary=ordinary)
+            messages.post({"facts": asdict(replace(facts, buffered=streamer.fill()))})
             streamer.run()
         finally:
             with contextlib.suppress(SoapyError):  # the first error is reported
@@ -248,10 +264,11 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to labseq, which ramps down
     pipe = os.dup(1)
     os.dup2(2, 1)  # the output of the radio's module goes to the log
+    ordinary = raise_priority() if "--real-time" in sys.argv else ""
     commands, messages = CommandReader(0), StatusWriter(pipe)
     gc.disable()  # nothing here creates reference cycles
     try:
-        stream(commands, messages)
+        stream(commands, messages, ordinary)
     except SoapyError as error:
         messages.post({"failed": str(error)})
         messages.finish()

@@ -28,11 +28,18 @@ shot:
 """
 
 
-def run(folder: Path, static: str = "{use: virtual}", mobile: str = "{use: virtual}") -> labseq.Run:
-    """Run it; the static tweezers are in line 5 of p.yaml, the mobile ones in line 6."""
+def write(folder: Path, static: str = "{use: virtual}", mobile: str = "{use: virtual}") -> Path:
+    """Its sequence; the static tweezers are in line 5 of p.yaml, the mobile ones in line 6."""
     folder.mkdir(exist_ok=True)
     profile = PROFILE.replace("STATIC", static).replace("MOBILE", mobile)
     (folder / "p.yaml").write_text(profile, encoding="utf-8")
     (folder / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
-    with labseq.Session.open(folder / "s.yaml", shots=1, seed=1, output=folder / "runs") as session:
+    return folder / "s.yaml"
+
+
+def run(folder: Path, static: str = "{use: virtual}", mobile: str = "{use: virtual}") -> labseq.Run:
+    """Run it; see :func:`write`."""
+    with labseq.Session.open(
+        write(folder, static, mobile), shots=1, seed=1, output=folder / "runs"
+    ) as session:
         return session.run()

@@ -21,7 +21,7 @@ from labseq.model.grid import centred_comb
 from labseq.plugin import Context, LimitError, SiteGrid
 from labseq.testing import StaticTweezersContract
 
-from .labseq_soapy_rig import GRID, SMALL, depth, made, need_radio, opened, recorded
+from .labseq_soapy_rig import GRID, SMALL, depth, made, need_radio, opened, recorded, until
 
 
 class TestSoapyStaticTweezers(StaticTweezersContract):
@@ -124,6 +124,71 @@ def test_phases_make_a_low_crest_factor(n_tones: int, crest: float) -> None:
     phases = tones.low_crest_phases(1e6 * np.arange(float(n_tones)))
     loop = tones.AxisLoop(512 * n_tones, 16 * np.arange(n_tones), phases)
     assert tones.crest_factor(loop.samples(np.ones(n_tones))) <= crest + 1e-3
+
+
+@pytest.mark.parametrize("components", [2, 1])
+def test_an_offset_moves_the_leakage_out_of_the_tones_and_leaves_them_where_they_are(components: int) -> None:
+    tones_hz = centred_comb(4, 100e6, 60e3)
+    for offset_hz in (0.0, 200e3):
+        with opened(arguments=f"leakage=0.01,components={components}", lo_offset=offset_hz) as rig:
+            rig.tweezers.start()
+            n = 1200 * 64
+            until(lambda ring=rig.ring, n=n: bool(ring["sent"] > 4 * n))
+            spectrum = np.abs(np.fft.fft(rig.ring.output(n)[1])) / n
+            zero_hz, loop = float(rig.ring["frequency_hz"][1]), rig.described("loop_samples")
+            leak_hz = rig.described("oscillator_hz")[1]
+        lines_hz = zero_hz + np.fft.fftfreq(n, 1 / 1.2e6)[np.flatnonzero(spectrum > 0.005)]
+        assert n % loop == 0
+        assert (zero_hz == leak_hz) == (components == 1 or not offset_hz)
+        strong = np.isclose(lines_hz[:, None], tones_hz, atol=20.0).any(axis=1)
+        assert np.count_nonzero(strong) == 4
+        (leaks_hz,) = lines_hz[~strong]
+        assert leaks_hz == pytest.approx(leak_hz, abs=20.0)
+        assert (tones_hz.min() < leaks_hz < tones_hz.max()) == (not offset_hz)
+
+
+B210, N210, X310 = "driver=uhd,type=b200", "driver=uhd,type=usrp2", "driver=uhd, product=X310"
+
+
+@pytest.mark.parametrize(
+    ("chosen", "expected"),
+    [
+        ({"device": "driver=uhd"}, []),
+        ({"device": X310}, []),
+        (
+            {"device": B210},
+            [("a USRP B2x0 takes at most 30.72 MHz on two channels", "a sample_rate up to 30.72 MHz")],
+        ),
+        (
+            {"device": N210},
+            [
+                (
+                    "two channels need 320 MB/s, but Gigabit Ethernet carries 100 MB/s",
+                    "a sample_rate up to 12.5 MHz",
+                )
+            ],
+        ),
+        ({"device": N210, "stream": "WIRE=sc8", "sample_rate": 25e6}, []),
+        (
+            {"device": X310, "bus": "1gbe", "stream": "WIRE=sc8"},
+            [
+                (
+                    "two channels need 160 MB/s, but Gigabit Ethernet carries 100 MB/s",
+                    "a sample_rate up to 25 MHz",
+                )
+            ],
+        ),
+        (
+            {"device": B210, "bus": "usb2", "sample_rate": 20e6},
+            [("two channels need 160 MB/s, but USB 2 carries 53.248 MB/s", "a sample_rate up to 6.656 MHz")],
+        ),
+    ],
+)
+def test_a_sample_rate_that_a_radio_or_its_connection_cannot_keep_up_with_is_warned_of(
+    chosen: dict[str, Any], expected: list[tuple[str, str]]
+) -> None:
+    found = [(what, better) for _, what, better in SoapySettings.model_validate(chosen).warnings()]
+    assert found == expected
 
 
 N_LOOP = 96

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import queue
+import re
 import signal
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +15,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from labseq_soapy import link
+from labseq_soapy import link, static_tweezers
 from labseq_soapy_sim import Fault, Ring
 from labseq_soapy_stream import soapysdr
 from labseq_soapy_stream.soapysdr import SoapyError
-from labseq_soapy_stream.streamer import Streamer, repeated
+from labseq_soapy_stream.streamer import Streamer, raise_priority, repeated
 
 from labseq import DeviceError, TransientError
 from labseq.errors import StopRequested
@@ -52,16 +54,18 @@ def link_of(rig: Rig) -> Any:
             {},
             "makes 1000000 samples per second; expected 1200000: choose a sample_rate",
         ),
-        ("", {"column_gain": 70.0}, "a gain of 70 dB; channel 1 has 0 to 60 dB"),
+        ("delay=0.3", {}, r"its timed start came too late: .* more than 0\.1 s; try again"),
+        ("speed=1", {"column_gain": 70.0}, "a gain of 70 dB; channel 1 has 0 to 60 dB"),
     ],
 )
-def test_a_wrong_radio_is_refused_with_what_is_wrong(
-    arguments: str, chosen: dict[str, Any], text: str
+def test_a_wrong_radio_is_refused_with_what_is_wrong_and_stays_off(
+    tmp_path: Path, arguments: str, chosen: dict[str, Any], text: str
 ) -> None:
-    rig = made(arguments=arguments, **chosen)
+    rig = made(arguments=f"folder={tmp_path},{arguments}", **chosen)
     with pytest.raises(DeviceError, match=text):
         rig.tweezers.open()
     rig.tweezers.close()
+    assert not (tmp_path / "ring").exists() or not Ring(tmp_path).is_transmitting
 
 
 def test_a_radio_that_another_program_has_is_busy(tmp_path: Path) -> None:
@@ -88,17 +92,81 @@ def test_without_a_compiler_the_error_says_what_to_install(
             use()
 
 
-def test_an_underflow_while_the_array_is_on_asks_for_the_shot_again_and_is_harmless_in_the_dark() -> None:
+DISTURBANCES = [
+    (Fault.UNDERFLOW, "underflows", "ran out of samples"),
+    (Fault.LOST_PACKET, "sequence_errors", "missed packets"),
+    (Fault.LATE_PACKET, "late_packets", "missed packets"),
+]
+
+
+@pytest.mark.parametrize(("fault", "count", "did"), DISTURBANCES)
+def test_a_disturbance_while_the_array_is_on_asks_for_the_shot_again_and_is_harmless_in_the_dark(
+    fault: Fault, count: str, did: str
+) -> None:
     with opened() as rig:
-        rig.ring.set_fault(Fault.UNDERFLOW)
-        until(lambda: rig.described("underflows") == 1)
+        rig.ring.set_fault(fault)
+        until(lambda: rig.tweezers.poll()[count] == 1)
         rig.tweezers.check_interlocks()
         rig.tweezers.start()
-        rig.ring.set_fault(Fault.UNDERFLOW)
-        until(raised(TransientError, rig.tweezers.check_interlocks))
+        rig.ring.set_fault(fault)
+        text = re.escape(f"the radio {did} 1 time(s) while the array was on: atoms may be lost")
+        until(lambda: rig.tweezers.poll()[count] == 2)
+        with pytest.raises(TransientError, match=text):
+            rig.tweezers.check_interlocks()
         rig.tweezers.check_interlocks()
         rig.tweezers.ramp(0.5, 0.001)
-        assert rig.described("underflows") == 2
+        names = "underflows", "sequence_errors", "late_packets"
+        assert rig.tweezers.poll() == {name: 2 if name == count else 0 for name in names}
+
+
+@pytest.mark.parametrize(("fault", "count", "did"), DISTURBANCES)
+def test_the_run_ends_above_so_many_disturbances_in_a_minute(fault: Fault, count: str, did: str) -> None:
+    setting = "max_underflows" if fault is Fault.UNDERFLOW else "max_lost_packets"
+    text = ""
+    with opened(**{setting: 1}) as rig:
+        rig.tweezers.start()
+        for number, error in enumerate((TransientError, TransientError, DeviceError), 1):
+            if number == 2:
+                rig.clock.sleep(61.0)
+            rig.ring.set_fault(fault)
+            until(lambda n=number: rig.tweezers.poll()[count] == n)
+            with pytest.raises(error) as caught:
+                rig.tweezers.check_interlocks()
+            text = str(caught.value)
+    assert f"the radio {did} 2 time(s) within a minute while the array was on; {setting} allows 1" in text
+
+
+def test_both_outputs_start_at_one_time_of_the_radio_s_clock_or_the_radio_is_said_to_have_none() -> None:
+    with opened() as rig:
+        rows_s, columns_s = rig.ring["start_s"]
+        assert rows_s == columns_s
+        assert rig.described("notes") == []
+    with opened(arguments="time=0") as rig:
+        rows_s, columns_s = rig.ring["start_s"]
+        assert columns_s > rows_s
+        assert rig.described("notes") == [static_tweezers.NO_CLOCK]
+        rig.tweezers.start()
+
+
+def test_the_process_has_real_time_priority_or_the_reason_is_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def real_time(*args: Any) -> link.Link:
+        name, clock, setup, log, environment, _ = args
+        return link.Link(name, clock, setup, log, environment, ["--real-time"])
+
+    monkeypatch.setattr(static_tweezers, "Link", real_time)
+    with opened() as rig:
+        notes, scheduler = rig.described("notes"), os.sched_getscheduler(link_of(rig).pid)
+    allowed = scheduler == os.SCHED_FIFO
+    assert allowed or ["operation not permitted" in note for note in notes] == [True]
+    assert not (allowed and notes)
+
+    def refuse(*_: Any) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert raise_priority() == "operation not permitted"
 
 
 def break_off(rig: Rig, depth: float) -> None:
@@ -232,8 +300,8 @@ class Sink:
         self.latest = samples[:, 2 * start :].copy()
         return 0 if self._is_stalled else self.latest.shape[1] // 2
 
-    def underflows(self) -> int:
-        return 0
+    def errors(self) -> Counter[str]:
+        return Counter()
 
 
 def streamer(sink: Sink, *messages: dict[str, Any]) -> tuple[Streamer, list[Any]]:

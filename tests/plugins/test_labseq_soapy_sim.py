@@ -10,18 +10,22 @@ from typing import cast
 import numpy as np
 import pytest
 from labseq_soapy import labseq_register
+from labseq_soapy.static_tweezers import NO_CLOCK
 from labseq_soapy_sim import Fault, build
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
+from labseq import Session
 from labseq.errors import LabseqError
 from labseq.plugin import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
 from labseq.registry import Registry
 from labseq.roles import RfSource, ToneSource
+from labseq.session.check import check
+from labseq.session.devices import check_devices
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 from .labseq_soapy_rig import GRID, Rig, need_radio, opened, until
-from .small_run import run
+from .small_run import run, write
 
 ROWS, COLUMNS = np.array([0.1, 0.2, 0.15]), np.array([0.1, 0.05, 0.2, 0.1])
 
@@ -187,7 +191,27 @@ def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path
         (
             "device: simulated, sample_rate: 8 MHz",
             2,
-            "p.yaml:5:18: static_tweezers: row tones: the outermost tone is 3.6 MHz",
+            "p.yaml:5:63: static_tweezers: row tones: the outermost tone is 3.6 MHz",
+        ),
+        (
+            "device: simulated, lo_offset: 1 MHz",
+            2,
+            "p.yaml:5:61: static_tweezers: lo_offset is 1 MHz, which leaves it among the tones",
+        ),
+        (
+            "device: driver=hackrf, lo_offset: 18 MHz",
+            2,
+            "p.yaml:5:65: static_tweezers: row tones: the outermost tone is 21.6 MHz from",
+        ),
+        (
+            "device: simulated, lo_offset: 18 MHz, bandwidth: 30 MHz",
+            2,
+            "p.yaml:5:80: static_tweezers: the distance of the outermost tone from the local",
+        ),
+        (
+            "device: 'simulated,coerce_rate=12500000'",
+            3,
+            "the radio makes 12500000 samples per second; expected 40000000: choose a sample_rate",
         ),
         ("row_channel: 1", 2, "row_channel and column_channel are both 1"),
         (
@@ -212,6 +236,19 @@ def test_mistakes_are_reported_with_their_place(
         run(tmp_path, f"{{use: soapy, {static}}}")
     assert caught.value.exit_code == exit_code
     assert text in str(caught.value)
+
+
+def test_check_warns_of_a_rate_beyond_the_bus_and_devices_of_a_radio_without_a_clock(tmp_path: Path) -> None:
+    need_radio()
+    static = "{use: soapy, device: 'driver=uhd,type=usrp2', sample_rate: 40 MHz}"
+    sequence = write(tmp_path, static)
+    warnings = [str(one) for one in check(Session.open(sequence, shots=1)).warnings]
+    text = "p.yaml:5:77: two channels need 320 MB/s, but Gigabit Ethernet carries 100 MB/s; expected"
+    assert [one for one in warnings if text in one]
+    radio = "profile.static_tweezers={use: soapy, device: 'simulated,time=0', sample_rate: 12.5 MHz}"
+    report = check_devices(str(tmp_path / "p.yaml"), [radio])
+    assert all(found.ok for found in report.devices), report.devices
+    assert [*report.warnings] == [f"static_tweezers: {NO_CLOCK}"]
 
 
 def test_where_it_cannot_be_compiled_a_dry_run_takes_the_virtual_tweezers(
