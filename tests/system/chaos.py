@@ -11,19 +11,19 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
+import itertools
 import json
 import os
 import random
 import secrets
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,6 +61,7 @@ class Broken(BaseException):
 
 
 def fail(how):
+    (FOLDER / "failed").touch()
     if how == "hangs":
         threading.Event().wait()
     raise {"fails": RuntimeError("rehearsed"), "breaks": Broken(), "exits": SystemExit(0)}[how]
@@ -157,35 +158,33 @@ JOBS: Final = {
     "calibration": ["calibrate", "thresholds", "--profile", "chaos", "--seed", "7", "--shots", "40"],
 }
 
-CLOCK: Final = r"""
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <fcntl.h>
-#include <stdlib.h>
-#include <sys/mman.h>
-#include <time.h>
-#include <unistd.h>
+CLOCK: Final = '''
+"""The wall clock of every process is off by the seconds in a file."""
+import os
+import pathlib
+import time
 
-/* The wall clock is off by the seconds in the file CHAOS_CLOCK; every other clock is right. */
-int clock_gettime(clockid_t clock, struct timespec *now) {
-    static int (*real)(clockid_t, struct timespec *);
-    static const volatile long long *offset;
-    if (!real) {
-        real = dlsym(RTLD_NEXT, "clock_gettime");
-        int file = open(getenv("CHAOS_CLOCK"), O_RDONLY);
-        void *page = mmap(0, sizeof *offset, PROT_READ, MAP_SHARED, file, 0);
-        if (page != MAP_FAILED) offset = page;
-        close(file);
-    }
-    int result = real(clock, now);
-    if (clock == CLOCK_REALTIME && offset) now->tv_sec += *offset;
-    return result;
-}
-"""
+OFFSET, RIGHT = pathlib.Path(os.environ["CHAOS_FOLDER"], "clock"), time.time
+time.time = lambda: RIGHT() + float(OFFSET.read_bytes() or 0)
+'''
 
 
 class BrokenPromiseError(AssertionError):
     """What must hold does not."""
+
+
+@dataclass
+class Disturbed:
+    """A disturbance of a command, and whether it happened before the command ended."""
+
+    kind: str
+    command: str
+    fault: str
+    happened: bool = False
+
+    def __str__(self) -> str:
+        fault = f" {self.fault}" * (self.fault != "::")
+        return f"{self.command}: {self.kind}{fault}{', too late' * (not self.happened)}"
 
 
 @dataclass
@@ -194,13 +193,13 @@ class Bench:
 
     folder: Path
     disk: Path | None
-    clock: Path | None
-    faults: list[str] = field(default_factory=list[str])
+    faults: list[Disturbed] = field(default_factory=list["Disturbed"])
 
     def __post_init__(self) -> None:
         (self.folder / "plugins").mkdir()
         (self.folder / "on").mkdir()
         files = {"plugins/chaos.py": PLUGIN, "emergency.py": EMERGENCY, "chaos.yaml": PROFILE}
+        files |= {"sitecustomize.py": CLOCK, "clock": ""}
         files |= {f"{job}.yaml": sequence_of(job, profile="chaos", planner="chaos") for job in SHOTS}
         for name, text in files.items():
             (self.folder / name).write_text(text, encoding="utf-8")
@@ -211,12 +210,9 @@ class Bench:
             "LABSEQ_STATE": str(self.folder / "state"),
             "LABSEQ_LOCKS": str(self.folder / "devices"),
             "CHAOS_FOLDER": str(self.folder),
+            "PYTHONPATH": str(self.folder),
             "GIT_DIR": os.devnull,  # edits of the code while this runs are no change of a run
         }
-        if self.clock is not None:
-            offset = self.folder / "clock"
-            offset.write_bytes(struct.pack("q", 0))
-            self.environment |= {"LD_PRELOAD": str(self.clock), "CHAOS_CLOCK": str(offset)}
 
     def start(self, *arguments: str, fault: str = "::") -> subprocess.Popen[str]:
         """Start a command; ``fault`` is role.method:n:how."""
@@ -271,15 +267,6 @@ class Bench:
         """Devices that are on."""
         return sorted(file.name for file in (self.folder / "on").iterdir())
 
-    def set_clock(self, offset_s: int) -> None:
-        """Set the wall clock of all commands."""
-        with (self.folder / "clock").open("r+b") as file:
-            file.write(struct.pack("q", offset_s))
-
-    def remount(self, options: str) -> None:
-        """Change the disk of the data."""
-        subprocess.run(["mount", "-o", f"remount,{options}", str(self.disk)], check=True)
-
 
 def result(bench: Bench, job: str) -> Any:
     """What a finished job left: the tables of its runs, or the values of its calibration."""
@@ -302,12 +289,8 @@ def check_after_end(bench: Bench, process: subprocess.Popen[str], text: str) -> 
         check_committed(run_dir, may_be_torn=True)
 
 
-Fault = Callable[[Bench, subprocess.Popen[str], random.Random], None]
-
-
-def kill(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
-    """Kill -9."""
-    process.kill()
+Fault = Callable[[Bench, subprocess.Popen[str], random.Random], object]
+"""Returns False if it did not succeed."""
 
 
 def pause(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
@@ -318,7 +301,7 @@ def pause(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -
 
 
 def freeze(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
-    """Stop the process for so long that its outputs must go off, then let it continue or kill it."""
+    """Stop the process for so long that its outputs must go off, then let it continue."""
     process.send_signal(signal.SIGSTOP)
     time.sleep(chance.uniform(2.0, 3.0))
     on = bench.is_on() if process.poll() is None else []
@@ -336,7 +319,8 @@ def interrupt(bench: Bench, process: subprocess.Popen[str], chance: random.Rando
 
 def set_clock(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
     """Set the wall clock back or forward, by up to a year."""
-    bench.set_clock(chance.choice([-1, 1]) * chance.choice([1, 60, 3600, 86400, 31536000]))
+    offset_s = chance.choice([-1, 1]) * chance.choice([1, 60, 3600, 86400, 31536000])
+    (bench.folder / "clock").write_text(str(offset_s), encoding="utf-8")
 
 
 def fill_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
@@ -347,14 +331,18 @@ def fill_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Rando
             file.write(bytes(65536))
 
 
-def lock_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
-    """Make the disk read-only until the command has ended; busy files may prevent it."""
-    with contextlib.suppress(subprocess.CalledProcessError):
-        subprocess.run(["mount", "-o", "remount,ro", str(bench.disk)], check=True, stderr=subprocess.DEVNULL)
+def lock_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> bool:
+    """Make the disk read-only until the command has ended, as soon as no file is open for writing."""
+    remount = ["mount", "-o", "remount,ro", str(bench.disk)]
+    deadline = time.monotonic() + 1.0
+    while process.poll() is None and time.monotonic() < deadline:
+        if subprocess.run(remount, check=False, capture_output=True).returncode == 0:
+            return True
+    return False
 
 
 DISTURBANCES: Final[dict[str, Fault]] = {
-    "kill -9": kill,
+    "kill -9": lambda _, process, __: process.kill(),
     "pause": pause,
     "freeze": freeze,
     "signal": interrupt,
@@ -373,23 +361,22 @@ DEVICE_CALLS: Final = [
 ]
 
 
-def device_fault(chance: random.Random) -> str:
-    """A device that fails, hangs, exits, or raises what cannot be printed, at some call."""
+def fault_of(kind: str, chance: random.Random) -> str:
+    """Where a device or the planner fails, hangs, exits, raises what cannot be printed, or plans nonsense."""
+    ways = ["fails", "hangs", "breaks", "exits"]
+    if kind == "planner":
+        return f"planner:{chance.randint(1, 20)}:{chance.choice([*ways, 'nonsense'])}"
+    if kind != "device":
+        return "::"
     call = chance.choice(DEVICE_CALLS)
     n = 1 if call.endswith((".open", ".safe_state", ".close")) else chance.randint(1, 20)
-    return f"{call}:{n}:{chance.choice(['fails', 'hangs', 'breaks', 'exits'])}"
-
-
-def planner_fault(chance: random.Random) -> str:
-    """The same for the planner, which may also return nonsense."""
-    how = chance.choice(["fails", "hangs", "breaks", "exits", "nonsense"])
-    return f"planner:{chance.randint(1, 20)}:{how}"
+    return f"{call}:{n}:{chance.choice(ways)}"
 
 
 def repair_machine(bench: Bench) -> None:
     """Put the disk right, as somebody would before going on."""
     if bench.disk is not None:
-        bench.remount("rw")
+        subprocess.run(["mount", "-o", "remount,rw", str(bench.disk)], check=True)
         (bench.disk / "ballast").unlink(missing_ok=True)
 
 
@@ -398,23 +385,24 @@ def disturbed(bench: Bench, command: list[str], chance: random.Random) -> str:
     kinds = ["device", "planner", *DISTURBANCES]
     if bench.disk is None:
         kinds = [kind for kind in kinds if not kind.startswith("disk")]
-    if bench.clock is None:
-        kinds.remove("clock")
     kind = chance.choice(kinds)
-    fault = {"device": device_fault, "planner": planner_fault}.get(kind, lambda _: "::")(chance)
+    fault = fault_of(kind, chance)
     n = bench.n_calls() + chance.randint(1, 150)
-    bench.faults.append(kind if fault == "::" else f"{kind} {fault}")
+    bench.faults.append(Disturbed(kind, command[0], fault))
     process = bench.start(*command, fault=fault)
     try:
         if kind in DISTURBANCES and bench.await_calls(process, n):
             time.sleep(chance.uniform(0.0, 0.02))
             if process.poll() is None:
-                DISTURBANCES[kind](bench, process, chance)
+                bench.faults[-1].happened = DISTURBANCES[kind](bench, process, chance) is not False
         text = bench.end(process)
     finally:
         if process.poll() is None:
             process.kill()
             process.communicate()
+    with contextlib.suppress(FileNotFoundError):
+        (bench.folder / "failed").unlink()
+        bench.faults[-1].happened = True
     repair_machine(bench)
     may_be_unsafe = ".safe_state:" in fault  # the device itself refuses; `labseq safe` must reach it later
     if may_be_unsafe and process.returncode == 3:
@@ -480,7 +468,7 @@ def check_in_the_end(bench: Bench, job: str, expected: Any) -> None:
 
 
 @contextlib.contextmanager
-def made_bench(clock: Path | None, *, small_disk: bool) -> Generator[Bench]:
+def made_bench(*, small_disk: bool) -> Generator[Bench]:
     """A bench in a folder of its own, if possible with a disk of its own."""
     folder = Path(tempfile.mkdtemp(prefix="labseq-chaos-"))
     disk = folder / "disk"
@@ -488,40 +476,26 @@ def made_bench(clock: Path | None, *, small_disk: bool) -> Generator[Bench]:
     mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk)]
     is_mounted = small_disk and subprocess.run(mount, check=False, capture_output=True).returncode == 0
     try:
-        yield Bench(folder, disk if is_mounted else None, clock)
+        yield Bench(folder, disk if is_mounted else None)
     finally:
         if is_mounted:
             subprocess.run(["umount", "-l", str(disk)], check=True)
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def built_clock(folder: Path) -> Path | None:
-    """The library that sets a clock; None without a C compiler."""
-    source, library = folder / "clock.c", folder / "clock.so"
-    source.write_text(CLOCK, encoding="utf-8")
-    command = ["gcc", "-shared", "-fPIC", "-O2", "-o", str(library), str(source)]
-    try:
-        subprocess.run(command, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return library
-
-
-def undisturbed(job: str, clock: Path | None) -> Any:
+def undisturbed(job: str) -> Any:
     """The result of a job that nothing interrupts."""
-    with made_bench(clock, small_disk=False) as bench:
+    with made_bench(small_disk=False) as bench:
         prepare(bench, job)
         bench.run(*JOBS[job])
         return result(bench, job)
 
 
-def one_trial(
-    seed: int, number: int, clock: Path | None, expected: dict[str, Any]
-) -> tuple[str, list[str], str]:
-    """Job, faults, and what does not hold ("" if all does) of a trial."""
+def one_trial(seed: int, number: int, expected: dict[str, Any]) -> tuple[str, list[Disturbed], str]:
+    """Job, disturbances, and what does not hold ("" if all does) of a trial."""
     chance = random.Random(f"{seed}/{number}")
     job = chance.choice(list(JOBS))
-    with made_bench(clock, small_disk=True) as bench:
+    with made_bench(small_disk=True) as bench:
         try:
             trial(bench, job, chance, expected[job])
         except BrokenPromiseError as error:
@@ -531,45 +505,47 @@ def one_trial(
         return job, bench.faults, ""
 
 
+def print_table(counts: collections.Counter[tuple[str, str]]) -> None:
+    """Print the number of disturbances by job."""
+    kinds = ["device", "planner", *DISTURBANCES]
+    print(f"{'':12}" + "".join(f"{kind:>16}" for kind in kinds))
+    for job in JOBS:
+        print(f"{job:12}" + "".join(f"{counts[job, kind]:16}" for kind in kinds))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Take trials until the time is over; returns 1 if anything did not hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--minutes", type=float, default=5.0)
-    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--seed", type=int, default=secrets.randbits(32))
     parser.add_argument("--trial", type=int, default=None, help="only this one")
     chosen = parser.parse_args(arguments)
-    seed = secrets.randbits(32) if chosen.seed is None else chosen.seed
     counts: collections.Counter[tuple[str, str]] = collections.Counter()
-    failures: list[str] = []
     deadline = time.monotonic() + 60 * chosen.minutes
+    numbers = itertools.count() if chosen.trial is None else iter([chosen.trial])
+    n_processes = os.cpu_count() or 1
 
-    def take(number: int) -> None:
-        if chosen.trial is None and time.monotonic() > deadline:
-            return
-        job, faults, why = one_trial(seed, number, clock, expected)
-        counts.update((job, fault.partition(" ")[0] if ":" in fault else fault) for fault in faults)
-        if why:
-            failures.append(f"--seed {seed} --trial {number} ({job}: {'; '.join(faults)}): {why}")
-            print(failures[-1], flush=True)
-
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        clock = built_clock(Path(folder))
-        expected = dict(zip(JOBS, pool.map(undisturbed, JOBS, [clock] * len(JOBS)), strict=True))
-        numbers = range(10**6) if chosen.trial is None else [chosen.trial]
-        waiting: collections.deque[Any] = collections.deque()
+    def take_some() -> Iterator[tuple[str, list[Disturbed], str]]:
         for number in numbers:
-            waiting.append(pool.submit(take, number))
-            if len(waiting) > 2 * (os.cpu_count() or 1):
-                waiting.popleft().result()
+            job, faults, why = one_trial(chosen.seed, number, expected)
+            if why:
+                done = "; ".join(map(str, faults))
+                print(f"--seed {chosen.seed} --trial {number} ({job}: {done}): {why}", flush=True)
+            yield job, faults, why
             if time.monotonic() > deadline:
-                break
-    kinds = sorted({kind for _, kind in counts})
-    print(f"seed {seed}; disturbances by job")
-    print(f"{'':12}" + "".join(f"{kind:>16}" for kind in kinds))
-    for job in JOBS:
-        print(f"{job:12}" + "".join(f"{counts[job, kind]:16}" for kind in kinds))
-    print(f"{sum(counts.values())} disturbances, {len(failures)} trials in which something did not hold")
-    return 1 if failures else 0
+                return
+
+    with ThreadPoolExecutor(n_processes) as pool:
+        expected = dict(zip(JOBS, pool.map(undisturbed, JOBS), strict=True))
+        taken = [*itertools.chain(*pool.map(lambda _: [*take_some()], range(n_processes)))]
+    for job, faults, _ in taken:
+        counts.update((job, fault.kind) for fault in faults if fault.happened)
+    n_late = sum(not fault.happened for _, faults, _ in taken for fault in faults)
+    n_failures = sum(bool(why) for *_, why in taken)
+    print(f"seed {chosen.seed}: {len(taken)} trials, {n_failures} in which something did not hold")
+    print(f"{counts.total()} disturbances, and {n_late} that came too late:")
+    print_table(counts)
+    return 1 if n_failures else 0
 
 
 if __name__ == "__main__":
