@@ -201,7 +201,7 @@ class _Process:
     def _report(self, cause: str, name: str, done: str, failure: str, after_s: float) -> None:
         """Write down what was done, first to the log, then for whoever looks at the terminal."""
         row = {
-            "t_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "t_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),  # noqa: TID251 - no other module here
             "cause": cause,
             "device": name,
             "ok": not failure,

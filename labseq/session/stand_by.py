@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
 from functools import partial
 from typing import Final
 
 from labseq.errors import ConfigError, DeviceError, ProblemCollector, RecordingError, StopRequested
 from labseq.guard import StopFlag, stop_on_signals
+from labseq.plain import now
 from labseq.processes import Holder, Lock, Process
 from labseq.recording import clear_active, lock_file
 from labseq.roles import RunObserver
@@ -63,7 +63,7 @@ def stand_by(
             stop.wait(LOOK_S)
             for holder, roles in look.new_troubles():
                 why = f"has not answered for {holder.silent_s:.0f} s" if holder.is_running else "died"
-                tell(f"{datetime.now():%Y-%m-%d %H:%M:%S} {holder} {why}")
+                tell(f"{now().astimezone():%Y-%m-%d %H:%M:%S} {holder} {why}")
                 stop.wait(FIRST_S)
                 for role in roles:
                     _secure(hardware, role, stop, look, observer)
