@@ -42,6 +42,15 @@ for order, name in (2, "second"), (1, "first"):
     (folder / name).touch()
     dog.add(name, order, folder / "emergency.py", {"name": str(folder / name)})
 print("on", *dog.notes(), flush=True)
+
+def lose_terminal():
+    import fcntl, termios
+    terminal, mine = os.openpty()
+    os.setsid()
+    fcntl.ioctl(mine, termios.TIOCSCTTY, 0)
+    os.close(terminal)
+    time.sleep(30)
+
 """
 SAFE = "dog.forget(['first', 'second']); dog.end()"
 
@@ -50,6 +59,7 @@ ENDS = {  # what the process does -> the cause that the watchdog names
     "_exit": ("os._exit(0)", "died"),
     "crash in C": ("ctypes.string_at(0)", "died"),
     "an error": ("raise ValueError", "died"),
+    "a closed terminal": ("lose_terminal()", "died"),
     "fork": ("if os.fork(): os.kill(os.getpid(), signal.SIGKILL)\ntime.sleep(1)", "died"),
     "stopped": ("os.kill(os.getpid(), signal.SIGSTOP)", "hung"),
     "a C call": ("ctypes.PyDLL(None).sleep(30)", "hung"),

@@ -1,4 +1,4 @@
-"""A shutter and a timing box that outlive the process that drives them, and processes that end badly."""
+"""Devices that outlive the process that drives them, and processes that end badly."""
 
 from __future__ import annotations
 
@@ -7,54 +7,118 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from labseq_soapy_sim import read_trace
+from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.emergency import ADDRESS, Connection
+
 from .labseq_serial_rig import Counterpart
 
 DRIVING = """
-import ctypes, os, signal, sys, time
+import ctypes, fcntl, os, resource, signal, sys, termios, threading, time
 from pathlib import Path
+import numpy as np
 from labseq_serial.device import SerialDevice
+from labseq_soapy.static_tweezers import SoapySettings, SoapyStaticTweezers
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers, SpcmSettings
 from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.settings import TtlSettings
-from labseq.plugin import Context
+from labseq.kernel import load_kernels
+from labseq.motion import tone_program
+from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
 from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import FakeClock
 from labseq.watchdog import Watchdog
 from tests.plugins.labseq_serial_rig import settings
 
-def drive(folder, cause):
-    clock = FakeClock()
-    shutter = SerialDevice(settings(port=str(folder / "port")), Context("shutter", clock=clock))
-    lines = ttl_lines(TtlSettings(port=str(folder / "box")), Context("lines", clock=clock, lines=SPECS))
-    dog = Watchdog("the run", folder / "watchdog.jsonl")
-    for order, (name, device) in enumerate({"shutter": shutter, "lines": lines}.items()):
-        device.open()
-        found = device.emergency()
+CLOCK = FakeClock()
+TONES, BAND = np.linspace(12e6, 18e6, 5), (10e6, 20e6)
+GRID = SiteGrid(5, 5, row_frequency_hz=TONES, column_frequency_hz=TONES)
+RF = RfSpec(row_band_hz=BAND, column_band_hz=BAND)
+MOTION = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=1.5e-5, rf=RF)
+PLAN = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 50)
+
+def shutter(folder, repeat):
+    device = SerialDevice(settings(port=str(folder / "port")), Context("shutter", clock=CLOCK))
+    return device, lambda: device.command("open")
+
+def lines(folder, repeat):
+    device = ttl_lines(TtlSettings(port=str(folder / "box")), Context("lines", clock=CLOCK, lines=SPECS))
+    return device, lambda: device._opened().set_lines(4)
+
+def radio(folder, repeat):
+    comb = {"centre": 100e6, "step": 60e3}
+    device = f"simulated,speed=1,buffer=0.02,patience=0,record=1000000,folder={folder}/radio{repeat}"
+    (folder / f"radio{repeat}").mkdir()
+    chosen = SoapySettings(device=device, sample_rate=1.2e6, row_frequency=comb, column_frequency=comb)
+    device = SoapyStaticTweezers(chosen, Context("static_tweezers", SiteGrid(3, 4)))
+    return device, device.start
+
+def card(folder, repeat, mode, name="simulated@{}/{}{}"):
+    name = name.format(folder, mode, repeat)
+    chosen = SpcmSettings(card=name, mode=mode, sample_rate=50e6, trigger="software", fill=0.1)
+    device = SpcmMobileTweezers(chosen, Context("mobile_tweezers", GRID, motion=MOTION))
+    def play():
+        device.prepare(tone_program(PLAN, GRID, MOTION, 1 if mode == "replay" else 50))
+        device.play()
+        if mode == "fifo":
+            threading.Thread(target=device.wait, args=(1e3,), daemon=True).start()
+    return device, play
+
+def drive(folder, names, repeat, cause):
+    dog, turn_on = Watchdog("the run", folder / "watchdog.jsonl"), []
+    for order, name in enumerate(names):
+        made = globals()[name](folder, repeat) if name in globals() else card(folder, repeat, name)
+        made[0].open()
+        found = made[0].emergency()
         dog.add(name, order, found.script, dict(found.arguments))
-    shutter.command("open")
-    lines._opened().set_lines(4)
+        turn_on.append(made[1])
+    for act in turn_on:
+        act()
     print("on", *dog.notes(), flush=True)
     sys.stdin.readline()
     print(time.monotonic(), flush=True)
     exec(cause)
 
-for cause in sys.stdin:
+def lose_terminal():
+    terminal, mine = os.openpty()
+    os.setsid()
+    fcntl.ioctl(mine, termios.TIOCSCTTY, 0)
+    os.close(terminal)
+    time.sleep(60)
+
+def fill_memory():
+    resource.setrlimit(resource.RLIMIT_AS, (64 << 20, 64 << 20))
+    full = [bytearray(1 << 20) for _ in range(1 << 20)]
+
+for mode in {"dds", "replay", "fifo"} & set(sys.argv[2:]):  # here, not again in every child
+    warmed, play = card(sys.argv[1], "", mode, "simulated")
+    warmed.warm()
+    load_kernels()
+    warmed.open()
+    warmed.prepare(tone_program(PLAN, GRID, MOTION, 1))
+    warmed.close()
+for repeat, cause in enumerate(sys.stdin):
     if child := os.fork():
         os.waitpid(child, 0)
     else:
-        drive(Path(sys.argv[1]), cause)
+        drive(Path(sys.argv[1]), sys.argv[2:], repeat, cause)
 """
 CAUSES: Final = {
     "kill -9": "os.kill(os.getpid(), signal.SIGKILL)",
     "os._exit": "os._exit(1)",
+    "hang-up": "lose_terminal()",
+    "no memory": "fill_memory()",
     "SIGSTOP": "os.kill(os.getpid(), signal.SIGSTOP)",
     "C call": "ctypes.PyDLL(None).sleep(60)",
 }
 """What ends or stops the process."""
+CARDS: Final = ("dds", "replay", "fifo")
+"""Simulated cards, by mode."""
 
 
 class TtlCounterpart(Counterpart):
@@ -71,22 +135,28 @@ class TtlCounterpart(Counterpart):
 
 
 class Outputs:
-    """The two devices, and a process that has a child drive them."""
+    """Devices, and a process that has a child drive them."""
 
-    def __init__(self, folder: Path, shutter: Counterpart, lines: Counterpart) -> None:
-        self._folder, self._shutter, self._lines = folder, shutter, lines
+    def __init__(
+        self, folder: Path, shutter: Counterpart, lines: Counterpart, names: Sequence[str], *, driven: bool
+    ) -> None:
+        self._folder, self._shutter, self._lines, self._names = folder, shutter, lines, names
+        self._repeat = -1
         root = str(Path(__file__).parents[2])
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", DRIVING, str(folder)],
-            cwd=root,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": root},
-        )
+        self._process: subprocess.Popen[str] | None = None
+        if driven:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", DRIVING, str(folder), *names],
+                cwd=root,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": root},
+            )
 
     def _ask(self, line: str) -> str:
+        assert self._process is not None
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(line + "\n")
@@ -94,39 +164,59 @@ class Outputs:
         return self._process.stdout.readline()
 
     def close(self) -> None:
-        """End the process."""
-        if self._process.poll() is None:
+        """End the process, and that of the cards."""
+        if self._process is not None:
             self._process.kill()
             self._process.communicate()
+        if (self._folder / ADDRESS).exists():
+            Connection(str(self._folder / "last"))("power_off")
 
     def off_since(self) -> dict[str, float | None]:
         """Device -> None while it is on, else when it went off."""
-        values, commanded_s = self._shutter.order("state")
-        on, since_s = self._lines.order("state")
-        return {
-            "shutter": None if values["open"] == "1" else commanded_s,
-            "lines": None if on else since_s,
-        }
+        return {name: self._off_since(name) for name in self._names}
+
+    def _off_since(self, name: str) -> float | None:
+        if name == "shutter":
+            values, since_s = self._shutter.order("state")
+            return None if values["open"] == "1" else since_s
+        if name == "lines":
+            on, since_s = self._lines.order("state")
+            return None if on else since_s
+        if name == "radio":
+            trace = read_trace(self._folder / f"radio{self._repeat}")
+            time_s, state, *_ = [entry for entry in trace if entry[1] in ("play", "stop", "close")][-1]
+            return None if state == "play" else time_s
+        card = Connection(str(self._folder / f"{name}{self._repeat}"))
+        try:
+            is_on = card("state") != (False, (False, False))
+            relays = [one for one in card("log") if (one.register, one.value) == OPEN_RELAYS]
+            return None if is_on else relays[-1].time_s
+        finally:
+            card.close()
 
     def times_to_off(self, cause: str) -> dict[str, float]:
-        """Have a process turn both on and end or hang; how long each stays on, in seconds."""
+        """Have a process turn all on and end or hang; how long each stays on, in seconds."""
         (self._folder / "watchdog.jsonl").unlink(missing_ok=True)
+        self._repeat += 1
         assert self._ask(CAUSES[cause]) == "on\n"
         assert set(self.off_since().values()) == {None}
         begun_s = float(self._ask(""))
         deadline_s = time.monotonic() + 20.0
-        while len(log_rows(self._folder)) < 2 and time.monotonic() < deadline_s:
+        while len(log_rows(self._folder)) < len(self._names) and time.monotonic() < deadline_s:
             time.sleep(5e-3)
         return {name: since_s - begun_s for name, since_s in self.off_since().items() if since_s is not None}
 
 
+OPEN_RELAYS: Final = (r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP)
+
+
 @contextmanager
-def outputs(folder: Path, *, driven: bool = True) -> Generator[Outputs]:
-    """A shutter and a timing box, driven by a process unless somebody else does."""
+def outputs(
+    folder: Path, names: Sequence[str] = ("shutter", "lines"), *, driven: bool = True
+) -> Generator[Outputs]:
+    """Devices, driven by a process unless somebody else does."""
     with Counterpart(folder) as shutter, TtlCounterpart(folder) as lines:
-        devices = Outputs(folder, shutter, lines)
-        if not driven:
-            devices.close()
+        devices = Outputs(folder, shutter, lines, names, driven=driven)
         try:
             yield devices
         finally:
