@@ -52,10 +52,11 @@ def test_a_signal_in_any_step_ends_safely(bench, step, number):
         assert attempt.timing  # what the shot has is written
 
 
-def test_a_signal_before_the_run_has_begun_ends_it(bench):
-    bench.environment["WATCHED_SIGNAL"] = f"static_tweezers.open:1:{int(signal.SIGINT)}:slow"
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGHUP", 143)])  # Ctrl-C, a lost terminal
+def test_a_signal_before_the_run_has_begun_ends_it(bench, name, code):
+    bench.environment["WATCHED_SIGNAL"] = f"static_tweezers.open:1:{int(getattr(signal, name))}:slow"
     done = bench.run("run", "sequence.yaml", "--realtime", "--set", "profile.timeouts.call=2 h")
-    assert done.returncode == 130, done.stderr
+    assert done.returncode == code, done.stderr
     assert safe_calls(bench.calls()) == SAFE_ORDER
 
 
