@@ -17,6 +17,8 @@ LASTING: Final = frozenset(
     {"settling", "compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
 )
 """Events that must stay on the screen above the live view."""
+NOTICED_S: Final = 1.0
+"""A device that settles within this time is not announced."""
 _LOGGED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
 
 
@@ -65,7 +67,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
             return f"warning: {values['device']} could not be {task}: {values['error']}"
-        case "settling":
+        case "settling" if values["timeout_s"] >= NOTICED_S:
             longest = format_quantity(values["timeout_s"], "time")
             return f"waiting for {values['device']} to settle, at most {longest}"
         case "compiling":

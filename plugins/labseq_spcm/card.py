@@ -169,6 +169,10 @@ class AwgCard:
         with self._translated_errors(what):
             self._card.set_i(self.spcm.SPC_M2CMD, command)
 
+    def write_setup(self) -> None:
+        """Send the settings to the card: until then, or until the start, only its driver has them."""
+        self.command(self.spcm.M2CMD_CARD_WRITESETUP, "writing the set-up")
+
     def define_transfer(self, frames: NDArray[np.int16], notify_bytes: int = 0) -> None:
         """Name the samples of the next transfer; the array must live until the transfer is over."""
         spcm, address = self.spcm, ctypes.c_void_p(frames.ctypes.data)

@@ -189,6 +189,7 @@ class Dds:
         self._n_events = 0
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_DDS, "card mode")
+        card.write_setup()  # the DDS takes nothing before
         self._queue_length = card.read(spcm.SPC_DDS_QUEUE_CMD_MAX)
         self._reset()
 

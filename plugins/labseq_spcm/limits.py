@@ -31,7 +31,7 @@ AMPLITUDE_MV: Final = (80, 2000)
 RELAY_MV: Final = (420, 480)
 """Both paths of the amplifier make these amplitudes; which one is used depends on the earlier amplitude."""
 RELAY_S: Final = 10e-3
-"""How long the output is off when the path changes."""
+"""How long the output is off when the path changes; of the output's own relay the manual gives no time."""
 
 SAMPLE_STEP: Final = 32
 """Memory sizes are multiples of this, in samples per channel."""
@@ -56,8 +56,8 @@ ROUNDING: Final = 1e-9
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
-    """Longest time from the trigger to the first sample, in seconds: 476.5 sample clocks and 16 ns."""
-    return 476.5 / sample_rate_hz + 16e-9
+    """From the trigger to the first sample: 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
+    return (476.5 if sample_rate_hz > 625e6 else 238.5) / sample_rate_hz + 16e-9
 
 
 def full_scale_mv(name: str, rf: RfSpec) -> int:

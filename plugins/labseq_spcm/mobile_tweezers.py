@@ -1,7 +1,7 @@
 """Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator.
 
 The order of calls follows the manual: in ``open`` the card is identified, reset and set up (``set_up.py``),
-then its mode; in ``prepare`` come the data, in ``play`` the outputs, the start and the trigger.
+then its mode; in ``settle`` the outputs; in ``prepare`` the data, in ``play`` the start and the trigger.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.dds import Dds, choose_cores, compile_commands
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
-from labseq_spcm.set_up import check_type, set_amplitude, set_up, switch_output
+from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output
 from labseq_spcm.settings import SpcmSettings
 
 RAMP_S: Final = 0.3e-3
@@ -142,7 +142,6 @@ class SpcmMobileTweezers(MobileTweezers):
         try:
             check_type(card, self._settings)
             self._facts = set_up(card, self._settings, self._amplitude_mv)
-            self._clock.sleep(limits.RELAY_S)
             self._mode = self._new_mode(card)
         except BaseException:
             self._disconnect()
@@ -153,6 +152,19 @@ class SpcmMobileTweezers(MobileTweezers):
             return Dds(card, self._cores)
         mode = Replay if self._settings.mode == "replay" else Fifo
         return mode(card, self._settings, self._facts["sample_rate_hz"])
+
+    @property
+    def settling_timeout_s(self) -> float:
+        """Time for the output relays."""
+        return limits.RELAY_S
+
+    def settle(self) -> None:
+        """Close the output relays and let them settle, once per run, before there are atoms.
+
+        After ``safe_state``, ``prepare`` does it again.
+        """
+        if close_relays(self._opened()[0]):
+            self._clock.sleep(limits.RELAY_S)
 
     def close(self) -> None:
         """Bring the outputs into the safe state and close the card; legal in any state."""
@@ -191,6 +203,7 @@ class SpcmMobileTweezers(MobileTweezers):
         self._duration_s = None
         limits.check_program(self._name, program, self._rf)
         card.stop()
+        self.settle()
         start_s = time.perf_counter()
         playing_s = mode.prepare(program)
         took_s = time.perf_counter() - start_s
@@ -216,8 +229,6 @@ class SpcmMobileTweezers(MobileTweezers):
             raise DeviceError(self._name, text)
         duration_s, self._duration_s = self._duration_s, None
         spcm = card.spcm
-        switch_output(card, 0, on=True)
-        switch_output(card, 1, on=True)
         command = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER
         if self._settings.trigger == "external":
             self._due_s = math.inf
@@ -286,7 +297,7 @@ class SpcmMobileTweezers(MobileTweezers):
             card.stop,
             partial(switch_output, card, 0, on=False),
             partial(switch_output, card, 1, on=False),
-            partial(card.command, card.spcm.M2CMD_CARD_WRITESETUP, "writing the set-up to open the relays"),
+            card.write_setup,
             partial(set_amplitude, card, self._amplitude_mv),
         ]
         failures = [failure for step in steps if (failure := _attempt_twice(step)) is not None]

@@ -82,6 +82,7 @@ class Replay:
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
         card.set(spcm.SPC_LOOPS, 1, "loops")
+        card.write_setup()
         self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
 
     def prepare(self, program: ToneProgram) -> float:
@@ -141,6 +142,7 @@ class Fifo:
         ahead = int(settings.fill * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
         self._fill = 1 << round(math.log2(max(MIN_FILL, ahead)))
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
+        card.write_setup()  # the buffer of a transfer is named afterwards
 
     def prepare(self, program: ToneProgram) -> float:
         """Fill ring and card with the beginning of a program; returns its playing time in seconds."""

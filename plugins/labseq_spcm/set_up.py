@@ -106,6 +106,17 @@ def set_amplitude(card: AwgCard, amplitude_mv: int) -> None:
     card.set(card.spcm.SPC_AMP1, amplitude_mv, "amplitude of output 1 in mV")
 
 
+def close_relays(card: AwgCard) -> bool:
+    """Close the relays of both outputs; whether any was open, and has to settle now."""
+    spcm = card.spcm
+    if card.read(spcm.SPC_ENABLEOUT0) and card.read(spcm.SPC_ENABLEOUT1):
+        return False
+    switch_output(card, 0, on=True)
+    switch_output(card, 1, on=True)
+    card.write_setup()
+    return True
+
+
 def switch_output(card: AwgCard, channel: int, *, on: bool) -> None:
     """Close or open the relay of an output, with the next WRITESETUP or start."""
     register = card.spcm.SPC_ENABLEOUT1 if channel else card.spcm.SPC_ENABLEOUT0

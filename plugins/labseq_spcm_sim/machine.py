@@ -119,7 +119,8 @@ class Machine:
         if register == r.SPC_M2CMD:
             self._command(int(value), now_s)
         elif register in DDS_REGISTERS:
-            self.dds.write(register, value, now_s)
+            if self.setup.on_card(r.SPC_CARDMODE) == r.SPC_REP_STD_DDS:  # else it is lost
+                self.dds.write(register, value, now_s)
         elif register == r.SPC_DATA_AVAIL_CARD_LEN:
             if self.fifo is None:
                 raise Refusal(r.ERR_SEQUENCE, "no FIFO buffer is defined")
@@ -169,14 +170,14 @@ class Machine:
         if command & r.M2CMD_CARD_STOP and self.running:
             self._end_run(now_s)
         if command & r.M2CMD_CARD_WRITESETUP:
-            self._switch_outputs(now_s)
+            self._write_setup(now_s)
         if command & r.M2CMD_DATA_STOPDMA:
             self.stop_dma(now_s)
         if command & r.M2CMD_DATA_STARTDMA:
             self._start_dma(now_s)
         if command & r.M2CMD_CARD_START:
             self._start()
-            self._switch_outputs(now_s)
+            self._write_setup(now_s)
         if command & r.M2CMD_CARD_ENABLETRIGGER:
             self.trigger_enabled = self.running
         if command & r.M2CMD_CARD_FORCETRIGGER:
@@ -184,8 +185,9 @@ class Machine:
         if command & r.M2CMD_CARD_DISABLETRIGGER:
             self.trigger_enabled = False
 
-    def _switch_outputs(self, now_s: float) -> None:
+    def _write_setup(self, now_s: float) -> None:
         """The set-up is written to the card: its relays follow the registers."""
+        self.setup.write_to_card()
         for register, channel in OUTPUTS.items():
             self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
 
@@ -229,11 +231,12 @@ class Machine:
 
     def pulse(self, voltage_v: float, now_s: float) -> bool:
         """A pulse from 0 V at the input Ext0; returns whether the card accepted it as a trigger."""
-        setup, level_v = self.setup, self.setup[r.SPC_TRIG_EXT0_LEVEL0] / 1000
+        on_card = self.setup.on_card
+        level_v = on_card(r.SPC_TRIG_EXT0_LEVEL0) / 1000
         accepted = (
             self.trigger_enabled
-            and setup[r.SPC_TRIG_ORMASK] == r.SPC_TMASK_EXT0
-            and setup[r.SPC_TRIG_EXT0_MODE] != r.SPC_TM_NONE
+            and on_card(r.SPC_TRIG_ORMASK) == r.SPC_TMASK_EXT0
+            and on_card(r.SPC_TRIG_EXT0_MODE) != r.SPC_TM_NONE
             and min(0.0, voltage_v) < level_v < max(0.0, voltage_v)
         )
         if accepted:
@@ -250,7 +253,7 @@ class Machine:
         if setup.mode == r.SPC_REP_FIFO_SINGLE:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
-            rate_hz, room_bytes = setup[r.SPC_SAMPLERATE], setup[r.SPC_DATA_OUTBUFSIZE]
+            rate_hz, room_bytes = setup[r.SPC_SAMPLERATE], setup.on_card(r.SPC_DATA_OUTBUFSIZE)
             self.fifo = Fifo(buffer, setup.frame_bytes, rate_hz, room_bytes, self.model.bus_bytes_per_s)
         elif buffer.n_bytes > (room := setup[r.SPC_MEMSIZE] * setup.frame_bytes):
             raise refuse(buffer.n_bytes, f"at most {room} bytes; set the memory size first")

@@ -155,7 +155,9 @@ class Amplifier:
         self._record(now_s)
 
     def enable(self, on: bool, now_s: float) -> None:
-        """Close or open the output relay."""
+        """Close or open the output relay, which takes some time to settle after it closes."""
+        if on and not self.enabled:
+            self._ready_s = max(self._ready_s, now_s + self.model.output_relay_s)
         self.enabled = on
         self._record(now_s)
 

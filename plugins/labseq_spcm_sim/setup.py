@@ -33,6 +33,7 @@ class CardModel:
         low_path_mv: The hysteresis between the amplifier's two paths: above the second the
             low path is left, below the first the high one.
         relay_s: How long the output is off when the path changes.
+        output_relay_s: How long an output is off after its relay was closed (ours, as the path's relay).
         bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
         n_dds_cores: DDS cores on the chip; that a 6631 has 23 is not measured.
         temperature_c: What its sensors read, in degrees Celsius (ours).
@@ -48,6 +49,7 @@ class CardModel:
     amplitude_mv: tuple[int, int] = (80, 2000)
     low_path_mv: tuple[int, int] = (420, 480)
     relay_s: float = 10e-3
+    output_relay_s: float = 10e-3
     bus_bytes_per_s: float = 2.8e9
     n_dds_cores: int = 23
     temperature_c: int = 45
@@ -135,12 +137,21 @@ class Setup:
     def __init__(self, model: CardModel) -> None:
         self.model = model
         self._values: dict[int, Number] = {**_DEFAULTS, **_fixed(model)}
+        self.write_to_card()
 
     def __contains__(self, register: int) -> bool:
         return register in self._values
 
     def __getitem__(self, register: int) -> int:
         return int(self._values[register])
+
+    def write_to_card(self) -> None:
+        """Send all values to the card, as WRITESETUP and the start do; before, only the driver has them."""
+        self._on_card = dict(self._values)
+
+    def on_card(self, register: int) -> int:
+        """The value that the card works with."""
+        return int(self._on_card[register])
 
     @property
     def mode(self) -> int:

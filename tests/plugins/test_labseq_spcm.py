@@ -102,7 +102,35 @@ class TestPlaying:
             triggered_s = lab.clock.now()
             assert lab.card.trigger()
             lab.tweezers.wait(duration_s + 1e-3)
-            assert lab.card.played(0)[0].start_s >= triggered_s
+            begun_s = _start_s(lab) if mode == "dds" else lab.card.played(0)[0].start_s
+            delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
+            assert begun_s - triggered_s == pytest.approx(delay_s, abs=1e-9)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_relays_close_once_and_settle_before_a_program(driver: Any, mode: str) -> None:
+    with driver(mode) as lab:
+        closed_s = lab.clock.now()
+        lab.tweezers.settle()
+        settled_s = lab.clock.now()
+        assert settled_s - closed_s == M4I6631.output_relay_s
+        assert lab.card.outputs_on == (True, True)
+        lab.card.log.clear()
+        for _ in range(2):
+            lab.play(lab.program(1))
+        assert not lab.written(registers.SPC_ENABLEOUT0)
+        lab.tweezers.safe_state()
+        assert lab.card.outputs_on == (False, False)
+        lab.card.forget(lab.clock.now())
+        lab.play(lab.program(1))
+        assert lab.written(registers.SPC_ENABLEOUT0) == [0, 1], "opened, and closed for the next program"
+        log = list(lab.card.log)
+        closing = max(n for n, e in enumerate(log) if e.register == registers.SPC_ENABLEOUT1)
+        written, *_, started = [
+            e for e in log[closing:] if e.register == registers.SPC_M2CMD and e.value & 0x6
+        ]
+        assert (written.value, started.value & 0x4) == (registers.M2CMD_CARD_WRITESETUP, 0x4)
+        assert started.time_s >= written.time_s + M4I6631.output_relay_s
 
 
 def test_an_external_clock_and_trigger_are_set_up(driver: Any) -> None:
@@ -356,10 +384,12 @@ def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) 
 def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> None:
     with driver(mode) as lab:
         assert offers(lab.tweezers, "self_test")
-        lab.tweezers.prepare(lab.program(1))
         lab.tweezers.self_test()
         assert lab.card.outputs_on == (False, False)
+        lab.tweezers.prepare(lab.program(1))
+        lab.tweezers.self_test()
         assert not lab.card.running
+        assert not lab.card.played(0)
         if mode == "replay":
             assert lab.card.memory.shape == (TEST_SAMPLES, 2)
             assert not lab.card.memory.any()

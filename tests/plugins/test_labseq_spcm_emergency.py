@@ -121,7 +121,7 @@ def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
     assert scope.after_death["replay"] == (True, (True, True))
     assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
     assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"
-    assert scope.after_death["prepared"] == (False, (False, False))
+    assert scope.after_death["prepared"] == (False, (True, True)), "likewise"
 
 
 @pytest.mark.parametrize("state", sorted(STATES))

@@ -425,17 +425,18 @@ class Calls(RuleBasedStateMachine):
         super().__init__()
         self.stack = ExitStack()
         self.lab = self.stack.enter_context(driver(mode, trigger=trigger, fill=1e-3))
-        self.is_open = self.safe = True
+        self.is_open = self.safe = self.idle = True
 
     @rule(n_batches=st.sampled_from([1, 2, 24]))
     def prepare(self, n_batches: int) -> None:
         with suppress(LabseqError):
+            self.safe = False
             self.lab.tweezers.prepare(self.lab.program(n_batches))
 
     @rule()
     def play(self) -> None:
         with suppress(LabseqError):
-            self.safe = False
+            self.safe = self.idle = False
             self.lab.tweezers.play()
 
     @rule(timeout_s=st.sampled_from([0.0, 0.3e-3, 5e-3, 1.0]))
@@ -461,12 +462,12 @@ class Calls(RuleBasedStateMachine):
     def make_safe(self, n_times: int) -> None:
         for _ in range(n_times):
             self.lab.tweezers.safe_state()
-        self.safe = True
+        self.safe = self.idle = True
 
     @rule()
     def close(self) -> None:
         self.lab.tweezers.close()
-        self.safe, self.is_open = True, False
+        self.safe, self.idle, self.is_open = True, True, False
 
     @precondition(lambda self: self.safe)
     @rule()
@@ -478,6 +479,7 @@ class Calls(RuleBasedStateMachine):
     def nothing_plays_in_the_safe_state(self) -> None:
         if self.safe:
             assert self.lab.card.outputs_on == (False, False)
+        if self.idle:
             assert not self.lab.card.running
 
     @invariant()
@@ -490,7 +492,7 @@ class Calls(RuleBasedStateMachine):
             self.lab.tweezers.safe_state()
             self.lab.tweezers.safe_state()
             now_s = self.lab.clock.now()
-            self.safe = True
+            self.safe = self.idle = True
             self.nothing_plays_in_the_safe_state()
             self.lab.clock.sleep(1.0)
             late = [

@@ -37,6 +37,7 @@ class Card(SimulatedCard):
         defaults = {"SPC_SAMPLERATE": int(RATE_HZ), "SPC_AMP0": 500, "SPC_AMP1": 500}
         on = {"SPC_ENABLEOUT0": 1, "SPC_ENABLEOUT1": 1}
         self.set(SPC_CARDMODE=mode, **(defaults | setup | on))
+        self.command(r.M2CMD_CARD_WRITESETUP)
         self.clock.sleep(0.02)  # the relays of the amplifiers settle
 
     def set(self, **values: int) -> None:
@@ -214,6 +215,8 @@ with installed(simulated) as name:
         handle = second.handle()
         second.loops(5)
         assert (first.loops(), second.loops()) == (1, 5)
+        second.card_mode(spcm.SPC_REP_STD_DDS)
+        second.write_setup()
         second.set_d(spcm.SPC_DDS_CORE0_AMP, 0.5)
         assert abs(second.get_d(spcm.SPC_DDS_CORE0_AMP) - 0.5) < 1e-4
         try:
@@ -304,12 +307,16 @@ def test_a_pulse_triggers_only_if_it_crosses_the_level(voltage_v: float, accepte
 
 
 def test_a_relay_changes_only_when_the_set_up_is_written_or_the_card_starts() -> None:
-    card = Card(SPC_LOOPS=0, SPC_ENABLEOUT0=1)
+    card = Card(SPC_LOOPS=0)
+    card.command(r.M2CMD_CARD_RESET)
+    card.set(SPC_ENABLEOUT0=1, SPC_ENABLEOUT1=1, SPC_LOOPS=0, SPC_SAMPLERATE=int(RATE_HZ))
     assert card.outputs_on == (False, False), "not written yet"
     card.upload(sines(6400))
     card.command(START | r.M2CMD_CARD_FORCETRIGGER)
+    started_s = card.clock.now()
     card.set(SPC_ENABLEOUT0=0)
-    card.clock.sleep(10e-6)
+    card.clock.sleep(10e-3 + 10e-6)
+    assert card.spans(0)[0].start_s == pytest.approx(started_s + 10e-3, abs=2 / RATE_HZ), "a relay settles"
     assert card.outputs_on == (True, True), "the register reads 0, and the output is on"
     assert card.spans(0)[0].end_s == pytest.approx(card.clock.now(), abs=2 / RATE_HZ)
     assert card.refusal(r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP) == r.ERR_RUNNING

@@ -28,9 +28,10 @@ class Synthesizer(SimulatedCard):
         super().__init__(self.clock)
         setup = {
             r.SPC_CARDMODE: r.SPC_REP_STD_DDS,
-            r.SPC_DDS_DATA_TRANSFER_MODE: r.SPCM_DDS_DTM_DMA,
             r.SPC_ENABLEOUT0: 1,
             r.SPC_ENABLEOUT1: 1,
+            r.SPC_M2CMD: r.M2CMD_CARD_WRITESETUP,
+            r.SPC_DDS_DATA_TRANSFER_MODE: r.SPCM_DDS_DTM_DMA,
         }
         assert self.write_all(setup.items()) == r.ERR_OK
         self.clock.sleep(0.02)
@@ -67,6 +68,15 @@ class Synthesizer(SimulatedCard):
 
     def status(self) -> int:
         return int(self.read(r.SPC_DDS_STATUS)[1])
+
+
+def test_it_takes_nothing_before_its_mode_is_written_to_the_card() -> None:
+    card = SimulatedCard(FakeClock())
+    card.write(r.SPC_CARDMODE, r.SPC_REP_STD_DDS)
+    for command, taken in ((r.M2CMD_CARD_STOP, 0.0), (r.M2CMD_CARD_WRITESETUP, 80e6)):
+        card.write(r.SPC_M2CMD, command)
+        assert card.write(FREQ, 80e6) == r.ERR_OK, "it is lost without a report"
+        assert card.read(FREQ)[1] == pytest.approx(taken, abs=1)
 
 
 def test_a_block_waits_in_the_shadow_registers_for_its_trigger() -> None:
@@ -209,7 +219,7 @@ def test_masks_that_the_chip_cannot_make_are_snapped_without_a_report(
 @settings(max_examples=30)
 @given(st.floats(83.2e-9, 27.48), st.floats(0, 625e6), st.floats(-1e12, 1e12))
 def test_inexact_values_are_rounded_and_read_back(timer_s: float, frequency_hz: float, slope: float) -> None:
-    card = SimulatedCard(FakeClock())
+    card = Synthesizer()
     for register, value, step in (
         (TIMER, timer_s, 6.4e-9),
         (FREQ, frequency_hz, 0.291038305),
@@ -220,7 +230,7 @@ def test_inexact_values_are_rounded_and_read_back(timer_s: float, frequency_hz: 
 
 
 def test_smaller_ramp_steps_make_finer_slopes() -> None:
-    card = SimulatedCard(FakeClock())
+    card = Synthesizer()
     card.write(r.SPC_DDS_FREQ_RAMP_STEPSIZE, 1000)
     card.write(FREQ_SLOPE, 100.0)
     assert card.read(FREQ_SLOPE)[1] == pytest.approx(100.0, abs=1.5)
