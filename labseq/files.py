@@ -11,8 +11,9 @@ import os
 import stat
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Final, Literal
+from typing import IO, Any, Final
 
 from labseq.errors import RecordingError
 from labseq.plain import dumps, parse_object
@@ -117,15 +118,24 @@ MAX_LINE: Final = 16 << 20
 """Longest line of a file of JSON lines, in bytes."""
 
 
-def open_ordinary(path: Path, mode: Literal["rb", "ab"] = "rb") -> BinaryIO:
-    """Open a file to read it, or to add to it.
+def check_ordinary(path: Path) -> None:
+    """Raise for a pipe or a device, which could block for ever.
 
     Raises:
-        OSError: It cannot be opened, or is a pipe or a device, which could block for ever.
+        OSError: It is one of them, or nothing is there.
     """
-    if (mode == "rb" or path.exists()) and not stat.S_ISREG(path.stat().st_mode):
+    if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "this is not an ordinary file")
-    return path.open(mode)
+
+
+def open_ordinary(path: Path) -> BufferedReader:
+    """Open a file to read it.
+
+    Raises:
+        OSError: It cannot be read, or is a pipe or a device.
+    """
+    check_ordinary(path)
+    return path.open("rb")
 
 
 def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:

@@ -10,21 +10,22 @@ import hashlib
 import os
 import re
 import time
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from labseq.errors import RecordingError
 from labseq.files import (
     LineLog,
+    check_ordinary,
     explained,
     lines_in,
     open_ordinary,
     read_file,
     sync_folder,
+    whole_file,
     write_file,
 )
 from labseq.plain import dumps, now_utc, parse_object
@@ -153,75 +154,81 @@ def _is_in_progress(run_dir: Path) -> bool:
     )
 
 
-_Line = tuple[bytes, dict[str, Any]]
-
-
 class _LineFile:
     """A file of JSON lines, read for repair; it is written once, when everything is known.
 
     Attributes:
         path: The file.
-        rows: The lines that are JSON objects, with their content.
-        kept: The lines that stay.
-        removed: The lines that go to quarantine.
+        first: Lines that are added before all others.
+        last: Lines that are added after all others.
         problems: Each problem, its place, and its repair when the file is saved.
     """
 
     def __init__(self, path: Path) -> None:
-        self._before = [*lines_in(path)] if path.exists() else []
         self.path = path
-        self.kept = [line[:-1] for line in self._before if line.endswith(b"\n")]
-        self.removed: list[bytes] = []
+        self.first: list[bytes] = []
+        self.last: list[bytes] = []
         self.problems: list[tuple[str, Path, str]] = []
-        self.rows: list[_Line] = []
-        if len(self.kept) < len(self._before):
-            self.removed.append(self._before[-1])
-            self.problems.append(("torn last line", path, _TO_QUARANTINE))
+        self._removed: set[int] = set()
+
+    def _lines(self) -> Iterator[tuple[int, bytes]]:
+        return enumerate(lines_in(self.path), start=1) if self.path.exists() else iter(())
+
+    def rows(self) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The lines that are JSON objects, with their numbers; the others are removed at the end."""
         damaged: list[int] = []
-        for number, line in enumerate(self.kept, start=1):
+        for number, line in self._lines():
             row = parse_object(line)
-            if row is None:
-                self.removed.append(line)
+            if not line.endswith(b"\n"):
+                self.remove([number], "torn last line")
+            elif row is None:
                 damaged.append(number)
             else:
-                self.rows.append((line, row))
-        self.kept = [line for line, _ in self.rows]
-        each = [f"line {number} is damaged" for number in damaged]
-        many = [f"{len(damaged)} lines are damaged, from line {damaged[0]} on"] if damaged else []
-        found = each if len(damaged) <= _MAX_FINDINGS else many
-        self.problems += [(what, path, _TO_QUARANTINE) for what in found]
+                yield number, row
+        self.remove(damaged)
+        texts = [f"line {number} is damaged" for number in damaged]
+        if len(damaged) > _MAX_FINDINGS:
+            texts = [f"{len(damaged)} lines are damaged, from line {damaged[0]} on"]
+        self.problems += [(text, self.path, _TO_QUARANTINE) for text in texts]
 
-    def remove(self, lines: Collection[bytes], what: str = "") -> None:
-        """Remove the first of such lines; ``what`` is the reason, unless another finding reports it."""
-        gone, kept = Counter(lines), list[bytes]()
-        for line in self.kept:
-            if gone[line] > 0:
-                gone[line] -= 1
-            else:
-                kept.append(line)
-        self.kept = kept
-        self.removed += lines
-        if what and lines:
-            texts = [what] if len(lines) > _MAX_FINDINGS else [what] * len(lines)
+    def remove(self, numbers: Collection[int], what: str = "") -> None:
+        """Remove lines; ``what`` is the reason, unless another finding reports it."""
+        self._removed.update(numbers)
+        if what and numbers:
+            texts = [what] if len(numbers) > _MAX_FINDINGS else [what] * len(numbers)
             self.problems += [(text, self.path, _TO_QUARANTINE) for text in texts]
 
     def save(self) -> None:
-        """Write the file if it has changed.
+        """Write the file if it changes, line by line: an index can be larger than the memory.
 
         Raises:
             RecordingError: It cannot be written; the old file is unchanged.
         """
-        lines = [line + b"\n" for line in self.kept]
-        if lines == self._before:
-            return
-        if self.removed:
+        if self._removed:
             goal = _quarantine_of(self.path.parent) / self.path.name
             _log_move(self.path.parent, "damaged or superfluous lines", self.path, goal)
+            with explained(goal):
+                goal.touch()
+                check_ordinary(goal)
             with explained(goal), goal.open("ab") as file:
-                file.write(b"".join(line + b"\n" for line in self.removed))
+                file.writelines(
+                    line.rstrip(b"\n") + b"\n" for number, line in self._lines() if number in self._removed
+                )
             with explained(goal):
                 sync_folder(goal.parent)
-        write_file(self.path, b"".join(lines))
+        if self._removed or self.first or self.last:
+            with explained(self.path), whole_file(self.path) as file:
+                file.writelines(line + b"\n" for line in self.first)
+                file.writelines(line for number, line in self._lines() if number not in self._removed)
+                file.writelines(line + b"\n" for line in self.last)
+
+
+class _Line(NamedTuple):
+    """What the index says of a file."""
+
+    number: int
+    sha256: str
+    n_bytes: int
 
 
 class _Check:
@@ -256,10 +263,13 @@ class _Check:
             self._check_state()
             self._check_shots(shots, str(record.get("run_id")))
             skipped = _LineFile(self.folder / folders.SKIPPED_FILE)
-            wrong = [line for line, row in skipped.rows if not is_skip_row(row, record["n_shots"])]
+            wrong = [number for number, row in skipped.rows() if not is_skip_row(row, record["n_shots"])]
             skipped.remove(wrong, "a line names no shots of this run, or no reason")
             logs = [results / name for name in names_in(results) if name.endswith(".jsonl")]
-            for lines in (skipped, *map(_LineFile, (self.folder / folders.EVENTS_FILE, *logs))):
+            self._save(skipped)
+            for lines in map(_LineFile, (self.folder / folders.EVENTS_FILE, *logs)):
+                for _ in lines.rows():
+                    pass
                 self._save(lines)
         except OSError as error:
             self._add(f"cannot be read: {str(error.strerror).lower()}", self.folder, _CHECK_PERMISSIONS)
@@ -325,16 +335,16 @@ class _Check:
     def _check_shots(self, folder: Path, run_id: str) -> None:
         """Compare the index with the files of the shots."""
         index = _LineFile(self.folder / folders.INDEX_FILE)
-        of_file, wrong = dict[str, list[_Line]](), list[bytes]()
-        for line, row in index.rows:
+        of_file, counted, wrong = dict[str, list[_Line]](), set[int](), list[int]()
+        for number, row in index.rows():
             if is_index_row(row) and _is_name_of(
                 row["file"], row["shot"], row["attempt"], counts=row["counts"]
             ):
-                of_file.setdefault(row["file"], []).append((line, row))
+                of_file.setdefault(row["file"], []).append(_Line(number, row["sha256"], row["bytes"]))
+                counted.update([row["shot"]] * row["counts"])
             else:
-                wrong.append(line)
+                wrong.append(number)
         index.remove(wrong, "a line of the index is not a shot's")
-        counted = {row["shot"] for same in of_file.values() for _, row in same if row["counts"]}
         for file, same in of_file.items():
             self.n_whole += self._check_file(self.folder / file, same, index)
         for name in names_in(folder):
@@ -342,7 +352,7 @@ class _Check:
                 row = self._row_of_stray(folder / name, run_id)
                 if row is not None:
                     # The last line of a shot counts, so another line of this shot keeps counting.
-                    index.kept.insert(0 if row["shot"] in counted else len(index.kept), dumps(row).encode())
+                    (index.first if row["shot"] in counted else index.last).append(dumps(row).encode())
                     remedy = "line added: the file is intact"
                     index.problems.append(("no line in the index", folder / name, remedy))
                     self.n_whole += 1
@@ -351,22 +361,22 @@ class _Check:
     def _check_file(self, path: Path, lines: list[_Line], index: _LineFile) -> bool:
         """Whether the file of a shot exists unchanged; further lines of the index for it are removed."""
         try:
-            n_bytes, sha256 = self._size_and_hash(path, {row["bytes"] for _, row in lines})
+            n_bytes, sha256 = self._size_and_hash(path, {line.n_bytes for line in lines})
         except FileNotFoundError:
-            index.remove([line for line, _ in lines])
+            index.remove([line.number for line in lines])
             remedy = "its line moved to quarantine; if you find the file, put it back and run this again"
             index.problems.append(("the shot's file is missing", path, remedy))
             return False
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return False
-        good = [i for i, (_, row) in enumerate(lines) if row["sha256"] == sha256]
+        good = [line.number for line in lines if line.sha256 == sha256]
         if not good:
-            what, remedy = _what_changed(n_bytes, lines[-1][1]["bytes"]), f"{_TO_QUARANTINE}, with its line"
+            what, remedy = _what_changed(n_bytes, lines[-1].n_bytes), f"{_TO_QUARANTINE}, with its line"
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
-                index.remove([line for line, _ in lines])
+                index.remove([line.number for line in lines])
             return False
-        second = [line for i, (line, _) in enumerate(lines) if i != good[-1]]
+        second = [line.number for line in lines if line.number != good[-1]]
         index.remove(second, f"a second line for {path.name}")
         return True
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import DeviceTimeoutError, LabseqError
-from labseq.files import open_ordinary
+from labseq.files import check_ordinary
 from labseq.guard import Guard, StopFlag
 from labseq.messages import format_error
 from labseq.model import CycleRecord, ShotRecord, StageTiming
@@ -216,7 +216,9 @@ class _AnalysisProcess:
         self._results = Results(self._results_file)
         self._size_before = self._size()
         self._start_s = time.monotonic()
-        with open_ordinary(self._log, "ab") as log:
+        if self._log.exists():
+            check_ordinary(self._log)
+        with self._log.open("ab") as log:
             self._seen = log.tell()
             self._process = subprocess.Popen(  # noqa: S603 - our own module, no shell
                 [sys.executable, "-P", "-m", _MODULE, str(run_dir), name, str(finish_within_s)],
