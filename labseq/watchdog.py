@@ -30,8 +30,8 @@ BEAT_S: Final = 0.05
 """Interval between two heartbeats, and between two looks of the watchdog."""
 HUNG_S: Final = 0.6
 """A run without a heartbeat for so long hangs; no call of a run holds the interpreter nearly as long."""
-DISK_S: Final = 10.0
-"""The same while one of its threads waits for a disk, or for memory that was swapped out."""
+WAITS_S: Final = 10.0
+"""The same while a thread waits for a disk, for memory that was swapped out, or for the processor."""
 TERM_S: Final = 0.1
 """How long a run that hangs may take to end after SIGTERM; then comes SIGKILL."""
 NEXT_S: Final = 0.05
@@ -131,7 +131,7 @@ class _Process:
             if now_s - looked_s > 2 * BEAT_S:  # the computer stood still, and so did the run
                 self._beat_s += now_s - looked_s - BEAT_S
             looked_s = now_s
-            if now_s - self._beat_s > HUNG_S and self._hangs(now_s - self._beat_s):
+            if self._hangs(now_s - self._beat_s):
                 self._end_run()
                 return self._switch_off("hung", self._beat_s)
 
@@ -219,20 +219,29 @@ class _Process:
 
 
 class Hanging:
-    """Tells whether a process without a heartbeat hangs, or just waits for a disk or for the processor."""
+    """Tells whether a process without a heartbeat hangs, or just waits for a disk or for the processor.
 
-    def __init__(self, pid: int) -> None:
+    Args:
+        pid: The process.
+        hung_s: How long the heartbeat of one that works may be missing.
+    """
+
+    def __init__(self, pid: int, hung_s: float = HUNG_S) -> None:
         self._pid = pid
+        self._hung_s = hung_s
         self._cpu_s = -1.0
 
     def __call__(self, silent_s: float) -> bool:
-        """Whether it hangs; to be asked again and again."""
+        """Whether it hangs; to be asked again and again, also while it does not."""
+        if silent_s < self._hung_s / 4:
+            self._cpu_s = -1.0
+            return False
         states, cpu_s = _threads(self._pid)
-        if "D" in states and "T" not in states:
-            return silent_s > DISK_S
-        starved = "R" in states and cpu_s == self._cpu_s
-        self._cpu_s = cpu_s
-        return not starved
+        if self._cpu_s < 0:
+            self._cpu_s = cpu_s
+        is_starved = "R" in states and cpu_s - self._cpu_s < self._hung_s / 2
+        waits = ("D" in states or is_starved) and "T" not in states
+        return silent_s > (WAITS_S if waits else self._hung_s)
 
 
 def _threads(pid: int) -> tuple[str, float]:

@@ -160,22 +160,27 @@ os._exit(0)
 
 
 @pytest.mark.parametrize(
-    ("states", "cpu_s", "silent_s", "hangs"),
+    ("states", "used_s", "silent_s", "hangs"),
     [
-        ("SS", 1.0, 1.0, True),
-        ("TT", 1.0, 1.0, True),
-        ("RS", 2.0, 1.0, True),  # a C call that computes
-        ("RS", 1.0, 1.0, False),  # it wants to run, and does not get the processor
-        ("DS", 1.0, 5.0, False),  # it waits for a disk
-        ("DS", 1.0, 11.0, True),
-        ("DT", 1.0, 1.0, True),
-        ("", -1.0, 1.0, True),  # not on this system
+        ("SS", 0.0, 0.5, False),
+        ("SS", 0.0, 0.7, True),
+        ("TT", 0.0, 0.7, True),
+        ("RS", 0.5, 0.7, True),  # a C call that computes
+        ("RS", 0.1, 0.7, False),  # it wants to run, and hardly gets the processor
+        ("RS", 0.1, 11.0, True),
+        ("DS", 0.0, 5.0, False),  # it waits for a disk
+        ("DS", 0.0, 11.0, True),
+        ("DT", 0.0, 0.7, True),
+        ("", 0.0, 0.7, True),  # not on this system
     ],
 )
-def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, cpu_s, silent_s, hangs):
-    is_hanging = watchdog.Hanging(0)
-    is_hanging._cpu_s = 1.0
-    monkeypatch.setattr(watchdog, "_threads", lambda pid: (states, cpu_s))
+def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, used_s, silent_s, hangs):
+    is_hanging, cpu_s = watchdog.Hanging(0), [7.0]
+    monkeypatch.setattr(watchdog, "_threads", lambda _: (states, cpu_s[0] if states else -1.0))
+    assert not is_hanging(0.1)
+    cpu_s[0] += 1.0  # while it worked
+    assert not is_hanging(0.2)
+    cpu_s[0] += used_s
     assert is_hanging(silent_s) is hangs
 
 

@@ -13,7 +13,7 @@ from typing import Final
 from labseq.errors import ConfigError, DeviceError, ProblemCollector, RecordingError, StopRequested
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.plain import now
-from labseq.processes import Holder, Lock, Process
+from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, lock_file
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import in_safe_order
@@ -123,5 +123,5 @@ class _Look:
         process = holder.process
         if process is None or not process.is_here or process.pid == os.getpid():
             return False
-        hangs = self._hanging.setdefault(process, Hanging(process.pid))
-        return not holder.is_running or (holder.hangs and hangs(holder.silent_s))
+        hangs = self._hanging.setdefault(process, Hanging(process.pid, HANG_S))
+        return not holder.is_running or hangs(holder.silent_s)
