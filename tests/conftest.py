@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import gc
+import importlib.metadata
 import itertools
 import os
 import re
@@ -9,12 +10,15 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Callable, Generator
+from functools import cache, partial
 from importlib.machinery import SourceFileLoader
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from _pytest.doctest import DoctestModule
 from hypothesis import settings
 
 from labseq.files import cache_root
@@ -28,6 +32,8 @@ for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not r
     os.environ.pop(_name, None)
 for _name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere
     os.environ[_name] = os.devnull
+
+gc.disable()  # until all tests are collected, which makes a million objects that stay
 
 if sys.dont_write_bytecode:  # else each process would compile the tests and numba's source again
     _BYTECODE, _TEMPORARY = cache_root() / "bytecode", Path(tempfile.gettempdir())
@@ -46,6 +52,9 @@ _NEEDS_MISSING = re.compile(
 )
 _NUMBERS = itertools.count()
 _WRITE: Callable[..., None] = vars(SourceFileLoader)["_cache_bytecode"]
+_ENTRY_POINTS = importlib.metadata.entry_points
+_GIT: dict[tuple[Path | str, ...], str | None] = {}
+_REPOSITORY = Path(__file__).parents[1]
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -54,21 +63,49 @@ def pytest_xdist_auto_num_workers() -> int:
     return n_cores + (n_cores + 1) // 2
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file(file_path: Path) -> Generator[None, list[Any], list[Any]]:
+    """Tests have no examples in their docstrings: not to look for them is a tenth of the collection."""
+    found = yield
+    within = file_path.is_relative_to(_REPOSITORY / "tests")
+    return [one for one in found if not (within and isinstance(one, DoctestModule))]
+
+
 def pytest_collection_finish() -> None:
     """What costs time for nothing in a process of thousands of tests.
 
     Each session goes through all objects before its first shot, and keeps those out of later rounds: here
     it would be a fifth of the time of all runs, for pytest's own and those of other tests. And what is
-    written need not outlive the machine; a process that is killed loses nothing of what it wrote.
+    written need not outlive the machine; a process that is killed loses nothing of what it wrote. What is
+    installed, and the state of this repository, stay the same: each run would read a hundred files for the
+    one and start five processes for the other.
     """
-    from labseq.session import session
+    from labseq.plugins import host
+    from labseq.session import provenance, session
 
     gc.collect()
     gc.freeze()
+    gc.enable()
     patch = pytest.MonkeyPatch()
     patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, unfreeze=int))
     patch.setattr(os, "fsync", os.fstat)
     patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
+    patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))
+    patch.setattr(host, "name_and_version", cache(host.name_and_version))
+    patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"]))
+
+
+@cache
+def _entry_points(_path: tuple[str, ...], **which: str) -> importlib.metadata.EntryPoints:
+    return _ENTRY_POINTS(**which)
+
+
+def _git_here_once(git: Callable[..., str | None], folder: Path, *arguments: str) -> str | None:
+    if not folder.resolve().is_relative_to(_REPOSITORY):
+        return git(folder, *arguments)
+    if (folder, *arguments) not in _GIT:
+        _GIT[folder, *arguments] = git(folder, *arguments)
+    return _GIT[folder, *arguments]
 
 
 def _cache_bytecode(
