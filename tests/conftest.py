@@ -52,7 +52,8 @@ _NEEDS_MISSING = re.compile(
 )
 _NUMBERS = itertools.count()
 _WRITE: Callable[..., None] = vars(SourceFileLoader)["_cache_bytecode"]
-_ENTRY_POINTS = importlib.metadata.entry_points
+_ENTRY_POINTS: Callable[..., Any] = importlib.metadata.entry_points
+_READ_TEXT = importlib.metadata.PathDistribution.read_text
 _GIT: dict[tuple[Path | str, ...], str | None] = {}
 _REPOSITORY = Path(__file__).parents[1]
 
@@ -80,7 +81,6 @@ def pytest_collection_finish() -> None:
     installed, and the state of this repository, stay the same: each run would read a hundred files for the
     one and start five processes for the other.
     """
-    from labseq.plugins import host
     from labseq.session import provenance, session
 
     gc.collect()
@@ -91,12 +91,12 @@ def pytest_collection_finish() -> None:
     patch.setattr(os, "fsync", os.fstat)
     patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
     patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))
-    patch.setattr(host, "name_and_version", cache(host.name_and_version))
+    patch.setattr(importlib.metadata.PathDistribution, "read_text", cache(_READ_TEXT))
     patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"]))
 
 
 @cache
-def _entry_points(_path: tuple[str, ...], **which: str) -> importlib.metadata.EntryPoints:
+def _entry_points(_path: tuple[str, ...], **which: str) -> Any:
     return _ENTRY_POINTS(**which)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -75,12 +74,6 @@ repeats: 2""",
   profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]
 order: shuffled""",
 }
-
-
-@pytest.fixture(autouse=True)
-def no_git(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Edits of labseq's code while the tests run are no change here."""
-    monkeypatch.setenv("GIT_DIR", os.devnull)
 
 
 def write(folder: Path, scan: str = "no scan") -> Path:
@@ -179,9 +172,7 @@ def changed(run_dir: Path, change: Any) -> None:
 def stopped_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a profile, a sequence, and a run of six shots: three are done, the fourth was begun."""
     folder = tmp_path_factory.mktemp("stopped")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("GIT_DIR", os.devnull)
-        interrupted(write(folder), "shot_started", 4)
+    interrupted(write(folder), "shot_started", 4)
     return folder
 
 

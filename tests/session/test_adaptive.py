@@ -17,9 +17,6 @@ from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 
 from .scripted_scanner import N_LINES, OVER, SEQUENCE, opened, run
-from .small_runs import no_git
-
-__all__ = ["no_git"]
 
 DOP = "planner.degree_of_parallelism"
 

@@ -13,9 +13,7 @@ import labseq
 from labseq.errors import CheckFailedError, ConfigError, DeviceError
 from labseq.testing.fakes import RecordingObserver
 
-from .small_runs import PROFILE, interrupted, no_git, resumed, table
-
-__all__ = ["no_git"]
+from .small_runs import PROFILE, interrupted, resumed, table
 
 PLUGIN = """
 import os, time

@@ -14,9 +14,9 @@ from labseq.session.provenance import run_record
 from labseq.session.resume import changes_between
 from labseq.testing.fakes import RecordingObserver
 
-from .small_runs import SEQUENCE, changed, no_git, resumed, stopped, stopped_home
+from .small_runs import SEQUENCE, changed, resumed, stopped, stopped_home
 
-__all__ = ["no_git", "stopped", "stopped_home"]
+__all__ = ["stopped", "stopped_home"]
 
 
 CHANGES: dict[str, tuple[Any, str]] = {

@@ -11,9 +11,7 @@ import labseq
 from labseq.errors import ConfigError
 
 from .scripted_scanner import PROFILE
-from .small_runs import Interrupting, no_git
-
-__all__ = ["no_git"]
+from .small_runs import Interrupting
 
 SEQUENCE = """labseq: 1
 name: follows

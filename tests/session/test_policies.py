@@ -13,9 +13,7 @@ from labseq.errors import CheckFailedError, ConfigError
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 
-from .small_runs import Interrupting, interrupted, no_git, resumed, table, write
-
-__all__ = ["no_git"]
+from .small_runs import Interrupting, interrupted, resumed, table, write
 
 PLUGIN = '''
 """A step that fails at some shots."""

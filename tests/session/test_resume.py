@@ -25,7 +25,6 @@ from .small_runs import (
     changed,
     interrupted,
     lines,
-    no_git,
     resumed,
     stopped,
     stopped_home,
@@ -34,7 +33,7 @@ from .small_runs import (
     write,
 )
 
-__all__ = ["no_git", "stopped", "stopped_home", "wholes"]
+__all__ = ["stopped", "stopped_home", "wholes"]
 
 
 @settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -26,7 +26,6 @@ from .small_runs import (
     Interrupting,
     Wholes,
     interrupted,
-    no_git,
     resumed,
     stopped,
     stopped_home,
@@ -35,7 +34,7 @@ from .small_runs import (
     write,
 )
 
-__all__ = ["no_git", "stopped", "stopped_home", "wholes"]
+__all__ = ["stopped", "stopped_home", "wholes"]
 
 
 def fill_disk(patch: pytest.MonkeyPatch, n_good: int, number: int = errno.ENOSPC) -> None:
