@@ -456,7 +456,9 @@ def _light_warnings(session: Session, lab: Lab) -> Iterator[Problem]:
     hardware = session.assembly.hardware
     document, lines, gain = hardware.document, hardware.profile.lines, lab.step_context.camera.em_gain
     takes_image = any(step.takes_image for _, step in session.assembly.steps)
-    others_may = any(step.device_setting or getattr(step, "signal", "") for _, step in session.assembly.steps)
+    others_may = any(
+        getattr(step, name, "") for _, step in session.assembly.steps for name in ("device_setting", "signal")
+    )
     is_lit = others_may or any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
     if takes_image and not is_lit and hardware.chosen["camera"].identities("camera"):
         what = "nothing of this profile switches the imaging light"

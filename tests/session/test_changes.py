@@ -23,7 +23,7 @@ CHANGES: dict[str, tuple[Any, str]] = {
     "version": (lambda r: r["provenance"].update(labseq="0.0.1"), r"labseq was 0\.0\.1, is 0\.2\.0"),
     "commit": (
         lambda r: r["provenance"].update(git={"code": {"commit": "a" * 40, "dirty": False}}),
-        r"labseq's commit was a+, is null",
+        r"labseq's commit was a+, is (null|[0-9a-f]{40})",
     ),
     "plugin": (lambda r: r["plugins"][0].update(version="7"), r"plugin .*: version was 7, is "),
     "setting": (
