@@ -86,10 +86,9 @@ class Results:
         """Read the files with these kinds and numbers."""
         for kind in {kind for kind, _ in cases}:  # imports take place here, once
             read_one(kind, -1, 0, self._templates, self._new_folder(kind, -1))
-        while cases:
-            kind = cases[0][0]
-            batch = [one for one in cases[:BATCH] if one[0] == kind or kind != "run"]
-            cases = self._in_a_child(batch) + cases[len(batch) :]
+        with contextlib.suppress(KeyboardInterrupt):  # the table then is of what was read
+            while cases:
+                cases = self._in_a_child(cases[:BATCH]) + cases[BATCH:]
 
     def examine(self, n_runs: int) -> None:
         """Let the doctor look at many damaged runs, repair them, and look again."""
@@ -122,9 +121,13 @@ class Results:
         sys.stdout.flush()
         if (pid := os.fork()) == 0:
             os.close(receive)
-            with os.fdopen(send, "w", buffering=1) as report:
-                self._read_batch(batch, report)
-            os._exit(0)
+            try:
+                with os.fdopen(send, "w", buffering=1) as report:
+                    self._read_batch(batch, report)
+                os._exit(0)
+            except BaseException:  # noqa: BLE001 - the caller must not go on twice
+                traceback.print_exc()
+                os._exit(1)
         os.close(send)
         with os.fdopen(receive) as report:
             lines = report.read().splitlines()
@@ -140,9 +143,10 @@ class Results:
             return []
         kind, number = batch[len(lines)]
         self._counts[kind] += 1
-        ended_by = os.WTERMSIG(status)
-        what = "a hang" if ended_by in _TIMERS else "a crash"
-        self._fail(kind, number, f"{what}: it ended the process ({signal.Signals(ended_by).name})")
+        code = os.waitstatus_to_exitcode(status)
+        what = "a hang" if -code in _TIMERS else "a crash"
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        self._fail(kind, number, f"{what}: it ended the process ({how})")
         return batch[len(lines) + 1 :]
 
     def _fail(self, kind: str, number: int, error: str) -> None:
