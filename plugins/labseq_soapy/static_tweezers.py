@@ -40,8 +40,8 @@ FAULTS: Final = {
     "missed packets": ("max_lost_packets", ("sequence_errors", "late_packets")),
 }
 """What the radio did -> the setting that limits it, the errors that it reports."""
-NO_CLOCK: Final = "it has no clock for a timed start: rows and columns may start some microseconds apart"
-ORDINARY: Final = (
+NO_CLOCK: Final = "it has no timed start: rows and columns may start some microseconds apart"
+NO_REAL_TIME: Final = (
     "the streaming process has no real-time priority ({}): a busy computer may let the radio run out of "
     "samples; under Linux add '@GROUP - rtprio 99' with your group to /etc/security/limits.conf, log in again"
 )
@@ -81,7 +81,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._amplitudes: Amplitudes | None = None
         self._depth: float | None = 0.0  # None: a ramp was interrupted
         self._seen: Mapping[str, int] = {}  # errors while the array was on
-        self._recent: deque[tuple[float, str]] = deque()  # what the radio did, when
+        self._recent: deque[tuple[float, Counter[str]]] = deque()  # when the radio did what how often
         self._link: Link | None = None
         self._facts: Facts | None = None
         self._is_loaded = False
@@ -271,7 +271,7 @@ class SoapyStaticTweezers(StaticTweezers):
 
     def _notes(self, facts: Facts) -> list[str]:
         notes = [] if facts.starts_together else [NO_CLOCK]
-        return notes + ([ORDINARY.format(facts.ordinary)] if facts.ordinary else [])
+        return notes + ([NO_REAL_TIME.format(facts.no_real_time)] if facts.no_real_time else [])
 
     def _connect(self) -> Link:
         settings = self._settings
@@ -325,19 +325,19 @@ class SoapyStaticTweezers(StaticTweezers):
         counts = link.status["lit"]
         new, self._seen = Counter(counts) - Counter(self._seen), counts
         now_s = self._clock.now()
-        did = {what: sum(new[key] for key in keys) for what, (_, keys) in FAULTS.items()}
-        self._recent += [(now_s, what) for what, count in did.items() for _ in range(count)]
         while self._recent and self._recent[0][0] < now_s - MINUTE_S:
             self._recent.popleft()
+        if not new:
+            return link
+        did = Counter({what: sum(new[key] for key in keys) for what, (_, keys) in FAULTS.items()})
+        self._recent.append((now_s, did))
         for what, (setting, _) in FAULTS.items():
-            count = sum(one == what for _, one in self._recent)
-            if did[what] and count > (limit := getattr(self._settings, setting)):
+            count, limit = sum(one[what] for _, one in self._recent), getattr(self._settings, setting)
+            if did[what] and count > limit:
                 text = f"the radio {what} {count} time(s) within a minute while the array was on"
                 raise DeviceError(self._name, f"{text}; {setting} allows {limit}")
-        if new:
-            texts = " and ".join(f"{what} {count} time(s)" for what, count in did.items() if count)
-            raise TransientError(f"the radio {texts} while the array was on: atoms may be lost", self._name)
-        return link
+        texts = " and ".join(f"{what} {count} time(s)" for what, count in did.items() if count)
+        raise TransientError(f"the radio {texts} while the array was on: atoms may be lost", self._name)
 
     def _disconnect(self) -> None:
         link, self._link, self._facts = self._link, None, None

@@ -105,7 +105,8 @@ def check_span(what: str, tones_hz: Floats, zero_hz: float, rate_hz: float, sett
     if farthest > limit_hz:
         came = f"{_mhz(farthest)} from the local oscillator at {_mhz(zero_hz)}"
         limit = f"{_mhz(limit_hz)}, half of {USABLE:.0%} of the sample rate of {_mhz(rate_hz)}"
-        hint = f"choose a sample_rate above {_mhz(2 * farthest / USABLE)}, or another local_oscillator"
+        other = "lo_offset" if setting == "lo_offset" else "local_oscillator"
+        hint = f"choose a sample_rate above {_mhz(2 * farthest / USABLE)}, or another {other}"
         raise LimitError(f"{what}: the outermost tone", came, limit, hint, setting=(setting,))
 
 

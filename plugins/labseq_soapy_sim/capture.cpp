@@ -7,8 +7,8 @@
 //
 // Arguments: folder (where its files are), channels, buffer (s), patience (s: how long its clock waits for
 // samples that are late), speed (of its clock), coerce_rate (Hz), record (samples kept in files), leakage (of
-// its local oscillators, part of full scale), time=0 (no hardware time), delay (s: of the first packet),
-// components=1 (no digital tuning), fault=absent.
+// its local oscillators, part of full scale), time (0: no hardware time; 2: no timed packets), delay (s: of the
+// first packet), components (1: no digital tuning), fault=absent.
 //
 // With record, the file "trace" gets a line for each change of the transmitters, also by later processes:
 // time in s (CLOCK_MONOTONIC), name, two numbers. A process that is killed leaves them as they are.
@@ -79,7 +79,7 @@ public:
     explicit Capture(const SoapySDR::Kwargs &args)
         : folder_(text(args, "folder", ".")), n_channels_(size_t(number(args, "channels", CHANNELS))),
           buffer_s_(number(args, "buffer", 0.05)), coerced_hz_(number(args, "coerce_rate", 0.0)),
-          delay_s_(number(args, "delay", 0.0)), has_time_(number(args, "time", 1.0) > 0.0), tunes_digitally_(number(args, "components", 2.0) > 1.0),
+          delay_s_(number(args, "delay", 0.0)), time_(number(args, "time", 1.0)), tunes_digitally_(number(args, "components", 2.0) > 1.0),
           n_record_(size_t(number(args, "record", 0.0))) {
         const std::string path = folder_ + "/ring";
         const size_t size = sizeof(Header) + CHANNELS * RING * sizeof(Sample);
@@ -145,7 +145,7 @@ public:
         return name == "RF" ? oscillator : header_->frequency_hz[channel] - oscillator;
     }
 
-    bool hasHardwareTime(const std::string &) const override { return has_time_; }
+    bool hasHardwareTime(const std::string &) const override { return time_ > 0.0; }
     long long getHardwareTime(const std::string &) const override { return (long long)(1e9 * (now_s() - zero_s_)); }
 
     void setGain(const int, const size_t channel, const double gain) override {
@@ -195,6 +195,7 @@ public:
     int writeStream(SoapySDR::Stream *, const void *const *buffers, const size_t n, int &flags,
                     const long long time_ns, const long timeout_us) override {
         if (!header_->is_active || (header_->fault & STREAM_ERROR)) return SOAPY_SDR_STREAM_ERROR;
+        if (time_ > 1.0 && (flags & SOAPY_SDR_HAS_TIME)) return SOAPY_SDR_NOT_SUPPORTED;
         if (header_->sent == 0) start(flags & SOAPY_SDR_HAS_TIME, zero_s_ + 1e-9 * double(time_ns));
         const size_t buffer = size_t(std::max(1.0, buffer_s_ * header_->rate_hz));
         const size_t room = wait_for_room(std::min(std::min(n, MTU), buffer), 1e-6 * double(timeout_us));
@@ -295,7 +296,8 @@ private:
     std::string folder_;
     size_t n_channels_;
     double buffer_s_, coerced_hz_, delay_s_, zero_s_ = now_s();
-    bool has_time_, tunes_digitally_;
+    double time_;
+    bool tunes_digitally_;
     size_t n_record_;
     int file_ = -1;
     Header *header_ = nullptr;

@@ -75,7 +75,7 @@ class Facts:
         gain_db: Their gains.
         buffered: Number of samples in its buffer when it takes no more.
         starts_together: Whether both channels started at one time.
-        ordinary: Why the process has no real-time priority; "" if it has.
+        no_real_time: Why the process has no real-time priority; "" if it has.
     """
 
     radio: Mapping[str, str]
@@ -85,7 +85,7 @@ class Facts:
     gain_db: Sequence[float]
     buffered: int = 0
     starts_together: bool = True
-    ordinary: str = ""
+    no_real_time: str = ""
 
 
 def send(pipe: int, message: Mapping[str, Any]) -> None:

@@ -292,6 +292,9 @@ class Stream:
         )
         if n_taken > 0:
             self._starts_ns = 0
+        elif n_taken == NOT_SUPPORTED and self._starts_ns:  # it has a clock, but not for this
+            self._starts_ns, self.starts_together = 0, False
+            return self.write(samples, start, timeout_s)
         elif n_taken in ERRORS:
             self._errors[ERRORS[n_taken]] += 1
         elif n_taken not in {0, TIMEOUT}:

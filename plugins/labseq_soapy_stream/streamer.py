@@ -225,7 +225,7 @@ def raise_priority() -> str:
     return ""
 
 
-def stream(commands: CommandReader, messages: StatusWriter, ordinary: str) -> None:
+def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -> None:
     """Open the radio, stream, close it."""
     setup = commands.setup
     radio = open_radio(setup)
@@ -239,8 +239,8 @@ def stream(commands: CommandReader, messages: StatusWriter, ordinary: str) -> No
         streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
         signal.signal(signal.SIGTERM, streamer.terminate)
         try:
-            facts = replace(facts, starts_together=samples.starts_together, ordinary=ordinary)
-            messages.post({"facts": asdict(replace(facts, buffered=streamer.fill()))})
+            facts = replace(facts, buffered=streamer.fill(), no_real_time=no_real_time)
+            messages.post({"facts": asdict(replace(facts, starts_together=samples.starts_together))})
             streamer.run()
         finally:
             with contextlib.suppress(SoapyError):  # the first error is reported
@@ -264,11 +264,11 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to labseq, which ramps down
     pipe = os.dup(1)
     os.dup2(2, 1)  # the output of the radio's module goes to the log
-    ordinary = raise_priority() if "--real-time" in sys.argv else ""
+    no_real_time = raise_priority() if "--real-time" in sys.argv else ""
     commands, messages = CommandReader(0), StatusWriter(pipe)
     gc.disable()  # nothing here creates reference cycles
     try:
-        stream(commands, messages, ordinary)
+        stream(commands, messages, no_real_time)
     except SoapyError as error:
         messages.post({"failed": str(error)})
         messages.finish()

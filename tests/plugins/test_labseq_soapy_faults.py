@@ -136,16 +136,17 @@ def test_the_run_ends_above_so_many_disturbances_in_a_minute(fault: Fault, count
     assert f"the radio {did} 2 time(s) within a minute while the array was on; {setting} allows 1" in text
 
 
-def test_both_outputs_start_at_one_time_of_the_radio_s_clock_or_the_radio_is_said_to_have_none() -> None:
-    with opened() as rig:
-        rows_s, columns_s = rig.ring["start_s"]
-        assert rows_s == columns_s
-        assert rig.described("notes") == []
-    with opened(arguments="time=0") as rig:
-        rows_s, columns_s = rig.ring["start_s"]
-        assert columns_s > rows_s
-        assert rig.described("notes") == [static_tweezers.NO_CLOCK]
+@pytest.mark.parametrize(
+    ("time", "notes"), [(1, []), (0, [static_tweezers.NO_CLOCK]), (2, [static_tweezers.NO_CLOCK])]
+)
+def test_both_outputs_start_at_one_time_of_the_radio_s_clock_or_it_is_said_that_they_do_not(
+    time: int, notes: list[str]
+) -> None:
+    with opened(arguments=f"time={time}") as rig:
         rig.tweezers.start()
+        rows_s, columns_s = rig.ring["start_s"]
+        assert (rows_s == columns_s) == (not notes)
+        assert rig.described("notes") == notes
 
 
 def test_the_process_has_real_time_priority_or_the_reason_is_reported(

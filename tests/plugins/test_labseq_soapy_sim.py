@@ -181,6 +181,8 @@ def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path
     need_radio()
     radio, virtual = run(tmp_path / "radio", SIMULATED), run(tmp_path / "virtual")
     assert (radio.status, radio.simulated, len(radio.shots)) == ("complete", True, 1)
+    names = ("underflows", "sequence_errors", "late_packets")
+    assert {radio.shots[0].readings[f"static_tweezers.{name}"] for name in names} == {0}
     for one, other in zip(radio.shots, virtual.shots, strict=True):
         assert np.array_equal(one.occupancies, other.occupancies)
 
