@@ -33,8 +33,8 @@ import labseq
 
 from .resumable import SHOTS, check_committed, sequence_of, table
 
-LONGEST_S: Final = 120.0
-"""A command that takes longer hangs."""
+LONGEST_S: Final = 600.0
+"""A command that takes longer hangs, however busy the computer is."""
 
 PLUGIN: Final = '''
 """The virtual devices and PSCA: they note each call and what is on, and fail where CHAOS_FAULT says."""
@@ -189,28 +189,32 @@ class Disturbed:
 
 @dataclass
 class Bench:
-    """A folder with the files of all jobs, a disk for the data, and devices that note what is on."""
+    """A disk with all that labseq reads and writes, and a folder in which the devices note what is on."""
 
     folder: Path
     disk: Path | None
     faults: list[Disturbed] = field(default_factory=list["Disturbed"])
 
     def __post_init__(self) -> None:
-        (self.folder / "plugins").mkdir()
+        self.home = self.disk or self.folder
+        self.data = self.home / "data"
+        (self.home / "plugins").mkdir()
         (self.folder / "on").mkdir()
-        files = {"plugins/chaos.py": PLUGIN, "emergency.py": EMERGENCY, "chaos.yaml": PROFILE}
-        files |= {"sitecustomize.py": CLOCK, "clock": ""}
-        files |= {f"{job}.yaml": sequence_of(job, profile="chaos", planner="chaos") for job in SHOTS}
-        for name, text in files.items():
-            (self.folder / name).write_text(text, encoding="utf-8")
-        self.data = (self.disk or self.folder) / "data"
+        files = {
+            self.home / f"{job}.yaml": sequence_of(job, profile="chaos", planner="chaos") for job in SHOTS
+        }
+        files |= {self.home / "plugins" / "chaos.py": PLUGIN, self.home / "chaos.yaml": PROFILE}
+        own = {"emergency.py": EMERGENCY, "sitecustomize.py": CLOCK, "clock": ""}
+        for path, text in {**files, **{self.folder / name: text for name, text in own.items()}}.items():
+            path.write_text(text, encoding="utf-8")
         self.environment = {
             **os.environ,
             "LABSEQ_DATA": str(self.data),
-            "LABSEQ_STATE": str(self.folder / "state"),
-            "LABSEQ_LOCKS": str(self.folder / "devices"),
+            "LABSEQ_STATE": str(self.home / "state"),
+            "LABSEQ_LOCKS": str(self.home / "devices"),
             "CHAOS_FOLDER": str(self.folder),
             "PYTHONPATH": str(self.folder),
+            "PYTHONFAULTHANDLER": "1",
             "GIT_DIR": os.devnull,  # edits of the code while this runs are no change of a run
         }
 
@@ -218,7 +222,7 @@ class Bench:
         """Start a command; ``fault`` is role.method:n:how."""
         return subprocess.Popen(
             [sys.executable, "-m", "labseq", *arguments],
-            cwd=self.folder,
+            cwd=self.home,
             env={**self.environment, "CHAOS_FAULT": fault},
             text=True,
             errors="replace",
@@ -232,7 +236,7 @@ class Bench:
         try:
             text, _ = process.communicate(timeout=LONGEST_S)
         except subprocess.TimeoutExpired:
-            process.kill()
+            process.send_signal(signal.SIGABRT)  # prints where each thread is
             text, _ = process.communicate()
             raise BrokenPromiseError(f"hangs: {process.args}\n{text}") from None
         if "Traceback" in text or "internal error" in text:
@@ -274,7 +278,7 @@ def result(bench: Bench, job: str) -> Any:
         return sorted(
             [table(labseq.open_run(folder)) for folder in bench.runs()], key=repr
         )  # a clock that is set changes names
-    found = sorted(bench.folder.glob("calibrations/**/thresholds-*.json"))
+    found = sorted(bench.home.glob("calibrations/**/thresholds-*.json"))
     return json.loads(found[-1].read_text(encoding="utf-8"))["values"]
 
 
@@ -414,7 +418,7 @@ def disturbed(bench: Bench, command: list[str], chance: random.Random) -> str:
 def next_command(bench: Bench, job: str) -> list[str] | None:
     """The command that gets a job on; None once it is done."""
     if job == "calibration":
-        return None if list(bench.folder.glob("calibrations/**/thresholds-*.json")) else JOBS[job]
+        return None if list(bench.home.glob("calibrations/**/thresholds-*.json")) else JOBS[job]
     runs = bench.runs()
     if job == "queue":
         entries = json.loads(bench.run("queue", "list", "--json"))["entries"]
