@@ -148,11 +148,12 @@ def test_the_commands_show_write_and_draw_the_same_points(
     assert header.startswith('shot.hold.duration,shots,"survival:before,after","survival:before,after low"')
     assert float(first.split(",")[2]) == rate.value
     assert len(rest) == 5
-    for name in ("scan.png", "scan_1.png"):
-        assert printed("plot", run, *scan, "--fit", "exponential") == f"written: {name}\n"
+    (tmp_path / "scan.png").touch()
+    assert printed("plot", run, *scan, "--fit", "exponential") == "written: scan_1.png\n"
     assert "this file exists already; expected a new name; --force replaces it" in printed(
         "plot", run, *scan, "-o", "scan.png"
     )
+    assert (tmp_path / "scan.png").stat().st_size == 0
     assert printed("plot", run, "--scan", "-o", "scan.png", "--force") == "written: scan.png\n"
 
 

@@ -13,7 +13,7 @@ from labseq.errors import RecordingError
 
 FULL = Path("/dev/full")
 PLAN = "plan random:8x8@0.75 --target compact:4x4 --step"
-COMMANDS = [("plugins", False), (f"{PLAN} --json -", True)]
+COMMANDS = [("runs", False), (f"{PLAN} --json -", True)]
 """Each with whether Python buffers what it prints."""
 
 CELLS = st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=8)
@@ -88,7 +88,7 @@ def test_a_reader_that_went_away_is_no_error(command: str, buffered: bool) -> No
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="no full device")
-@pytest.mark.parametrize(("command", "buffered"), [("plugins", False), ("--help", True)])
+@pytest.mark.parametrize(("command", "buffered"), [("runs", False), ("--help", True)])
 def test_a_full_disk_is_reported_in_a_line(command: str, buffered: bool) -> None:
     with FULL.open("w", encoding="utf-8") as full:
         done = perform(command, full.fileno(), buffered)

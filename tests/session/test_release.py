@@ -114,10 +114,8 @@ def recaptured(path: Path, folder: Path, *overrides: str) -> tuple[float, labseq
     return 1 - lost / before, run
 
 
-@pytest.mark.parametrize("temperature_k", [15e-6, 30e-6])
-def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(
-    temperature_k: float, tmp_path: Path
-) -> None:
+def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(tmp_path: Path) -> None:
+    temperature_k = 30e-6  # that of the profile, 15 uK, is found in tests/analysis/test_quantities.py
     overrides = [f"profile.simulation.temperature={temperature_k} K", "repeats=1", "record_frames=none"]
     sequence = ROOT / "sequences" / "release_recapture.yaml"
     with labseq.Session.open(sequence, output=tmp_path, seed=2, overrides=overrides) as session:

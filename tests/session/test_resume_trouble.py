@@ -151,9 +151,7 @@ def test_a_clock_that_is_set_changes_nothing_but_time_stamps(
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("GIT_DIR", os.devnull)
-        return resumed(interrupted(write(tmp_path_factory.mktemp("run")), "shot_started", 4))
+    return resumed(interrupted(write(tmp_path_factory.mktemp("run")), "shot_started", 4))
 
 
 def test_a_run_on_an_earlier_day_than_others_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
