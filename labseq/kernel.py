@@ -53,7 +53,7 @@ MAX_WORKERS: Final = 4
 """Maximum number of processes that compile; each needs about 200 MB."""
 WORTH_A_PROCESS_S: Final = 3.0
 """What would take less than this is compiled without starting processes."""
-COMPILE_S: Final = 0.0042
+COMPILE_S: Final = 0.0031
 """Scale of the estimates of the time for compiling, in seconds; measured on two cores."""
 
 _INTERPRETED = threading.Event()
