@@ -337,9 +337,7 @@ class _Check:
         index = _LineFile(self.folder / folders.INDEX_FILE)
         of_file, counted, wrong = dict[str, list[_Line]](), set[int](), list[int]()
         for number, row in index.rows():
-            if is_index_row(row) and _is_name_of(
-                row["file"], row["shot"], row["attempt"], counts=row["counts"]
-            ):
+            if is_index_row(row) and _is_name(row):
                 of_file.setdefault(row["file"], []).append(_Line(number, row["sha256"], row["bytes"]))
                 counted.update([row["shot"]] * row["counts"])
             else:
@@ -390,14 +388,21 @@ class _Check:
 
     def _row_of_stray(self, path: Path, run_id: str) -> dict[str, Any] | None:
         """The line for a file that has none, if the file is a whole shot of this run."""
-        from labseq.recording.shot_file import iter_frames, read_content  # h5py takes 0.1 s to import
+        from labseq.recording.shot_file import (  # h5py takes 0.1 s to import
+            damage_reported,
+            iter_frames,
+            read_content,
+        )
 
+        file = path.relative_to(self.folder).as_posix()
         try:
             content = read_content(path)
             for _ in iter_frames(path):  # each must be readable
                 pass
             n_bytes = path.stat().st_size
             _, sha256 = self._size_and_hash(path, [n_bytes])
+            with damage_reported(path):
+                row = index_row(content.record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return None
@@ -407,15 +412,13 @@ class _Check:
         except RecordingError as error:
             self._quarantine(f"no line in the index, and {_reason(error).partition('; ')[0]}", path)
             return None
-        record, file = content.record, path.relative_to(self.folder).as_posix()
-        counts = record.status == "complete"
         if content.run_id != run_id:
             self._quarantine(f"a shot of another run, {content.run_id}", path)
             return None
-        if not _is_name_of(file, record.shot_index, record.attempt, counts=counts):
+        if not is_index_row(row) or not _is_name(row):
             self._quarantine("a shot under a name that is not its own", path)
             return None
-        return index_row(record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
+        return row
 
     def _save(self, lines: _LineFile) -> None:
         """Save a file of lines, and report its defects."""
@@ -462,10 +465,12 @@ def _what_changed(found: int, n_bytes: int) -> str:
     return "the checksum does not hold: a byte has changed since it was written"
 
 
-def _is_name_of(file: str, shot_index: int, attempt: int, *, counts: bool) -> bool:
-    match = SHOT_FILE.fullmatch(file)
+def _is_name(row: dict[str, Any]) -> bool:
+    """Whether the file in a line of the index has the name of its shot."""
+    match = SHOT_FILE.fullmatch(row["file"])
     take = int(match[3] or 1) if match else 1
-    return file == folders.shot_file_name(shot_index, attempt, counts=counts, take=take)
+    name = folders.shot_file_name(row["shot"], row["attempt"], counts=row["counts"], take=take)
+    return row["file"] == name
 
 
 def _reason(error: RecordingError) -> str:

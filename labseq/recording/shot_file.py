@@ -272,14 +272,24 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
         raise RecordingError(path, f"cannot be read: {what}; restore it from a backup")
     if not path.is_file():
         raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
+    # A finished file never changes, and locks fail on network folders.
+    with damage_reported(path), h5py.File(path, "r", locking=False) as file:
+        if read_attribute(file, "format") != schema.FORMAT:
+            raise RecordingError(path, "is not a shot's file of labseq")
+        check_version(path, str(read_attribute(file, "format_version")), schema.FORMAT_VERSION)
+        check_contents(file, path.stat().st_size, only)
+        yield cast("Any", file["entry"])
+
+
+@contextlib.contextmanager
+def damage_reported(path: Path) -> Generator[None]:
+    """Report the file as damaged if anything fails within.
+
+    Raises:
+        RecordingError: Something failed.
+    """
     try:
-        # A finished file never changes, and locks fail on network folders.
-        with h5py.File(path, "r", locking=False) as file:
-            if read_attribute(file, "format") != schema.FORMAT:
-                raise RecordingError(path, "is not a shot's file of labseq")
-            check_version(path, str(read_attribute(file, "format_version")), schema.FORMAT_VERSION)
-            check_contents(file, path.stat().st_size, only)
-            yield cast("Any", file["entry"])
+        yield
     except RecordingError:
         raise
     except Exception as error:  # of h5py, numpy, and whatever a damaged file has instead of the values

@@ -225,6 +225,27 @@ def test_a_shot_of_a_newer_labseq_is_left(run_dir: Path) -> None:
     assert "update labseq" in found.done
 
 
+def other_grid(file: Any) -> None:
+    del file["entry/detection/occupancy"]
+    file["entry/detection/occupancy"] = np.ones((3, 9, 9), np.uint8)
+
+
+def list_of_readings(file: Any) -> None:
+    del file["entry/readings"]
+    file["entry/readings"] = np.bytes_(b"[1]")
+
+
+@pytest.mark.parametrize("plant", [other_grid, list_of_readings])
+def test_a_file_that_gives_no_line_goes_to_quarantine(run_dir: Path, plant: Callable[[Any], None]) -> None:
+    lost_line(run_dir)
+    path = run_dir / "shots" / "shot_000001.h5"
+    with h5py.File(path, "r+") as file:
+        plant(file)
+    (found,) = examine(run_dir).findings
+    assert found.what.startswith("no line in the index, and is damaged: ")
+    assert (run_dir / "quarantine" / path.name).exists()
+
+
 def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
     root = run_dir.parents[1]
     for plant in (lost_line, part_left, torn_events, empty_file):
