@@ -139,7 +139,9 @@ def _run_case(kind: str, rng: random.Random, templates: Templates, folder: Path)
 
 def damage_run(rng: random.Random, run_dir: Path) -> None:
     """Damage a run in up to six places; one run of a hundred gets files of an absurd size."""
-    for plant in rng.sample([*MENDED, *LOST], rng.randint(1, 3)) + [swollen] * (rng.random() < 0.01):
+    for plant in rng.sample([*MENDED, *LOST], rng.randint(1, 3)) + [
+        rng.choice([swollen, swollen_document])
+    ] * (rng.random() < 0.01):
         with suppress(OSError, IndexError, KeyError, ValueError):  # nothing is left to damage
             plant(run_dir)
     files = sorted(path for path in run_dir.rglob("*") if path.is_file() and path.stat().st_size < 1 << 20)
@@ -152,10 +154,15 @@ def swollen(run_dir: Path) -> None:
     for name in ("shots/shot_000002.h5", "shots/shot_000008.h5", "STATE", "skipped.jsonl"):
         with (run_dir / name).open("ab") as file:
             file.truncate(1 << 40)
-    run_file, index = run_dir / "run.json", run_dir / "index.jsonl"
-    run_file.write_bytes(run_file.read_bytes().rstrip()[:-1] + b', "x": [' + b"[]," * 20_000_000 + b"[]]}")
+    index = run_dir / "index.jsonl"
     index.write_bytes(index.read_bytes() * 10_000)
     (run_dir / "events.jsonl").write_bytes(b"x\n" * 1_000_000)
+
+
+def swollen_document(run_dir: Path) -> None:
+    """A run.json with millions of values."""
+    path = run_dir / "run.json"
+    path.write_bytes(path.read_bytes().rstrip()[:-1] + b', "x": [' + b"[]," * 5_000_000 + b"[]]}")
 
 
 def _read_run(run_dir: Path, *, repair: bool = False) -> None:

@@ -56,7 +56,10 @@ def main() -> int:
     if arguments.only:
         cases = [(arguments.only[0], int(arguments.only[1]))]
     shutil.rmtree(arguments.keep, ignore_errors=True)
-    os.environ["LABSEQ_STATE"] = str(arguments.keep / "state")
+    os.environ |= {
+        "LABSEQ_STATE": str(arguments.keep / "state"),
+        "LABSEQ_LOCKS": str(arguments.keep / "locks"),
+    }
     results = Results(arguments.keep, arguments.seed)
     results.read(cases)
     results.print()
@@ -203,15 +206,15 @@ def _examine(data: Path, what: str) -> None:
     if what == "repair":
         reports = list[Report]()
         for run_dir in sorted(data.glob("*/*_damaged")):
-            began_s = time.perf_counter()
+            began_s = time.process_time()
             reports.append(examine(run_dir))
-            slowest = max(slowest, (time.perf_counter() - began_s, run_dir.name))
+            slowest = max(slowest, (time.process_time() - began_s, run_dir.name))
     else:
         reports = [examine(data, dry_run=True)]
     findings = [one for report in reports for one in report.findings]
     print(
         f"doctor, {what}: {len(findings)} findings, {sum(one.left for one in findings)} left; "
-        f"{time.perf_counter() - start_s:.1f} s, slowest run {slowest[0]:.2f} s {slowest[1]}; "
+        f"{time.perf_counter() - start_s:.1f} s, most of the processor {slowest[0]:.2f} s {slowest[1]}; "
         f"{_peak_mb():.0f} MB",
         flush=True,
     )
