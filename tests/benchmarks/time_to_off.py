@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tests.plugins.outputs_rig import CARDS, CAUSES, outputs
 
-DEVICES = ("shutter", "lines", *CARDS, "radio")
+DEVICES = ("shutter", "lines", "radio", *CARDS)
 
 
 def main() -> None:

@@ -85,6 +85,7 @@ def drive(folder, names, repeat, cause):
     exec(cause)
 
 def lose_terminal():
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     terminal, mine = os.openpty()
     os.setsid()
     fcntl.ioctl(mine, termios.TIOCSCTTY, 0)
@@ -117,8 +118,8 @@ CAUSES: Final = {
     "C call": "ctypes.PyDLL(None).sleep(60)",
 }
 """What ends or stops the process."""
-CARDS: Final = ("dds", "replay", "fifo")
-"""Simulated cards, by mode."""
+CARDS: Final = ("dds", "fifo", "replay")
+"""Simulated cards, by mode; replay comes last, because it plays for less than a second."""
 
 
 class TtlCounterpart(Counterpart):
@@ -199,7 +200,7 @@ class Outputs:
         (self._folder / "watchdog.jsonl").unlink(missing_ok=True)
         self._repeat += 1
         assert self._ask(CAUSES[cause]) == "on\n"
-        assert set(self.off_since().values()) == {None}
+        assert set((states := self.off_since()).values()) == {None}, states
         begun_s = float(self._ask(""))
         deadline_s = time.monotonic() + 20.0
         while len(log_rows(self._folder)) < len(self._names) and time.monotonic() < deadline_s:
