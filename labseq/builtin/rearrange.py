@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from numbers import Real
 from typing import Literal, Self
 
@@ -209,8 +210,8 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
             shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
     shot.check_interlocks()
     budget_s = duration_s + shot.margin_s("rearrange")
-    with shot.stage("play", budget_s, cycle), shot.lines_on("rearrange", duration_s):
-        shot.call("mobile_tweezers", limit_s, mobile.play)
+    start = partial(shot.call, "mobile_tweezers", limit_s, mobile.play)
+    with shot.stage("play", budget_s, cycle), shot.lines_on("rearrange", duration_s, start):
         shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
 
 

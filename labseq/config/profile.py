@@ -140,6 +140,8 @@ class CalibrationSettings(Settings):
 MAX_PULSE_S: Final = 1.0
 
 
+_TRIGGERED: Final = {"camera": "image", "mobile_tweezers": "rearrange"}
+"""Role -> the kind of step that begins with its trigger."""
 _SHAPES: Final = ("lead", "lag", "pulse")
 
 
@@ -158,9 +160,9 @@ class ChannelSettings(Settings):
         default=0.0,
         description="a pulse of this length at the beginning of such a step, instead of being on throughout",
     )
-    triggers: Literal["", "camera"] = Field(
+    triggers: Literal["", "camera", "mobile_tweezers"] = Field(
         default="",
-        description="the role whose trigger input it is wired to: its exposures begin with the line",
+        description="the role whose trigger input it is wired to: its exposures or moves begin with the line",
     )
     blinding: bool = Field(
         default=False, description="its light would harm a camera with EM gain: never on during an exposure"
@@ -191,10 +193,9 @@ class ChannelSettings(Settings):
             raise setting_error(
                 "a pulse has 'idle' among its steps", "kinds of step, which have a beginning", at=("on",)
             )
-        if self.triggers == "camera" and set(self.on) != {"image"}:
-            raise setting_error(
-                "a line that triggers the camera is on at other times", "`on: [image]`", at=("on",)
-            )
+        if self.triggers and set(self.on) != {kind := _TRIGGERED[self.triggers]}:
+            what = f"a line that triggers the {self.triggers.replace('_', ' ')} is on at other times"
+            raise setting_error(what, f"`on: [{kind}]`", at=("on",))
         if self.triggers and self.lead:
             raise setting_error(
                 "lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True
@@ -222,10 +223,10 @@ def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings
         if a.channel == b.channel:
             what = f"'{first}' and '{second}' are both on channel {a.channel}"
             raise setting_error(what, "a channel for each line", at=(second, "channel"))
-    triggers = [name for name, channel in channels.items() if channel.triggers == "camera"]
-    if len(triggers) > 1:
-        what = f"'{triggers[0]}' and '{triggers[1]}' both trigger the camera"
-        raise setting_error(what, "one line for that", at=(triggers[1], "triggers"))
+    for (first, a), (second, b) in combinations(channels.items(), 2):
+        if a.triggers and a.triggers == b.triggers:
+            what = f"'{first}' and '{second}' both trigger the {a.triggers.replace('_', ' ')}"
+            raise setting_error(what, "one line for that", at=(second, "triggers"))
     for name in channels:
         device_name(name, "a line")
     return channels

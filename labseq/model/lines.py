@@ -27,7 +27,7 @@ class LineSpec:
         lag_s: How long after it it is turned off, in seconds.
         pulse_s: Length of a pulse at the beginning of such a step, in seconds, in the place of a line
             that is on throughout; 0 for none.
-        triggers: The role whose trigger input it is wired to, "camera"; "" for none.
+        triggers: The role whose trigger input it is wired to, "camera", "mobile_tweezers"; "" for none.
         blinding: Whether its light would harm a camera with EM gain.
         active_low: Whether the output is low while the line is on.
         turns_off: The role whose light is off while the line is on, "static_tweezers"; "" for none.

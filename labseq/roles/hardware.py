@@ -176,6 +176,14 @@ class StaticTweezers(Hardware):
 class MobileTweezers(Hardware):
     """The mobile tweezers."""
 
+    @property
+    def waits_for_trigger(self) -> bool:
+        """Whether ``play`` only arms them, and an edge at their input starts them; also before ``open()``.
+
+        Drivers that can do so do it if ``trigger_line(context.lines, "mobile_tweezers")`` names a line.
+        """
+        return False
+
     def check_program(self, program: ToneProgram) -> None:
         """Refuse before the device is opened what ``prepare`` would refuse; nothing is sent.
 
@@ -196,7 +204,7 @@ class MobileTweezers(Hardware):
 
     @abstractmethod
     def play(self) -> None:
-        """Start playing the prepared program; returns at once."""
+        """Start playing the prepared program, or arm it for its trigger; returns at once."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> None:

@@ -267,12 +267,16 @@ class Shot(Protocol):
         """The context from which the step laid out its timeline."""
         ...
 
-    def lines_on(self, kind: str, duration_s: float) -> AbstractContextManager[None]:
+    def lines_on(
+        self, kind: str, duration_s: float, start: Callable[[], object] | None = None
+    ) -> AbstractContextManager[None]:
         """Context manager for the work of a step: its lines switch on before it and off after it.
 
         Args:
             kind: Kind of the step, as the profile's lines name it: "image".
             duration_s: Duration of the step, in seconds.
+            start: Starts the step's device when the step begins, or arms it before the lines are fired if
+                one of them triggers it.
         """
         ...
 

@@ -24,6 +24,7 @@ from labseq.model import (
     StepTiming,
     TimelineEntry,
 )
+from labseq.model.lines import lines_of
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.roles import Device, ReportsSignals, StepContext, offers
 from labseq.sequencer.images import CameraSeries
@@ -133,6 +134,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 EARLY_S = 1e-6
 """A frame may be there so much earlier than its exposure should end, because of rounding."""
+PLAYED_EARLY_S = 10e-6
+"""Likewise a program, whose playing time includes delays of the device."""
 
 
 class RunningShot:
@@ -297,22 +300,41 @@ class RunningShot:
         return margin_s(self.lab.line_specs, kind)
 
     @contextmanager
-    def lines_on(self, kind: str, duration_s: float) -> Generator[None]:
+    def lines_on(
+        self, kind: str, duration_s: float, start: Callable[[], object] | None = None
+    ) -> Generator[None]:
         """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
-        lines, timeout_s = self.lab.lines, self.call_timeout_s
+        lines, timeout_s, specs = self.lab.lines, self.call_timeout_s, self.lab.line_specs
+        is_triggered = any(spec.triggers == "mobile_tweezers" for spec in lines_of(specs, kind))
+        if start is not None and (lines is None or is_triggered):
+            start()
         if lines is None:
             yield
             return
-        program = line_program(self.lab.line_specs, kind, duration_s)
+        program = line_program(specs, kind, duration_s)
         self.call("lines", timeout_s, lines.compile, program)
         self.call("lines", timeout_s, lines.arm)
         self._fired_s = self.clock.now()
         self.call("lines", timeout_s, lines.fire)
         fired_s = self.clock.now()  # after the call, which takes a moment
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
+        if start is not None and not is_triggered:
+            start()
         yield
+        if is_triggered:
+            self._check_end(program.begin_s + duration_s)
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
         self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
+
+    def _check_end(self, least_s: float) -> None:
+        """Refuse a program that ended before it can be over: it was started by a trigger too many."""
+        early_s = self._fired_s + least_s - self.clock.now()
+        if early_s > PLAYED_EARLY_S:
+            text = (
+                f"a program ended {format_quantity(early_s, 'time')} too early, so a pulse before that of the"
+            )
+            text += " line started it; look for a second edge at the trigger input"
+            raise DeviceError("mobile_tweezers", text)
 
     def release(self, duration_s: float) -> float:
         """Turn the static tweezers off for a time that hardware keeps; see ``labseq.plugin.Shot``.

@@ -223,6 +223,11 @@ def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
         loc = ("lines", "channels", wired.name, "triggers")
         expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
         problems.append(document.problem(loc, what, expected))
+    wired, mobile = trigger_line(lab.line_specs, "mobile_tweezers"), lab.mobile_tweezers
+    if wired is not None and not (offers(mobile, "waits_for_trigger") and mobile.waits_for_trigger):
+        loc = ("lines", "channels", wired.name, "triggers")
+        what = "the mobile tweezers take no external trigger"
+        problems.append(document.problem(loc, what, "mobile tweezers that do, such as `spcm`"))
     return problems
 
 

@@ -25,6 +25,7 @@ from labseq.plugin import (
     ToneProgram,
     TransientError,
     format_quantity,
+    trigger_line,
     warm_rendering,
 )
 from labseq_spcm import limits
@@ -100,6 +101,8 @@ class SpcmMobileTweezers(MobileTweezers):
 
     def __init__(self, settings: SpcmSettings, context: Context) -> None:
         self._name = context.name or "mobile_tweezers"
+        if trigger_line(context.lines, "mobile_tweezers") is not None:
+            settings = settings.model_copy(update={"trigger": "external"})
         self._settings = settings
         self._clock = context.clock
         self._rf = context.motion.rf
@@ -116,6 +119,11 @@ class SpcmMobileTweezers(MobileTweezers):
         self._timings: dict[str, float] = {}
         self._duration_s: float | None = None
         self._due_s: float | None = None
+
+    @property
+    def waits_for_trigger(self) -> bool:
+        """Whether an edge at Ext0 starts the programs."""
+        return self._settings.trigger == "external"
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
@@ -230,7 +238,7 @@ class SpcmMobileTweezers(MobileTweezers):
         duration_s, self._duration_s = self._duration_s, None
         spcm = card.spcm
         command = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER
-        if self._settings.trigger == "external":
+        if self.waits_for_trigger:
             self._due_s = math.inf
         else:
             self._due_s = self._clock.now() + duration_s

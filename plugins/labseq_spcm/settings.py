@@ -34,7 +34,9 @@ class SpcmSettings(Settings):
     row_channel: Channel = Field(default=0, description="output that drives the row axis")
     column_channel: Channel = Field(default=1, description="output that drives the column axis")
     trigger: Literal["software", "external"] = Field(
-        default="software", description="what starts a program: the driver, or an edge at the input Ext0"
+        default="software",
+        description="what starts a program: the driver, or an edge at the input Ext0, also from a line with "
+        "`triggers: mobile_tweezers`",
     )
     trigger_level: Annotated[Voltage, Field(ge=-10, le=10)] = Field(
         default=1.5, description="level of the edge, in steps of 10 mV"

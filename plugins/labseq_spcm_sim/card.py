@@ -23,6 +23,8 @@ LIST_PARAM: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
 """A version that ``spcm`` accepts; the vendor has no such version."""
 LOG_SIZE: Final = 100_000
+EDGE_V: Final = 3.3
+"""Height of a pulse at Ext0, of LVTTL."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,7 @@ class SimulatedCard:
         self._lock = threading.RLock()
         self._machine = Machine(model)
         self._error = ErrorInfo()
+        self._edges_s: list[float] = []
         self._is_open = False
         self._identity: dict[int, int] = {
             r.SPC_PCISERIALNO: serial_number,
@@ -96,7 +99,7 @@ class SimulatedCard:
 
     # From outside: trigger input, outputs
 
-    def trigger(self, voltage_v: float = 3.3) -> bool:
+    def trigger(self, voltage_v: float = EDGE_V) -> bool:
         """A pulse from 0 V at the input Ext0, now.
 
         Returns:
@@ -105,6 +108,12 @@ class SimulatedCard:
         """
         with self._lock:
             return self._machine.pulse(voltage_v, self._advance())
+
+    def trigger_at(self, time_s: float) -> None:
+        """A pulse of 3.3 V at the input Ext0 at a time, now or later."""
+        with self._lock:
+            self._edges_s.append(time_s)
+            self._edges_s.sort()
 
     def played(self, channel: int) -> list[Span]:
         """The output of a channel up to now, in time's order; between the spans there is silence."""
@@ -160,6 +169,10 @@ class SimulatedCard:
 
     def _advance(self) -> float:
         now_s = self._clock.now()
+        while self._edges_s and self._edges_s[0] <= now_s:
+            edge_s = self._edges_s.pop(0)
+            self._machine.advance(edge_s)
+            self._machine.pulse(EDGE_V, edge_s)
         self._machine.advance(now_s)
         return now_s
 

@@ -33,6 +33,7 @@ from labseq.plugin import (
     RfSpan,
     RfTones,
     Simulation,
+    offers,
 )
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
@@ -316,6 +317,8 @@ class SimulatedLibrary:
         elif self._name == PREFIX:
             received = isinstance(self._simulation, ReceivesOutput)
             self.card = card = SimulatedCard(self._clock, keep_history=received)
+            if self._simulation is not None and offers(self._simulation, "wire"):
+                self._simulation.wire("mobile_tweezers", card.trigger_at)
             name = ""
         else:
             return self._name

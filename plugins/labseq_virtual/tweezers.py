@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, Final
@@ -26,6 +27,7 @@ from labseq.plugin import (
     TweezerAmplitudes,
     TweezersFacts,
     format_quantity,
+    trigger_line,
 )
 from labseq_virtual.settings import MobileTweezersSettings, StaticTweezersSettings
 
@@ -100,7 +102,20 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         self._settings = settings
         self._grid = context.grid
         self._prepared: ToneProgram | None = None
+        self._armed: ToneProgram | None = None
         self._playing_until_s: float | None = None
+        self._is_wired = trigger_line(context.lines, "mobile_tweezers") is not None
+
+    @property
+    def waits_for_trigger(self) -> bool:
+        """Whether a line triggers them."""
+        return self._is_wired
+
+    def open(self) -> None:
+        """Connect to the simulation, and to the line that triggers them."""
+        super().open()
+        if self._is_wired:
+            self._simulation.wire("mobile_tweezers", self._start)
 
     def warm(self) -> None:
         """Compile or load the kernels of transport."""
@@ -145,10 +160,16 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
             raise DeviceError(
                 self._name, "play() without a prepared program; call prepare() before each play()"
             )
-        program, self._prepared = self._prepared, None
-        now_s = self._clock.now()
-        self._simulation.play("mobile_tweezers", program, now_s)
-        self._playing_until_s = now_s + program.total_duration_s
+        self._armed, self._prepared, self._playing_until_s = self._prepared, None, math.inf
+        if not self._is_wired:
+            self._start(self._clock.now())
+
+    def _start(self, t_s: float) -> None:
+        """Start the armed program; without one the edge has no effect."""
+        program, self._armed = self._armed, None
+        if program is not None:
+            self._simulation.play("mobile_tweezers", program, t_s)
+            self._playing_until_s = t_s + program.total_duration_s
 
     def wait(self, timeout_s: float) -> None:
         """Wait for the end of the program; returns at once if none is playing.
@@ -163,14 +184,15 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         self._clock.sleep(min(left_s, timeout_s))
         if left_s > timeout_s:
             waited, left = format_quantity(timeout_s, "time"), format_quantity(left_s, "time")
-            raise DeviceTimeoutError(
-                self._name, f"still playing after {waited}; the program needed {left}", timeout_s
-            )
+            text = f"still playing after {waited}; the program needed {left}"
+            if self._armed is not None:
+                text = f"no trigger came within {waited}"
+            raise DeviceTimeoutError(self._name, text, timeout_s)
         self._playing_until_s = None
 
     def safe_state(self) -> None:
         """All tones off, at once; the prepared program is dropped."""
-        self._prepared = None
+        self._prepared = self._armed = None
         if self._playing_until_s is not None:
             self._playing_until_s = None
             self._simulation.play("mobile_tweezers", SILENCE, self._clock.now())

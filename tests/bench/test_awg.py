@@ -26,7 +26,9 @@ from tests.plugins.needs import need_library
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 N_SHOTS = int(os.environ.get("LABSEQ_SHOTS", "1"))
 MOBILE = "profile.mobile_tweezers"
-DDS = (f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE}.max_column_tones=5")
+TRIGGER = "awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, triggers: mobile_tweezers}"
+TRIGGERED = (f"profile.lines={{use: virtual, channels: {{{TRIGGER}}}}}",)
+DDS = (*TRIGGERED, f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE}.max_column_tones=5")
 
 RunProfile = Callable[..., Run]
 
@@ -53,10 +55,10 @@ def filled_once(shot: Shot, done: Run) -> float:
     return done.target.filling_fraction(shot.occupancies[first])
 
 
-@pytest.mark.parametrize("overrides", [(), DDS], ids=["replay", "dds"])
+@pytest.mark.parametrize("overrides", [TRIGGERED, DDS], ids=["replay", "dds"])
 def test_filling_agrees_with_the_virtual_profile(run: RunProfile, overrides: tuple[str, ...]) -> None:
     played = run("bench_awg", *overrides)
-    motion = [text for text in overrides if "mode=" not in text]
+    motion = [text for text in overrides if "max_" in text]
     virtual = run("virtual", *motion, shots=10 * N_SHOTS)
     assert virtual.shots[0].atom_events == {}
     found, expected = (np.array([filled_once(s, done) for s in done.shots]) for done in (played, virtual))
@@ -84,8 +86,8 @@ def compare_flights(shot: Shot, other: Shot, but: tuple[str, ...] = ()) -> None:
 
 
 def test_streamed_samples_move_atoms_as_replayed_ones_do(run: RunProfile) -> None:
-    streamed = run("bench_awg", f"{MOBILE}.mode=fifo", shots=1)
-    shot, replayed = streamed.shots[0], run("bench_awg").shots[0]
+    streamed = run("bench_awg", *TRIGGERED, f"{MOBILE}.mode=fifo", shots=1)
+    shot, replayed = streamed.shots[0], run("bench_awg", *TRIGGERED).shots[0]
     compare_flights(shot, replayed, but=("held_s", "lost_s"))  # streaming starts earlier
 
 
@@ -97,7 +99,8 @@ def installed() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_run_through_every_driver_is_the_one_through_virtual_devices(run: RunProfile) -> None:
-    bench, expected = run("bench", shots=1), run("bench_awg")
+    line = f"profile.lines.channels.{TRIGGER.replace(': {', '={', 1)}"
+    bench, expected = run("bench", line, shots=1), run("bench_awg", *TRIGGERED)
     assert bench.simulated
     compare_flights(bench.shots[0], expected.shots[0])  # depths follow what the radio sent
 

@@ -25,7 +25,7 @@ from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, vendor_library_found
+from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, vendor_library_found
 
 from labseq.motion import tone_program
 from labseq.plugin import (
@@ -312,9 +312,58 @@ def test_closing_goes_through_even_if_the_card_is_broken(driver: Any) -> None:
         "{use: spcm, card: simulated, mode: dds, max_row_tones: 16, max_column_tones: 5}",
     ],
 )
-def test_a_simulated_card_plays_in_virtual_time(tmp_path: Path, mobile: str) -> None:
-    done = run(tmp_path, mobile=mobile)
+def test_a_simulated_card_plays_in_virtual_time_from_the_edge_of_a_line_on(
+    tmp_path: Path, mobile: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edges: list[tuple[bool, float]] = []
+    trigger_at = SimulatedCard.trigger_at
+
+    def watched(card: SimulatedCard, time_s: float) -> None:
+        edges.append((card._machine.trigger_enabled, time_s))
+        trigger_at(card, time_s)
+
+    monkeypatch.setattr(SimulatedCard, "trigger_at", watched)
+    done = run(tmp_path, mobile=mobile + LINE)
     assert (done.status, done.simulated, len(done.shots)) == ("complete", True, 1)
+    assert [is_armed for is_armed, _ in edges] == [True]
+
+
+LINE = (
+    "\nlines: {use: virtual, channels: {awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, "
+    "triggers: mobile_tweezers}}}"
+)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("n_edges", "text"),
+    [
+        (0, r"no trigger came within .* s; check the cable at Ext0 and trigger_level"),
+        (2, r"ended \d+ us too early, so a pulse before that of the line started it; look for a second edge"),
+    ],
+)
+def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
+    tmp_path: Path, mode: str, n_edges: int, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cards: list[Any] = []
+    play = SpcmMobileTweezers.play
+
+    def disturbed(tweezers: SpcmMobileTweezers) -> None:
+        play(tweezers)
+        assert isinstance(tweezers.library, SimulatedLibrary)
+        cards.append(tweezers.library.card)
+        if n_edges == 2:
+            cards[0].trigger()
+            tweezers._clock.sleep(1e-3)
+
+    monkeypatch.setattr(SpcmMobileTweezers, "play", disturbed)
+    if n_edges == 0:
+        monkeypatch.setattr(SimulatedCard, "trigger_at", lambda *_: None)
+    tones = ", max_row_tones: 16, max_column_tones: 5" if mode == "dds" else ", sample_rate: 250 MHz"
+    with pytest.raises(DeviceError, match=text) as raised:
+        run(tmp_path, mobile=f"{{use: spcm, card: simulated, mode: {mode}{tones}}}{LINE}")
+    assert (raised.value.device, raised.value.exit_code) == ("mobile_tweezers", 3)
+    assert (cards[0].running, cards[0].outputs_on) == (False, (False, False))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -442,6 +443,7 @@ lines:
     mot: {channel: 3, on: [load], lag: 5 ms, blinding: true}
     imaging: {channel: 4, on: [image], lead: 0.2 ms}
     camera_trigger: {channel: 6, on: [image], pulse: 1 ms, triggers: camera}
+    awg_trigger: {channel: 7, on: [rearrange], pulse: 1 ms, triggers: mobile_tweezers}
 """
 
 MOVED = ("simulation.lost.transport", "simulation.lost.hand_over")
@@ -473,10 +475,10 @@ def test_a_run_without_molasses_in_the_moves_loses_more_atoms(tmp_path: Path) ->
     assert n_hot > 1.8 * n_cool > 0
 
 
-def test_the_trigger_line_starts_the_exposures(tmp_path: Path) -> None:
+def test_the_trigger_lines_start_the_exposures_and_the_moves(tmp_path: Path) -> None:
     triggered, by_software = (
         run(tmp_path / name, lines, shots=1).shots[0]
-        for name, lines in (("a", LINES), ("b", LINES.replace(", triggers: camera", "")))
+        for name, lines in (("a", LINES), ("b", re.sub(", triggers: [a-z_]+", "", LINES)))
     )
     assert triggered.filling_fraction > 0.9
     assert np.array_equal(triggered.occupancies, by_software.occupancies)
@@ -492,6 +494,11 @@ def test_the_trigger_line_starts_the_exposures(tmp_path: Path) -> None:
         ),
         ("channel: 3", "channel: 77", "the box has no channel 77"),
         ("on: [image], pulse", "on: [load], pulse", "a line that triggers the camera is on at other times"),
+        (
+            "on: [rearrange], pulse",
+            "on: [image], pulse",
+            "a line that triggers the mobile tweezers is on at other times; expected `on: \\[rearrange\\]`",
+        ),
         (
             "  channels:",
             "  mutually_exclusive: [[mot, cooling]]\n  channels:",
