@@ -64,18 +64,26 @@ class MachineCode(NamedTuple):
 
 def environment() -> str:
     """Text of everything but its source that machine code depends on."""
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    return repr((_versions(), settings, _processor()))
+
+
+@cache
+def _versions() -> tuple[str, ...]:
     from importlib.metadata import version
 
+    return (sys.version, version("numba"), version("llvmlite"), np.__version__)
+
+
+@cache
+def _processor() -> tuple[str, ...]:
     from llvmlite import binding
 
-    versions = (sys.version, version("numba"), version("llvmlite"), np.__version__)
-    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    processor = (
+    return (
         binding.get_process_triple(),
         binding.get_host_cpu_name(),
         binding.get_host_cpu_features().flatten(),
     )
-    return repr((versions, settings, processor))
 
 
 def compile_for_python(result: Any, *, is_only: bool) -> MachineCode:

@@ -292,6 +292,37 @@ def test_several_signatures_and_read_only_arrays(cache: Path) -> None:
         total(values.astype(np.int16))
 
 
+def test_machine_code_is_given_only_what_it_was_compiled_for(cache: Path) -> None:
+    pair = "Tuple((float64[::1], float64))"
+
+    @kernel(f"Tuple((float64[::1], int64))(float64[::1], {const('int16', 2)}, int64, {pair})")
+    def scaled(values: Any, grid: Any, n: Any, pair: Any) -> Any:
+        return values * n + pair[0] * pair[1] + grid[0, 0], n
+
+    grid, values = np.full((2, 3), 5, np.int16), np.arange(3.0)
+    read_only = values.copy()
+    read_only.flags.writeable = False
+    for _ in range(3):  # arrays that a kernel returns belong to Python
+        result, n = scaled(values, grid, np.int32(2), (values, 1))
+        assert (result.tolist(), n, result.flags.writeable) == ([5.0, 8.0, 11.0], 2, True)
+    wrong: list[tuple[Any, ...]] = [
+        (read_only, grid, 2, (values, 1.0)),
+        (np.arange(6.0)[::2], grid, 2, (values, 1.0)),
+        (values.astype(np.float32), grid, 2, (values, 1.0)),
+        (values.tolist(), grid, 2, (values, 1.0)),
+        (values, grid[0], 2, (values, 1.0)),
+        (values, grid.T, 2, (values, 1.0)),
+        (values, grid.astype(np.uint16), 2, (values, 1.0)),
+        (values, grid, "2", (values, 1.0)),
+        (values, grid, 2, (values, 1.0, 1.0)),
+        (values, grid, 2, (grid, 1.0)),
+        (values, grid, 2, values),
+    ]
+    for arguments in wrong:
+        with pytest.raises(TypeError, match="No matching definition of kernel 'scaled' for "):
+            scaled(*arguments)
+
+
 def run_python(code: str, **environment: str) -> str:
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", textwrap.dedent(code)],
