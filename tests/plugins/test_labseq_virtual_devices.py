@@ -514,6 +514,17 @@ def test_mistakes_in_lines_are_reported_with_line_and_column(
     assert all(problem.line > 0 for problem in caught.value.problems)
 
 
+def test_a_trigger_line_for_a_driver_that_cannot_wait_for_it_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(VirtualMobileTweezers, "waits_for_trigger", False)
+    message = (
+        r"lined.yaml:\d+:\d+: the mobile tweezers take no external trigger; expected mobile tweezers that do"
+    )
+    with pytest.raises(ConfigError, match=message):
+        run(tmp_path, LINES)
+
+
 def test_a_blinding_line_in_an_exposure_with_em_gain_is_refused_before_the_run(tmp_path: Path) -> None:
     lines = LINES.replace("on: [load], lag", "on: [load, image], lag")
     with pytest.raises(ConfigError, match="'mot' is blinding and on during `image`, with an EM gain of 300"):
