@@ -229,32 +229,36 @@ class Hanging:
     def __init__(self, pid: int, hung_s: float = HUNG_S) -> None:
         self._pid = pid
         self._hung_s = hung_s
-        self._cpu_s = -1.0
+        self._since: tuple[float, dict[str, float]] | None = None
 
     def __call__(self, silent_s: float) -> bool:
         """Whether it hangs; to be asked again and again, also while it does not."""
         if silent_s < self._hung_s / 4:
-            self._cpu_s = -1.0
+            self._since = None
             return False
-        states, cpu_s = _threads(self._pid)
-        if self._cpu_s < 0:
-            self._cpu_s = cpu_s
-        is_starved = "R" in states and cpu_s - self._cpu_s < self._hung_s / 2
+        states, waited_s = _threads(self._pid)
+        if self._since is None:
+            self._since = silent_s, waited_s
+        since_s, before_s = self._since
+        longest_s = max((all_s - before_s.get(one, all_s) for one, all_s in waited_s.items()), default=0.0)
+        is_starved = "R" in states and longest_s > (silent_s - since_s) / 2
         waits = ("D" in states or is_starved) and "T" not in states
         return silent_s > (WAITS_S if waits else self._hung_s)
 
 
-def _threads(pid: int) -> tuple[str, float]:
-    """States of a process's threads, one letter each, and its processor time; Linux only, else ("", -1)."""
-    states, ticks = "", 0
-    with suppress(OSError, ValueError, IndexError):
+def _threads(pid: int) -> tuple[str, dict[str, float]]:
+    """States of a process's threads, one letter each, and how long each has waited for a processor.
+
+    Linux only, else nothing.
+    """
+    states, waited_s = "", {}
+    with suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
-            text = (thread / "stat").read_text(encoding="utf-8", errors="replace")
-            fields = text.rpartition(")")[2].split()
-            states += fields[0].upper()
-            ticks += int(fields[11]) + int(fields[12])
-        return states, ticks / 100
-    return "", -1.0
+            with suppress(OSError, ValueError, IndexError):  # it has ended
+                text = (thread / "stat").read_text(encoding="utf-8", errors="replace")
+                states += text.rpartition(")")[2].split()[0].upper()
+                waited_s[thread.name] = int((thread / "schedstat").read_text("ascii").split()[1]) / 1e9
+    return states, waited_s
 
 
 def _format_error(error: BaseException) -> str:

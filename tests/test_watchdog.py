@@ -160,27 +160,27 @@ os._exit(0)
 
 
 @pytest.mark.parametrize(
-    ("states", "used_s", "silent_s", "hangs"),
+    ("states", "waited_s", "silent_s", "hangs"),
     [
         ("SS", 0.0, 0.5, False),
         ("SS", 0.0, 0.7, True),
         ("TT", 0.0, 0.7, True),
-        ("RS", 0.5, 0.7, True),  # a C call that computes
-        ("RS", 0.1, 0.7, False),  # it wants to run, and hardly gets the processor
-        ("RS", 0.1, 11.0, True),
+        ("RS", 0.2, 0.7, True),  # a C call that computes
+        ("RS", 0.4, 0.7, False),  # it wants to run, and hardly gets the processor
+        ("RS", 9.0, 11.0, True),
         ("DS", 0.0, 5.0, False),  # it waits for a disk
         ("DS", 0.0, 11.0, True),
         ("DT", 0.0, 0.7, True),
         ("", 0.0, 0.7, True),  # not on this system
     ],
 )
-def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, used_s, silent_s, hangs):
-    is_hanging, cpu_s = watchdog.Hanging(0), [7.0]
-    monkeypatch.setattr(watchdog, "_threads", lambda _: (states, cpu_s[0] if states else -1.0))
+def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, waited_s, silent_s, hangs):
+    is_hanging, all_s = watchdog.Hanging(0), [7.0]
+    monkeypatch.setattr(watchdog, "_threads", lambda _: (states, {"1": 7.0, "2": all_s[0]} if states else {}))
     assert not is_hanging(0.1)
-    cpu_s[0] += 1.0  # while it worked
+    all_s[0] += 1.0  # while it worked
     assert not is_hanging(0.2)
-    cpu_s[0] += used_s
+    all_s[0] += waited_s
     assert is_hanging(silent_s) is hangs
 
 
