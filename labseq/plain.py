@@ -111,6 +111,8 @@ def _repr(value: Any) -> str:
 
 def parse_object(data: bytes) -> dict[str, Any] | None:
     """Read a JSON object; None if it is anything else, or nested deeper than 32."""
+    if data[:1].isalnum():  # a million of such lines would take 10 s
+        return None
     try:
         value = parse_value(data)
     except ValueError:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.model.records import STEP
-from labseq.plain import dumps
+from labseq.plain import dumps, plain_text
 from labseq.recording import schema
 from labseq.recording.results import result_columns
 from labseq.recording.run_file import SIMULATION
@@ -174,7 +174,7 @@ def _duration_s(stage_s: Mapping[str, float | None]) -> float | None:
 
 def _column_name(prefix: str, name: str) -> str:
     """The name of a column, without spaces."""
-    return "_".join(f"{prefix}{name}".split())
+    return "_".join(plain_text(f"{prefix}{name}").split())
 
 
 def _array(values: Sequence[Any], *, text: bool = False) -> NDArray[Any]:
@@ -196,4 +196,4 @@ def _fits(value: float | None) -> bool:
 def _text(value: object) -> str:
     if value is None:
         return ""
-    return value if isinstance(value, str) else dumps(value)
+    return plain_text(value) if isinstance(value, str) else dumps(value)

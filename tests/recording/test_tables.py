@@ -97,6 +97,12 @@ def test_what_is_not_known_is_nan(tmp_path: Path) -> None:
     assert table["calibration.sites"].tolist() == ["f102b3cd999c", ""]
 
 
+def test_texts_that_have_no_utf8_are_escaped(tmp_path: Path) -> None:
+    run = write(tmp_path, make_shot(0))
+    run.shots[0].row["parameters"] = {"a \ud800": "\ud800"}
+    assert run.to_dataframe()["a_\\ud800"].tolist() == ["\\ud800"]
+
+
 def test_attempts_have_rows_where_they_are_asked_for(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     for shot in (make_shot(0, status="failed"), make_shot(0, attempt=1), make_shot(1)):
