@@ -217,7 +217,7 @@ def repeated(loop: Samples) -> Samples:
 def raise_priority() -> str:
     """Give this thread, and those that it starts, real-time priority; returns why not, or ""."""
     if sys.platform != "linux":
-        return "this system is not Linux"
+        return "set under Linux only"
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError as error:

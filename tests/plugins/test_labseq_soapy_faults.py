@@ -6,6 +6,7 @@ import os
 import queue
 import re
 import signal
+import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -144,6 +145,7 @@ def test_both_outputs_start_at_one_time_of_the_radio_s_clock_or_it_is_said_that_
         assert rig.described("notes") == notes
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of Linux")
 def test_the_process_has_real_time_priority_or_the_reason_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
