@@ -40,7 +40,7 @@ FAULTS: Final = {
     "missed packets": ("max_lost_packets", ("sequence_errors", "late_packets")),
 }
 """What the radio did -> the setting that limits it, the errors that it reports."""
-NO_CLOCK: Final = "it has no timed start: rows and columns may start some microseconds apart"
+APART: Final = "it had no timed start, or too late: rows and columns may be some microseconds apart"
 NO_REAL_TIME: Final = (
     "the streaming process has no real-time priority ({}): a busy computer may let the radio run out of "
     "samples; under Linux add '@GROUP - rtprio 99' with your group to /etc/security/limits.conf, log in again"
@@ -270,7 +270,7 @@ class SoapyStaticTweezers(StaticTweezers):
         return {key: counts.get(key, 0) for _, keys in FAULTS.values() for key in keys}
 
     def _notes(self, facts: Facts) -> list[str]:
-        notes = [] if facts.starts_together else [NO_CLOCK]
+        notes = [] if facts.starts_together else [APART]
         return notes + ([NO_REAL_TIME.format(facts.no_real_time)] if facts.no_real_time else [])
 
     def _connect(self) -> Link:

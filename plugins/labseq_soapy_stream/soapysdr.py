@@ -258,15 +258,10 @@ class Stream:
         self._activated_s = time.monotonic()
 
     def check_start(self) -> None:
-        """Check that the first samples came in time; does not wait until they are played.
-
-        Raises:
-            SoapyError: They were late: the channels did not start together.
-        """
+        """Find out whether the first samples came in time; does not wait until they are played."""
         left_s = self._activated_s + START_S / 2 - time.monotonic()
         if self.starts_together and self.errors(max(0.0, left_s))["late_packets"]:
-            text = f"its timed start came too late: the computer took more than {START_S:g} s"
-            raise SoapyError(f"{text}; try again, with fewer programs running")
+            self.starts_together = False
 
     def write(self, samples: NDArray[np.float32], start: int, timeout_s: float) -> int:
         """Write samples to the stream.

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import pytest
 from labseq_soapy import labseq_register
-from labseq_soapy.static_tweezers import NO_CLOCK
+from labseq_soapy.static_tweezers import APART
 from labseq_soapy_sim import Fault, build
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
@@ -250,7 +250,7 @@ def test_check_warns_of_a_rate_beyond_the_bus_and_devices_of_a_radio_without_a_c
     radio = "profile.static_tweezers={use: soapy, device: 'simulated,time=0', sample_rate: 12.5 MHz}"
     report = check_devices(str(tmp_path / "p.yaml"), [radio])
     assert all(found.ok for found in report.devices), report.devices
-    assert [*report.warnings] == [f"static_tweezers: {NO_CLOCK}"]
+    assert [*report.warnings] == [f"static_tweezers: {APART}"]
 
 
 def test_where_it_cannot_be_compiled_a_dry_run_takes_the_virtual_tweezers(
