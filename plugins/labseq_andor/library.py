@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from types import SimpleNamespace
 from typing import Any, Final
@@ -77,11 +78,28 @@ def library_for(settings: AndorSettings, context: Context) -> AndorLibrary:
 def load_pylablib(name: str) -> Any:
     """Import pylablib's module for SDK2, whose ``lib`` is the library that was bound last."""
     try:
-        return importlib.import_module("pylablib.devices.Andor.AndorSDK2")
+        with _compiled_on_first_use():
+            return importlib.import_module("pylablib.devices.Andor.AndorSDK2")
     except ModuleNotFoundError as error:
         text = f"the Python package 'pylablib' cannot be imported ({error})"
         install = f"install it with {install_hint('andor')}"
         raise DeviceError(name, f"{text}; {install}; {OTHERWISE}") from error
+
+
+@contextmanager
+def _compiled_on_first_use() -> Generator[None]:
+    """With its SDK2, pylablib imports that for SDK3, which compiles a function for a second or two."""
+    numba: Any = importlib.import_module("numba")  # which takes long too; pylablib needs it
+    njit = numba.njit
+
+    def later(*_signature: Any, **options: Any) -> Any:
+        return njit(**options)
+
+    numba.njit = later
+    try:
+        yield
+    finally:
+        numba.njit = njit
 
 
 @lru_cache(maxsize=8)

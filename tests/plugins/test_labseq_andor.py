@@ -33,6 +33,12 @@ def pylablib() -> None:
     need_library(lambda: load_pylablib("camera"))
 
 
+def test_nothing_is_compiled_to_import_pylablib() -> None:
+    from pylablib.devices.Andor.atcore_lib import read_uint12
+
+    assert read_uint12.signatures == []
+
+
 @settings(max_examples=12)
 @given(data=st.data(), binning=st.integers(1, 4), isolated=st.booleans())
 def test_region_and_binning_are_those_of_the_settings(data: Any, binning: int, isolated: bool) -> None:
