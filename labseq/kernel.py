@@ -215,7 +215,11 @@ class _Kernel:
         """Compile it or load its machine code from the cache, for Python."""
         with _LOADING:
             if self._call == self._first_call:
-                self._call = calling(self.function.__name__, [*map(self._load, range(len(self.signatures)))])
+                try:
+                    codes = [*map(self._load, range(len(self.signatures)))]
+                    self._call = calling(self.function.__name__, codes)
+                except (AttributeError, ImportError, LookupError):  # another numba than machine_code knows
+                    self._call = _numba().njit(self.signatures, **self._options)(self.function)
                 if not self.is_helper:
                     _PENDING.pop(self, None)
 

@@ -323,6 +323,17 @@ def test_machine_code_is_given_only_what_it_was_compiled_for(cache: Path) -> Non
             scaled(*arguments)
 
 
+def test_with_another_numba_than_this_one_kernels_are_slower_to_load_but_work(
+    package: Package, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def changed(*_: Any, **__: Any) -> None:
+        raise AttributeError("numba has no such method")
+
+    monkeypatch.setattr(labseq.kernel, "compile_for_python", changed)
+    assert package.result() == 102
+    assert package.result() == 102
+
+
 def run_python(code: str, **environment: str) -> str:
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", textwrap.dedent(code)],
