@@ -107,6 +107,7 @@ def compile_for_python(result: Any, *, is_only: bool) -> MachineCode:
             return self.get_c_object(NDARRAY) if structptr is np.ndarray else super().unserialize(structptr)
 
     context, function = result.target_context.subtarget(enable_nrt=True), result.fndesc
+    context.refresh()  # what was not compiled, but loaded, has not made it learn all types
     context.get_python_api = partial(cast("Any", Api), context)
     codegen = context.codegen()
     library = codegen.create_library(function.qualname)

@@ -11,7 +11,6 @@ from typing import Any, Final
 _MAX_LENGTH: Final = 60
 _MAX_LISTED: Final = 50
 _MAX_NAMES: Final = 300
-"""Names that are compared with a wrong one, which takes 10 us each."""
 MAX_ERROR: Final = 2000
 """Maximum number of characters of an error's text that labseq shows, logs and records."""
 
@@ -110,9 +109,12 @@ def listing(names: Iterable[str]) -> str:
     return ("one of " if len(known) > 1 else "") + ", ".join(known[:_MAX_LISTED] + more if more else known)
 
 
-def closest(name: str, names: Iterable[str]) -> str:
-    """The known name with the most similar spelling, ignoring case and dashes; "" if none is similar."""
-    folded = {known.lower().replace("-", "_"): known for known in islice(names, _MAX_NAMES)}
+def closest(name: str, names: Iterable[str], most: int | None = _MAX_NAMES) -> str:
+    """The known name with the most similar spelling, ignoring case and dashes; "" if none is similar.
+
+    At most so many names are compared, which takes 10 us each; None for all.
+    """
+    folded = {known.lower().replace("-", "_"): known for known in islice(names, most)}
     found = difflib.get_close_matches(name.lower().replace("-", "_")[:_MAX_LENGTH], folded, n=1)
     return folded[found[0]] if found else ""
 

@@ -54,7 +54,7 @@ _NUMBERS = itertools.count()
 _WRITE: Callable[..., None] = vars(SourceFileLoader)["_cache_bytecode"]
 _ENTRY_POINTS: Callable[..., Any] = importlib.metadata.entry_points
 _READ_TEXT = importlib.metadata.PathDistribution.read_text
-_GIT: dict[tuple[Path | str, ...], str | None] = {}
+_GIT: dict[tuple[Path | str | None, ...], str | None] = {}
 _REPOSITORY = Path(__file__).parents[1]
 
 
@@ -103,9 +103,10 @@ def _entry_points(_path: tuple[str, ...], **which: str) -> Any:
 def _git_here_once(git: Callable[..., str | None], folder: Path, *arguments: str) -> str | None:
     if not folder.resolve().is_relative_to(_REPOSITORY):
         return git(folder, *arguments)
-    if (folder, *arguments) not in _GIT:
-        _GIT[folder, *arguments] = git(folder, *arguments)
-    return _GIT[folder, *arguments]
+    asked = (os.environ.get("GIT_DIR"), folder, *arguments)
+    if asked not in _GIT:
+        _GIT[asked] = git(folder, *arguments)
+    return _GIT[asked]
 
 
 def _cache_bytecode(

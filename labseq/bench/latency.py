@@ -263,7 +263,7 @@ class _Measured(Step):
         return []
 
     def run(self, shot: Shot) -> None:
-        """Plan, prepare and start playing; then stop the device."""
+        """Plan, prepare and start playing; then wait for the end, as a run does."""
         occupancy = shot.occupancy
         assert occupancy is not None
         mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
@@ -286,10 +286,10 @@ class _Measured(Step):
         self.own_s.append((self._timed.detect_s, self._timed.plan_s))
         self.plans.append((plan.n_batches, program.total_duration_s))
         with shot.stage("prepare"):
-            shot.call("mobile_tweezers", limit_s, mobile.prepare, program)
+            playing_s = shot.call("mobile_tweezers", limit_s, mobile.prepare, program)
         with shot.stage("start"):
             shot.call("mobile_tweezers", limit_s, mobile.play)
-        shot.call("mobile_tweezers", limit_s, mobile.safe_state)
+        shot.call("mobile_tweezers", playing_s + 2 * limit_s, mobile.wait, playing_s + limit_s)
 
     def _render_first(self, renderer: Renderer) -> None:
         """Render a chunk that begins with the first tones, for both channels in parallel."""

@@ -178,7 +178,8 @@ class CameraDriver(Camera):
             raise DeviceError(self._name, "triggered, but not armed for another frame; call arm() first")
         if series.trigger != "software":
             raise DeviceError(self._name, f"triggered, but armed for the {series.trigger} trigger")
-        if self._fired_s and now_s < (until_s := self._fired_s[-1] + series.exposure_s):
+        is_exposing = len(self._fired_s) > self._n_read
+        if is_exposing and now_s < (until_s := self._fired_s[-1] + series.exposure_s):
             raise DeviceError(self._name, f"triggered during an exposure that ends at {until_s:.6f} s")
         self._fired_s.append(now_s)
         self._fire()

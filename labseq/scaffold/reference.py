@@ -623,8 +623,8 @@ def find(found: Mapping[str, Topic], what: str) -> list[str]:
     begun = [name for key, name in folded.items() if len(key) == len(words) and _begins(key, words)]
     if ending or begun:
         return ending or begun
-    near = closest(" ".join(words), (" ".join(key) for key in folded)) or closest(
-        words[-1] if words else "", (key[-1] for key in folded)
+    near = closest(" ".join(words), (" ".join(key) for key in folded), None) or closest(
+        words[-1] if words else "", (key[-1] for key in folded), None
     )
     hint = f"did you mean '{near}'?" if near else "`labseq explain` lists what there is"
     raise ConfigError(Problem(f"there is nothing called '{clean(what)}' to explain", hint=hint))

@@ -35,7 +35,7 @@ def test_a_line_is_drawn_where_it_is_on() -> None:
 
 def test_a_check_names_the_devices_that_it_did_not_ask(capsys: pytest.CaptureFixture[str]) -> None:
     check_sequence(Path(SEQUENCE), "lab", [], "off", as_json=False)
-    row = "not opened       camera, static_tweezers, mobile_tweezers, shutter: limits that only the"
+    row = "not opened       camera, static_tweezers, mobile_tweezers, lines, shutter: limits that only"
     assert row in capsys.readouterr().out
     check_sequence(Path(SEQUENCE), "lab", [], "full", as_json=False)
     assert "not opened" not in capsys.readouterr().out

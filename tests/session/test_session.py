@@ -74,7 +74,8 @@ def test_a_run_reads_back(tmp_path):
     assert "numpy" in done.record["provenance"]["packages"]
     assert not done.events[-1]["values"]["error"]
     with h5py.File(shot.file) as file:  # a viewer of HDF5 shows the frames
-        entry: Any = file[file.attrs["default"].decode()]
+        attributes: Any = file.attrs
+        entry: Any = file[attributes["default"].decode()]
         view = entry[entry.attrs["default"].decode()]
         assert view[view.attrs["signal"].decode()].shape[1:] == (512, 512)
 
