@@ -92,7 +92,7 @@ def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: p
         monkeypatch.setattr(lab.camera._link, "check_alive", lambda: asked.append(None))
         monkeypatch.setattr(acquisition, "poll", lambda s: poll(s) if len(asked) > 2 else None)
         frames = lab.take(1, 0.01)
-        assert len(asked) == 3
+        assert len(asked) >= 3  # the frame itself may take longer than such a period
         assert lab.clock.now() == pytest.approx(0.015)
         assert_shown(frames, lab)
 
