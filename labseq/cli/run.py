@@ -12,7 +12,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from labseq.cli.summary import json_summary, summary_lines
 from labseq.console.errors import lines_of
 from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
@@ -86,6 +85,8 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
 
 def json_result(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
     """The result of a run as one line of JSON."""
+    from labseq.cli.summary import json_summary  # only now, because it takes 0.1 s to import
+
     values = json_summary(run)
     if run is None and session is not None and session.run_dir is not None:
         values["run_dir"] = str(session.run_dir)
@@ -97,6 +98,8 @@ def json_result(session: Session | None, run: Run | None, failure: BaseException
 
 def _report(run: Run) -> None:
     """Print the summary; an error of stdout, such as a full disk, does not affect the run."""
+    from labseq.cli.summary import summary_lines
+
     lines = summary_lines(run)
     try:
         say(*lines)
