@@ -132,10 +132,10 @@ class Stages:
 
 P = ParamSpec("P")
 T = TypeVar("T")
-EARLY_S = 1e-6
-"""A frame may be there so much earlier than its exposure should end, because of rounding."""
+EARLY = 0.05
+"""Part of its exposure by which a frame may come early: cameras round exposure times."""
 PLAYED_EARLY_S = 10e-6
-"""Likewise a program, whose playing time includes delays of the device."""
+"""By how much a program may end early: its playing time includes delays of the device."""
 
 
 class RunningShot:
@@ -420,7 +420,7 @@ class RunningShot:
     def _check_order(self, exposure_s: float) -> None:
         """Refuse a frame that is there before its own exposure can be over: of a trigger too many."""
         early_s = self._fired_s + exposure_s - self.clock.now()
-        if self.series.by_line and early_s > EARLY_S:
+        if self.series.by_line and early_s > EARLY * exposure_s:
             text = (
                 f"a frame came {format_quantity(early_s, 'time')} before its exposure was over, so an earlier"
             )
