@@ -45,7 +45,10 @@ class Hardware(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Connect and initialise; the first call that may do I/O."""
+        """Connect and initialise; the first call that may do I/O.
+
+        It turns no output on: the watchdog learns only afterwards how to switch the device off.
+        """
 
     @abstractmethod
     def close(self) -> None:
