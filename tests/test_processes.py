@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from labseq.processes import Holder, Lock, Process, knows_no_locks
+from tests.locking import held_elsewhere
 
 
 def test_it_comes_back_from_plain_values() -> None:
@@ -42,17 +43,6 @@ def test_a_later_process_of_the_same_number_is_another_one() -> None:
     assert not owner.is_running
 
 
-HOLD = """
-import sys
-from pathlib import Path
-from labseq.processes import Lock
-lock = Lock(Path(sys.argv[1]), "the run µ")
-assert lock.take() is None
-print("held", flush=True)
-input()
-"""
-
-
 def test_a_lock_has_one_holder(tmp_path: Path) -> None:
     first, second = (
         Lock(tmp_path / "new" / "lab.lock", "labseq devices"),
@@ -76,10 +66,7 @@ def test_a_lock_has_one_holder(tmp_path: Path) -> None:
 def test_a_holder_that_is_killed_loses_its_lock(tmp_path: Path) -> None:
     path = tmp_path / "lab.lock"
     mine = Lock(path, "mine")
-    command = [sys.executable, "-c", HOLD, str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        assert child.stdout is not None
-        child.stdout.readline()
+    with held_elsewhere(path, "the run µ") as child:
         holder = mine.take()
         assert holder is not None
         assert holder.process is not None

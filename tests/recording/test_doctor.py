@@ -19,6 +19,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from labseq.recording import RunWriter, mark_active, open_run
 from labseq.recording.doctor import examine
+from tests.locking import held_elsewhere
 
 from .damages import (
     LOST,
@@ -264,23 +265,9 @@ def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
 
 
-LOCK = """
-import sys
-from pathlib import Path
-from labseq.processes import Lock
-lock = Lock(Path(sys.argv[1]), "labseq resume")
-assert lock.take() is None
-print("taken", flush=True)
-input()
-"""
-
-
 def test_a_run_that_somebody_goes_on_with_is_not_touched(run_dir: Path) -> None:
     lost_line(run_dir)
-    command = [sys.executable, "-c", LOCK, run_dir / ".lock"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        other.stdout.readline()
+    with held_elsewhere(run_dir / ".lock", "labseq resume"):
         assert examine(run_dir).in_progress == [run_dir]
     found = reported(examine(run_dir))  # it was killed, or so its note says
     assert found[-1] == ("no line in the index", "shot_000001.h5")
