@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_validator
 
@@ -23,6 +23,11 @@ class RegionSettings(Settings):
     width: PositiveInt = Field(description="number of columns")
 
 
+_ARMING_TIME: Final = (
+    "time from arming for a series until it can be triggered, for budgets; simulated cameras take so long"
+)
+
+
 class CameraSettings(Settings):
     """Settings of the sensor that every camera has; a plugin adds its own."""
 
@@ -35,8 +40,7 @@ class CameraSettings(Settings):
     max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure")
     arming_time: Duration = Field(
         default=0.0,
-        description="time from arming for a series until it can be triggered, for budgets; simulated "
-        "cameras take so long",
+        description=_ARMING_TIME,
     )
 
     @property
@@ -93,8 +97,7 @@ class IndustrialCameraSettings(CameraSettings):
     )
     arming_time: Duration = Field(
         default=40e-3,
-        description="time from arming for a series until it can be triggered, for budgets; simulated "
-        "cameras take so long",
+        description=_ARMING_TIME,
     )
     trigger_line: str = Field(
         default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
