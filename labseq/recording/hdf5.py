@@ -94,10 +94,8 @@ def check_attributes(file: Any) -> None:
 
 
 def _read(attribute: Any) -> NDArray[Any]:
-    kind, place = (
-        attribute.get_type(),
-        f"the attribute '{attribute.name.decode('utf-8', 'backslashreplace')}'",
-    )
+    kind = attribute.get_type()
+    place = f"the attribute '{attribute.name.decode('utf-8', 'backslashreplace')}'"
     _check_type(kind, place)
     n_bytes = math.prod(attribute.shape) * kind.get_size()
     if n_bytes >= 1 << 16:

@@ -41,10 +41,14 @@ class CameraSeries:
         self._is_armed, self._n_left, self._exposure_s = False, 0, math.nan
         self._step = self._n_taken = 0
 
+    def entries(self, number: int) -> Sequence[TimelineEntry]:
+        """The timeline of a step; empty if it is not known."""
+        return self._timelines[number] if number < len(self._timelines) else ()
+
     def begin_step(self, number: int) -> None:
         """Begin a step: disarm the camera if light of this step may harm it."""
         self._step, self._n_taken = number, 0
-        if any(self._may_blind(entry) for entry in self._entries(number)):
+        if any(self._may_blind(entry) for entry in self.entries(number)):
             self.end()
 
     def is_ready(self, exposure_s: float) -> bool:
@@ -73,9 +77,6 @@ class CameraSeries:
     def forget(self) -> None:
         """The camera was made safe, and the step begins again."""
         self._is_armed, self._n_left, self._n_taken = False, 0, 0
-
-    def _entries(self, number: int) -> Sequence[TimelineEntry]:
-        return self._timelines[number] if number < len(self._timelines) else ()
 
     def _alike(self, exposure_s: float) -> Iterator[int]:
         """Numbers of the images to come, as long as they are alike and no light may harm the camera."""

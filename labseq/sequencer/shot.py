@@ -24,13 +24,12 @@ from labseq.model import (
     StepTiming,
     TimelineEntry,
 )
-from labseq.model.lines import lines_of
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.roles import Device, ReportsSignals, StepContext, offers
 from labseq.sequencer.images import CameraSeries
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
-from labseq.sequencer.lines import line_program, margin_s
+from labseq.sequencer.lines import line_program, margin_s, trigger_line
 from labseq.sequencer.policies import StepPolicy
 from labseq.units import format_quantity
 
@@ -183,7 +182,6 @@ class RunningShot:
         self.start_s = self.stages.start_s
         self.leaders = LeaderAnswers(lab, guard, record, emit)
         self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
-        self._timelines = timelines
         self._fired_s = 0.0
         self._guard = guard
         self._emit = emit
@@ -223,7 +221,7 @@ class RunningShot:
         self.stages.begin_step(number, name, policy)
         self.series.begin_step(number)
         start_s, host_start_s = self.elapsed_s, time.perf_counter()
-        entries = self._timelines[number] if self._timelines else ()
+        entries = self.series.entries(number)
         planned_s = sum(entry.duration_s for entry in entries)
         arms = any(entry.n_images and not self.series.is_ready(entry.exposure_s) for entry in entries)
         # a timeline leaves out the arming and the detection
@@ -305,7 +303,7 @@ class RunningShot:
     ) -> Generator[None]:
         """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
         lines, timeout_s, specs = self.lab.lines, self.call_timeout_s, self.lab.line_specs
-        is_triggered = any(spec.triggers == "mobile_tweezers" for spec in lines_of(specs, kind))
+        is_triggered = start is not None and trigger_line(specs, "mobile_tweezers") is not None
         if start is not None and (lines is None or is_triggered):
             start()
         if lines is None:
@@ -330,10 +328,8 @@ class RunningShot:
         """Refuse a program that ended before it can be over: it was started by a trigger too many."""
         early_s = self._fired_s + least_s - self.clock.now()
         if early_s > PLAYED_EARLY_S:
-            text = (
-                f"a program ended {format_quantity(early_s, 'time')} too early, so a pulse before that of the"
-            )
-            text += " line started it; look for a second edge at the trigger input"
+            text = f"a program ended {format_quantity(early_s, 'time')} too early, so a pulse before that of"
+            text += " the line started it; look for a second edge at the trigger input"
             raise DeviceError("mobile_tweezers", text)
 
     def release(self, duration_s: float) -> float:
@@ -421,10 +417,9 @@ class RunningShot:
         """Refuse a frame that is there before its own exposure can be over: of a trigger too many."""
         early_s = self._fired_s + exposure_s - self.clock.now()
         if self.series.by_line and early_s > EARLY * exposure_s:
-            text = (
-                f"a frame came {format_quantity(early_s, 'time')} before its exposure was over, so an earlier"
-            )
-            text += " pulse at the camera's trigger input started it; look at that line for a second edge"
+            text = f"a frame came {format_quantity(early_s, 'time')} before its exposure was over, so an"
+            text += " earlier pulse at the camera's trigger input started it;"
+            text += " look at that line for a second edge"
             raise DeviceError("camera", text)
 
     def judge(self) -> None:
