@@ -25,6 +25,8 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
+FORMAT: Final = 1
+"""Raised when this module makes other machine code of the same kernel."""
 NDARRAY: Final = "labseq_ndarray"
 """Symbol of the class of arrays in machine code; numba would import all of itself to find it."""
 FLAGS: Final = {"C": 0x101, "F": 0x102, "A": 0x100}
@@ -65,7 +67,7 @@ class MachineCode(NamedTuple):
 def environment() -> str:
     """Text of everything but its source that machine code depends on."""
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    return repr((_versions(), settings, _processor()))
+    return repr((FORMAT, _versions(), settings, _processor()))
 
 
 @cache
