@@ -298,7 +298,7 @@ def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list
     low = 0.0 if is_rate else min(high - _FILLING_RANGE, *(v for v in values if v is not None))
     bar = max(1, min(_BAR, (width - _LABEL) // len(shown)))
     rows = _bars(values, low, high, height - 2, bar, glyphs)
-    ends = [f"{100 * end:.3g} %".rjust(_LABEL - 1) + " " for end in (high, low)]
+    ends = [f"{round(100 * end, 1):g} %".rjust(_LABEL - 1) + " " for end in (high, low)]
     margins = [ends[0], *[" " * _LABEL] * (len(rows) - 2), ends[1]]
     first, last = points[0][0], points[-1][0]
     below = first + last.rjust(bar * len(shown) - len(first))
