@@ -87,7 +87,7 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
     patch = pytest.MonkeyPatch()
-    patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, unfreeze=int))
+    patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
     patch.setattr(os, "fsync", os.fstat)
     patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
     patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))

@@ -10,8 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, cast
 
-import numpy as np
-
 from labseq.calibration.compare import age_s, quality_text
 from labseq.config.scan import Axis
 from labseq.config.sequence import CheckSettings
@@ -182,8 +180,8 @@ def _as_values(assembly: Assembly, checked: CheckReport) -> dict[str, Any]:
 
 
 def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
-    median, p95 = np.quantile(rehearsal.duration_s, [0.5, 0.95])
-    return {"median": float(median), "p95": float(p95), "n_loadings": rehearsal.n_loadings}
+    median, p95 = rehearsal.quantile_s(0.5), rehearsal.quantile_s(0.95)
+    return {"median": median, "p95": p95, "n_loadings": rehearsal.n_loadings}
 
 
 def _subject(assembly: Assembly) -> list[tuple[str, str]]:

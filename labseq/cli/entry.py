@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import threading
@@ -28,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     Raises:
         SystemExit: Always, with the exit code.
     """
+    gc.set_threshold(
+        20_000, *gc.get_threshold()[1:]
+    )  # imports leave no garbage to look for every 700 objects
     import typer
 
     from labseq.cli.app import app

@@ -437,7 +437,7 @@ def _window_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Probl
         loc = (*shot[number].loc, "window")
         first, shortest = windows[number][0], min(windows[number])
         n_fit = int(np.count_nonzero(rehearsal.duration_s <= first + 1e-9))
-        enough = format_quantity(float(np.quantile(rehearsal.duration_s, 0.95)), "time")
+        enough = format_quantity(rehearsal.quantile_s(0.95), "time")
         if 2 * n_fit < rehearsal.n_loadings:
             what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
             what += f" ({n_fit} of {rehearsal.n_loadings} fit)"

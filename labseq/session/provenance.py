@@ -10,6 +10,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, Final
@@ -39,6 +40,10 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
         JSON-ready values: labseq, python, platform, host, user, git (of the code
         and of the sequence, with whether uncommitted changes were there), packages.
     """
+    with ThreadPoolExecutor(2) as threads:  # git takes longer than the rest of this function
+        code = threads.submit(git_state, Path(labseq.__file__).parent, of="__init__.py")
+        sequence = threads.submit(git_state, sequence_folder)
+        packages = dict(_packages())
     return {
         "labseq": labseq.__version__,
         "python": sys.version.split()[0],
@@ -46,11 +51,8 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
         "host": platform.node(),
         "user": _user(),
         "pid": os.getpid(),
-        "git": {
-            "code": git_state(Path(labseq.__file__).parent, of="__init__.py"),
-            "sequence": git_state(sequence_folder),
-        },
-        "packages": dict(_packages()),
+        "git": {"code": code.result(), "sequence": sequence.result()},
+        "packages": packages,
     }
 
 
@@ -69,10 +71,11 @@ def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
     """
     if of and _git(folder, "ls-files", "--error-unmatch", of) is None:
         return None
-    commit = _git(folder, "rev-parse", "HEAD")
-    if commit is None:
+    lines = (_git(folder, "status", "--porcelain=v2", "--branch", "--untracked-files=no") or "").splitlines()
+    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid")), "(initial)")
+    if commit == "(initial)":
         return None
-    changes = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    changes = [line for line in lines if not line.startswith("#")]
     code = _git(folder, "diff", "--no-ext-diff", "--no-color", "HEAD", "--", ":(top)*.py") if changes else ""
     digest = hashlib.sha256(code.encode()).hexdigest() if code else ""
     return {"commit": commit, "dirty": bool(changes), "code_sha256": digest}

@@ -41,6 +41,11 @@ class Rehearsal:
     duration_s: NDArray[np.float64]
     first_batch_s: NDArray[np.float64]
 
+    def quantile_s(self, share: float) -> float:
+        """Duration within which a share of the plans end; ``np.quantile`` would import ``numpy.ma``."""
+        ranks = np.arange(len(self.duration_s))
+        return float(np.interp(share * ranks[-1], ranks, np.sort(self.duration_s)))
+
 
 def windows_of(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
     """Step number -> window per cycle, of each rearrangement."""

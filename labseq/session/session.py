@@ -202,8 +202,9 @@ class Session:
             lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
-            gc.unfreeze()  # left by an earlier run in this process
-            gc.collect()
+            if gc.get_freeze_count():  # by an earlier run in this process
+                gc.unfreeze()
+                gc.collect()
             gc.freeze()  # loaded modules stay: searching them for garbage would take 0.1 s of a shot
             return self._run(lab, root, warnings)
 
