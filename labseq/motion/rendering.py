@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,12 @@ MAX_PERIOD: Final = 4096
 
 BLOCK: Final = 1536
 """Smallest size of a block, in samples."""
+
+MIN_REUSED: Final = 1 << 19
+MAX_REUSED: Final = 1 << 26
+"""Samples of both channels, of waveforms whose memory :func:`render` uses again: 1 to 128 MB."""
+
+_FREE_SAMPLES: Final[deque[NDArray[np.int16]]] = deque(maxlen=2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,6 +271,9 @@ def _free_workspaces(block: int) -> deque[Workspace]:  # noqa: ARG001 - the key 
 def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
     """Render a whole tone program; see :class:`labseq.motion.Renderer` for what a sample is.
 
+    Memory of up to two waveforms that are no longer used is kept for the next ones, up to 128 MB each:
+    with new memory, rendering takes up to twice as long.
+
     Args:
         program: The tone program.
         sample_rate_hz: Sample rate; fastest at :func:`labseq.motion.comb_sample_rate`.
@@ -281,7 +291,7 @@ def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
         (2, 180904)
     """
     renderer = Renderer(program, sample_rate_hz)
-    samples = np.empty((N_CHANNELS, renderer.n_samples), np.int16)
+    samples = _new_samples(N_CHANNELS * renderer.n_samples).reshape(N_CHANNELS, -1)
     half = renderer.n_samples // 2
     with ThreadPoolExecutor(1) as other:
         later = other.submit(_write_channels, renderer, half, samples[:, half:])
@@ -289,6 +299,23 @@ def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
         later.result()
     samples.flags.writeable = False
     return Waveform(samples, renderer.sample_rate_hz)
+
+
+def _new_samples(size: int) -> NDArray[np.int16]:
+    """int16 (size,), in memory that no waveform uses any longer if there is some."""
+    if not MIN_REUSED <= size <= MAX_REUSED:
+        return np.empty(size, np.int16)
+    try:
+        block = _FREE_SAMPLES.pop()
+    except IndexError:
+        block = np.empty(0, np.int16)
+    if len(block) < size:
+        block = np.empty(1 << (size - 1).bit_length(), np.int16)
+    samples = np.frombuffer(block.data, np.int16, size)
+    all_views = samples.base
+    assert isinstance(all_views, memoryview)  # it lives as long as any part of these samples
+    weakref.finalize(all_views, _FREE_SAMPLES.append, block).atexit = False
+    return samples
 
 
 def render_chunks(

@@ -190,6 +190,19 @@ def test_many_threads_render_at_the_same_time_into_the_callers_buffers() -> None
     assert np.array_equal(out, whole)
 
 
+def test_only_the_memory_of_waveforms_that_are_gone_is_used_again() -> None:
+    programs = [program_of(*(move(n, [1]) for _ in range(20 + n)), still=False) for n in (2, 4, 3)]
+    expected = [render(program, COMB_HZ).samples.copy() for program in programs]
+    whole, part = render(programs[0], COMB_HZ), render(programs[1], COMB_HZ).samples[1, 1000:2000]
+    third = render(programs[2], COMB_HZ)
+    assert np.array_equal(whole.samples, expected[0])
+    assert np.array_equal(part, expected[1][1, 1000:2000])
+    assert np.array_equal(third.samples, expected[2])
+    gone = third.samples.ctypes.data
+    del third
+    assert render(programs[1], COMB_HZ).samples.ctypes.data == gone
+
+
 def test_chunks_come_in_the_callers_buffers_in_turn() -> None:
     buffers = tuple(np.empty((2, 2000), np.int16) for _ in range(3))
     chunks = list(render_chunks(program_of(move(2, [1])), 200e6, 2000, buffers))
