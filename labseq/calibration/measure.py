@@ -128,7 +128,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         quality=result.quality,
         grid=grid_facts(hardware.grid),
         origin={**_origin(method, request, hardware, run), **result.origin},
-        taken_utc=now_utc("seconds") if run is None else str(run.record["t_start_utc"]),
+        taken_utc=now_utc() if run is None else str(run.record["t_start_utc"]),
     )
     store = store_of(document, spec, request.dry_run)
     before, (picture, warnings) = _in_use(store, entry), _picture(result)

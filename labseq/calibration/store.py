@@ -38,7 +38,7 @@ def stem_of(entry: CalibrationEntry) -> str:
         >>> from labseq.model import SiteGrid, grid_facts
         >>> stem_of(CalibrationEntry("overlay", {"offset_m": [3e-8, 0.0]}, {}, grid_facts(SiteGrid()), {},
         ...                          "2026-11-20T09:05:00+01:00"))
-        'overlay-20261120T080500Z-f102b3cd999c'
+        'overlay-20261120T080500Z-c317ed8fca10'
     """
     taken = datetime.fromisoformat(entry.taken_utc).astimezone(UTC)
     return f"{entry.kind}-{taken:%Y%m%dT%H%M%SZ}-{entry.id}"
@@ -271,8 +271,7 @@ class Store:
     """A folder of calibrations, which is created with the first entry.
 
     An entry is a JSON file, and a picture of the same name. They never change. The same values
-    measured again make another entry with the same id; the id then refers to the newest. Several
-    processes may use a store at the same time.
+    measured again have another id. Several processes may use a store at the same time.
 
     Args:
         folder: The folder.

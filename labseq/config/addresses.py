@@ -18,13 +18,11 @@ ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lin
 MAY_ADD: Final = (
     "timeouts",
     "budgets",
-    "grid.row_frequency",
-    "grid.column_frequency",
-    "mobile_tweezers.rf",
     "calibrations",
-    "calibrations.use",
 )
-"""Addresses of mappings in the profile that an override may add."""
+"""Keys of the profile whose mappings an override may add."""
+NAMED: Final = ("devices",)
+"""Mappings of the profile whose keys are names that the user chose."""
 _SHOWN: Final = 80
 
 
@@ -114,8 +112,11 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
     return profile
 
 
-def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] = ()) -> Loc:
+def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] | None = None) -> Loc:
     """Convert an address to a location in a file; the last key of a mapping need not exist yet.
+
+    With ``may_add``, neither need mappings in the settings of a plugin, a step or the grid, and those that
+    it lists: "faults" of ``camera.faults.transient``.
 
     A list item with a ``name`` is addressed by it, and the address continues in its
     settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
@@ -134,8 +135,10 @@ def find(root: Node, address: str, name: str, source: str, may_add: Collection[s
             continue
         steps = _steps(node, part)
         child = node.at(steps) if steps else None
-        is_new = isinstance(node.value, dict) and (i == len(parts) - 1 or ".".join(parts[: i + 1]) in may_add)
-        if child is None and not is_new:
+        new = i == len(parts) - 1 or (
+            may_add is not None and (part in may_add if i == 0 else here not in NAMED)
+        )
+        if child is None and not (new and isinstance(node.value, dict)):
             raise ConfigError(_lost(node, part, here, name, source))
         loc, node = loc + (steps or (part,)), child
     return loc

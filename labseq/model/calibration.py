@@ -60,8 +60,8 @@ class CalibrationEntry:
         origin: Where it comes from, JSON-ready: command, run, number of shots, profile, version of labseq,
             ids of the other calibrations in use.
         taken_utc: When it was made, ISO 8601, UTC.
-        id: From kind, grid and values alone: the digits of their SHA-256 in hexadecimal from the first
-            letter on, twelve of them. YAML would read digits without a letter before them as a number.
+        id: From kind, grid, values and ``taken_utc``: the digits of their SHA-256 in hexadecimal from the
+            first letter on, twelve of them. YAML would read digits without a letter before them as a number.
 
     Raises:
         ValueError: A value is missing, of another shape, not finite, or out of range.
@@ -70,7 +70,7 @@ class CalibrationEntry:
         >>> entry = CalibrationEntry("overlay", {"offset_m": [3e-8, 0.0]}, {"error_m": 1e-8},
         ...                          grid_facts(SiteGrid()), {}, "2026-11-20T08:00:00+00:00")
         >>> entry.id
-        'f102b3cd999c'
+        'db3073122486'
     """
 
     kind: CalibrationKind
@@ -93,7 +93,7 @@ class CalibrationEntry:
         self._check_range()
         if datetime.fromisoformat(self.taken_utc).tzinfo is None:
             raise ValueError(f"taken_utc is {self.taken_utc}, without a time zone")
-        set_field(self, "id", _content_id(self.kind, self.grid, self.values))
+        set_field(self, "id", _content_id(self))
 
     def is_for(self, grid: SiteGrid) -> bool:
         """Whether it was made for a grid of these sites; the tones of rows and columns are ignored."""
@@ -173,8 +173,9 @@ def _finite(name: str, value: ArrayLike) -> NDArray[np.float64]:
     return read_only(array, np.float64, (-1,) * array.ndim, name)
 
 
-def _content_id(kind: str, grid: Mapping[str, Any], values: Mapping[str, NDArray[np.float64]]) -> str:
-    plain = {name: value.tolist() for name, value in values.items()}
-    content = json.dumps([kind, grid, plain], sort_keys=True, separators=(",", ":"))
-    digest = hashlib.sha256(content.encode()).hexdigest()
+def _content_id(entry: CalibrationEntry) -> str:
+    values = {name: value.tolist() for name, value in entry.values.items()}
+    content = [entry.kind, entry.grid, values, entry.taken_utc]
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    digest = hashlib.sha256(text.encode()).hexdigest()
     return digest.lstrip(string.digits)[:ID_DIGITS]

@@ -51,9 +51,11 @@ def test_an_entry_and_its_picture_are_kept(store: Store) -> None:
 def test_nothing_is_ever_overwritten(store: Store) -> None:
     first, second, third = (store.add(overlay()) for _ in range(3))
     assert len({first.path, second.path, third.path}) == 3
-    assert first.entry.id == third.entry.id
     assert store.find(first.entry.id).path == third.path  # the newest is meant
     assert store.find(first.path.name).path == first.path
+    again = store.add(overlay(minute=1))  # the same values, measured again
+    assert again.entry.id != first.entry.id
+    assert store.find(again.entry.id).path == again.path
 
 
 def test_so_much_of_an_id_as_is_unique_is_enough(store: Store) -> None:

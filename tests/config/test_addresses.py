@@ -71,6 +71,20 @@ def test_lost(address: str, message: str) -> None:
     assert str(caught.value) == f"--set: {message}"
 
 
+@pytest.mark.parametrize(
+    ("address", "loc"),
+    [
+        ("policy.retry", ("policy", "retry")),
+        ("shot.0.load.light.power", ("shot", 0, "load", "light", "power")),
+        ("single.only.a.b.c", ("single", 0, "kind", "a", "b", "c")),
+    ],
+)
+def test_optional_mappings_are_added_by_an_override(address: str, loc: Loc) -> None:
+    assert find(DOCUMENT.root, address, "f.yaml", "--set", ("policy",)) == loc
+    with pytest.raises(ConfigError, match=r"there is no 'shoot' in f\.yaml"):
+        find(DOCUMENT.root, f"shoot.{address}", "f.yaml", "--set", ("policy",))
+
+
 def test_split() -> None:
     assert split_overrides(["shots=5", "profile=lab", "profile.grid.rows=3", " a.b = c=d"]) == (
         [

@@ -83,6 +83,7 @@ def test_the_leader_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.Cap
         f"ready shot={shot.index} success={int(shot.success)} filling={shot.filling_fraction:.4g}"
         for shot in done.shots
     ]
+    assert [shot.file.name for shot in done.shots] == ["shot_000000.h5", "shot_000001.h5"]
     assert [shot.readings["leader.go"] for shot in done.shots] == [["0"], ["1"]]
     assert [shot.readings["leader.answer"] for shot in done.shots] == [["ready"]] * 2
     assert min(shot.filling_fraction for shot in done.shots) > 0.94
