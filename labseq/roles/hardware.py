@@ -249,7 +249,7 @@ class Lines(Hardware):
     """The timing box that switches light and sends triggers; ``context.lines`` names its wired channels.
 
     Between steps the lines are idle: on where :data:`labseq.model.lines.IDLE` says so. ``open()``
-    puts them there, ``safe_state`` turns all of them off.
+    leaves all of them off, as ``safe_state`` does.
     """
 
     @property
@@ -263,6 +263,10 @@ class Lines(Hardware):
         Raises:
             LimitError: The program has more edges, or edges closer together, than the box can make.
         """
+
+    @abstractmethod
+    def idle(self) -> None:
+        """Turn on the lines that are on between steps, and the others off; called once, after ``open()``."""
 
     @abstractmethod
     def compile(self, program: LineProgram) -> None:

@@ -87,7 +87,7 @@ def open_devices(
 ) -> None:
     """Open the simulation and the devices of these names; then wait for those that need time.
 
-    Static tweezers among them are turned on. The watchdog learns how each is switched off.
+    The watchdog learns how each is switched off; then idle lines and static tweezers are turned on.
 
     Raises:
         LabseqError: One of them fails, or the run is asked to stop.
@@ -102,6 +102,8 @@ def open_devices(
             open_device(guard, name, part, timeout_s, watchdog, order[name])
     for text in watchdog.notes():
         emit("warning", {"text": text})
+    if lab.lines is not None and "lines" in names:
+        guard.call("lines", timeout_s, lab.lines.idle)
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)

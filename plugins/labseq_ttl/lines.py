@@ -88,7 +88,7 @@ class TtlLines(Lines):
         self.access.warm()
 
     def open(self) -> None:
-        """Connect to the box; the lines are idle. No effect if it is open.
+        """Connect to the box, which turns all lines off. No effect if it is open.
 
         Raises:
             ConfigError: A line is on a channel that the box does not have.
@@ -100,13 +100,17 @@ class TtlLines(Lines):
             if spec.channel not in CHANNELS:
                 text = f"{self._name}: the box has no channel {spec.channel} for '{spec.name}'"
                 raise ConfigError(f"{text}; expected {one_of(tuple(map(str, CHANNELS)))}")
-        idle = idle_program(self._specs)
         self._connect()
-        try:
-            self._opened().set_lines(mask_of(idle.on[-1].tolist(), self._specs))
-        except BaseException:
-            self._disconnect()
-            raise
+        self.access.lines_set(off_program(self._specs))
+
+    def idle(self) -> None:
+        """Turn on the lines that are on between steps.
+
+        Raises:
+            DeviceError: The box is not open, or does not confirm it.
+        """
+        idle = idle_program(self._specs)
+        self._opened().set_lines(mask_of(idle.on[-1].tolist(), self._specs))
         self.access.lines_set(idle)
 
     def close(self) -> None:

@@ -50,11 +50,14 @@ class VirtualLines(VirtualDriver, Lines):
         channels = tuple(range(settings.n_channels))
         return LinesFacts(channels, settings.resolution, settings.shortest, settings.max_edges)
 
-    def open(self) -> None:
-        """Connect to the simulation; the lines are idle."""
-        if not self._is_open:
-            super().open()
-            self._play(idle_program(self._specs))
+    def idle(self) -> None:
+        """Turn on the lines that are on between steps.
+
+        Raises:
+            DeviceError: Not open.
+        """
+        self._check_open()
+        self._play(idle_program(self._specs))
 
     def compile(self, program: LineProgram) -> None:
         """Check a program and keep it for the next ``fire``.

@@ -64,6 +64,7 @@ def test_the_simulation_receives_what_the_box_plays(simulated_by: str) -> None:
 @SIMULATED
 def test_the_self_test_changes_no_line(simulated_by: str) -> None:
     with rig(simulated_by=simulated_by) as lab:
+        lab.lines.idle()
         n_played = len(lab.played)
         lab.lines.self_test()
         assert len(lab.played) == n_played

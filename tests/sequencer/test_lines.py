@@ -116,7 +116,7 @@ def test_each_step_fires_its_lines() -> None:
         ("image", pytest.approx(0.048)),
     ]
     firing = ["lines.compile", "lines.arm", "lines.fire", "lines.wait"]
-    assert made.lab.calls.names("lines") == ["lines.open", *firing * 3, "lines.safe_state", "lines.close"]
+    assert made.lab.calls.names("lines") == ["lines.open", "lines.idle", *firing * 3, "lines.safe_state", "lines.close"]
 
 
 def test_an_exposure_begins_after_the_lead_and_the_next_step_after_the_lag() -> None:
@@ -169,7 +169,7 @@ def test_a_line_that_triggers_the_camera_takes_the_place_of_the_software() -> No
     made.run()
     assert camera.armed_for == "external"
     names = [name for name in made.lab.calls.names("camera", "lines") if name != "camera.trigger"]
-    assert names[2:7] == ["camera.arm", "lines.compile", "lines.arm", "lines.fire", "camera.read"]
+    assert names[3:8] == ["camera.arm", "lines.compile", "lines.arm", "lines.fire", "camera.read"]
 
 
 def test_a_blinding_line_refuses_an_exposure_with_em_gain() -> None:

@@ -43,6 +43,12 @@ class StaysArmed(RecordingLines):
         self._is_armed = True
 
 
+class OpensWithLightOn(RecordingLines):
+    def open(self) -> None:
+        super().open()
+        self.idle()
+
+
 class LeavesLightOn(RecordingLines):
     def safe_state(self) -> None:
         self.note("safe_state")
@@ -58,6 +64,7 @@ PLANTED = Planted(
         (ComesBackAtOnce, "test_waits_for_the_end"),
         (WaitsInFire, "test_waits_for_the_end"),
         (StaysArmed, "test_refuses_fire_without_arm"),
+        (OpensWithLightOn, "test_rests"),
         (LeavesLightOn, "test_rests"),
     ),
 )

@@ -419,9 +419,9 @@ class RecordingLines(RecordingHardware):
         self._specs = () if context is None else context.lines
         self.reset()
 
-    def open(self) -> None:
-        """Idle."""
-        super().open()
+    def idle(self) -> None:
+        """On where the profile says so."""
+        self.use("idle")
         self._apply_lines(idle_program(self._specs))
 
     def safe_state(self) -> None:
