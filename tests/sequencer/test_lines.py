@@ -116,7 +116,13 @@ def test_each_step_fires_its_lines() -> None:
         ("image", pytest.approx(0.048)),
     ]
     firing = ["lines.compile", "lines.arm", "lines.fire", "lines.wait"]
-    assert made.lab.calls.names("lines") == ["lines.open", "lines.idle", *firing * 3, "lines.safe_state", "lines.close"]
+    assert made.lab.calls.names("lines") == [
+        "lines.open",
+        "lines.idle",
+        *firing * 3,
+        "lines.safe_state",
+        "lines.close",
+    ]
 
 
 def test_an_exposure_begins_after_the_lead_and_the_next_step_after_the_lag() -> None:
