@@ -317,11 +317,11 @@ class SimulatedLibrary:
         elif self._name == PREFIX:
             received = isinstance(self._simulation, ReceivesOutput)
             self.card = card = SimulatedCard(self._clock, keep_history=received)
-            if self._simulation is not None and offers(self._simulation, "wire"):
-                self._simulation.wire("mobile_tweezers", card.trigger_at)
             name = ""
         else:
             return self._name
+        if self._simulation is not None and offers(self._simulation, "wire"):
+            self._simulation.wire("mobile_tweezers", card.trigger_at)
         if isinstance(self._simulation, ReceivesOutput):
             self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))
         return install(card, name)

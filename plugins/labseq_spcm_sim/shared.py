@@ -120,6 +120,11 @@ class SharedCard:
         """The process of the card does not answer, or has failed."""
         self._fault = ErrorInfo(r.ERR_INTERNAL_ERROR, text=f"fault of the simulator: {reason}")
 
+    def trigger_at(self, time_s: float) -> None:
+        """A pulse at the input Ext0 at a time of the computer's clock; lost if the card is gone."""
+        with suppress(OSError, EOFError):
+            self._ask("trigger_at", time_s)
+
     def played(self, channel: int) -> list[Span]:
         """The output of a channel up to now; see ``SimulatedCard.played``."""
         return list(self._ask("played", channel))
@@ -233,6 +238,9 @@ class _Opened:
 
     def trigger(self, voltage_v: float) -> bool:
         return self._card.trigger(voltage_v)
+
+    def trigger_at(self, time_s: float) -> None:
+        self._card.trigger_at(time_s)
 
 
 class _Computer:

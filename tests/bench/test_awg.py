@@ -99,8 +99,7 @@ def installed() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_run_through_every_driver_is_the_one_through_virtual_devices(run: RunProfile) -> None:
-    line = f"profile.lines.channels.{TRIGGER.replace(': {', '={', 1)}"
-    bench, expected = run("bench", line, shots=1), run("bench_awg", *TRIGGERED)
+    bench, expected = run("bench", shots=1), run("bench_awg", *TRIGGERED)
     assert bench.simulated
     compare_flights(bench.shots[0], expected.shots[0])  # depths follow what the radio sent
 

@@ -26,6 +26,7 @@ from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, vendor_library_found
+from labseq_spcm_sim.emergency import Connection
 
 from labseq.motion import tone_program
 from labseq.plugin import (
@@ -332,6 +333,17 @@ LINE = (
     "\nlines: {use: virtual, channels: {awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, "
     "triggers: mobile_tweezers}}}"
 )
+
+
+def test_a_line_starts_a_card_that_outlives_the_process(tmp_path: Path) -> None:
+    tones = "max_row_tones: 16, max_column_tones: 5"
+    card = tmp_path / "card"
+    try:
+        done = run(tmp_path, mobile=f"{{use: spcm, card: simulated@{card}, mode: dds, {tones}}}{LINE}")
+        assert (done.status, len(done.shots), done.shots[0].attempt) == ("complete", 1, 0)
+        assert not Connection(str(card))("state")[0]
+    finally:
+        Connection(str(card))("power_off")
 
 
 @pytest.mark.parametrize("mode", MODES)
