@@ -146,6 +146,9 @@ def _print(assembly: Assembly, checked: CheckReport) -> None:
         columns(_subject(assembly)),
         timeline_table(checked.timeline, block, width),
         lines_table(checked.lines, checked.longest_shot_s, block, width),
+        columns(
+            [("output", "when nothing plays"), *checked.idle_outputs.items()] if checked.idle_outputs else []
+        ),
         columns([*_totals(checked, assembly), *_rehearsed(checked)]),
         columns(_limits(assembly)),
     )
@@ -168,6 +171,7 @@ def _as_values(assembly: Assembly, checked: CheckReport) -> dict[str, Any]:
         "points": checked.n_points,
         "run_s": checked.run_s,
         "lines": checked.lines,
+        "idle_outputs": checked.idle_outputs,
         "n_images": checked.n_images,
         "shot_bytes": checked.shot_bytes,
         "run_bytes": None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,

@@ -69,6 +69,11 @@ class Hardware(ABC):
     def describe(self) -> Mapping[str, Any]:
         """Model, serial number, firmware, current settings: JSON-ready values."""
 
+    @property
+    def idle_output(self) -> str:
+        """What it puts out when nothing plays, in a few words for ``labseq check``; "" for nothing."""
+        return ""
+
     def warm(self) -> None:
         """Import every kernel that a shot needs, before ``open()``; labseq then compiles or loads them."""
 

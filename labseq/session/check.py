@@ -262,6 +262,7 @@ class CheckReport:
         rehearsal: The planner's results for random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
         lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
+        idle_outputs: Name of each device that puts out something when nothing plays -> what.
     """
 
     timeline: Timeline
@@ -272,6 +273,7 @@ class CheckReport:
     rehearsal: Rehearsal | None
     shot_bytes: int | None
     lines: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict[str, Any])
+    idle_outputs: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def bars(self) -> list[TimelineEntry]:
@@ -332,6 +334,7 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
         next(iter(rehearsals.values()), None),
         _shot_bytes(session, lab, timeline),
         spans_on(lab.line_specs, (bar for _, bars in timeline for bar in bars)),
+        {name: text for name, one in lab.hardware() if (text := getattr(one, "idle_output", ""))},
     )
 
 

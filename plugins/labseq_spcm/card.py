@@ -121,6 +121,11 @@ class AwgCard:
         """Whether it was started and has not come to its end."""
         return not self.status & self.spcm.M2STAT_CARD_READY
 
+    @property
+    def triggered(self) -> bool:
+        """Whether a trigger has come since the start."""
+        return bool(self.status & self.spcm.M2STAT_CARD_TRIGGER)
+
     def clear_error(self) -> str:
         """Read the pending error: until then the driver library refuses every other call."""
         return str(self._card.get_error_info())

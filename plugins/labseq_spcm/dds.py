@@ -19,6 +19,7 @@ from labseq.plugin import (
 )
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard
+from labseq_spcm.keep_warm import KeepWarm
 from labseq_spcm.settings import SpcmSettings
 
 ENTRY: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<i8")])
@@ -56,6 +57,14 @@ class Cores:
     row: NDArray[np.int64]
     column: NDArray[np.int64]
     masks: tuple[int, int]
+
+    def idle_state(self, tones: KeepWarm | None) -> NDArray[np.float64]:
+        """Frequency, its slope, amplitude and its slope of each core between programs, float64 (4, n)."""
+        state = np.zeros((4, len(self.row) + len(self.column)))
+        if tones is not None:
+            first = [0, len(self.row)]
+            state[0, first], state[2, first] = tones.hz, tones.amplitude
+        return state
 
 
 def choose_cores(name: str, settings: SpcmSettings, motion: MotionSpec) -> Cores:
@@ -97,13 +106,16 @@ class Commands:
 NO_COMMANDS: Final = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
 
 
-def compile_commands(name: str, program: ToneProgram, cores: Cores) -> Commands:
+def compile_commands(
+    name: str, program: ToneProgram, cores: Cores, keep_warm: KeepWarm | None = None
+) -> Commands:
     """Compile a program into DDS commands.
 
     Args:
         name: Name of the device, for messages.
         program: A program that passed :func:`labseq_spcm.limits.check_program`.
         cores: The cores of each axis.
+        keep_warm: The tones before and after the program; None for silence.
 
     Raises:
         LimitError: It has more tones than cores, a segment that is too short for the DDS's timer,
@@ -118,8 +130,9 @@ def compile_commands(name: str, program: ToneProgram, cores: Cores) -> Commands:
     registers, values = np.empty(n_most, np.int32), np.empty(n_most)
     ends = np.empty(kernels.COURSE_STEPS * program.n_segments + 2, np.int64)
     n_blocks = kernels.compile_program(
-        program.duration_s, program.course, offsets, tones, both, len(cores.row), registers, values, ends
-    )
+        program.duration_s, program.course, offsets, tones, both, len(cores.row),
+        cores.idle_state(keep_warm), registers, values, ends,
+    )  # fmt: skip
     if n_blocks == kernels.TOO_MANY:
         raise _too_many_tones(name, program, cores, int(ends[0]))
     if n_blocks == kernels.TOO_SHORT:
@@ -172,18 +185,23 @@ class Dds:
 
     Commands go to the card by DMA. Before each portion is sent the queue must have room for it; the
     rest is sent while the program plays. The card sets a flag if a block comes too late.
+    With keep-warm tones the card runs between programs too: the first block of a program ends them,
+    and its last but one brings them back.
 
     Args:
         card: The open card.
         cores: The cores of each axis.
+        keep_warm: The tones between programs; None for silence.
     """
 
     max_wait_s = POLL_S
     render_s = 0.0
 
-    def __init__(self, card: AwgCard, cores: Cores) -> None:
+    def __init__(self, card: AwgCard, cores: Cores, keep_warm: KeepWarm | None) -> None:
         self._card = card
         self._cores = cores
+        self._keep_warm = keep_warm
+        self._is_at_rest = False
         self._commands = NO_COMMANDS
         self._n_sent = 0
         self._n_events = 0
@@ -206,19 +224,46 @@ class Dds:
     def prepare(self, program: ToneProgram) -> float:
         """Compile a program, and queue as much as there is room for; returns its playing time in seconds."""
         start_s = time.perf_counter()
-        self._commands = compile_commands(self._card.name, program, self._cores)
+        self._commands = compile_commands(self._card.name, program, self._cores, self._keep_warm)
         self.render_s = time.perf_counter() - start_s
         self._n_sent = 0
-        self._reset()
+        if not (self._is_at_rest and self._card.running):
+            self.rest()
+        self._is_at_rest = False
         self._card.wait_until(self._feed, "the DDS takes no commands: its queue stays full")
         self._card.clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
         return program.total_duration_s
 
-    def start(self, command: int) -> None:
-        """Start the card; enable triggers only when the first block waits for one."""
+    def rest(self) -> None:
+        """Stop, forget all commands, and start the keep-warm tones if there are any."""
+        from labseq_spcm import kernels
+
         card, spcm = self._card, self._card.spcm
-        self._n_events = card.read(spcm.SPC_DDS_TRG_COUNT)
-        card.command(spcm.M2CMD_CARD_START, "start")
+        card.stop()
+        self._reset()
+        if self._keep_warm is None:
+            return
+        entries = [(kernels.SOURCE, TYPE_INT64, kernels.FROM_CARD)]
+        for axis, cores in enumerate((self._cores.row, self._cores.column)):
+            for register, value in (
+                (kernels.FREQUENCY, self._keep_warm.hz[axis]),
+                (kernels.AMPLITUDE, self._keep_warm.amplitude[axis]),
+            ):
+                bits = int(np.float64(value).view(np.int64))
+                entries.append((register + int(cores[0]), TYPE_DOUBLE, bits))
+        commands = kernels.AT_TRIGGER, spcm.SPCM_DDS_CMD_WRITE_TO_CARD
+        entries += [(kernels.COMMAND, TYPE_INT64, command) for command in commands]
+        card.write_list(np.array(entries, ENTRY), "keep-warm tones")
+        card.clock.sleep(ARRIVAL_S)
+        self._start_triggered(spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER)
+        card.command(spcm.M2CMD_CARD_DISABLETRIGGER, "disabling the trigger")
+        self._is_at_rest = True
+
+    def _start_triggered(self, command: int) -> None:
+        """Start the card if it stands still; enable triggers only when the first block waits for one."""
+        card, spcm = self._card, self._card.spcm
+        if not card.running:
+            card.command(spcm.M2CMD_CARD_START, "start")
         card.wait_until(
             lambda: bool(card.read(spcm.SPC_DDS_STATUS) & spcm.SPCM_DDS_STAT_WAITING_FOR_TRG),
             "the DDS waits for no trigger: its first commands have not arrived",
@@ -226,16 +271,30 @@ class Dds:
         )
         card.command(command & ~spcm.M2CMD_CARD_START, "trigger")
 
+    def start(self, command: int) -> None:
+        """Start the program."""
+        self._n_events = self._card.read(self._card.spcm.SPC_DDS_TRG_COUNT)
+        self._start_triggered(command)
+
+    def triggered(self) -> bool:
+        """Whether the program has begun."""
+        if self._keep_warm is None:
+            return self._card.triggered
+        return self._card.read(self._card.spcm.SPC_DDS_TRG_COUNT) > self._n_events
+
     def finished(self) -> bool:
         """Queue more while there is room; whether the last block took effect.
 
-        The number of queued commands is 0 while a block still waits, so the events are counted.
+        The number of queued commands is 0 while a block still waits, so the events are counted. The card's
+        count leaves out the first after a reset, which is the start of the keep-warm tones.
         """
         card, spcm = self._card, self._card.spcm
         self._feed()
         n_events = card.read(spcm.SPC_DDS_TRG_COUNT) - self._n_events
-        if n_events >= len(self._commands.ends) - 1:
-            card.command(spcm.M2CMD_CARD_STOP, "stop")
+        if n_events >= len(self._commands.ends) - (self._keep_warm is None):
+            self._is_at_rest = self._keep_warm is not None
+            command = spcm.M2CMD_CARD_DISABLETRIGGER if self._is_at_rest else spcm.M2CMD_CARD_STOP
+            card.command(command, "end of the program")
             return True
         too_late = spcm.SPCM_DDS_STAT_QUEUE_UNDERRUN | spcm.SPCM_DDS_STAT_QUEUE_OVERRUN
         if card.read(spcm.SPC_DDS_STATUS) & too_late:

@@ -222,17 +222,17 @@ def drive_tones(
 
 
 @kernel(
-    f"int64({const('float64', 1)}, {const('int8', 1)}, {const('int32', 2)}, {TONES}, {CORES}, int64,"
+    f"int64({const('float64', 1)}, {const('int8', 1)}, {const('int32', 2)}, {TONES}, {CORES}, int64, {TONES},"
     " int32[::1], float64[::1], int64[::1])"
 )
 def compile_program(
     duration_s: Reals, course: NDArray[np.int8], offsets: Shorts, tones: Reals, cores: Ints,
-    n_row_cores: int, registers: Shorts, values: Reals, ends: Ints,
+    n_row_cores: int, idle: Reals, registers: Shorts, values: Reals, ends: Ints,
 ) -> int:  # fmt: skip
     """Compile a tone program into blocks of commands.
 
     The first block takes effect at the card's trigger, the others at ticks of the timer. The last
-    but one silences all tones; the last switches the timer off.
+    but one brings all cores back into the idle state; the last switches the timer off.
 
     Args:
         duration_s: Of each segment.
@@ -241,6 +241,7 @@ def compile_program(
         tones: float64 (5, n): start and end frequency, start and end amplitude, phase in turns.
         cores: The cores of the row axis, then those of the column axis.
         n_row_cores: How many the row axis has.
+        idle: float64 (4, n_cores): frequency, its slope, amplitude and its slope between programs; 0: silent.
         registers: Result: register of each command.
         values: Result: its value.
         ends: Result: end of each block among the commands.
@@ -248,7 +249,7 @@ def compile_program(
     Returns:
         Number of blocks; or TOO_SHORT or TOO_MANY, and ``ends[0]`` is the segment.
     """
-    now, core_of = np.zeros((4, len(cores))), np.zeros(tones.shape[1], np.int64)
+    now, core_of = idle.copy(), np.zeros(tones.shape[1], np.int64)
     set_phase = np.ones(tones.shape[1], np.bool_)
     used, on = np.zeros(len(cores), np.bool_), np.zeros(len(cores), np.bool_)
     widest, knots = np.zeros(2), np.zeros(COURSE_STEPS + 1)
@@ -289,8 +290,9 @@ def compile_program(
             ends[n_blocks] = n
             n_blocks += 1
         joint_s += before_s
-    on[:] = False
-    n = silence(cores, on, now, registers, values, n)
+    for at in range(len(cores)):
+        hz = idle[HZ, at] if idle[AMP, at] > 0.0 else now[HZ, at]
+        n = drive_core(cores, at, hz, 0.0, idle[AMP, at], 0.0, now, registers, values, n)
     n = add_command(TIMER, 2 * DDS_MIN_TICKS * DDS_TICK_S, registers, values, n)
     n = add_command(COMMAND, AT_TRIGGER, registers, values, n)
     ends[n_blocks] = n

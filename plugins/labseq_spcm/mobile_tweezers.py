@@ -31,6 +31,7 @@ from labseq.plugin import (
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.dds import Dds, choose_cores, compile_commands
+from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output
@@ -69,6 +70,14 @@ class PlayMode(Protocol):
         """Start the card with this command."""
         ...
 
+    def triggered(self) -> bool:
+        """Whether the program has begun."""
+        ...
+
+    def rest(self) -> None:
+        """Start the keep-warm tones if there are any."""
+        ...
+
     def finished(self) -> bool:
         """Whether the program was played to its end; called repeatedly, it keeps the card supplied.
 
@@ -94,8 +103,8 @@ class SpcmMobileTweezers(MobileTweezers):
         library: Where the card comes from; a simulated one keeps its card as ``library.card``.
 
     Raises:
-        LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``, or the sample
-            rate is too low for its bands.
+        LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``, the sample
+            rate is too low for its bands, or a keep-warm tone is on the atoms or outside them.
         ConfigError: The mode is ``dds``, and the profile allows more tones than it has.
     """
 
@@ -112,6 +121,8 @@ class SpcmMobileTweezers(MobileTweezers):
             self._cores = choose_cores(self._name, settings, context.motion)
         else:
             limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
+        warm = settings.keep_warm
+        self._keep_warm = None if warm is None else keep_warm_tones(self._name, warm, context)
         self.library = choose_library(self._name, settings, context)
         self._card: AwgCard | None = None
         self._mode: PlayMode | None = None
@@ -124,6 +135,19 @@ class SpcmMobileTweezers(MobileTweezers):
     def waits_for_trigger(self) -> bool:
         """Whether an edge at Ext0 starts the programs."""
         return self._settings.trigger == "external"
+
+    @property
+    def idle_output(self) -> str:
+        """The keep-warm tones."""
+        tones = self._keep_warm
+        if tones is None:
+            return ""
+        each = (
+            f"{hz / 1e6:.6g} MHz ({format_quantity(a**2 * self._rf.full_scale_power_w, 'power')})"
+            for hz, a in zip(tones.hz, tones.amplitude, strict=True)
+        )
+        dark = "" if self._cores is not None else ", dark from upload to start"
+        return f"keep-warm tones off the atoms: {' and '.join(each)}{dark}"
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
@@ -157,9 +181,9 @@ class SpcmMobileTweezers(MobileTweezers):
 
     def _new_mode(self, card: AwgCard) -> PlayMode:
         if self._cores is not None:
-            return Dds(card, self._cores)
+            return Dds(card, self._cores, self._keep_warm)
         mode = Replay if self._settings.mode == "replay" else Fifo
-        return mode(card, self._settings, self._facts["sample_rate_hz"])
+        return mode(card, self._settings, self._facts["sample_rate_hz"], self._keep_warm)
 
     @property
     def settling_timeout_s(self) -> float:
@@ -169,10 +193,17 @@ class SpcmMobileTweezers(MobileTweezers):
     def settle(self) -> None:
         """Close the output relays and let them settle, once per run, before there are atoms.
 
-        After ``safe_state``, ``prepare`` does it again.
+        The keep-warm tones begin. After ``safe_state``, ``prepare`` does it again.
         """
-        if close_relays(self._opened()[0]):
+        card, mode = self._opened()
+        if close_relays(card):
             self._clock.sleep(limits.RELAY_S)
+        self._rest(card, mode)
+
+    def _rest(self, card: AwgCard, mode: PlayMode) -> None:
+        """Have the keep-warm tones play."""
+        if self._keep_warm is not None and not card.running:
+            mode.rest()
 
     def close(self) -> None:
         """Bring the outputs into the safe state and close the card; legal in any state."""
@@ -206,11 +237,10 @@ class SpcmMobileTweezers(MobileTweezers):
             LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
             DeviceError: Not open, still playing, or the card refuses.
         """
-        card, mode = self._opened()
+        mode = self._opened()[1]
         self._check_idle("prepare()")
         self._duration_s = None
         limits.check_program(self._name, program, self._rf)
-        card.stop()
         self.settle()
         start_s = time.perf_counter()
         playing_s = mode.prepare(program)
@@ -263,11 +293,13 @@ class SpcmMobileTweezers(MobileTweezers):
             while not mode.finished():
                 now_s = self._clock.now()
                 if now_s >= deadline_s:
-                    raise self._timeout(card, timeout_s)
+                    raise self._timeout(mode, timeout_s)
                 idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
                 self._clock.sleep(min(deadline_s - now_s, mode.max_wait_s, idle_s))
                 if self._due_s is None:
                     break
+            if self._due_s is not None:
+                self._rest(card, mode)
         except (DeviceError, TransientError):
             if self._due_s is not None:
                 self.safe_state()
@@ -276,9 +308,9 @@ class SpcmMobileTweezers(MobileTweezers):
             raise DeviceError(self._name, "stopped by safe_state() while it played")
         self._due_s = None
 
-    def _timeout(self, card: AwgCard, timeout_s: float) -> DeviceTimeoutError:
+    def _timeout(self, mode: PlayMode, timeout_s: float) -> DeviceTimeoutError:
         waited = format_quantity(timeout_s, "time")
-        if card.status & card.spcm.M2STAT_CARD_TRIGGER:
+        if mode.triggered():
             text = f"still playing after {waited}"
         else:
             text = f"no trigger came within {waited}; check the cable at Ext0 and trigger_level"
@@ -337,6 +369,7 @@ class SpcmMobileTweezers(MobileTweezers):
         card, _ = self._opened()
         self._check_idle("self_test()")
         self._duration_s = None
+        card.stop()
         spcm = card.spcm
         sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("output module", spcm.SPC_MON_TC_MODULE_0))
         for place, register in sensors:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, Renderer, ToneProgram, TransientError
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
+from labseq_spcm.keep_warm import KeepWarm, Loop
 from labseq_spcm.limits import SAMPLE_STEP
 from labseq_spcm.settings import SpcmSettings
 
@@ -62,27 +63,64 @@ class InterleavedRenderer:
             interleave(first_words, second_words, frames[first : first + CHUNK])
 
 
-class Replay:
-    """Mode ``replay``: uploads the whole program, then waits for its end. See ``PlayMode``.
+class SampleMode:
+    """What ``replay`` and ``fifo`` have in common: rendered samples, and a loop for the keep-warm tones.
 
     Args:
         card: The open card.
         settings: The driver's settings.
         sample_rate_hz: The rate that the card's clock really makes.
+        keep_warm: The tones between programs; None for silence.
     """
 
-    max_wait_s = math.inf
     render_s = 0.0
 
-    def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
+    def __init__(
+        self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None
+    ) -> None:
         self._card = card
         self._row_channel = settings.row_channel
         self._rate_hz = sample_rate_hz
+        self._loop = keep_warm and Loop(card, keep_warm, sample_rate_hz, settings.row_channel)
+
+    def _set_mode(self) -> None:
+        """Set up the mode of the programs; the card stands still."""
+        raise NotImplementedError
+
+    def rest(self) -> None:
+        """Start the keep-warm tones if there are any; the card stands still."""
+        if self._loop is not None:
+            spcm = self._card.spcm
+            self._card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
+            self._loop.start()
+
+    def _stop(self) -> None:
+        """Stop what plays, also the keep-warm tones."""
+        self._card.stop()
+        if self._loop is not None:
+            self._set_mode()
+
+    def start(self, command: int) -> None:
+        """Start the card."""
+        self._card.command(command, "start")
+
+    def triggered(self) -> bool:
+        """Whether the program has begun."""
+        return self._card.triggered
+
+
+class Replay(SampleMode):
+    """Mode ``replay``: uploads the whole program, then waits for its end. See ``PlayMode``."""
+
+    max_wait_s = math.inf
+
+    def __init__(
+        self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
+    ) -> None:
+        super().__init__(card, settings, sample_rate_hz, keep_warm)
         self._buffer = Buffer()
+        self._set_mode()
         spcm = card.spcm
-        card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
-        card.set(spcm.SPC_LOOPS, 1, "loops")
-        card.write_setup()
         self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
 
     def prepare(self, program: ToneProgram) -> float:
@@ -98,49 +136,49 @@ class Replay:
         frames = self._buffer.reserve(n_samples)
         renderer.write(0, frames)
         self.render_s = time.perf_counter() - start_s
+        self._stop()
         self._card.set(self._card.spcm.SPC_MEMSIZE, n_samples, "memory size")
         self._card.upload(frames)
         return n_samples / self._rate_hz
 
-    def start(self, command: int) -> None:
-        """Start the card."""
-        self._card.command(command, "start")
+    def _set_mode(self) -> None:
+        spcm = self._card.spcm
+        self._card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
+        self._card.set(spcm.SPC_LOOPS, 1, "loops")
+        self._card.write_setup()
 
     def finished(self) -> bool:
         """Whether the program has been played to its end."""
         return not self._card.running
 
 
-class Fifo:
+class Fifo(SampleMode):
     """Mode ``fifo``: streams a program while the rest is still being rendered. See ``PlayMode``.
 
     Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
     and from there to the outputs. Ring and memory are bounded, so a program is rendered about
     ``fill`` ahead. Before the start both are filled, or hold the whole program. The card knows how
     many samples to play: it stops after them, and reports if it runs dry before.
-
-    Args:
-        card: The open card.
-        settings: The driver's settings.
-        sample_rate_hz: The rate that the card's clock really makes.
     """
 
     max_wait_s = 0.0
-    render_s = 0.0
 
-    def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
-        self._card = card
-        self._row_channel = settings.row_channel
-        self._rate_hz = sample_rate_hz
+    def __init__(
+        self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
+    ) -> None:
+        super().__init__(card, settings, sample_rate_hz, keep_warm)
         self._ring = Buffer().reserve(RING_CHUNKS * CHUNK)
         self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
         self._renderer: InterleavedRenderer | None = None
         self._n_rendered = self._n_samples = 0
-        spcm = card.spcm
-        card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
-        card.set(spcm.SPC_LOOPS, 1, "loops")
         ahead = int(settings.fill * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
         self._fill = 1 << round(math.log2(max(MIN_FILL, ahead)))
+        self._set_mode()
+
+    def _set_mode(self) -> None:
+        card, spcm = self._card, self._card.spcm
+        card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
+        card.set(spcm.SPC_LOOPS, 1, "loops")
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
         card.write_setup()  # the buffer of a transfer is named afterwards
 
@@ -151,6 +189,7 @@ class Fifo:
         self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         self.render_s = time.perf_counter() - start_s
         self._n_samples, self._n_rendered = self._renderer.n_samples, 0
+        self._stop()
         card.set(spcm.SPC_SEGMENTSIZE, self._n_samples, "number of samples")
         card.define_transfer(self._ring, CHUNK * FRAME_BYTES)
         self._feed()
@@ -164,10 +203,6 @@ class Fifo:
             if not self._feed():
                 card.clock.sleep(POLL_S)
         return self._n_samples / self._rate_hz
-
-    def start(self, command: int) -> None:
-        """Start the card."""
-        self._card.command(command, "start")
 
     def finished(self) -> bool:
         """Feed the card while it has room; whether it has played to the end."""

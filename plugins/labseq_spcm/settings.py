@@ -13,6 +13,18 @@ Mode: TypeAlias = Literal["replay", "fifo", "dds"]
 Channel: TypeAlias = Literal[0, 1]
 
 
+class KeepWarmSettings(Settings):
+    """A tone on each axis that plays whenever no program does, so that the AODs stay warm."""
+
+    row_frequency: Frequency = Field(description="tone of the row axis: within the AOD's band, off the atoms")
+    column_frequency: Frequency = Field(description="tone of the column axis, likewise")
+    amplitude: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=None,
+        description="of full scale, on both axes; none: the mean power of as many tones as the profile "
+        "allows at once",
+    )
+
+
 class SpcmSettings(Settings):
     """Mobile tweezers on a Spectrum M4i.66xx."""
 
@@ -54,6 +66,9 @@ class SpcmSettings(Settings):
     fill: Annotated[Duration, Field(ge=1e-3, le=1.0)] = Field(
         default=8e-3,
         description="fifo: playing time that is rendered ahead, about: the card takes powers of two",
+    )
+    keep_warm: KeepWarmSettings | None = Field(
+        default=None, description="tones off the atoms between programs; none: silence"
     )
 
     @field_validator("sample_rate")

@@ -368,15 +368,17 @@ class CardOutputs:
 
     def _since(self, channel: int, until_s: float) -> list[RfSpan]:
         spans = (
-            span.between(max(span.start_s, self._reported_s), min(span.end_s, until_s))
+            (span, span.between(max(span.start_s, self._reported_s), min(span.end_s, until_s)))
             for span in self._card.played(channel)
             if span.end_s > self._reported_s and span.start_s < until_s
         )
-        return [_rf_span(span) for span in spans if span.end_s > span.start_s]
+        return [_rf_span(part, span) for span, part in spans if part.end_s > part.start_s]
 
 
-def _rf_span(span: Span) -> RfSpan:
+def _rf_span(span: Span, whole: Span) -> RfSpan:
     if isinstance(span, SampleSpan):
+        if isinstance(whole, SampleSpan) and whole.n_samples > len(whole.samples):
+            return _loop_tones(span)
         return RfSamples(span.start_s, span.sample_rate_hz, span.values(), span.amplitude_v / FULL_SCALE)
     values = [
         (
@@ -389,6 +391,16 @@ def _rf_span(span: Span) -> RfSpan:
         for tone in span.tones
     ]
     return RfTones(span.start_s, span.end_s, *np.array(values, np.float64).reshape(-1, 5).T)
+
+
+def _loop_tones(span: SampleSpan) -> RfTones:
+    """Samples that repeat as the tones that they are made of, but for those lost in their rounding."""
+    n = len(span.samples)
+    spectrum = np.fft.rfft(np.roll(span.samples, -span.first)) * (2 / n)
+    bins = np.flatnonzero(np.abs(spectrum) > 1.0)
+    zeros, found = np.zeros(len(bins)), spectrum[bins]
+    hz, volts = bins * span.sample_rate_hz / n, np.abs(found) * span.amplitude_v / FULL_SCALE
+    return RfTones(span.start_s, span.end_s, hz, zeros, volts, zeros, np.angle(found))
 
 
 def install(card: Card, name: str = "") -> str:

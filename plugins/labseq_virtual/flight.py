@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from labseq.plugin import MotionSpec, SiteGrid
 from labseq_virtual.handover import full_amplitudes
 from labseq_virtual.jumps import JUMPS, find_jumps
-from labseq_virtual.rf_analysis import WINDOW, Band, RfPulse, Tracks, check_resolvable, track_tones
+from labseq_virtual.rf_analysis import (
+    WINDOW,
+    Band,
+    RfPulse,
+    Tracks,
+    check_resolvable,
+    reach_hz,
+    track_tones,
+)
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import TonePositions
 
@@ -151,6 +159,8 @@ class RfTransport:
         self._positions = positions or TonePositions(grid, light)
         self._full_v = _full_volts(grid, motion, light.tone_voltage)
         self._bands = _bands(grid)
+        axes_hz = grid.row_frequency_hz, grid.column_frequency_hz
+        self.reach_hz = [reach_hz(hz, motion.eject_slots) for hz in axes_hz]
         a1, a2 = grid.axes
         inverse = np.linalg.inv(np.stack([a2, a1], axis=1))
         self._plane = np.ascontiguousarray(np.vstack([grid.positions_m[0, 0], a2, a1, inverse]))

@@ -34,6 +34,11 @@ EDGE: Final = 0.05
 """Fraction of the band at each end over which the AOD's response falls to 0 (ours)."""
 
 
+BESIDE: Final = 0.25
+"""How far beyond the outermost site or ejection slot a resting tone is dark, in tone spacings (ours)."""
+EVERYWHERE: Final = (-math.inf, math.inf)
+
+
 @dataclass(frozen=True, slots=True)
 class Band:
     """The frequencies that an AOD deflects.
@@ -65,10 +70,20 @@ class Envelope:
     values: NDArray[np.complex64]
 
 
-def active_spans(span: RfSpan) -> list[tuple[float, float]]:
-    """Times when a span is not silent: (start, end) in seconds, in order."""
+def reach_hz(sites_hz: NDArray[np.float64], eject_slots: int) -> tuple[float, float]:
+    """The tones that send light to a site or an ejection slot; a tone that rests outside of them does not."""
+    step_hz = float(np.abs(np.diff(sites_hz)).max(initial=0.0))
+    margin_hz = (eject_slots + BESIDE) * step_hz
+    return float(sites_hz.min()) - margin_hz, float(sites_hz.max()) + margin_hz
+
+
+def active_spans(span: RfSpan, reach_hz: tuple[float, float] = EVERYWHERE) -> list[tuple[float, float]]:
+    """Times when a span sends light to the atoms: (start, end) in seconds, in order."""
     if isinstance(span, RfTones):
-        return [(span.start_s, span.end_s)] if len(span.frequency_hz) else []
+        low, high = reach_hz
+        near = (span.frequency_hz > low) & (span.frequency_hz < high)
+        lit = near.any() or span.frequency_slope.any() or span.amplitude_slope.any()
+        return [(span.start_s, span.end_s)] if lit else []
     n_blocks = math.ceil(len(span.samples) / BLOCK)
     loud = np.zeros(n_blocks, np.bool_)
     whole = len(span.samples) // BLOCK
@@ -312,18 +327,30 @@ class PulseReceiver:
     Args:
         source: The outputs.
         silence_s: Shortest silence that ends a pulse.
+        reach_hz: For each axis the tones that send light to the atoms; others that rest count as silence.
     """
 
-    def __init__(self, source: RfSource, silence_s: float) -> None:
+    def __init__(
+        self,
+        source: RfSource,
+        silence_s: float,
+        reach_hz: Sequence[tuple[float, float]] = (EVERYWHERE, EVERYWHERE),
+    ) -> None:
         self._source = source
         self._silence_s = silence_s
+        self._reach_hz = reach_hz
         self._cut_s = -math.inf
 
     def receive_until(self, until_s: float) -> Iterator[RfPulse]:
         """The pulses played until a time; the last one is cut off there if it has not ended."""
         played = self._source.played(until_s)
         cut_s, self._cut_s = self._cut_s, until_s
-        times = [times for spans in played for span in spans for times in active_spans(span)]
+        times = [
+            times
+            for spans, reach_hz in zip(played, self._reach_hz, strict=True)
+            for span in spans
+            for times in active_spans(span, reach_hz)
+        ]
         for start_s, end_s in _merged(times, self._silence_s):
             rows, columns = (_between(spans, start_s, end_s) for spans in played)
             yield RfPulse(start_s, end_s, rows, columns, start_s < cut_s + ROUNDING_S)

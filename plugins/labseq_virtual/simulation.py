@@ -189,7 +189,9 @@ class VirtualSimulation(Simulation):
             )
         self._flight.check_resolvable()
         self._apply_output(self._clock.now())
-        self._pulse_receiver = PulseReceiver(cast("RfSource", source), 2 * self._flight.margin_s)
+        self._pulse_receiver = PulseReceiver(
+            cast("RfSource", source), 2 * self._flight.margin_s, self._flight.reach_hz
+        )
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """Take a frame; imaging light heats some atoms out of their tweezers, and they shine until then.

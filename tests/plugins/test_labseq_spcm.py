@@ -3,32 +3,51 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from labseq_spcm.keep_warm import KeepWarm
 from labseq_spcm.mobile_tweezers import HOT_C, TEST_SAMPLES, SpcmMobileTweezers
 from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, SimulatedLibrary, Span, Tone, ToneSpan, registers
+from labseq_spcm_sim import (
+    M4I6631,
+    SampleSpan,
+    SimulatedCard,
+    SimulatedLibrary,
+    Span,
+    Tone,
+    ToneSpan,
+    installed,
+    registers,
+)
+from labseq_spcm_sim.library import CardOutputs
+from labseq_virtual.rf_analysis import active_spans, reach_hz
 
 from labseq.motion import render, tone_program
 from labseq.plugin import (
     ConfigError,
     Context,
     DeviceError,
+    DeviceTimeoutError,
     LimitError,
     MotionSpec,
     Plan,
     RfSpec,
+    RfTones,
     TransientError,
 )
 from labseq.roles import offers
 from labseq.testing import MobileTweezersContract
 from labseq.testing.fakes import FakeClock
+
+from .conftest import RATE_HZ
 
 MODES = ["replay", "fifo", "dds"]
 
@@ -155,6 +174,163 @@ EXTERNAL = {
 }
 MOTION = MotionSpec(max_row_tones=16, max_column_tones=5)
 DDS_CMD, EXEC_AT_TRG, WRITE_TO_CARD = 608003, 2, 8
+
+
+PARKED = {"row_frequency": 82.2e6, "column_frequency": 117.9e6}
+
+
+def _power_w(lab: Any, channel: int, start_s: float, end_s: float) -> float:
+    """Mean power into 50 Ohm of what an output played within a time."""
+    energy = 0.0
+    for span in lab.card.played(channel):
+        part = span.between(start_s, end_s) if span.start_s < end_s and span.end_s > start_s else None
+        if isinstance(part, ToneSpan):
+            length_s = part.end_s - part.start_s
+            for tone in part.tones:
+                first, last = tone.amplitude, tone.after(length_s).amplitude
+                energy += (first**2 + first * last + last**2) / 3 * part.amplitude_v**2 * length_s / 100
+        elif part is not None and part.n_samples:
+            once = part.samples if part.n_samples > len(part.samples) else part.values()
+            rms = np.sqrt(np.mean(np.square(once / 32767)))
+            energy += (rms * part.amplitude_v) ** 2 / 50 * part.n_samples / part.sample_rate_hz
+    return energy / (end_s - start_s)
+
+
+def _shot(lab: Any) -> tuple[float, float, float]:
+    """Play two programs within 60 ms; start, end, and the time of upload and playing as a fraction."""
+    lab.tweezers.settle()
+    start_s, busy_s = lab.clock.now(), 0.0
+    for _ in range(2):
+        lab.clock.sleep(20e-3)
+        begun_s = lab.clock.now()
+        lab.play(lab.program(4))
+        busy_s += lab.clock.now() - begun_s
+    lab.clock.sleep(20e-3)
+    return start_s, lab.clock.now(), busy_s / (lab.clock.now() - start_s)
+
+
+class TestKeepWarm:
+    @pytest.mark.parametrize("mode", MODES)
+    def test_holds_the_mean_power_over_a_shot(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
+            start_s, end_s, busy = _shot(lab)
+            assert busy < 0.2
+            silent = [_power_w(lab, channel, start_s, end_s) for channel in (0, 1)]
+        with driver(mode, keep_warm=PARKED) as lab:
+            n_tones = lab.motion.max_row_tones, lab.motion.max_column_tones
+            assert _power_w(lab, 0, lab.clock.now() - 1e-3, lab.clock.now()) == 0
+            start_s, end_s, busy = _shot(lab)
+            for channel in (0, 1):
+                held_w = 1.6**2 / 100 / n_tones[channel]
+                assert _power_w(lab, channel, end_s - 10e-3, end_s) == pytest.approx(held_w, rel=0.01)
+                share = _power_w(lab, channel, start_s, end_s) / held_w
+                assert 1 - busy - 0.01 < share < 1.01
+                assert silent[channel] / held_w < 0.2
+            lab.tweezers.safe_state()
+            assert _power_w(lab, 0, lab.clock.now(), lab.clock.now() + 1e-3) == 0
+            assert lab.card.outputs_on == (False, False)
+            lab.play(lab.program(1))
+            assert lab.card.outputs_on == (True, True)
+
+    def test_with_the_dds_lasts_until_the_trigger_and_follows_the_program_at_once(self, driver: Any) -> None:
+        motion = MotionSpec(max_row_tones=16, max_column_tones=5, overhead_per_batch_s=0.0)
+        with driver("dds", motion=motion, keep_warm=PARKED, trigger="external") as lab:
+            for n in range(3):
+                duration_s = lab.tweezers.prepare(lab.program(2))
+                if n == 1:  # prepared again without being played
+                    lab.tweezers.prepare(lab.program(2))
+                assert not lab.card.trigger(), "not armed yet"
+                lab.tweezers.play()
+                lab.clock.sleep(1e-3)
+                assert lab.card.trigger()
+                lab.tweezers.wait(duration_s + 1e-3)
+            lab.clock.sleep(1e-3)
+            spans = [span for span in lab.card.played(0) if isinstance(span, ToneSpan)]
+            parked = [[tone.frequency_hz for tone in span.tones] == [pytest.approx(82.2e6)] for span in spans]
+            assert parked[0]
+            assert parked[-1]
+            dark = [after.start_s - before.end_s for before, after in pairwise(spans)]
+            assert max(dark) < 200e-6
+            assert sum(gap_s > 1e-9 for gap_s in dark) == 1, "only where a prepared program was dropped"
+
+    @pytest.mark.parametrize("mode", MODES)
+    def test_plays_the_same_programs(self, driver: Any, mode: str) -> None:
+        played = []
+        for warm in (None, PARKED):
+            with driver(mode, keep_warm=warm) as lab:
+                lab.play(lab.program(1))
+                lab.card.forget(lab.clock.now())
+                begun_s = lab.clock.now()
+                lab.play(lab.program(3))
+                spans = [span for span in lab.card.played(0) if span.start_s >= begun_s]
+                if mode == "dds":
+                    tones = [
+                        sorted((round(t.frequency_hz), round(t.amplitude, 4)) for t in span.tones)
+                        for span in spans
+                        if isinstance(span, ToneSpan)
+                    ]
+                    played.append([t for t in tones if t and t[0][0] != 82_200_000])
+                else:
+                    played.append(
+                        [
+                            span.values().tolist()
+                            for span in spans
+                            if isinstance(span, SampleSpan) and span.n_samples == len(span.samples)
+                        ]
+                    )
+        assert played[0]
+        assert played[0] == played[1]
+
+    def test_of_which_the_trigger_never_comes_says_so(self, driver: Any) -> None:
+        with driver("dds", keep_warm=PARKED, trigger="external") as lab:
+            lab.tweezers.prepare(lab.program(1))
+            lab.tweezers.play()
+            with pytest.raises(DeviceTimeoutError, match="no trigger came within"):
+                lab.tweezers.wait(10e-3)
+            assert lab.card.outputs_on == (False, False)
+
+    @pytest.mark.parametrize(
+        ("key", "hz", "says"),
+        [
+            ("row_frequency", 100e6, "is 100 MHz; the limit is 82 to 82.4 MHz or 117.6 to 118 MHz: within"),
+            ("row_frequency", 83.2e6, "the AOD's band and off the atoms"),
+            ("column_frequency", 81e6, "keep_warm.column_frequency is 81 MHz"),
+            ("amplitude", 1.0, "mean power of the row axis' keep-warm tone"),
+        ],
+    )
+    def test_on_the_atoms_outside_the_band_or_too_strong_is_refused(
+        self, key: str, hz: float, says: str
+    ) -> None:
+        settings = SpcmSettings.model_validate({"card": "simulated", "keep_warm": {**PARKED, key: hz}})
+        motion = MotionSpec(eject_slots=1, rf=RfSpec(max_mean_power_w=2.0))
+        with pytest.raises(LimitError, match=re.escape(says)) as refused:
+            SpcmMobileTweezers(settings, Context("mobile_tweezers", motion=motion))
+        assert refused.value.setting == ("keep_warm", key)
+
+    @pytest.mark.parametrize("row_hz", [82.2e6, 84.8e6])
+    def test_reaches_the_virtual_atoms_only_if_it_is_on_them(self, row_hz: float) -> None:
+        tones = KeepWarm((row_hz, 84.8e6), (0.3, 0.3))
+        clock, grid = FakeClock(), Context().grid
+        card = SimulatedCard(clock)
+        with installed(card) as name:
+            settings = SpcmSettings(card=name, sample_rate=RATE_HZ)
+            tweezers = SpcmMobileTweezers(settings, Context("mobile_tweezers", clock=clock))
+            tweezers._keep_warm = tones
+            tweezers.open()
+            tweezers.settle()
+            clock.sleep(2e-3)
+            reach = [reach_hz(hz, 0) for hz in (grid.row_frequency_hz, grid.column_frequency_hz)]
+            (row,), _ = source = CardOutputs(card, 0).played(clock.now())
+            assert isinstance(row, RfTones)
+            assert row.frequency_hz == pytest.approx([row_hz], abs=2e3)
+            assert row.amplitude_v == pytest.approx([0.3 * 1.6], rel=1e-3)
+            lit = [active_spans(spans[0], limits) for spans, limits in zip(source, reach, strict=True)]
+            assert [bool(spans) for spans in lit] == [row_hz > 84e6, True]
+            clock.sleep(20e-6)  # less than a period of the loop
+            later = CardOutputs(card, 0)
+            later.played(clock.now() - 10e-6)
+            assert all(isinstance(span, RfTones) for spans in later.played(clock.now()) for span in spans)
+            tweezers.close()
 
 
 def _start_s(lab: Any) -> float:

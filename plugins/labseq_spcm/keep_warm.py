@@ -1,0 +1,109 @@
+"""Tones off the atoms that keep the AODs warm between programs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import Context, LimitError, format_quantity
+from labseq_spcm.card import AwgCard, Buffer
+from labseq_spcm.settings import KeepWarmSettings
+
+CLEARANCE: Final = 0.5
+"""Distance from the outermost place of a mobile tweezer, ejection slots included, in tone spacings (ours)."""
+PERIOD: Final = 1 << 16
+"""Samples of the loop: the tones are at multiples of 10 kHz at 625 MS/s."""
+FULL_SCALE: Final = 32767
+
+
+@dataclass(frozen=True, slots=True)
+class KeepWarm:
+    """One tone per axis, first the row axis.
+
+    Attributes:
+        hz: Their frequencies.
+        amplitude: Their amplitudes, of full scale.
+    """
+
+    hz: tuple[float, float]
+    amplitude: tuple[float, float]
+
+
+def keep_warm_tones(name: str, settings: KeepWarmSettings, context: Context) -> KeepWarm:
+    """The tones for these settings, checked against grid, bands and amplifiers.
+
+    Raises:
+        LimitError: A frequency is outside the AOD's band or among the tones of the mobile tweezers, or the
+            power is too much.
+    """
+    grid, motion = context.grid, context.motion
+    rf, chosen = motion.rf, list[float]()
+    for word, hz, sites_hz, band, full, n_most in (
+        ("row", settings.row_frequency, grid.row_frequency_hz, rf.row_band_hz, rf.row_amplitudes,
+         motion.max_row_tones),
+        ("column", settings.column_frequency, grid.column_frequency_hz, rf.column_band_hz,
+         rf.column_amplitudes, motion.max_column_tones),
+    ):  # fmt: skip
+        _check_parking(name, word, hz, sites_hz, motion.eject_slots, band)
+        each = full or (1 / n_most,) * n_most
+        power = (
+            sum(a**2 for a in sorted(each)[-n_most:]) if settings.amplitude is None else settings.amplitude**2
+        )
+        power_w = power * rf.full_scale_power_w
+        if power_w > rf.max_mean_power_w:
+            most, came = (format_quantity(w, "power") for w in (rf.max_mean_power_w, power_w))
+            what = f"{name}: mean power of the {word} axis' keep-warm tone"
+            raise LimitError(what, came, f"{most} at the AOD", setting=("keep_warm", "amplitude"))
+        chosen.append(math.sqrt(min(1.0, power)))
+    return KeepWarm((settings.row_frequency, settings.column_frequency), (chosen[0], chosen[1]))
+
+
+def _check_parking(
+    name: str, word: str, hz: float, sites_hz: NDArray[np.float64], slots: int, band: tuple[float, float]
+) -> None:
+    """Refuse a tone that could heat an atom, or that the AOD does not deflect."""
+    step_hz = float(np.abs(np.diff(sites_hz)).max(initial=0.0))
+    reach_hz = (slots + CLEARANCE) * step_hz
+    below, above = float(sites_hz.min()) - reach_hz, float(sites_hz.max()) + reach_hz
+    if band[0] <= hz <= band[1] and not below < hz < above:
+        return
+    ranges = [(low, high) for low, high in ((band[0], below), (above, band[1])) if low <= high]
+    free = " or ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in ranges)
+    limit = f"{free}: within the AOD's band and off the atoms"
+    if not ranges:
+        limit = "none: the mobile tweezers need the whole band; lower eject_slots"
+    key = f"{word}_frequency"
+    what = f"{name}: keep_warm.{key}"
+    raise LimitError(what, f"{hz / 1e6:.6g} MHz", limit, setting=("keep_warm", key))
+
+
+class Loop:
+    """Plays the tones from the card's memory, over and over, until the card is stopped.
+
+    Args:
+        card: The open card.
+        tones: The tones.
+        sample_rate_hz: The rate that the card's clock really makes.
+        row_channel: The output of the row axis, 0 or 1.
+    """
+
+    def __init__(self, card: AwgCard, tones: KeepWarm, sample_rate_hz: float, row_channel: int) -> None:
+        self._card = card
+        self._frames = Buffer().reserve(PERIOD)
+        for axis, channel in enumerate((row_channel, 1 - row_channel)):
+            periods = round(tones.hz[axis] / sample_rate_hz * PERIOD)
+            turns = np.arange(PERIOD) * periods % PERIOD / PERIOD
+            self._frames[:, channel] = np.rint(FULL_SCALE * tones.amplitude[axis] * np.cos(2 * np.pi * turns))
+
+    def start(self) -> None:
+        """Start it, in the mode STD_SINGLE; the card stands still."""
+        card, spcm = self._card, self._card.spcm
+        card.set(spcm.SPC_LOOPS, 0, "loops")
+        card.set(spcm.SPC_MEMSIZE, PERIOD, "memory size")
+        card.upload(self._frames)
+        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
+        card.command(start, "start of the keep-warm tones")
