@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import statistics
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from numbers import Real
@@ -10,6 +12,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from labseq.model.records import OVERSHOOT_S
 from labseq.plugin import (
     COMPUTER,
     CycleRecord,
@@ -40,7 +43,8 @@ class RearrangeSettings(Settings):
     cycles: int = Field(default=1, ge=1, le=100, description="maximum number of cycles of plan, move, image")
     window: Duration | tuple[Duration, ...] = Field(
         default=60e-3,
-        description="longest time for the moves of one cycle, overheads included; a list gives one per cycle",
+        description="longest time from the image to the end of a cycle's moves: planning, upload, start and "
+        "moves; a list gives one per cycle",
     )
     exposure: PositiveDuration = Field(
         default=45e-3, description="exposure time of the image that ends a cycle"
@@ -73,7 +77,8 @@ class RearrangeSettings(Settings):
 class RearrangeStep(Step):
     """Rearranges in cycles; cycle k is plan, check, move, image.
 
-    A batch that would end after the cycle's window is not started. With
+    A batch that would end after the cycle's window is not started: batches are chosen by how long it took
+    to prepare one second of moves before, and once more if the device takes longer than that. With
     ``window_mode: early`` the image follows the last batch; with ``fixed`` the
     step waits for the end of the window.
     """
@@ -86,6 +91,7 @@ class RearrangeStep(Step):
         self.settings = settings
         self.windows_s = tuple(settings.window_of(cycle) for cycle in range(settings.cycles))
         self.judges_shot = settings.stop_when == "never"
+        self._measured = deque[float](maxlen=5)  # time to prepare / time to play, of the latest programs
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """Two entries per cycle, the moves at their window."""
@@ -121,35 +127,48 @@ class RearrangeStep(Step):
         with shot.stage("move", window_s, cycle):
             plan, report = checked_plan(shot, cycle)
             n_played = self._play(shot, plan, report, cycle, start_s)
-            left_s = window_s - (shot.clock.now() - start_s)
-            if self.settings.window_mode == "fixed" and left_s > 0:
-                shot.clock.sleep(left_s)
+            late_s = shot.clock.now() - start_s - window_s
+            if self.settings.window_mode == "fixed" and late_s < 0:
+                shot.clock.sleep(-late_s)
+        late_s = late_s if n_played and late_s > OVERSHOOT_S else 0.0
+        if late_s:
+            shot.log("window_exceeded", cycle=cycle, window_s=window_s, late_s=late_s)
         moves_s = float(report.batch_end_s[n_played - 1]) if n_played else 0.0
+        begun_s = start_s - shot.start_s
         shot.record_cycle(
-            CycleRecord(shot.step, cycle, plan, report, n_played, window_s, start_s - shot.start_s, moves_s)
+            CycleRecord(shot.step, cycle, plan, report, n_played, window_s, begun_s, moves_s, late_s)
         )
 
     def _play(self, shot: Shot, plan: Plan, report: PlanReport, cycle: int, start_s: float) -> int:
-        """Play the batches that fit into the window; returns their number.
+        """Play the batches that end within the window; returns their number.
 
-        The modelled overhead of the cycle (planning, rendering, upload) counts in
-        full; only the time that they really took beyond it shortens the window.
+        If preparing them took too long for the window, fewer are prepared.
         """
-        if plan.n_batches == 0:
-            return 0
-        overhead_s = shot.motion.overhead_per_cycle_s
-        late_s = max(0.0, shot.clock.now() - start_s - overhead_s) + shot.margin_s("rearrange")
-        n_played = fitting_batches(report, plan, self.settings.window_of(cycle) - late_s)
-        if n_played < plan.n_batches:
-            shot.log("window_too_short", cycle=cycle, n_batches=plan.n_batches, n_batches_played=n_played)
-        if n_played > 0:
-            play(
-                shot,
-                lambda: tone_program(plan, grid=shot.grid, motion=shot.motion, n_batches=n_played),
-                start_s,
-                cycle,
-            )
-        return n_played
+        end_s = start_s + self.settings.window_of(cycle) - shot.margin_s("rearrange")
+        duration_s, n_batches = 0.0, self._n_fitting(shot, plan, report, start_s, end_s)
+        while n_batches:
+            program = partial(tone_program, plan, grid=shot.grid, motion=shot.motion, n_batches=n_batches)
+            duration_s, took_s = prepare(shot, program, start_s, cycle)
+            if duration_s > 0:
+                self._measured.append(took_s / duration_s)
+            if shot.clock.now() + duration_s <= end_s + OVERSHOOT_S:
+                break
+            moves_s = float(report.batch_end_s[n_batches - 1]) - shot.motion.overhead_per_cycle_s
+            n_batches = self._n_fitting(shot, plan, report, start_s, end_s - (duration_s - moves_s))
+        if n_batches < plan.n_batches:
+            values = {"n_batches": plan.n_batches, "n_batches_played": n_batches}
+            shot.log("window_too_short", cycle=cycle, **values, before_moves_s=shot.clock.now() - start_s)
+        if n_batches:
+            play_prepared(shot, duration_s, cycle)
+        return n_batches
+
+    def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
+        """How many batches end in time if preparing takes as long as before, or as the profile says."""
+        part = statistics.median(self._measured) if self._measured else 0.0
+        window_s = shot.motion.overhead_per_cycle_s + (end_s - shot.clock.now()) / (1 + part)
+        if shot.clock.virtual or not self._measured:
+            window_s = min(window_s, end_s - start_s)
+        return fitting_batches(report, plan, window_s)
 
 
 def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:
@@ -183,9 +202,14 @@ def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:
 
 
 def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = -1) -> None:
-    """Build a tone program, play it and wait for its end.
+    """Prepare a tone program, play it and wait for its end; see :func:`prepare`."""
+    play_prepared(shot, prepare(shot, build, start_s, cycle)[0], cycle)
 
-    On a virtual clock it takes at least the modelled overhead of a cycle, as on real hardware.
+
+def prepare(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int) -> tuple[float, float]:
+    """Build a tone program and upload it.
+
+    On a virtual clock it ends the modelled overhead of a cycle after ``start_s``, or later.
 
     Args:
         shot: The running shot.
@@ -193,21 +217,36 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
         start_s: Start of the cycle on the session's clock; its overhead counts from there.
         cycle: Index of the rearrangement cycle; -1 outside of one.
 
+    Returns:
+        Its playing time, and how long it took to make and upload, in seconds.
+
     Raises:
         LimitError: The program breaks a limit.
-        DeviceError: The mobile tweezers fail, or a watched value is past its limit.
+        DeviceError: The mobile tweezers fail.
     """
     overhead_s = shot.motion.overhead_per_cycle_s
     mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
     with shot.stage("prepare", overhead_s, cycle):
+        began_s = shot.clock.now()
         with shot.stage("tones", cycle=cycle):
             program = build()
         duration_s = _playing_time_s(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
+        took_s = shot.clock.now() - began_s
         if offers(mobile, "timings"):
             for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
                 shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
         if shot.clock.virtual:
             shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
+    return duration_s, took_s
+
+
+def play_prepared(shot: Shot, duration_s: float, cycle: int = -1) -> None:
+    """Play the prepared program and wait for its end.
+
+    Raises:
+        DeviceError: The mobile tweezers fail, or a watched value is past its limit.
+    """
+    mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
     shot.check_interlocks()
     budget_s = duration_s + shot.margin_s("rearrange")
     start = partial(shot.call, "mobile_tweezers", limit_s, mobile.play)

@@ -76,9 +76,8 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
             return f"compiled in {format_quantity(values['duration_s'], 'time')}"
         case "warning":
             return f"warning: {values['text']}"
-        case "window_too_short":
-            where = f"shot {values['shot']}, cycle {values['cycle']}"
-            return f"{where}: {values['n_batches_played']} of {values['n_batches']} batches fit the window"
+        case "window_too_short" | "window_exceeded":
+            return window_text(values)
         case "leader_awaited":
             longest = format_quantity(values["timeout_s"], "time")
             who, signal = values["device"], values["signal"]
@@ -91,6 +90,16 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
             return f"shot {values['shot']}: {values['device']}: {values['command']}"
         case _:
             return ""
+
+
+def window_text(values: Mapping[str, Any]) -> str:
+    """A line about a window that was too short for all batches, or for those that were played."""
+    where = f"shot {values['shot']}, cycle {values['cycle']}"
+    if "late_s" in values:
+        late, window = (format_quantity(values[name], "time") for name in ("late_s", "window_s"))
+        return f"{where}: the moves ended {late} after the window of {window}"
+    fitting = f"{values['n_batches_played']} of {values['n_batches']} batches fit the window"
+    return f"{where}: {fitting}; {format_quantity(values['before_moves_s'], 'time')} passed before the moves"
 
 
 def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:

@@ -155,6 +155,7 @@ class CycleRecord:
         window_s: The window of this cycle, in seconds.
         t_start_s: Start of the cycle, from the start of the shot.
         moves_s: Modelled duration of what was played, overheads included.
+        late_s: How long after the window the moves ended; 0 if they ended in time.
     """
 
     step: int
@@ -165,6 +166,7 @@ class CycleRecord:
     window_s: float
     t_start_s: float
     moves_s: float
+    late_s: float = 0.0
 
     @property
     def n_atom_moves_played(self) -> int:

@@ -293,7 +293,7 @@ CYCLES: Final = Table(
             "report.n_surplus",
         ),
         Field("t_start_s", "f8", "start of the cycle, from the start of the shot"),
-        Field("window_s", "f8", "time that the cycle had for its moves"),
+        Field("window_s", "f8", "time that the cycle had from its start to the end of the moves"),
         Field(
             "planned_duration_s",
             "f8",
@@ -301,6 +301,7 @@ CYCLES: Final = Table(
             "report.duration_s",
         ),
         Field("moves_s", "f8", "modelled duration of what was played, overheads included"),
+        Field("late_s", "f8", "how long after the window the moves ended; 0 if they ended in time"),
     ),
 )
 """Of :class:`CycleRecord`."""

@@ -438,6 +438,7 @@ EVENTS: Final = {
     "over_budget": "a stage took longer than its budget",
     "too_few_atoms": "there are fewer atoms than the target needs",
     "window_too_short": "not all batches of a plan fitted into the window",
+    "window_exceeded": "the moves ended after the window, with the delay",
     "ramped": "the static tweezers have another depth",
     "released": "the static tweezers were off for a moment, and are on again",
     "device_command": "a device carried out a command",

@@ -113,6 +113,50 @@ def test_the_time_that_planning_takes_beyond_the_overhead_shortens_the_window(wi
     assert (cycle.plan.n_batches, cycle.n_batches_played) == (1, n_played)
 
 
+BACK_AND_FORTH = Plan.from_batches([([(0, 2)], [(0, 1)]), ([(0, 1)], [(0, 2)])] * 10)
+
+
+def uploading(part: float, window: float, cycles: int = 2) -> Any:
+    """A rig whose mobile tweezers take a part of the playing time to prepare, and 2 ms on top."""
+    rig = rearranging([HALF], ScriptedPlanner([BACK_AND_FORTH]), window=window, cycles=cycles)
+    prepare = rig.lab.mobile_tweezers.prepare
+
+    def slow(program: Any) -> float:
+        rig.lab.clock.sleep(2e-3 + part * program.total_duration_s)
+        return prepare(program)
+
+    vars(rig.lab.mobile_tweezers)["prepare"] = slow
+    return rig
+
+
+def test_batches_are_chosen_by_how_long_their_preparation_takes():
+    rig = uploading(part=1.5, window=0.030)
+    rig.run()
+    moves = [t for t in rig.record().timing if t.stage == "move"]
+    first, second = rig.record().cycles
+    assert first.plan.n_batches == 20
+    assert 0 < first.n_batches_played < 20
+    assert 0 < second.n_batches_played < 20
+    assert all(move.duration_s <= 0.031 for move in moves)
+    assert [cycle.late_s for cycle in (first, second)] == [0.0, 0.0]
+    n_prepared = [sum(t.stage == "prepare" and t.cycle == k for t in rig.record().timing) for k in (0, 1)]
+    assert n_prepared == [2, 1], "the second cycle knows how long it takes"
+    reported, _ = rig.observer.of("window_too_short")
+    assert reported["before_moves_s"] > 0.025
+    assert not rig.observer.of("window_exceeded")
+
+
+def test_moves_that_end_after_the_window_are_recorded():
+    rig = uploading(part=0.0, window=0.030, cycles=1)
+    wait = rig.lab.mobile_tweezers.wait
+    vars(rig.lab.mobile_tweezers)["wait"] = lambda limit_s: (wait(limit_s), rig.lab.clock.sleep(0.020))
+    rig.run()
+    (cycle,), (reported,) = rig.record().cycles, rig.observer.of("window_exceeded")
+    (move,) = [t for t in rig.record().timing if t.stage == "move"]
+    assert cycle.late_s == reported["late_s"] == pytest.approx(move.duration_s - 0.030)
+    assert cycle.late_s > 0.005
+
+
 def test_an_image_is_needed():
     settings_given = given(
         cycles=1, exposure=0.02, stop_when="never", window_mode="early", window_of=lambda c: 0.06
