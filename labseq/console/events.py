@@ -14,9 +14,21 @@ from labseq.model import RunRecord, ShotRecord
 from labseq.units import format_quantity, written
 
 LASTING: Final = frozenset(
-    {"settling", "compiling", "compiled", "warning", "run_starting", "shot_repeated", "safe_state", "closed"}
+    {
+        "settling",
+        "left_on",
+        "compiling",
+        "compiled",
+        "warning",
+        "run_starting",
+        "shot_repeated",
+        "safe_state",
+        "closed",
+    }
 )
 """Events that must stay on the screen above the live view."""
+FIXED: Final = {"left_on": "the static tweezers stay on; 'labseq safe PROFILE' switches them off"}
+"""Events whose line has no values."""
 NOTICED_S: Final = 1.0
 """A device that settles within this time is not announced."""
 _LOGGED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
@@ -89,7 +101,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "device_command":
             return f"shot {values['shot']}: {values['device']}: {values['command']}"
         case _:
-            return ""
+            return FIXED.get(name, "")
 
 
 def window_text(values: Mapping[str, Any]) -> str:

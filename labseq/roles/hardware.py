@@ -180,6 +180,17 @@ class StaticTweezers(Hardware):
         """
         raise NotImplementedError("these static tweezers cannot release atoms")
 
+    def leave_on(self) -> bool:
+        """Disconnect and leave the light on, if the profile asks for it; after a run that took all its shots.
+
+        From then on ``safe_state`` and ``close`` have no effect, and no watchdog knows of the light. The next
+        ``open()``, as of ``labseq safe``, must be able to switch it off.
+
+        Returns:
+            Whether the light was left on; if not, or if this fails, ``safe_state`` and ``close`` follow.
+        """
+        return False
+
 
 class MobileTweezers(Hardware):
     """The mobile tweezers."""

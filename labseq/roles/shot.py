@@ -454,6 +454,7 @@ EVENTS: Final = {
     "scan_ended": "the scanner chose no further point",
     "scan_result": "an adaptive scan is over: the best point, its value with error, and the suggested values",
     "warning": "something that the user should know; the run continues",
+    "left_on": "the static tweezers stay on after the run",
     "safe_state": "a device was brought to its safe state, or could not be",
     "closed": "a device was closed, or could not be",
     "run_finished": "the run has ended, in whatever way; all devices are in their safe state",

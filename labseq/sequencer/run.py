@@ -305,15 +305,19 @@ class Sequencer:
                     break
         return failed
 
-    def shut_down(self) -> Mapping[str, LabseqError]:
+    def shut_down(self, *, ended_well: bool = False) -> Mapping[str, LabseqError]:
         """Safe state of every device, then close; from any state, any number of times.
+
+        Args:
+            ended_well: Whether the run took all its shots: static tweezers may then be left on, if every
+                other device is safe.
 
         Returns:
             The devices that could not be made safe, and why.
         """
         if self.state is not State.CLOSED:
             if self.state is not State.SAFE:
-                self._secure()
+                self._secure(ended_well=ended_well)
             self._states.to(State.CLOSING, announce=False)
             with self._stop.held():
                 outcome = close_all(self.lab, self.guard)
@@ -325,15 +329,31 @@ class Sequencer:
             self._states.to(State.CLOSED)
         return self._unsafe
 
-    def _secure(self) -> None:
+    def _secure(self, *, ended_well: bool = False) -> None:
         self._states.to(State.MAKING_SAFE, announce=False)
         with self._stop.held():
-            outcome = make_safe(self.lab, self.guard)
+            others = {name for name, _ in self.lab.hardware()} - {"static_tweezers"}
+            outcome = make_safe(self.lab, self.guard, others)
+            event = self._leave_on() if ended_well and not any(outcome.values()) else None
+            outcome |= make_safe(self.lab, self.guard, {"static_tweezers"})
         self._unsafe = {name: error for name, error in outcome.items() if error is not None}
         self._states.to(State.SAFE, announce=False)
         self._announce(State.MAKING_SAFE)  # only now: neither a screen nor a disk may delay the devices
         self._report("safe_state", outcome)
+        if event is not None:
+            self._emit(*event)
         self._announce(State.SAFE)
+
+    def _leave_on(self) -> tuple[str, dict[str, Any]] | None:
+        """Leave the static tweezers on if they are to be; returns the event that reports it, or why not."""
+        name, device = "static_tweezers", self.lab.static_tweezers
+        if not offers(device, "leave_on"):
+            return None
+        try:
+            left = self.guard.call_despite_stop(name, self.lab.timeouts.safe_state_s, device.leave_on)
+        except LabseqError as failure:
+            return "warning", {"text": f"{name} cannot be left on, and are switched off: {failure}"}
+        return ("left_on", {"device": name}) if left else None
 
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
         """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""

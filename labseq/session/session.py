@@ -230,7 +230,7 @@ class Session:
             self._take_shots(lab, writer, record)
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
-        unsafe = self._shut_down()
+        unsafe = self._shut_down(ended_well=error is None)
         self._try(self._observers.finish_analyses)
         if error is None and self.scan_run.is_adaptive:
             self._try(self._report_best, writer.run_dir)
@@ -320,8 +320,8 @@ class Session:
     def _warn(self, text: str) -> None:
         self._observers.event("warning", {"text": text})
 
-    def _shut_down(self) -> Mapping[str, LabseqError]:
-        return self._sequencer.shut_down() if self._sequencer is not None else {}
+    def _shut_down(self, *, ended_well: bool = False) -> Mapping[str, LabseqError]:
+        return self._sequencer.shut_down(ended_well=ended_well) if self._sequencer is not None else {}
 
     def _finish(self, writer: RunWriter, record: RunRecord, error: BaseException | None) -> None:
         status, text = ending(error)

@@ -34,6 +34,9 @@ class RealRadio:
     def __init__(self, device: str) -> None:
         self._device = device
 
+    outlives_run = True
+    """Whether it can stay on when labseq has ended."""
+
     def warm(self) -> None:
         """Do what takes long before the first shot: nothing."""
 

@@ -137,6 +137,13 @@ class Link:
         """Play silence for some samples, then the loop again; wait until that is at the connectors."""
         self._do("release", n_samples=n_samples)
 
+    def leave(self) -> None:
+        """Have the process go on alone; it ends when its marker file is deleted, or by a signal."""
+        self._do("leave")
+        self._closing.set()
+        with contextlib.suppress(OSError):
+            self._in.close()
+
     def check(self) -> None:
         """Check that the stream is alive.
 
@@ -218,6 +225,9 @@ class Link:
                 why = message.get("failed") or message.get("ended") or why
                 self._news.notify_all()
         code = self._process.wait()
+        if self._closing.is_set():
+            with contextlib.suppress(OSError):
+                self._out.close()
         with self._news:
             self._ended = why or f"its streaming process ended with code {code}{self._last_line()}"
             self._news.notify_all()

@@ -87,6 +87,11 @@ class SoapySettings(Settings):
         description="the light when labseq is killed or hangs: ramped down, or held until labseq opens "
         "the radio again",
     )
+    after_run: Literal["off", "on"] = Field(
+        default="off",
+        description="the light after a run that took all its shots: ramped down, or left on until the next "
+        "labseq opens the radio (a run, `labseq devices`, `labseq safe`)",
+    )
     patience: Annotated[Duration, Field(ge=0.2, le=3600)] = Field(
         default=5.0, description="with `ramp_down`: how long labseq may be silent before it counts as hung"
     )

@@ -216,6 +216,32 @@ class SoapyStaticTweezers(StaticTweezers):
             link.switch_off()
             self._depth = 0.0
 
+    @property
+    def idle_output(self) -> str:
+        """The array, if it stays on."""
+        return "the array stays on after the run" if self._settings.after_run == "on" else ""
+
+    def leave_on(self) -> bool:
+        """Have the streaming process go on without labseq, at the present depth, if ``after_run`` is on.
+
+        Raises:
+            TransientError: The radio ran out of samples while the array was on.
+            DeviceError: The stream is dead.
+        """
+        link = self._link
+        if (
+            self._settings.after_run == "off"
+            or link is None
+            or not self._depth
+            or not self.radio.outlives_run
+        ):
+            return False
+        self._checked()
+        link.leave()
+        self._link = None
+        self._disconnect()
+        return True
+
     def emergency(self) -> Emergency | None:
         """The streaming process is ended, and closes the radio; None if the light is to be held."""
         if self._link is None or self._settings.on_exit == "hold":

@@ -105,6 +105,11 @@ class SimulatedRadio:
         """Compile it."""
         build_module(self._name)
 
+    @property
+    def outlives_run(self) -> bool:
+        """Whether it can stay on when labseq has ended: only if its files are in a folder that stays."""
+        return self._given
+
     def connect(self) -> tuple[str, Mapping[str, str], Path]:
         """Make the radio available.
 

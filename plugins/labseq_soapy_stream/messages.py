@@ -8,6 +8,7 @@ labseq's first line is a :class:`Setup`; then come commands, each with a key ``d
 ``loop``    ``id``, ``file``, ``fade_s``           ``{"done": id}`` when it is at the connectors
 ``ramp``    ``id``, ``depth``, ``duration_s``      the same
 ``release``  ``id``, ``n_samples``                 the same; silence, then the loop at the same depth
+``leave``   ``id``                                 the same; it then goes on without labseq
 ``end``     none                                   none: it ramps down, closes the radio and ends
 ``beat``    none                                   none: shows that labseq is alive
 ==========  =====================================  ==============================================

@@ -142,6 +142,10 @@ class Streamer:
             case "release":
                 self._output.release(message["n_samples"])
                 self._begin(message["id"])
+            case "leave":
+                self._setup = replace(self._setup, hold=True)
+                self._continue_alone("")
+                self._post({"done": message["id"]})
             case "end":
                 self._leave("")
             case "fail":

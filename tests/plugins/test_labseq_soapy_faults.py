@@ -17,6 +17,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from labseq_soapy import link, static_tweezers
+from labseq_soapy.access import marker_of
 from labseq_soapy_sim import Fault, Ring
 from labseq_soapy_stream import soapysdr
 from labseq_soapy_stream.soapysdr import SoapyError
@@ -25,7 +26,16 @@ from labseq_soapy_stream.streamer import Streamer, raise_priority, repeated
 from labseq import DeviceError, TransientError
 from labseq.errors import StopRequested
 
-from .labseq_soapy_rig import Rig, another_labseq, assert_ramped_down, made, opened, recorded, until
+from .labseq_soapy_rig import (
+    SMALL,
+    Rig,
+    another_labseq,
+    assert_ramped_down,
+    made,
+    opened,
+    recorded,
+    until,
+)
 
 
 def raised(kind: type[Exception], call: Callable[[], object]) -> Callable[[], bool]:
@@ -282,6 +292,29 @@ def test_with_hold_the_light_stays_until_the_next_labseq_ends_it(tmp_path: Path)
         assert not any(alone())
         assert not rig.ring.latest(100).any()
         rig.tweezers.start()
+
+
+def test_left_on_after_the_run_the_light_stays_until_the_next_labseq_ends_it(tmp_path: Path) -> None:
+    marker = marker_of(f"{SMALL['device']},folder={tmp_path},record=10000000")
+    with opened(arguments=f"folder={tmp_path},record=10000000", after_run="on") as rig:
+        assert not rig.tweezers.leave_on(), "it was not on"
+        rig.tweezers.start()
+        assert rig.tweezers.emergency() is not None, "until then the watchdog switches it off"
+        assert rig.tweezers.leave_on()
+        assert rig.tweezers.emergency() is None
+        rig.tweezers.safe_state()
+        rig.tweezers.close()
+        ring, number = Ring(tmp_path), marker.read_text("ascii")
+        assert np.abs(ring.latest(100)).max() > 0.1
+    until(lambda: ring.is_playing)
+    assert marker.read_text("ascii") == number
+    n_lit = np.count_nonzero(recorded(tmp_path))
+    until(lambda: bool(np.count_nonzero(recorded(tmp_path)) > n_lit + 50_000))
+    with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
+        assert not marker.exists()
+        assert not rig.ring.latest(100).any()
+        rig.tweezers.start()
+        assert not rig.tweezers.leave_on(), "after_run is off by default"
 
 
 class Sink:

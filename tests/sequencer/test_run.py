@@ -139,6 +139,40 @@ def test_between_shots_a_device_is_made_safe_closed_and_opened_again():
     assert not rig.sequencer.shut_down()
 
 
+@pytest.mark.parametrize(
+    ("ended_well", "camera", "leaves"),
+    [(True, None, True), (True, None, False), (True, None, None), (False, None, True), (True, "stuck", True)],
+)
+def test_static_tweezers_stay_on_only_after_a_good_run_with_all_else_safe(ended_well, camera, leaves):
+    rig = Rig(fail_on={"camera.safe_state": DeviceError("camera", camera)} if camera else {})
+    asked = []
+
+    def leave_on(_):
+        asked.append(rig.made_safe())
+        if leaves is None:
+            raise DeviceError("static_tweezers", "the stream is dead")
+        return leaves
+
+    tweezers = rig.lab.static_tweezers
+    tweezers.__class__ = type("LeftOn", (type(tweezers),), {"leave_on": leave_on})
+    rig.sequencer.open()
+    rig.sequencer.run([0])
+    rig.sequencer.shut_down(ended_well=ended_well)
+    assert asked == ([SAFE_ORDER[:-1]] if ended_well and not camera else [])
+    assert rig.made_safe() == SAFE_ORDER, "of no effect on a device that has disconnected"
+    assert rig.observer.of("left_on") == ([{"device": "static_tweezers"}] if asked and leaves else [])
+    assert [*rig.observer.of("warning")] == (
+        []
+        if leaves is not None
+        else [
+            {
+                "text": "static_tweezers cannot be left on, and are switched off: "
+                "static_tweezers: the stream is dead"
+            }
+        ]
+    )
+
+
 def test_a_change_of_planner_and_steps_touches_no_device():
     rig = Rig()
     rig.sequencer.open()
