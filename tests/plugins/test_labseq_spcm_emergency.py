@@ -41,14 +41,16 @@ grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
 plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 50)
 
-def tweezers(state, mode, speed_m_s, n_batches, trigger="software"):
+def tweezers(state, mode, speed_m_s, n_batches, trigger="software", keep_warm=None):
     rf = RfSpec(row_band_hz=band, column_band_hz=band)
-    motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=speed_m_s, rf=rf)
+    motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=speed_m_s, eject_slots=0, rf=rf)
     card = f"simulated@{sys.argv[1]}/{state}"
-    settings = SpcmSettings(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=0.1)
+    settings = dict(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=0.1, keep_warm=keep_warm)
+    settings = SpcmSettings.model_validate(settings)
     device = SpcmMobileTweezers(settings, Context("mobile_tweezers", grid, motion=motion))
     device.open()
-    device.prepare(tone_program(plan, grid, motion, n_batches))
+    if n_batches:
+        device.prepare(tone_program(plan, grid, motion, n_batches))
     return device
 
 devices = {
@@ -59,14 +61,21 @@ devices = {
     "replay": tweezers("replay", "replay", 1.5e-5, 1),
     "fifo": tweezers("fifo", "fifo", 1e-5, 50),
 }
-prepared = tweezers("prepared", "replay", 0.130, 1)
+parked = {"row_frequency": 10e6, "column_frequency": 10e6}
+idle = {
+    "prepared": tweezers("prepared", "replay", 0.130, 1),
+    "warm": tweezers("warm", "replay", 0.130, 0, keep_warm=parked),
+    "warm_dds": tweezers("warm_dds", "dds", 0.130, 0, keep_warm=parked),
+}
 jobs = {
     state: (str(found.script), dict(found.arguments))
-    for state, device in {**devices, "prepared": prepared}.items()
+    for state, device in {**devices, **idle}.items()
     if (found := device.emergency())
 }
 print(json.dumps(jobs), flush=True)
 sys.stdin.readline()
+idle["warm"].settle()
+idle["warm_dds"].settle()
 for device in devices.values():
     device.play()
 threading.Thread(target=devices["fifo"].wait, args=(1e3,), daemon=True).start()
@@ -76,7 +85,8 @@ assert card.spcm.spcm_dwSetParam_i64(card._card.handle(), 30010, 9000) == 0x101 
 print("on", flush=True)
 sys.stdin.read()
 """
-STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "dds"}
+STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "dds", "warm", "warm_dds"}
+ENDLESS = ("dds", "locked", "warm", "warm_dds")
 
 
 class Scope:
@@ -117,7 +127,7 @@ def scope(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scope]:
 def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
     """The reason for all of this: outputs on, and in the mode dds for ever."""
     assert set(scope.after_death) == STATES
-    assert scope.after_death["dds"] == scope.after_death["locked"] == (True, (True, True))
+    assert {scope.after_death[state] for state in ENDLESS} == {(True, (True, True))}
     assert scope.after_death["replay"] == (True, (True, True))
     assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
     assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"
@@ -133,7 +143,7 @@ def test_a_plain_process_brings_its_outputs_to_zero(scope: Scope, state: str) ->
     for channel in (0, 1):
         end_s = scope.end_s(state, channel)
         assert end_s <= done.end_s
-        if state in ("dds", "locked"):
+        if state in ENDLESS:
             assert end_s > done.start_s, "it played until then"
     assert scope.again[state].text == done.text, "it can be repeated"
     assert not scope.heavy_modules
