@@ -33,12 +33,25 @@ def test_a_line_is_drawn_where_it_is_on() -> None:
     assert lines_table({}, 1.0, "#") == []
 
 
-def test_a_check_names_the_devices_that_it_did_not_ask(capsys: pytest.CaptureFixture[str]) -> None:
-    check_sequence(Path(SEQUENCE), "lab", [], "off", as_json=False)
+def test_a_check_names_the_devices_that_it_did_not_ask_and_what_stays_on(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    warm = "profile.mobile_tweezers.keep_warm={row_frequency: 82.2 MHz, column_frequency: 117.8 MHz}"
+    overrides = [warm, "profile.static_tweezers.after_run=on"]
+    check_sequence(Path(SEQUENCE), "lab", overrides, "off", as_json=False)
+    shown = capsys.readouterr().out
     row = "not opened       camera, static_tweezers, mobile_tweezers, lines, shutter: limits that only"
-    assert row in capsys.readouterr().out
+    assert row in shown
+    assert (
+        "output           when nothing plays\n"
+        "static_tweezers  the array stays on after the run\n"
+        "mobile_tweezers  keep-warm tones off the atoms: 82.2 MHz (2 mW) and 117.8 MHz (2 mW), dark"
+        " from upload to start\n"
+    ) in shown
     check_sequence(Path(SEQUENCE), "lab", [], "full", as_json=False)
-    assert "not opened" not in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "not opened" not in shown
+    assert "when nothing plays" not in shown
 
 
 def test_timeline_table() -> None:
