@@ -63,9 +63,16 @@ def exit_code(report: DevicesReport) -> int:
 
 
 def table(report: DevicesReport) -> list[str]:
-    """A row per device."""
+    """A row per device; below it one for each of their versions."""
     rows = [_HEADER, *(_row(found, report.plugins[found.name]) for found in report.devices)]
-    return columns(rows, right=(_HEADER.index("latency"),))
+    versions = [
+        (found.name, what, clean(here) or "unknown", tried or "none", "differs" * differs)
+        for found in report.devices
+        for what, (here, tried) in found.versions.items()
+        for differs in [bool(tried) and here not in tried.split(", ")]
+    ]
+    below = ["", *columns([("device", "version of", "here", "tried with", ""), *versions])]
+    return [*columns(rows, right=(_HEADER.index("latency"),)), *(below if versions else ())]
 
 
 def _row(found: CheckedDevice, plugin: str) -> tuple[str, ...]:
@@ -93,6 +100,9 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
             "model": found.described.get("model"),
             "serial_number": found.described.get("serial_number"),
             "firmware": found.described.get("firmware"),
+            "versions": {
+                what: {"here": here, "tried": tried} for what, (here, tried) in found.versions.items()
+            },
             "latency_s": found.latency_s,
             "self_test": found.tested,
             "described": found.described,

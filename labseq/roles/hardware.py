@@ -69,6 +69,14 @@ class Hardware(ABC):
     def describe(self) -> Mapping[str, Any]:
         """Model, serial number, firmware, current settings: JSON-ready values."""
 
+    def versions(self) -> Mapping[str, tuple[str, str]]:
+        """Versions of packages, libraries and firmware of the open device, for ``labseq devices``.
+
+        Each name -> the version found, and those that the driver was tried with, separated by ", "; "" where
+        there is none.
+        """
+        return {}
+
     @property
     def idle_output(self) -> str:
         """What it puts out when nothing plays, in a few words for ``labseq check``; "" for nothing."""

@@ -39,6 +39,7 @@ class CheckedDevice:
     Attributes:
         name: Its role, or its name in the profile.
         described: The device's own description; empty if the check failed before it.
+        versions: See ``Hardware.versions``.
         tested: Whether it passed its self test; False also if it has none.
         latency_s: Time of a ``describe()``, from the call to the answer; None if the check failed before it.
         constructed: Whether its plugin could construct it; if not, ``failure`` says why.
@@ -49,6 +50,7 @@ class CheckedDevice:
 
     name: str
     described: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    versions: Mapping[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     tested: bool = False
     latency_s: float | None = None
     constructed: bool = True
@@ -184,6 +186,8 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts, watchdog
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
         found = replace(found, described=described)
+        if offers(device, "versions"):
+            found = replace(found, versions=dict(guard.call(name, timeouts.call_s, device.versions)))
         if offers(device, "self_test"):
             guard.call(name, timeouts.call_s, device.self_test)
             found = replace(found, tested=True)

@@ -34,7 +34,7 @@ from labseq_andor.codes import (
     Triggers,
     explain,
 )
-from labseq_andor.library import library_for, load_pylablib
+from labseq_andor.library import library_for, load_pylablib, pylablib_version
 from labseq_andor.sdk import Sdk, code_of
 from labseq_andor.settings import AndorSettings
 from labseq_andor.setup import set_up
@@ -104,6 +104,15 @@ class AndorCamera(CameraDriver):
         with suppress(DeviceError):  # open() reports what is missing
             load_pylablib(self._name)
         self.library.warm(self.facts.em_gain)
+
+    def versions(self) -> Mapping[str, tuple[str, str]]:
+        """Those of the package, the SDK and the camera; no real camera was tried."""
+        found = self._reported
+        return {
+            "package pylablib": (pylablib_version(), "1.4.3, 1.4.5"),
+            "SDK2": (found.get("sdk_version", ""), ""),
+            "firmware": (found.get("firmware", ""), ""),
+        }
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also what the camera reports, and its current state."""

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import lru_cache, partial
+from importlib import metadata
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -84,6 +85,12 @@ def load_pylablib(name: str) -> Any:
         text = f"the Python package 'pylablib' cannot be imported ({error})"
         install = f"install it with {install_hint('andor')}"
         raise DeviceError(name, f"{text}; {install}; {OTHERWISE}") from error
+
+
+def pylablib_version() -> str:
+    """Version of the package, which has two names; "" if it was not installed as one."""
+    found = {one.name: one.version for one in metadata.distributions() if one.name.startswith("pylablib")}
+    return found.get("pylablib") or found.get("pylablib-lightweight", "")
 
 
 @contextmanager

@@ -5,7 +5,13 @@ that the process of a simulated camera starts fast.
 """
 
 from labseq_aravis.camera import Camera, FoundCamera, find_cameras
-from labseq_aravis.library import AravisError, LibraryMissingError, PixelFormatError, load_library
+from labseq_aravis.library import (
+    AravisError,
+    LibraryMissingError,
+    PixelFormatError,
+    library_version,
+    load_library,
+)
 from labseq_aravis.stream import Buffer, Stream, StreamOptions
 
 __all__ = [
@@ -18,5 +24,6 @@ __all__ = [
     "Stream",
     "StreamOptions",
     "find_cameras",
+    "library_version",
     "load_library",
 ]

@@ -132,6 +132,9 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_get_device_serial_nbr": "s u",
     "arv_get_device_vendor": "s u",
     "arv_get_interface_id": "s u",
+    "arv_get_major_version": "u ",
+    "arv_get_micro_version": "u ",
+    "arv_get_minor_version": "u ",
     "arv_get_n_devices": "u ",
     "arv_get_n_interfaces": "u ",
     "arv_update_device_list": "v ",
@@ -335,6 +338,12 @@ def load_library() -> Library:
         if _library is None:
             _library = Library()
         return _library
+
+
+def library_version() -> str:
+    """Version of the library, such as "0.8.26"."""
+    parts = (getattr(load_library(), f"arv_get_{part}_version")() for part in ("major", "minor", "micro"))
+    return ".".join(map(str, parts))
 
 
 def text(value: bytes | None) -> str:

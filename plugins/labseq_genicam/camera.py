@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
+from labseq_aravis import library_version
+
 from labseq.plugin import CameraDriver, CameraFacts, Context, DeviceError, ExposureResult, Series, wait_for
 from labseq_genicam.acquisition import Acquisition
 from labseq_genicam.connection import Link, connection_for
@@ -52,6 +54,13 @@ class GenicamCamera(CameraDriver):
     def warm(self) -> None:
         """Do slow work that can be done before the camera is opened."""
         self._connection.warm()
+
+    def versions(self) -> Mapping[str, tuple[str, str]]:
+        """Those of libaravis and the camera; no real camera was tried."""
+        return {
+            "libaravis": (library_version(), "0.8.26"),
+            "firmware": (self._reported.get("firmware", ""), ""),
+        }
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also what the camera reports, and its temperature in kelvins."""

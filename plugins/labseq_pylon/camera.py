@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+from importlib import metadata
 from typing import Any
 
 from labseq.plugin import CameraDriver, CameraFacts, Context, DeviceError, ExposureResult, Series
@@ -46,6 +47,15 @@ class PylonCamera(CameraDriver):
         with suppress(DeviceError):  # open() reports what is missing
             load_pypylon(self._name)
         self._connection.warm()
+
+    def versions(self) -> Mapping[str, tuple[str, str]]:
+        """Those of the package, pylon and the camera; no real camera was tried."""
+        found = self._reported
+        return {
+            "package pypylon": (metadata.version("pypylon"), "26.9"),
+            "pylon": (found.get("pylon_version", ""), "12.4.2"),
+            "firmware": (found.get("firmware") or "", ""),
+        }
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also what the camera reports, and its temperature in kelvins."""

@@ -269,6 +269,12 @@ class SoapyStaticTweezers(StaticTweezers):
         except LimitError as error:
             raise DeviceError(self._name, f"it cannot play the calibrated amplitudes: {error}") from error
 
+    def versions(self) -> Mapping[str, tuple[str, str]]:
+        """Those that SoapySDR and the radio's module report; no real radio was tried."""
+        radio = {} if self._facts is None else self._facts.radio
+        found = {name: (value, "") for name, value in radio.items() if "version" in name}
+        return found | ({"SoapySDR": (radio["SoapySDR"], "0.8.1-3")} if "SoapySDR" in radio else {})
+
     def describe(self) -> Mapping[str, Any]:
         """Settings, depth, amplitudes; once opened, also the radio, the loop and underflows."""
         given = self._amplitudes

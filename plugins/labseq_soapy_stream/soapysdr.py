@@ -102,6 +102,7 @@ _SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
     "Kwargs_clear": (None, (POINTER(_Kwargs),)),
     "Strings_clear": (None, (POINTER(c_void_p), c_size_t)),
     "_errToStr": (c_char_p, (c_int,)),
+    "_getLibVersion": (c_char_p, ()),
     "_free": (None, (c_void_p,)),
 }
 """Name after "SoapySDR" -> type of the result, types of the arguments."""
@@ -162,7 +163,8 @@ class Radio:
         info = _call("getHardwareInfo", self._device)
         details = {info.keys[i].decode(): info.vals[i].decode() for i in range(info.size)}
         library().SoapySDRKwargs_clear(byref(info))
-        return {"driver": self._text("getDriverKey"), "hardware": self._text("getHardwareKey"), **details}
+        own = {"driver": self._text("getDriverKey"), "hardware": self._text("getHardwareKey")}
+        return {**own, "SoapySDR": library().SoapySDR_getLibVersion().decode(), **details}
 
     @property
     def n_channels(self) -> int:

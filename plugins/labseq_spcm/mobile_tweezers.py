@@ -34,7 +34,7 @@ from labseq_spcm.dds import Dds, choose_cores, compile_commands
 from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
-from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output
+from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output, versions
 from labseq_spcm.settings import SpcmSettings
 
 RAMP_S: Final = 0.3e-3
@@ -42,6 +42,8 @@ RAMP_S: Final = 0.3e-3
 RAMP_STEPS: Final = 15
 HOT_C: Final = 80
 """Highest temperature that passes the self test, in degrees Celsius (our choice)."""
+RECOVERY: Final = 2
+"""Type of the firmware with which a card starts if its own cannot be loaded."""
 TEST_SAMPLES: Final = 1 << 16
 """Samples of both outputs, all 0, that the self test sends to the card's memory."""
 
@@ -359,7 +361,7 @@ class SpcmMobileTweezers(MobileTweezers):
             set_amplitude(card, round(self._amplitude_mv - drop_mv))
 
     def self_test(self) -> None:
-        """Check the card's temperatures, its clock and its memory, outputs off; drops the prepared program.
+        """Check the card's firmware, temperatures, clock and memory, outputs off; drops the prepared program.
 
         Samples are sent in the mode ``replay`` only: the others do not use the memory as a whole.
 
@@ -371,6 +373,9 @@ class SpcmMobileTweezers(MobileTweezers):
         self._duration_s = None
         card.stop()
         spcm = card.spcm
+        if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == RECOVERY:
+            text = "the card runs its recovery firmware; restart the computer, else update the firmware"
+            raise DeviceError(self._name, f"{text} with Spectrum's Control Center")
         sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("output module", spcm.SPC_MON_TC_MODULE_0))
         for place, register in sensors:
             temperature_c = card.read(register)
@@ -386,6 +391,10 @@ class SpcmMobileTweezers(MobileTweezers):
             frames[:] = 0
             card.set(spcm.SPC_MEMSIZE, TEST_SAMPLES, "memory size")
             card.upload(frames)
+
+    def versions(self) -> Mapping[str, tuple[str, str]]:
+        """Those of the package, the drivers and the card's firmware."""
+        return versions(self._opened()[0])
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also the card and every value that it read back."""

@@ -6,6 +6,7 @@ snaps others.
 
 from __future__ import annotations
 
+from importlib import metadata
 from typing import Any, Final
 
 from labseq.plugin import DeviceError
@@ -48,17 +49,33 @@ def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str
     rate_hz = _set_clock(card, settings)
     _set_outputs(card, amplitude_mv)
     _set_trigger(card, settings)
-    version = card.read(card.spcm.SPC_GETDRVVERSION)
     is_dds = settings.mode == "dds"
     return {
         "model": card.product,
         "serial_number": card.serial_number,
-        "driver_version": f"{version >> 24}.{version >> 16 & 0xFF}.{version & 0xFFFF}",
+        "driver_version": _version(card, card.spcm.SPC_GETDRVVERSION),
         "sample_rate_hz": rate_hz,
         "trigger_delay_s": limits.DDS_DELAY_S if is_dds else limits.trigger_delay_s(rate_hz),
         "amplitude_mv": amplitude_mv,
         "trigger_level_mv": card.read(card.spcm.SPC_TRIG_EXT0_LEVEL0),
     }
+
+
+def versions(card: AwgCard) -> dict[str, tuple[str, str]]:
+    """Versions of the vendor's software and of the firmware: found, tried; no real card was."""
+    spcm = card.spcm
+    return {
+        "package spcm": (metadata.version("spcm"), "1.13.4"),
+        "driver": (_version(card, spcm.SPC_GETDRVVERSION), ""),
+        "kernel driver": (_version(card, spcm.SPC_GETKERNELVERSION), ""),
+        "main control firmware": (str(card.read(spcm.SPCM_FW_CTRL) & 0xFFFF), ""),
+    }
+
+
+def _version(card: AwgCard, register: int) -> str:
+    """Major, minor, build, as the manual has them in one register."""
+    value = card.read(register)
+    return f"{value >> 24}.{value >> 16 & 0xFF}.{value & 0xFFFF}"
 
 
 def _set_clock(card: AwgCard, settings: SpcmSettings) -> float:

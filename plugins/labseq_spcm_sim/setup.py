@@ -37,6 +37,7 @@ class CardModel:
         bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
         n_dds_cores: DDS cores on the chip; that a 6631 has 23 is not measured.
         temperature_c: What its sensors read, in degrees Celsius (ours).
+        firmware_type: 1 for its own, 2 for the recovery firmware.
         dds_queue: Commands that the DDS queue holds (an M4i.9622 reads 4098).
     """
 
@@ -53,11 +54,14 @@ class CardModel:
     bus_bytes_per_s: float = 2.8e9
     n_dds_cores: int = 23
     temperature_c: int = 45
+    firmware_type: int = 1
     dds_queue: int = 4096
 
 
 M4I6631: Final = CardModel()
 
+FIRMWARE: Final = 1
+"""Version of the main control's firmware (ours)."""
 MEMORY_STEP: Final = 32
 """Step and minimum of the memory size, in samples per channel."""
 MAX_LOOPS: Final = 2**32 - 1
@@ -321,6 +325,8 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_READAOGAINMAX: model.amplitude_mv[1],
         r.SPC_MON_TC_BASE_CTRL: model.temperature_c,
         r.SPC_MON_TC_MODULE_0: model.temperature_c,
+        r.SPCM_FW_CTRL: 1 << 16 | FIRMWARE,
+        r.SPCM_FW_CTRL_ACTIVE: model.firmware_type << 28 | FIRMWARE << 16,
         r.SPC_AVAILCARDMODES: sum(_MODES),
         r.SPC_AVAILMEMSIZE_MIN: MEMORY_STEP,
         r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,

@@ -42,6 +42,9 @@ class Fine(VirtualDevice):
     def self_test(self):
         pass
 
+    def versions(self):
+        return {"library": ("1.3", "1.2, 1.3"), "firmware": ("2.4", "2.3"), "board": ("", "")}
+
 
 def jam(self):
     raise OSError("jammed")
@@ -74,8 +77,8 @@ def write(shutter: str) -> None:
 
 
 def rows(out: str) -> dict[str, str]:
-    """Device -> its row, without the header."""
-    return {line.split()[0]: line for line in out.splitlines()[1:]}
+    """Device -> its row, without the header and the versions below."""
+    return {line.split()[0]: line for line in out.split("\n\n", maxsplit=1)[0].splitlines()[1:]}
 
 
 def test_a_device_that_works_is_reported_with_model_serial_number_and_firmware(call: Any) -> None:
@@ -87,6 +90,12 @@ def test_a_device_that_works_is_reported_with_model_serial_number_and_firmware(c
     shutter = rows(out)["shutter"].split()
     assert (shutter[:5], shutter[-1]) == (["shutter", "fine", "SH-1", "17", "2.4"], "ok")
     assert rows(out)["simulation"].endswith("ok, no self test")
+    below = [line.split() for line in out.splitlines() if line.startswith("shutter")][1:]
+    assert below == [
+        ["shutter", "library", "1.3", "1.2,", "1.3"],
+        ["shutter", "firmware", "2.4", "2.3", "differs"],
+        ["shutter", "board", "unknown", "none"],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -141,6 +150,11 @@ def test_json_holds_all_that_a_device_says_of_itself(call: Any) -> None:
         "model": "SH-1",
         "serial_number": 17,
         "firmware": "2.4",
+        "versions": {
+            "library": {"here": "1.3", "tried": "1.2, 1.3"},
+            "firmware": {"here": "2.4", "tried": "2.3"},
+            "board": {"here": "", "tried": ""},
+        },
         "latency_s": None,
         "self_test": False,
         "described": {"model": "SH-1", "serial_number": 17, "firmware": "2.4", "odd": None},

@@ -584,6 +584,13 @@ def test_a_hot_card_is_reported(driver: Any, above_c: int, well: bool) -> None:
             lab.tweezers.self_test()
 
 
+def test_a_card_with_its_recovery_firmware_is_reported(driver: Any) -> None:
+    with driver(model=replace(M4I6631, firmware_type=2)) as lab:
+        assert lab.tweezers.versions()["driver"] == ("7.9.22000", "")
+        with pytest.raises(DeviceError, match="the card runs its recovery firmware"):
+            lab.tweezers.self_test()
+
+
 def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> None:
     with driver() as lab:
         lab.card.write(20000, 100_000_000)
