@@ -57,12 +57,14 @@ class ChosenPlugin:
         settings: Its settings; None if it takes none.
         document: The file that chose it; None if no file did.
         loc: Location of its settings in that file.
+        by_line: Whether a line of the profile triggers it, whatever its setting ``trigger`` is.
     """
 
     entry: Entry
     settings: Settings | None
     document: Document | None = None
     loc: Loc = ()
+    by_line: bool = False
 
     @property
     def virtual_time(self) -> bool:
@@ -70,7 +72,8 @@ class ChosenPlugin:
         simulated = self.entry.simulated
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
-        return self.settings.model_copy(update=dict(simulated)) == self.settings
+        update = {key: value for key, value in simulated.items() if key != "trigger" or not self.by_line}
+        return self.settings.model_copy(update=update) == self.settings
 
     def identities(self, role: str) -> tuple[str, ...]:
         """What only one process can use, of the hardware of a role; () if all of it is simulated."""

@@ -27,6 +27,7 @@ from labseq.motion import standing_on_sites
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Clock, Context
+from labseq.sequencer.lines import trigger_line
 from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
 from labseq.settings import Choice
 
@@ -198,7 +199,9 @@ def choose_plugins(
             refused[role] = ConfigError("what the profile says of it is wrong")
             continue
         try:
-            chosen[role], warning = choose(host, document, kind, choice, dry_run)
+            one, warning = choose(host, document, kind, choice, dry_run)
+            by_line = kind == role and trigger_line(spec.line_specs, role) is not None
+            chosen[role] = replace(one, by_line=by_line)
             warnings += [f"{role}: {warning}"] if warning else []
         except ConfigError as error:
             refused[role] = error

@@ -33,6 +33,11 @@ shot:
 """
 
 
+LINE = """
+lines: {use: virtual, channels: {awg: {channel: 7, on: [rearrange], pulse: 1 ms, triggers: mobile_tweezers}}}
+"""
+
+
 def profile(folder: Path, mobile: str) -> str:
     path = folder / "p.yaml"
     path.write_text(PROFILE.replace("MOBILE", mobile), encoding="utf-8")
@@ -45,6 +50,7 @@ def profile(folder: Path, mobile: str) -> str:
         ("{use: spcm, card: simulated, mode: fifo, sample_rate: 250 MHz}", True),
         ("{use: spcm, card: /dev/spcm0}", False),
         ("{use: spcm, card: simulated, trigger: external}", False),  # somebody else must give it
+        ("{use: spcm, card: simulated, trigger: external}" + LINE, True),
     ],
 )
 def test_a_driver_needs_no_real_time_if_it_is_set_up_as_in_a_dry_run(
