@@ -24,7 +24,7 @@ from labseq.plain import now_utc, parse_object
 from labseq.units import format_quantity
 
 FORMAT: Final = "labseq-calibration"
-FORMAT_VERSION: Final = "1.0"
+FORMAT_VERSION: Final = "2.0"
 """major.minor; this labseq reads files of the same or an older major version."""
 
 SUFFIX: Final = ".json"
@@ -94,7 +94,7 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
     """Read a JSON object with the keys ``format`` and ``format_version``.
 
     Raises:
-        ConfigError: It is missing, damaged, of another format, or written by a newer labseq.
+        ConfigError: It is missing, damaged, of another format, or written by an older or newer labseq.
     """
     try:
         content = parse_object(read_file(path))
@@ -109,9 +109,11 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
     major = version.partition(".")[0]
     if not major.isdecimal():
         raise damaged(path, f"its format version is '{version}'")
-    if int(major) > int(FORMAT_VERSION.partition(".")[0]):
-        what, expected = f"its format version is {version}", f"{FORMAT_VERSION} or older"
-        raise ConfigError(Problem(what, str(path), expected=expected, hint="update labseq"))
+    newer = int(major) - int(FORMAT_VERSION.partition(".")[0])
+    if newer:
+        hint = "update labseq" if newer > 0 else "calibrate again; an earlier labseq wrote it"
+        what = f"its format version is {version}"
+        raise ConfigError(Problem(what, str(path), expected=FORMAT_VERSION, hint=hint))
     return content
 
 

@@ -104,9 +104,13 @@ def test_what_is_wrong_with_a_file_is_reported(tmp_path: Path, changes: dict[str
 
 
 def test_a_file_of_a_newer_labseq_is_refused_and_one_with_more_in_it_is_not(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"its format version is 2.0; expected 1.0 or older; update labseq"):
-        read_entry(changed(tmp_path, format_version="2.0"))
-    assert read_entry(changed(tmp_path, format_version="1.7", new="x")).kind == "overlay"
+    with pytest.raises(ConfigError, match=r"its format version is 3.0; expected 2.0; update labseq"):
+        read_entry(changed(tmp_path, format_version="3.0"))
+    with pytest.raises(
+        ConfigError, match=r"is 1.7; expected 2.0; calibrate again; an earlier labseq wrote it"
+    ):
+        read_entry(changed(tmp_path, format_version="1.7"))
+    assert read_entry(changed(tmp_path, format_version="2.7", new="x")).kind == "overlay"
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"[" * 100_000, b"\xff", b"1" * 5000])

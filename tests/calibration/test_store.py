@@ -121,7 +121,7 @@ def test_a_renamed_or_exchanged_file_is_refused(store: Store) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    ["{", "[]", '{"format": "labseq-active-calibrations", "format_version": "1.0", "history": [{}]}'],
+    ["{", "[]", '{"format": "labseq-active-calibrations", "format_version": "2.0", "history": [{}]}'],
 )
 def test_a_damaged_note_of_what_is_in_use_is_refused(store: Store, content: str) -> None:
     stored = store.add(overlay())
