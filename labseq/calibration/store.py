@@ -25,7 +25,7 @@ from labseq.units import format_quantity
 
 FORMAT: Final = "labseq-calibration"
 FORMAT_VERSION: Final = "2.0"
-"""major.minor; this labseq reads files of the same or an older major version."""
+"""major.minor; this labseq reads files of the same major version."""
 
 SUFFIX: Final = ".json"
 PICTURE_SUFFIX: Final = ".png"
@@ -67,7 +67,7 @@ def read_entry(path: Path) -> CalibrationEntry:
     """Read an entry's file.
 
     Raises:
-        ConfigError: It is missing, damaged, changed by hand, or written by a newer labseq.
+        ConfigError: It is missing, damaged, changed by hand, or written by an older or newer labseq.
     """
     content = read_object(path, FORMAT)
     try:
