@@ -13,6 +13,7 @@ from pathlib import PurePath
 from typing import Any, Final, cast
 
 _MAX_DEPTH: Final = 32
+_MAX_PARTS: Final = 500_000
 _MAX_BITS: Final = 4096  # Python refuses to write much longer integers in decimal
 
 
@@ -110,7 +111,7 @@ def _repr(value: Any) -> str:
 
 
 def parse_object(data: bytes) -> dict[str, Any] | None:
-    """Read a JSON object; None if it is anything else, or nested deeper than 32."""
+    """Read a JSON object; None if it is anything else, nested too deep, or of too many parts."""
     if data[:1].isalnum():  # a million of such lines would take 10 s
         return None
     try:
@@ -121,17 +122,20 @@ def parse_object(data: bytes) -> dict[str, Any] | None:
 
 
 def parse_value(data: bytes | str) -> Any:
-    """Read JSON of limited depth.
+    """Read JSON of limited depth and size: at most 32 levels, and 500,000 lists and objects.
 
     Raises:
-        ValueError: It is not JSON, or nested deeper than 32.
+        ValueError: It is not JSON, is nested deeper, or has more parts.
     """
+    text = data if isinstance(data, str) else data.decode("latin-1")
+    n_parts = text.count("[") + text.count("{")
+    if n_parts > _MAX_PARTS:
+        raise ValueError(f"it has more than {_MAX_PARTS:,} lists and objects")
     try:
         value = json.loads(data)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
-    opening = (b"[", b"{") if isinstance(data, bytes) else ("[", "{")
-    if sum(map(data.count, opening)) > _MAX_DEPTH and _is_too_deep(value):  # pyright: ignore[reportArgumentType]
+    if n_parts > _MAX_DEPTH and _is_too_deep(value):
         raise ValueError("it is nested too deep")
     return value
 

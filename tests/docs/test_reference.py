@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
@@ -74,12 +72,6 @@ MODELS = sorted({m for m in [*SUBJECTS.values(), *FILES.values(), Choice, Patter
 def test_the_generated_parts_of_a_page_are_current(page: Path) -> None:
     is_current = SCRIPT.current(TEXTS[page]) == TEXTS[page]
     assert is_current, f"{page.relative_to(ROOT)} is out of date; run `uv run poe reference`, and commit it"
-
-
-def test_the_documentation_builds_without_a_warning(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "dummy"]
-    built = subprocess.run([*command, ROOT / "docs", tmp_path], capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
 
 
 def test_everything_is_on_a_page() -> None:

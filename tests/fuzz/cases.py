@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import shutil
@@ -259,7 +260,8 @@ def damaged_json(rng: random.Random, data: bytes) -> bytes:
         if rng.random() < 0.2:
             del parent[key]
         else:
-            parent[key] = rng.choice([*ODD, [rng.choice(ODD)], {"a": rng.choice(ODD)}])
+            # A copy: an odd value that is damaged in its turn must not come to hold itself.
+            parent[key] = copy.deepcopy(rng.choice([*ODD, [rng.choice(ODD)], {"a": rng.choice(ODD)}]))
     return json.dumps(value).encode()
 
 

@@ -28,8 +28,11 @@ from labseq.errors import LabseqError
 from labseq.recording.doctor import Report, examine
 from tests.fuzz.cases import KINDS, Templates, damage_run, make_case
 
-LIMIT_S: Final = 5.0
-"""Longest time of the processor for a file; a file for which a process waits has ten times as long."""
+LIMIT_S: Final = 10.0
+"""Longest time of the processor for a file, which the doctor reads three times before the readers do.
+
+A file for which a process waits has ten times as long.
+"""
 MEMORY: Final = 1 << 30
 BATCH: Final = 20
 _TIMERS: Final = {

@@ -2,9 +2,8 @@
 
 The frames (5,000 of 3 x 3 pixels at three gains, from github.com/fatmac78/EMCCD-calibration) are not part of
 this repository; the tests read them from the folder LABSEQ_EMCCD_DATA, else from ``shared/data/emccd``
-next to the checkout, and by default only those at gain 300. Offset, read noise, light and counts per electron
-of that camera are not known, so the compared figures do not depend on them. ``-s`` prints the figures of
-``docs/explanation/virtual-images.md``.
+next to the checkout. Offset, read noise, light and counts per electron of that camera are not known, so the
+compared figures do not depend on them. ``-s`` prints the figures of ``docs/explanation/virtual-images.md``.
 """
 
 from __future__ import annotations
@@ -35,20 +34,10 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-thorough = pytest.mark.skipif(
-    "LABSEQ_EMCCD_DATA" not in os.environ, reason="reading all frames takes seconds: set LABSEQ_EMCCD_DATA"
-)
-
-
 @cache
 def frames(gain: int) -> Floats:
     """Measured counts (n_frames, 3, 3)."""
-    pages: list[Any] = []
-    with pytest.importorskip("PIL.Image").open(FOLDER / FILES[gain]) as image:
-        for page in range(image.n_frames):
-            image.seek(page)
-            pages.append(np.array(image, np.float64))
-    return np.stack(pages)
+    return pytest.importorskip("tifffile").imread(FOLDER / FILES[gain]).astype(np.float64)
 
 
 class Moments:
@@ -106,7 +95,6 @@ def setting_error(probabilities: Floats) -> tuple[float, float]:
     return float(distance), float(((often - expected) ** 2 / expected).sum())
 
 
-@thorough
 def test_without_gain_the_counts_are_normal() -> None:
     counts = frames(1)
     moments = Moments(counts)
@@ -119,7 +107,7 @@ def test_without_gain_the_counts_are_normal() -> None:
     assert square < chi2.ppf(0.999, N_BINS - 3)
 
 
-@pytest.mark.parametrize("gain", [pytest.param(100, marks=thorough), 300])
+@pytest.mark.parametrize("gain", [100, 300])
 def test_with_gain_the_histogram_has_the_models_shape(gain: int) -> None:
     counts = frames(gain)
     offset = fitted_offset(gain, Moments(counts))
@@ -130,7 +118,6 @@ def test_with_gain_the_histogram_has_the_models_shape(gain: int) -> None:
     assert setting_error(ndtr(normal))[1] > 3 * square  # a normal distribution is refused
 
 
-@thorough
 def test_the_kurtosis_is_the_one_that_the_skewness_predicts() -> None:
     for gain in (100, 300):
         counts, (second, third, fourth) = frames(gain), cumulants(gain)
@@ -141,7 +128,6 @@ def test_the_kurtosis_is_the_one_that_the_skewness_predicts() -> None:
         assert abs(moments.kurtosis - predicted) < 3 * error
 
 
-@thorough
 def test_one_offset_for_both_gains_gives_the_excess_noise_of_the_model() -> None:
     """Skewness times signal over noise is 1 for Poisson light alone and 1.49 in the model, in any unit."""
     low, high = frames(100), frames(300)
@@ -161,7 +147,6 @@ def test_one_offset_for_both_gains_gives_the_excess_noise_of_the_model() -> None
     assert square < chi2.ppf(0.999, N_BINS - 3)
 
 
-@thorough
 def test_the_variance_without_gain_gives_a_gain_of_the_right_size() -> None:
     """Read noise put aside, variance at gain 1 gives the electrons per count, and that the true gain."""
     counts, low = frames(1), frames(100)

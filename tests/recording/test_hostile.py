@@ -101,6 +101,11 @@ def deep_json(file: Any, secret: Path) -> None:
     file["entry"].create_dataset("readings", data=np.bytes_(b"[" * 500 + b"]" * 500))
 
 
+def many_parts(file: Any, secret: Path) -> None:
+    del file["entry/readings"]
+    file["entry"].create_dataset("readings", data=np.bytes_(b"[" + b"[]," * 500_000 + b"1]"))
+
+
 @pytest.mark.parametrize(
     ("plant", "what"),
     [
@@ -117,6 +122,7 @@ def deep_json(file: Any, secret: Path) -> None:
         (attribute_of_any_length, "the attribute 'status' is a text of variable length"),
         (more_batches_than_planned, "33554432 of 3 batches were played"),
         (deep_json, "it is nested too deep"),
+        (many_parts, "it has more than 500,000 lists and objects"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
