@@ -19,7 +19,12 @@ from labseq.drivers.serial_port import (
     ports_text,
     serial_emergency,
 )
-from labseq.drivers.settings import CameraSettings, CoolingSettings, IndustrialCameraSettings
+from labseq.drivers.settings import (
+    CameraSettings,
+    CoolingSettings,
+    IndustrialCameraSettings,
+    OrientationSettings,
+)
 from labseq.errors import (
     ConfigError,
     DeviceError,
@@ -57,6 +62,7 @@ from labseq.model import (
     LineSpec,
     MotionSpec,
     Occupancy,
+    Orientation,
     Plan,
     PlanReport,
     RandomStream,
@@ -200,6 +206,8 @@ __all__ = [
     "NeedsWarmUp",
     "NeverStopped",
     "Occupancy",
+    "Orientation",
+    "OrientationSettings",
     "Plan",
     "PlanError",
     "PlanReport",

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, TransientError, one_of
-from labseq.model import CameraFacts, Frame, SensorMode
+from labseq.model import CameraFacts, Frame, Orientation, SensorMode
 from labseq.roles import Camera, Clock, Context, Simulation, Trigger
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
@@ -43,7 +43,7 @@ class ExposureResult:
 
     Attributes:
         number: Its place in the series as the camera counted it, from 0.
-        image: uint16 (height, width), not used elsewhere; None if the frame was lost.
+        image: uint16 (height, width) as the sensor delivers it, not used elsewhere; None if it was lost.
         fault: What happened to a frame that was lost.
         exposure_s: Exposure time as the camera made it, in seconds; nan: as asked for.
         t_start_s: Start of the exposure on the session's clock; nan: worked out from the trigger.
@@ -65,7 +65,8 @@ class CameraDriver(Camera):
     """Base of camera drivers: plays the role, and asks a subclass only for what its camera does.
 
     It refuses what the camera cannot do before it is asked to, keeps to as many frames as were
-    armed for, and finds out when frames are missing: their numbers have a gap.
+    armed for, finds out when frames are missing, since their numbers have a gap, and gives images their
+    orientation.
 
     A subclass implements ``facts``, ``describe`` and the methods below with one underscore; they
     are called in this order: ``_connect``, then for each series ``_start``, ``_fire`` and ``_take``,
@@ -73,9 +74,12 @@ class CameraDriver(Camera):
 
     Args:
         context: Name of the camera, and clock.
+        orientation: How images lie relative to the sensor's frames: ``settings.orientation`` of
+            :class:`CameraSettings`, whose ``frame_shape`` is that of the images.
     """
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, orientation: Orientation = Orientation()) -> None:  # noqa: B008 - frozen
+        self._orientation = orientation
         self._name = context.name or "camera"
         self._clock = context.clock
         self._is_open = False
@@ -208,7 +212,8 @@ class CameraDriver(Camera):
             raise self._lost(taken.number, taken.fault)
         exposure_s = series.exposure_s if math.isnan(taken.exposure_s) else taken.exposure_s
         t_start_s = self._t_start_s(taken, exposure_s)
-        return Frame(taken.image, exposure_s, t_start_s, self._name, taken.number, taken.device_time_s)
+        image = self._orientation.apply(taken.image)
+        return Frame(image, exposure_s, t_start_s, self._name, taken.number, taken.device_time_s)
 
     def self_test(self) -> None:
         """Take a frame without EM gain, if the camera can be triggered; those not yet read are dropped.

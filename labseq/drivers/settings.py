@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_
 
 from labseq.drivers import Cooling
 from labseq.errors import ConfigError, LimitError
-from labseq.model import SensorMode
+from labseq.model import Flip, Orientation, SensorMode
 from labseq.roles import Context, Simulation, offers
 from labseq.settings import Duration, PositiveDuration, Settings, Temperature
 from labseq.units import ZERO_CELSIUS_K, format_quantity
@@ -28,11 +28,30 @@ _ARMING_TIME: Final = (
 )
 
 
-class CameraSettings(Settings):
+class OrientationSettings(Settings):
+    """How images lie relative to the sensor; sites and regions around them are places in the image."""
+
+    transpose: bool = Field(
+        default=False, description="exchange rows and columns of the sensor's frame, before `flip`"
+    )
+    flip: Flip = Field(
+        default="none",
+        description="reverse the order of rows (the image is turned upside down), of columns (it is mirrored "
+        "left to right), or of both",
+    )
+
+    @property
+    def orientation(self) -> Orientation:
+        """The same for drivers."""
+        return Orientation(self.transpose, self.flip)
+
+
+class CameraSettings(OrientationSettings):
     """Settings of the sensor that every camera has; a plugin adds its own."""
 
     region: RegionSettings | None = Field(
-        default=None, description="the part of the sensor that is read; none: all of it"
+        default=None,
+        description="the part of the sensor that is read, in the orientation of the sensor; none: all of it",
     )
     binning: PositiveInt = Field(
         default=1, description="pixels of the sensor per pixel of a frame, along each axis"
@@ -51,9 +70,10 @@ class CameraSettings(Settings):
         return SensorMode(place, self.binning)
 
     def frame_shape(self, sensor_shape: tuple[int, int] | None) -> tuple[int, int] | None:
-        """(height, width) of the frames; None if neither the sensor nor a region is known."""
-        is_known = sensor_shape is not None or self.region is not None
-        return self.mode.frame_shape(sensor_shape or (0, 0)) if is_known else None
+        """(height, width) of the images; None if neither the sensor nor a region is known."""
+        if sensor_shape is None and self.region is None:
+            return None
+        return self.orientation.shape(self.mode.frame_shape(sensor_shape or (0, 0)))
 
     def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
         """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""

@@ -8,7 +8,7 @@ from labseq.model.calibration import (
     grid_facts,
     same_grid,
 )
-from labseq.model.camera import CameraFacts, Frame, SensorMode
+from labseq.model.camera import CameraFacts, Flip, Frame, Orientation, SensorMode
 from labseq.model.grid import SiteGrid, TargetPattern
 from labseq.model.lines import LineProgram, LinesFacts, LineSpec
 from labseq.model.motion import MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
@@ -49,6 +49,7 @@ __all__ = [
     "CameraFacts",
     "CycleRecord",
     "DepthRamp",
+    "Flip",
     "Frame",
     "FrequencyCourse",
     "ImageRecord",
@@ -57,6 +58,7 @@ __all__ = [
     "LinesFacts",
     "MotionSpec",
     "Occupancy",
+    "Orientation",
     "Plan",
     "PlanReport",
     "RandomStream",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,37 @@ from numpy.typing import NDArray
 from labseq.errors import LimitError
 from labseq.model.arrays import read_only
 from labseq.units import format_quantity
+
+Flip: TypeAlias = Literal["none", "rows", "columns", "both"]
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """How an image lies relative to the frame that the sensor delivers.
+
+    Attributes:
+        transpose: Whether rows and columns are exchanged, before the flip.
+        flip: What is reversed then: "none", the order of "rows" (upside down), of "columns" (left to right),
+            or "both".
+    """
+
+    transpose: bool = False
+    flip: Flip = "none"
+
+    def apply(self, frame: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """The image (rows, columns), a view of the sensor's frame.
+
+        Example:
+            >>> Orientation(transpose=True, flip="rows").apply(np.array([[1, 2], [3, 4]], np.uint16)).tolist()
+            [[2, 4], [1, 3]]
+        """
+        axes = {"none": (), "rows": (0,), "columns": (1,), "both": (0, 1)}[self.flip]
+        return np.flip(frame.T if self.transpose else frame, axes)
+
+    def shape(self, frame_shape: tuple[int, int]) -> tuple[int, int]:
+        """(rows, columns) of the image of a frame of (height, width) pixels."""
+        height, width = frame_shape
+        return (width, height) if self.transpose else (height, width)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +63,7 @@ class SensorMode:
     shutter_open: bool = True
 
     def frame_shape(self, sensor_shape: tuple[int, int]) -> tuple[int, int]:
-        """(height, width) of the frames of a sensor of this size."""
+        """(height, width) of the frames that a sensor of this size delivers."""
         height, width = sensor_shape if self.region is None else self.region[2:]
         return height // self.binning, width // self.binning
 
@@ -43,7 +75,7 @@ class CameraFacts:
     Attributes:
         readout_s: From the end of an exposure until the frame can be read, in seconds.
         max_exposure_s: Longest exposure, in seconds.
-        frame_shape: (height, width) of its frames; None if not known.
+        frame_shape: (height, width) of its images, in their orientation; None if not known.
         em_gain: Mean gain of the EM register in an exposure; 1 for a camera without one.
         triggers: What may start its exposures: "software", "internal", "external".
         min_exposure_s: Shortest exposure, in seconds; 0 if not known.
@@ -75,7 +107,7 @@ class CameraFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One exposure as the camera delivered it.
+    """One exposure, in the orientation that the profile sets.
 
     Attributes:
         image: uint16 (height, width), in camera counts (ADU), pixel (y, x).

@@ -71,7 +71,7 @@ class AndorCamera(CameraDriver):
     """
 
     def __init__(self, settings: AndorSettings, context: Context) -> None:
-        super().__init__(context)
+        super().__init__(context, settings.orientation)
         self._settings = settings
         self._cooling = None if settings.cooling is None else settings.cooling.spec()
         self.library = library_for(settings, context)

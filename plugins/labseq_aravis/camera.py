@@ -186,6 +186,10 @@ class Camera:
         """Set a text or an enumeration."""
         self._call("arv_camera_set_string", feature.encode(), value.encode())
 
+    def set_boolean(self, feature: str, value: bool) -> None:
+        """Switch something on or off."""
+        self._call("arv_camera_set_boolean", feature.encode(), int(value))
+
     def get_integer(self, feature: str) -> int:
         """Value of an integer."""
         return int(self._call("arv_camera_get_integer", feature.encode()))

@@ -173,6 +173,7 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_camera_new": "p se",
     "arv_camera_set_acquisition_mode": "v pie",
     "arv_camera_set_binning": "v piie",
+    "arv_camera_set_boolean": "v psie",
     "arv_camera_set_exposure_time": "v pde",
     "arv_camera_set_frame_rate": "v pde",
     "arv_camera_set_gain": "v pde",

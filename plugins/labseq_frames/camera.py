@@ -20,8 +20,8 @@ from labseq.plugin import (
     Duration,
     ExposureResult,
     FilePath,
+    OrientationSettings,
     Series,
-    Settings,
 )
 from labseq_frames.files import BadFramesError, Picture, Source, find_source, format_shape
 
@@ -29,7 +29,7 @@ MAX_EXPOSURE_S: Final = 3600.0
 """Longest exposure, in seconds; frames from files do not depend on it."""
 
 
-class FramesSettings(Settings):
+class FramesSettings(OrientationSettings):
     """Frames from files instead of a camera."""
 
     path: FilePath = Field(
@@ -64,7 +64,7 @@ class FramesCamera(CameraDriver):
     """
 
     def __init__(self, settings: FramesSettings, context: Context) -> None:
-        super().__init__(context)
+        super().__init__(context, settings.orientation)
         self._settings = settings
         self._source: Source | None = None
         self._pictures: Generator[Picture] | None = None
@@ -86,15 +86,19 @@ class FramesCamera(CameraDriver):
         if not self._has_looked:
             with suppress(BadFramesError):
                 self._look()
-        readout_s, shape = self._settings.readout, self._shape
-        frame_shape = None if shape is None else (shape[0], shape[1])
-        return CameraFacts(readout_s, MAX_EXPOSURE_S, frame_shape, triggers=("software", "internal"))
+        readout_s = self._settings.readout
+        return CameraFacts(readout_s, MAX_EXPOSURE_S, self._image_shape, triggers=("software", "internal"))
 
     def describe(self) -> Mapping[str, Any]:
         """Settings, the files that were found, and the size of the frames."""
         about = {} if self._source is None else self._source.about
         settings = self._settings.model_dump(mode="json")
-        return {"model": "frames from files", **about, "frame_shape": self._shape, **settings}
+        return {"model": "frames from files", **about, "frame_shape": self._image_shape, **settings}
+
+    @property
+    def _image_shape(self) -> tuple[int, int] | None:
+        """(height, width) of the images; None if no frame was found."""
+        return None if self._shape is None else self._orientation.shape((self._shape[0], self._shape[1]))
 
     def _connect(self) -> None:
         try:

@@ -27,7 +27,7 @@ class GenicamCamera(CameraDriver):
     """
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:
-        super().__init__(context)
+        super().__init__(context, settings.orientation)
         self._settings = settings
         self._connection = connection_for(settings, context)
         self._link: Link | None = None

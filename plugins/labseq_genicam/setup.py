@@ -44,6 +44,9 @@ def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> di
         ):
             if camera.is_available(feature):
                 camera.set_string(feature, value)
+        for feature in ("ReverseX", "ReverseY"):
+            if camera.is_available(feature):
+                camera.set_boolean(feature, False)
         pixel_format = _set_pixel_format(link.name, camera, settings.pixel_format)
         sensor_shape = _set_binning(link.name, camera, settings.binning)
         frame_shape = _set_region(link.name, camera, settings, sensor_shape)
@@ -52,7 +55,7 @@ def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> di
         return {
             "pixel_format": pixel_format,
             "sensor_shape": sensor_shape,
-            "frame_shape": frame_shape,
+            "frame_shape": settings.orientation.shape(frame_shape),
             "gain_now": camera.gain if camera.has_gain else None,
             "exposure_bounds_s": camera.exposure_bounds_s,
         }

@@ -8,6 +8,7 @@ the parent process makes the pixels. This module imports nothing, so that the ca
 feature            behaviour
 =================  =================================================================================
 region             any on the sensor, in steps of one pixel
+reversed order     passed to the parent only; the columns are reversed when it starts
 binning            1 to 8 each way; changes the bounds of the region; the parent does the binning
 pixel format       Mono8, Mono10, Mono12, Mono16, unpacked; larger values are clipped
 exposure           10 us to 10 s in steps of 1 us; passed to the parent only: a frame takes no time

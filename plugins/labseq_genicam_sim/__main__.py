@@ -88,6 +88,7 @@ class SimulatedCamera:
             "SensorHeight": height,
             "Width": min(width, 512),
             "Height": min(height, 512),
+            "ReverseX": 1,  # as another program may have left it
         }
         for name, value in sizes.items():
             self._library.arv_fake_camera_write_register(self._registers, REGISTERS[name], value)
@@ -99,6 +100,7 @@ class SimulatedCamera:
         """Fill a frame; the library calls this when it begins the frame."""
         n, self._n = self._n, self._n + 1
         names = ("OffsetX", "OffsetY", "Width", "Height", "BinningHorizontal", "BinningVertical")
+        names += ("ReverseX", "ReverseY")
         values = (self._register(REGISTERS[name]) for name in names)
         if self._cable is not None:
             host = self._register(STREAM_ADDRESS).to_bytes(4, "big")

@@ -170,14 +170,15 @@ class SimulatedConnection(CameraConnection):
         """Raise if the camera is not set to what the simulation shows."""
         binning, (y, x) = self._mode.binning, (self._mode.region or (0, 0))[:2]
         height, width = self._mode.frame_shape(self._world.sensor_shape)
-        wanted = (y // binning, x // binning, height, width, (binning, binning))
+        wanted = (y // binning, x // binning, height, width, (binning, binning), (0, 0))
         came = (
             exposure.y,
             exposure.x,
             exposure.height,
             exposure.width,
             (exposure.binning_y, exposure.binning_x),
+            (exposure.reverse_y, exposure.reverse_x),
         )
         if came != wanted:
-            text = f"the camera reads (y, x, height, width, binning) = {came}; expected {wanted}"
+            text = f"the camera reads (y, x, height, width, binning, reverse) = {came}; expected {wanted}"
             raise DeviceError(self._name, text)

@@ -32,6 +32,8 @@ REGISTERS: Final = {
     "OffsetX": 0x130,
     "OffsetY": 0x134,
     "AcquisitionFramePeriod": 0x138,
+    "ReverseX": 0x140,
+    "ReverseY": 0x144,
     "TriggerMode": 0x300,
     "TriggerSource": 0x304,
     "TriggerActivation": 0x308,
@@ -57,7 +59,7 @@ CATEGORIES: Final = {
     "DeviceControl": tuple(TEXTS),
     "ImageFormatControl": (
         *("SensorWidth", "SensorHeight", "WidthMax", "HeightMax", "Width", "Height", "OffsetX", "OffsetY"),
-        *("BinningHorizontal", "BinningVertical", "PixelFormat"),
+        *("BinningHorizontal", "BinningVertical", "ReverseX", "ReverseY", "PixelFormat"),
     ),
     "AcquisitionControl": (
         *("AcquisitionMode", "AcquisitionStart", "AcquisitionStop", "AcquisitionFrameRate"),
@@ -106,6 +108,8 @@ def _image_format() -> Iterable[str]:
         yield _formula(f"Offset{axis}Max", "MAX - SIZE", {"MAX": f"{side}Max", "SIZE": side})
         yield _integer(side, _value(side), f"<Min>1</Min><pMax>{side}Max</pMax>")
         yield _integer(f"Offset{axis}", _value(f"Offset{axis}"), f"<Min>0</Min><pMax>Offset{axis}Max</pMax>")
+    for name in ("ReverseX", "ReverseY"):
+        yield f'<Boolean Name="{name}">{_value(name)}<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>'
     formats = {name: MONO[name] for name in ("Mono8", "Mono10", "Mono12", "Mono16")}
     yield _enumeration("PixelFormat", formats)
     size = "WIDTH * HEIGHT * ((FORMAT >> 16) & 0xFF) / 8"

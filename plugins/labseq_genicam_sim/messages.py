@@ -83,6 +83,8 @@ class Exposure:
         height: Number of rows, in binned pixels.
         binning_x: Columns that are added up.
         binning_y: Rows that are added up.
+        reverse_x: 1 if the camera reverses the order of the columns.
+        reverse_y: 1 if it reverses that of the rows.
     """
 
     n: int
@@ -95,6 +97,8 @@ class Exposure:
     height: int
     binning_x: int
     binning_y: int
+    reverse_x: int = 0
+    reverse_y: int = 0
 
     @property
     def exposure_s(self) -> float:

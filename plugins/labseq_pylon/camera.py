@@ -24,7 +24,7 @@ class PylonCamera(CameraDriver):
     """
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
-        super().__init__(context)
+        super().__init__(context, settings.orientation)
         self._settings = settings
         self._connection = connection_for(settings, context)
         self._sdk: Sdk | None = None

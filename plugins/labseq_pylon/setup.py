@@ -21,7 +21,8 @@ def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int])
     for auto in ("ExposureAuto", "GainAuto"):
         nodes.choose(auto, auto, "Off", if_there=True)
     nodes.choose("ExposureMode", "exposure mode", "Timed", if_there=True)
-    nodes.switch_off("AcquisitionFrameRateEnable")
+    for name in ("AcquisitionFrameRateEnable", "ReverseX", "ReverseY"):
+        nodes.switch_off(name)
     pixel_format = _set_pixel_format(nodes, settings.pixel_format)
     frame_shape = _set_sensor(nodes, settings, sensor_shape)
     _set_gain(nodes, settings)
@@ -29,7 +30,7 @@ def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int])
     return {
         "pixel_format": pixel_format,
         "sensor_shape": sensor_shape,
-        "frame_shape": frame_shape,
+        "frame_shape": settings.orientation.shape(frame_shape),
         "gain_now": nodes.read("Gain"),
         "gain_raw_now": nodes.read("GainRaw"),
         "packet_size_now": nodes.read("GevSCPSPacketSize"),

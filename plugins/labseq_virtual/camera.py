@@ -83,7 +83,7 @@ class VirtualCamera(CameraDriver):
     """
 
     def __init__(self, settings: CameraSettings, context: Context) -> None:
-        super().__init__(context)
+        super().__init__(context, settings.orientation)
         self._settings = settings
         self._random = context.random
         self._simulation = require_simulation(context)
@@ -99,7 +99,7 @@ class VirtualCamera(CameraDriver):
             if setting_error := settings.sensor_conflict(self._simulation.sensor_shape):
                 raise ConfigError(setting_error)
             self._readout_s *= self._simulation.readout_fraction(self._mode)
-            self._frame_shape = self._mode.frame_shape(self._simulation.sensor_shape)
+            self._frame_shape = settings.frame_shape(self._simulation.sensor_shape)
         cooling = settings.cooling
         self._cooling = None if cooling is None else cooling.spec()
         self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)

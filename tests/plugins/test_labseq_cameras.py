@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import pytest
 import yaml
 
 from labseq import ConfigError, Run, Session
+from labseq.detection.sites import site_pixels
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
+from labseq.model import SiteGrid
 from labseq.plugin import Context
 from labseq.roles import Trigger
 from labseq.testing import CameraContract
@@ -174,6 +177,42 @@ REAL: dict[str, dict[str, Any]] = {
     "pylon": {"camera": 22345678, "model": "acA1920-40um"},
 }
 """Profiles of real cameras."""
+
+
+@pytest.mark.parametrize("name", ["virtual", *DRIVERS])
+def test_every_orientation_shows_the_same_atoms(tmp_path: Path, name: str) -> None:
+    if name in DRIVERS:
+        need_library(DRIVERS[name][2])
+    (tmp_path / "look.yaml").write_text(
+        "labseq: 1\nname: look\nprofile: bench.yaml\nrecord_frames: all\n"
+        "shot: [load: {duration: 500 ms}, image: {exposure: 45 ms}]\n"
+    )
+    height, width = 120, 200
+    plain = site_pixels(SiteGrid(6, 9, 4.49e-6, "triangular"), 0.35e-6, ((height - 1) / 2, (width - 1) / 2))
+    region = {"y": (512 - height) // 2, "x": (512 - width) // 2, "height": height, "width": width}
+    seen: list[Any] = []
+    for transpose, flip in product((False, True), ("none", "rows", "columns", "both")):
+        sites, shape = (plain[..., ::-1], (width, height)) if transpose else (plain, (height, width))
+        sites = np.array(sites)
+        for axis, which in enumerate(("rows", "columns")):
+            if flip in (which, "both"):
+                sites[..., axis] = shape[axis] - 1 - sites[..., axis]
+        np.save(tmp_path / "sites.npy", sites)
+        parts = yaml.safe_load((ROOT / "hardware_profiles" / "virtual.yaml").read_text())
+        parts["grid"] |= {"rows": 6, "cols": 9}
+        gain = {"em_gain": 300} if name == "andor" else {}
+        parts["camera"] = {"use": name, "region": region, "transpose": transpose, "flip": flip, **gain}
+        parts["detector"] = {"use": "threshold", "sites": "sites.npy", "frame": list(shape)}
+        (tmp_path / "bench.yaml").write_text(yaml.safe_dump(parts))
+        with Session.open(
+            tmp_path / "look.yaml", shots=1, seed=1, output=tmp_path / "data", dry_run="full"
+        ) as session:
+            shot = session.run().shots[0]
+        assert shot.frames[0].shape == shape
+        seen.append(shot.occupancies[0])
+    assert 30 < seen[0].sum() < 54
+    for occupied in seen:
+        np.testing.assert_array_equal(occupied, seen[0])
 
 
 def test_a_dry_run_with_a_real_cameras_profile_sees_what_the_virtual_camera_sees(

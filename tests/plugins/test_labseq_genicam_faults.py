@@ -198,7 +198,7 @@ def test_a_camera_that_reads_another_region_is_noticed() -> None:
         assert lab.camera._link is not None
         lab.camera._link.camera.set_integer("OffsetX", 5)
         lab.camera.arm(1, 0.01, "software")
-        with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, \(1, 1\)\); expected"):
+        with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, .*\); expected"):
             lab.camera.trigger()
 
 
