@@ -159,15 +159,13 @@ class _LineFile:
 
     Attributes:
         path: The file.
-        first: Lines that are added before all others.
-        last: Lines that are added after all others.
+        added: Lines that are added at the end.
         problems: Each problem, its place, and its repair when the file is saved.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.first: list[bytes] = []
-        self.last: list[bytes] = []
+        self.added: list[bytes] = []
         self.problems: list[tuple[str, Path, str]] = []
         self._removed: set[int] = set()
 
@@ -216,11 +214,10 @@ class _LineFile:
                 )
             with explained(goal):
                 sync_folder(goal.parent)
-        if self._removed or self.first or self.last:
+        if self._removed or self.added:
             with explained(self.path), whole_file(self.path) as file:
-                file.writelines(line + b"\n" for line in self.first)
                 file.writelines(line for number, line in self._lines() if number not in self._removed)
-                file.writelines(line + b"\n" for line in self.last)
+                file.writelines(line + b"\n" for line in self.added)
 
 
 class _Line(NamedTuple):
@@ -335,26 +332,41 @@ class _Check:
     def _check_shots(self, folder: Path, run_id: str) -> None:
         """Compare the index with the files of the shots."""
         index = _LineFile(self.folder / folders.INDEX_FILE)
-        of_file, counted, wrong = dict[str, list[_Line]](), set[int](), list[int]()
+        of_file, file_of, wrong = dict[str, list[_Line]](), dict[int, str](), list[int]()
         for number, row in index.rows():
             if is_index_row(row) and _is_name(row):
                 of_file.setdefault(row["file"], []).append(_Line(number, row["sha256"], row["bytes"]))
-                counted.update([row["shot"]] * row["counts"])
+                if row["counts"]:
+                    file_of[row["shot"]] = row["file"]
             else:
                 wrong.append(number)
         index.remove(wrong, "a line of the index is not a shot's")
-        for file, same in of_file.items():
-            self.n_whole += self._check_file(self.folder / file, same, index)
-        for name in names_in(folder):
+        whole = {file for file, same in of_file.items() if self._check_file(self.folder / file, same, index)}
+        self.n_whole += len(whole)
+        file_of = {shot: file for shot, file in file_of.items() if file in whole}
+        for name in sorted(names_in(folder), key=lambda name: (len(name), name), reverse=True):
             if SHOT_FILE.fullmatch(file := f"{folder.name}/{name}") and file not in of_file:
-                row = self._row_of_stray(folder / name, run_id)
-                if row is not None:
-                    # The last line of a shot counts, so another line of this shot keeps counting.
-                    (index.first if row["shot"] in counted else index.last).append(dumps(row).encode())
-                    remedy = "line added: the file is intact"
-                    index.problems.append(("no line in the index", folder / name, remedy))
-                    self.n_whole += 1
+                self._check_stray(folder / name, run_id, file_of, index)
         self._save(index)
+
+    def _check_stray(self, path: Path, run_id: str, file_of: dict[int, str], index: _LineFile) -> None:
+        """Add a line for a shot's file that has none, unless the shot was taken again.
+
+        Args:
+            path: The file; later takes of a shot come before earlier ones.
+            run_id: The run's identity.
+            file_of: Shot -> the file that counts; the shot is added.
+            index: The index.
+        """
+        row = self._row_of_stray(path, run_id)
+        if row is None:
+            return
+        if row["counts"] and (later := file_of.setdefault(row["shot"], row["file"])) != row["file"]:
+            self._quarantine(f"an earlier take of shot {row['shot']}, taken again as {Path(later).name}", path)
+            return
+        index.added.append(dumps(row).encode())
+        index.problems.append(("no line in the index", path, "line added: the file is intact"))
+        self.n_whole += 1
 
     def _check_file(self, path: Path, lines: list[_Line], index: _LineFile) -> bool:
         """Whether the file of a shot exists unchanged; further lines of the index for it are removed."""

@@ -145,8 +145,15 @@ def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> 
     rows = [json.loads(line) for line in (run_dir / "index.jsonl").read_bytes().splitlines()]
     rows[-1]["sha256"] = hashlib.sha256(later.read_bytes()).hexdigest()
     (run_dir / "index.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), "utf-8")
-    assert reported(examine(run_dir)) == [("no line in the index", "shot_000001.h5")]
+    what = "an earlier take of shot 1, taken again as shot_000001.take_2.h5"
+    assert reported(examine(run_dir)) == [(what, "shot_000001.h5")]
     assert not open_run(run_dir).shots[1].success
+    shots = [json.loads(line)["shot"] for line in (run_dir / "index.jsonl").read_bytes().splitlines()]
+    assert shots.count(1) == 1
+    (run_dir / "quarantine" / "shot_000001.h5").rename(run_dir / "shots" / "shot_000001.h5")
+    (run_dir / "index.jsonl").write_bytes(b"")
+    examine(run_dir)
+    assert not open_run(run_dir).shots[1].success, "of two takes without a line the later counts"
 
 
 damages = st.lists(st.sampled_from([*MENDED, *LOST]), max_size=4, unique=True)
