@@ -4,6 +4,7 @@ import re
 import signal
 import sys
 from fractions import Fraction
+from pathlib import Path
 
 import pytest
 
@@ -51,15 +52,16 @@ def test_a_file_in_a_folder_is_a_plugin(host, tmp_path):
     assert entry.factory.__module__ == "labseq_local.mine"
 
 
-def test_a_package_is_loaded_as_it_is_now(tmp_path):
+def test_a_package_is_loaded_as_it_is_now(tmp_path, monkeypatch):
     for folder, value in (("one", 1), ("two", 2)):  # of one name, in one process, as in a notebook
         package = tmp_path / folder / "mine"
         package.mkdir(parents=True)
         text = GOOD.replace("class Mine:", "from .part import VALUE\nclass Mine:\n    value = VALUE")
         (package / "__init__.py").write_text(text)
         (package / "part.py").write_text(f"VALUE = {value}\n")
+        monkeypatch.chdir(tmp_path / folder)
         host = PluginHost()
-        host.load_folders([tmp_path / folder])
+        host.load_folders([Path()])
         assert vars(host.get("planner", "mine").factory)["value"] == value
 
 

@@ -136,6 +136,7 @@ def import_file(name: str, path: Path) -> ModuleType:
         sys.modules[LOCAL_PACKAGE] = ModuleType(LOCAL_PACKAGE)
         sys.modules[LOCAL_PACKAGE].__path__ = []
     full_name = f"{LOCAL_PACKAGE}.{name}"
+    path = path.absolute()  # Python remembers where a relative folder once was
     inside = [str(path.parent)] if path.name == "__init__.py" else None
     spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
     if spec is None or spec.loader is None:
