@@ -62,22 +62,25 @@ def card(folder, repeat, mode, name="simulated@{}/{}{}"):
     name = name.format(folder, mode, repeat)
     chosen = SpcmSettings(card=name, mode=mode, sample_rate=50e6, trigger="software", fill=0.1)
     device = SpcmMobileTweezers(chosen, Context("mobile_tweezers", GRID, motion=MOTION))
+    program = tone_program(PLAN, GRID, MOTION, 1 if mode == "replay" else 50)
     def play():
-        device.prepare(tone_program(PLAN, GRID, MOTION, 1 if mode == "replay" else 50))
         device.play()
         if mode == "fifo":
             threading.Thread(target=device.wait, args=(1e3,), daemon=True).start()
-    return device, play
+    return device, play, lambda: device.prepare(program)
 
 def drive(folder, names, repeat, cause):
-    dog, turn_on = Watchdog("the run", folder / "watchdog.jsonl"), []
+    dog, made = Watchdog("the run", folder / "watchdog.jsonl"), []
     for order, name in enumerate(names):
-        made = globals()[name](folder, repeat) if name in globals() else card(folder, repeat, name)
-        made[0].open()
-        found = made[0].emergency()
+        made.append(globals()[name](folder, repeat) if name in globals() else card(folder, repeat, name))
+        device = made[-1][0]
+        device.open()
+        found = device.emergency()
         dog.add(name, order, found.script, dict(found.arguments))
-        turn_on.append(made[1])
-    for act in turn_on:
+    for _, _, *prepare in made:  # before any plays: replay is over in less than a second
+        for act in prepare:
+            act()
+    for _, act, *_ in made:
         act()
     print("on", *dog.notes(), flush=True)
     sys.stdin.readline()
@@ -97,7 +100,7 @@ def fill_memory():
     full = [bytearray(1 << 20) for _ in range(1 << 20)]
 
 for mode in {"dds", "replay", "fifo"} & set(sys.argv[2:]):  # here, not again in every child
-    warmed, play = card(sys.argv[1], "", mode, "simulated")
+    warmed, *_ = card(sys.argv[1], "", mode, "simulated")
     warmed.warm()
     load_kernels()
     warmed.open()
