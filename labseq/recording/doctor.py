@@ -362,7 +362,8 @@ class _Check:
         if row is None:
             return
         if row["counts"] and (later := file_of.setdefault(row["shot"], row["file"])) != row["file"]:
-            self._quarantine(f"an earlier take of shot {row['shot']}, taken again as {Path(later).name}", path)
+            what = f"an earlier take of shot {row['shot']}, taken again as {Path(later).name}"
+            self._quarantine(what, path)
             return
         index.added.append(dumps(row).encode())
         index.problems.append(("no line in the index", path, "line added: the file is intact"))
