@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
+from itertools import combinations
 from numbers import Real
 from typing import Literal, Self
 
@@ -78,7 +79,7 @@ class RearrangeStep(Step):
     """Rearranges in cycles; cycle k is plan, check, move, image.
 
     A batch that would end after the cycle's window is not started: batches are chosen by how long it took
-    to prepare one second of moves before, and once more if the device takes longer than that. With
+    to prepare earlier programs, and once more if the device takes longer than that. With
     ``window_mode: early`` the image follows the last batch; with ``fixed`` the
     step waits for the end of the window.
     """
@@ -91,7 +92,7 @@ class RearrangeStep(Step):
         self.settings = settings
         self.windows_s = tuple(settings.window_of(cycle) for cycle in range(settings.cycles))
         self.judges_shot = settings.stop_when == "never"
-        self._measured = deque[float](maxlen=5)  # time to prepare / time to play, of the latest programs
+        self._measured = deque[tuple[float, float]](maxlen=7)  # times to play and to prepare a program
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """Two entries per cycle, the moves at their window."""
@@ -150,7 +151,7 @@ class RearrangeStep(Step):
             program = partial(tone_program, plan, grid=shot.grid, motion=shot.motion, n_batches=n_batches)
             duration_s, took_s = prepare(shot, program, start_s, cycle)
             if duration_s > 0:
-                self._measured.append(took_s / duration_s)
+                self._measured.append((duration_s, took_s))
             if shot.clock.now() + duration_s <= end_s + OVERSHOOT_S:
                 break
             moves_s = float(report.batch_end_s[n_batches - 1]) - shot.motion.overhead_per_cycle_s
@@ -164,11 +165,38 @@ class RearrangeStep(Step):
 
     def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
         """How many batches end in time if preparing takes as long as before, or as the profile says."""
-        part = statistics.median(self._measured) if self._measured else 0.0
-        window_s = shot.motion.overhead_per_cycle_s + (end_s - shot.clock.now()) / (1 + part)
+        fixed_s, part = preparing_time(self._measured)
+        left_s = max(0.0, end_s - shot.clock.now() - fixed_s)
+        window_s = shot.motion.overhead_per_cycle_s + left_s / (1 + part)
         if shot.clock.virtual or not self._measured:
             window_s = min(window_s, end_s - start_s)
         return fitting_batches(report, plan, window_s)
+
+
+def preparing_time(measured: Collection[tuple[float, float]]) -> tuple[float, float]:
+    """Fit how long preparing takes: a fixed time, and a part of the program's playing time.
+
+    A straight line by the medians of slopes and intercepts (Theil and Sen), so that a program during which
+    the computer was busy does not count. Programs of about equal length tell a part only.
+
+    Args:
+        measured: Playing time and time to prepare of earlier programs, in seconds.
+
+    Returns:
+        The fixed time in seconds, and the part.
+
+    Example:
+        >>> fixed_s, part = preparing_time([(0.01, 0.007), (0.02, 0.012), (0.04, 0.022)])
+        >>> round(fixed_s, 6), round(part, 6)
+        (0.002, 0.5)
+    """
+    if not measured:
+        return 0.0, 0.0
+    pairs = [(a, b) for a, b in combinations(measured, 2) if abs(a[0] - b[0]) > 0.1 * max(a[0], b[0])]
+    if not pairs:
+        return 0.0, statistics.median(took_s / duration_s for duration_s, took_s in measured)
+    part = max(0.0, statistics.median((b[1] - a[1]) / (b[0] - a[0]) for a, b in pairs))
+    return max(0.0, statistics.median(took_s - part * duration_s for duration_s, took_s in measured)), part
 
 
 def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:

@@ -362,7 +362,9 @@ class MotionSettings(Settings):
         "batch, and with a course other than constant all atoms of a batch start and arrive together",
     )
     overhead_per_batch: Duration = Field(
-        default=_MOTION.overhead_per_batch_s, description="time that passes before each batch, tweezers off"
+        default=_MOTION.overhead_per_batch_s,
+        description="time that passes before each batch, tweezers off; only of `use: virtual`, as a model of "
+        "another setup",
     )
     overhead_per_cycle: Duration = Field(
         default=_MOTION.overhead_per_cycle_s, description="time that passes before the first batch of a cycle"

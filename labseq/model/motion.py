@@ -82,10 +82,9 @@ class RfSpec:
 class MotionSpec:
     """Ramps, speed, overheads and limits of the mobile tweezers.
 
-    Ramps and speed are the paper's ("Experimental Setup"). The overheads are
-    ours: the paper's windows (60-200 ms) imply about 1 ms per batch at its
-    slowest, and its cycle time of x1.8 over ten cycles leaves about 13 ms per
-    later cycle beside the exposure.
+    Ramps and speed are the paper's ("Experimental Setup"). The overhead of a cycle is ours:
+    the paper's cycle time of x1.8 over ten cycles leaves about 13 ms per later cycle
+    beside the exposure.
 
     Attributes:
         pick_up_s: Pick-up ramp, in seconds.
@@ -94,7 +93,8 @@ class MotionSpec:
         speed_profile: Course of the speed during a transport. At "constant" speed all
             atoms of a batch are equally fast, and those with a shorter way arrive earlier.
             With "minimum_jerk" and "constant_jerk" they start and arrive together.
-        overhead_per_batch_s: Time that passes before each batch, tweezers off.
+        overhead_per_batch_s: Time that passes before each batch, tweezers off. Outputs that play
+            samples need none; the virtual tweezers model with it a setup that does.
         overhead_per_cycle_s: Time that passes before the first batch of a cycle
             (planning, rendering, upload); not spent on an empty plan.
         max_tweezers: Most mobile tweezers on at once, whatever the planner's
@@ -109,7 +109,7 @@ class MotionSpec:
     drop_off_s: float = 60e-6
     speed_m_s: float = 0.130
     speed_profile: SpeedProfile = "constant"
-    overhead_per_batch_s: float = 0.5e-3
+    overhead_per_batch_s: float = 0.0
     overhead_per_cycle_s: float = 13e-3
     max_tweezers: int = 20
     max_row_tones: int = 20

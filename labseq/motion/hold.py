@@ -167,7 +167,8 @@ def _phase_times_s(
         (SegmentKind.TRANSPORT, hold_s),
         (SegmentKind.DROP_OFF, drop_off_s),
     ]
-    return [one for one in segments if one[0] is not SegmentKind.TRANSPORT or hold_s > 0]
+    optional = SegmentKind.IDLE, SegmentKind.TRANSPORT
+    return [(kind, time_s) for kind, time_s in segments if time_s > 0 or kind not in optional]
 
 
 def _axis(

@@ -288,7 +288,7 @@ def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
         >>> from labseq import Plan, tone_program
         >>> program = tone_program(Plan.from_batches([([(0, 0)], [(0, 3)])]))
         >>> render(program, 250e6).samples.shape
-        (2, 180904)
+        (2, 55904)
     """
     renderer = Renderer(program, sample_rate_hz)
     samples = _new_samples(N_CHANNELS * renderer.n_samples).reshape(N_CHANNELS, -1)

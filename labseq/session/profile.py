@@ -111,6 +111,15 @@ def _takes_time(host: PluginHost, step: str) -> bool:
     return bool(getattr(host.registry.get("step", step).factory, "takes_time", True))
 
 
+def check_dead_time(document: Document, spec: ProfileSpec, found: ProblemCollector) -> None:
+    """Find a dead time before each batch of tweezers that are not virtual: they would play it as silence."""
+    mobile = spec.mobile_tweezers
+    if mobile.overhead_per_batch and not mobile.use.startswith(VIRTUAL_TWIN):
+        what = f"a dead time before each batch is set for '{clean(mobile.use)}', which would play silence"
+        expected = "none: batches follow each other, and only `use: virtual` models a setup that cannot do so"
+        found.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))
+
+
 class RecordedSetup(NamedTuple):
     """The profile and calibrations that a run began with, for resuming it.
 
@@ -207,6 +216,7 @@ def choose_plugins(
             refused[role] = error
             found.add(error)
     check_kinds(document, spec, host, found)
+    check_dead_time(document, spec, found)
     detector = chosen["detector"].dump() if "detector" in chosen else {}
     made = (
         ActiveCalibrations({}, spec.grid_model())

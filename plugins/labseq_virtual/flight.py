@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -98,6 +100,8 @@ STEP_S: Final = 0.1e-6
 """Step of the integration, in seconds: a seventieth of a period in a tweezer of 2.1 mK."""
 BAND_HZ: Final = 50e6
 """Smallest width of the AODs' band (ours)."""
+DARK: Final = 0.1
+"""Fraction of the full depth below which the tweezers of a batch have let go of their atoms (ours)."""
 MIN_TONE_DEPTH: Final = 2e-3
 """Fraction of the full depth below which a tone counts as off (ours)."""
 SLEW_HZ: Final = 4e6
@@ -210,6 +214,20 @@ class RfTransport:
         Returns:
             Number of atoms lost by each cause: hand_over, transport, collision, ejected.
         """
+        lost: Counter[str] = Counter()
+        for tones, t_s in self._find_tones(pulse):
+            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor)
+        return lost
+
+    def _carry_batch(
+        self,
+        occupied: Mask,
+        tones: tuple[Floats, ...],
+        t_s: Floats,
+        depth: Floats,
+        rng: np.random.Generator,
+        loss_factor: float,
+    ) -> Counter[str]:
         from labseq_virtual.flight_kernels import (
             COLLIDED,
             DEPTH,
@@ -220,10 +238,7 @@ class RfTransport:
             follow_atoms,
         )
 
-        tones = self._find_tones(pulse)
-        if tones is None:
-            return Counter()
-        (rows, row_depth, cols, col_depth), t_s = tones
+        rows, row_depth, cols, col_depth = tones
         row, col = np.nonzero(occupied & self._near(rows, cols) & (depth > 0))
         static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
         kt = KELVIN * self._settings.temperature
@@ -255,12 +270,15 @@ class RfTransport:
         self._flights.append(flights[held | ~kept])
         return Counter(fate.decode() for fate in flights["fate"][~kept].tolist())
 
-    def _find_tones(self, pulse: RfPulse) -> tuple[tuple[Floats, Floats, Floats, Floats], Floats] | None:
-        """Positions (in sites) and depth factors of the row and column tones, and the times of the frames."""
+    def _find_tones(self, pulse: RfPulse) -> Iterator[tuple[tuple[Floats, ...], Floats]]:
+        """Positions (in sites) and depth factors of row and column tones, and the times of the frames.
+
+        Those of one batch after the other: batches without a pause are told apart by the dark between them.
+        """
         found: list[Tracks] = []
         for axis, spans in enumerate((pulse.rows, pulse.columns)):
             if not spans:
-                return None
+                return
             start_s, end_s = pulse.start_s - self.margin_s, pulse.end_s + 2 * self.margin_s
             min_v = float(self._full_v[axis].min()) * math.sqrt(MIN_TONE_DEPTH)
             transit_s = self._light.transit_time
@@ -273,8 +291,12 @@ class RfTransport:
             intended, full_v = self._positions.intended(axis, hz), self._full_v[axis]
             sites.append(self._positions.actual(axis, hz))
             depths.append((volts / np.interp(intended, np.arange(len(full_v)), full_v)) ** 2)
-        self._jumps += find_jumps(found, sites, depths)
-        return (sites[0], depths[0], sites[1], depths[1]), found[0].t_s[:n_frames]
+        bright = _light(depths) > DARK
+        self._jumps += find_jumps(found, sites, depths, bright)
+        for frames in _batches(bright):
+            on = [~np.isnan(one[frames]).all(axis=0) for one in sites]
+            parts = (one[frames][:, on[axis]] for axis in (0, 1) for one in (sites[axis], depths[axis]))
+            yield tuple(map(np.ascontiguousarray, parts)), found[0].t_s[frames]
 
     def _near(self, rows: Floats, cols: Floats) -> Mask:
         """Sites that any tweezer comes close to, bool (n_rows, n_cols)."""
@@ -335,6 +357,19 @@ def _lines(tracks: Floats, n_sites: int) -> Mask:
     lines = np.zeros((len(tracks), n_sites + 4), np.bool_)
     lines[frame, below] = lines[frame, below + 1] = True
     return lines[:, 2 : n_sites + 2]
+
+
+def _light(depths: list[Floats]) -> Floats:
+    """Depth factor of the deepest tweezer in each frame, (n_frames,)."""
+    rows, cols = (np.nan_to_num(one).max(axis=1, initial=0.0) for one in depths)
+    return rows * cols
+
+
+def _batches(bright: Mask) -> list[slice]:
+    """The frames of each batch: cut in the middle of the dark between two that are bright."""
+    edges = np.flatnonzero(np.diff(bright, prepend=False, append=False))
+    cuts = [0, *((edges[1:-1:2] + edges[2::2]) // 2).tolist(), len(bright) - 1]
+    return [slice(first, last + 1) for first, last in pairwise(cuts)]
 
 
 def _max_on(tracks: Floats) -> int:

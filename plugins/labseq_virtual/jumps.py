@@ -116,18 +116,23 @@ def _wrapped(phase_rad: Floats) -> Floats:
     return (phase_rad + np.pi) % (2 * np.pi) - np.pi
 
 
-def find_jumps(found: list[Tracks], sites: list[Floats], depths: list[Floats]) -> list[tuple[Any, ...]]:
+def find_jumps(
+    found: list[Tracks], sites: list[Floats], depths: list[Floats], bright: NDArray[np.bool_]
+) -> list[tuple[Any, ...]]:
     """The jumps of the row and the column tones, and of their tweezers, each as a row of :data:`JUMPS`.
 
     Args:
         found: Tones of the rows and of the columns.
         sites: Their positions in sites, (n_frames, n_tones) each.
         depths: Their factors of the full depth, likewise.
+        bright: bool (n_frames,), whether a tweezer is deep; atoms do not feel a phase that jumps in the dark.
     """
     jumps: list[tuple[Any, ...]] = []
     for axis, tracks in enumerate(found):
         for j in range(sites[axis].shape[1]):
             for time_s, k, size in phase_jumps(tracks, j):
+                if not bright[max(0, k - HOPS) : k + HOPS + 1].all():
+                    continue
                 place = sites[axis][min(k, len(sites[axis]) - 1), j]
                 where = (place, math.nan) if axis == 0 else (math.nan, place)
                 jumps.append((time_s, b"phase", *where, size))

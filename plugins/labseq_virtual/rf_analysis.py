@@ -173,8 +173,8 @@ APART_HZ: Final = 450e3
 """Smallest distance of two tones that can be resolved (ours)."""
 MAX_TONES: Final = 64
 """Maximum number of simultaneous tones of an axis."""
-FRAMES: Final = 4096
-"""Spectra computed at once: 40 MB at a transit time of 10 us, for programs of any length."""
+FRAMES: Final = 8192
+"""Spectra computed at once: 80 MB at a transit time of 10 us, for programs of any length."""
 
 
 MIN_TURNS: Final = 2.0

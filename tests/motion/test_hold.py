@@ -21,7 +21,7 @@ offsets = st.tuples(*[st.floats(-1.4e-6, 1.4e-6)] * 2)
 
 
 def spec(**changes: Any) -> MotionSpec:
-    return MotionSpec(**changes)
+    return MotionSpec(**{"overhead_per_batch_s": 0.5e-3, **changes})
 
 
 def places(program: ToneProgram, grid: SiteGrid, segment: int) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -69,9 +69,9 @@ def test_a_batch_is_a_pause_a_pick_up_a_hold_and_a_drop_off() -> None:
     assert np.diff(program.column.offsets)[:4].tolist() == [0, 6, 6, 6]
 
 
-def test_without_a_time_to_hold_there_is_no_segment_for_it() -> None:
-    program = hold_program(GRID, spec(), ALL, (0.0, 0.0), 0.0)
-    assert program.kind.tolist() == [IDLE, PICK_UP, DROP_OFF] * 5
+def test_without_a_time_to_hold_or_a_pause_there_is_no_segment_for_it() -> None:
+    program = hold_program(GRID, spec(overhead_per_batch_s=0.0), ALL, (0.0, 0.0), 0.0)
+    assert program.kind.tolist() == [PICK_UP, DROP_OFF] * 5
     assert (program.duration_s > 0).all()
 
 

@@ -97,7 +97,7 @@ def test_the_lines_are_where_the_program_has_its_tones(profile: SpeedProfile) ->
 
 RATE_HZ = 250e6
 PLAN = Plan.from_batches([([(0, 0), (0, 5)], [(0, 3), (0, 7)]), ([(0, 3)], [(0, 1)])])
-PROGRAM = tone_program(PLAN)
+PROGRAM = tone_program(PLAN, motion=MotionSpec(overhead_per_batch_s=0.5e-3))
 RENDERER = Renderer(PROGRAM, RATE_HZ)
 
 

@@ -261,7 +261,7 @@ class TestKeepWarm:
                 lab.play(lab.program(1))
                 lab.card.forget(lab.clock.now())
                 begun_s = lab.clock.now()
-                lab.play(lab.program(3))
+                lab.play(lab.program(12))
                 spans = [span for span in lab.card.played(0) if span.start_s >= begun_s]
                 if mode == "dds":
                     tones = [
@@ -498,7 +498,7 @@ def test_a_card_is_kept_supplied_when_that_takes_most_of_the_time(
 
 def test_data_that_is_withheld_is_an_underrun_and_ends_in_the_safe_state(driver: Any) -> None:
     with driver("fifo", fill=1e-3) as lab:
-        lab.tweezers.prepare(lab.program(16))
+        lab.tweezers.prepare(lab.program(60))
         lab.tweezers.play()
         lab.clock.sleep(0.1)  # nobody feeds the card
         with pytest.raises(TransientError, match="underrun"):
@@ -548,7 +548,7 @@ def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) 
     whole = render(program, 625e6).samples
     renderer = InterleavedRenderer(program, 625e6, row_channel)
     assert 0 <= renderer.n_samples - whole.shape[1] < 32
-    wanted = np.zeros((renderer.n_samples + CHUNK, 2), np.int16)
+    wanted = np.zeros((renderer.n_samples + 2 * CHUNK, 2), np.int16)
     wanted[: whole.shape[1]] = whole.T if row_channel == 0 else whole[::-1].T
     for start, n_samples in [(0, len(wanted)), (0, 1), (12345, CHUNK), (CHUNK - 7, CHUNK + 100)]:
         out = np.full((n_samples, 2), 99, np.int16)

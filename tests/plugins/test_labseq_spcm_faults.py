@@ -404,7 +404,7 @@ class TestSafeState:
     @pytest.mark.parametrize("mode", MODES)
     def test_ramps_down_stops_and_opens_the_output_relays(self, driver: Any, mode: str) -> None:
         with driver(mode) as lab:
-            lab.tweezers.prepare(lab.program())
+            lab.tweezers.prepare(lab.program(20))
             lab.tweezers.play()
             lab.clock.sleep(0.6e-3)
             lab.card.log.clear()

@@ -215,6 +215,21 @@ def test_atoms_are_where_the_plan_says() -> None:
     assert (flights["held_s"][:3] < program.joint_s[-1] / 2).all()
 
 
+@pytest.mark.parametrize("pause_s", [0.0, 0.5e-3])
+def test_each_batch_moves_its_atoms_anew(pause_s: float) -> None:
+    """Batches that follow each other at once are flights of their own, and each costs its hand-over loss."""
+    there, back = batch(((5, 2), (5, 4))), batch(((5, 4), (5, 2)))
+    program = program_of(there, back, there, overhead_per_batch_s=pause_s)
+    sites, flights, jumps = fly(program, [(5, 2)])
+    assert sites == {(5, 4)}
+    assert flights["to_col"].tolist() == [4, 2, 4]
+    assert (np.diff(flights["held_s"]) > 120e-6).all()
+    assert len(jumps) == 0
+    lossy = SimulationSettings(transport_loss=0.1)
+    _, flights, _ = fly(program, [(5, 2), (9, 2)], lossy, loss_factor=10)
+    assert flights["fate"].tolist() == [b"hand_over"]
+
+
 def test_a_row_that_moves_by_a_site_keeps_all_atoms() -> None:
     row = range(3, 10)
     sites, _, _ = fly(program_of(batch(*(((4, c), (4, c + 1)) for c in row))), [(4, c) for c in row])
@@ -226,7 +241,7 @@ def test_an_atom_that_is_moved_over_another_costs_both() -> None:
     assert sites == set()
     assert flights["fate"].tolist() == [b"collision", b"collision"]
     assert flights["lost_col"] == pytest.approx([5, 5], abs=0.3)
-    assert flights["lost_s"][0] == pytest.approx(0.5e-3 + 60e-6 + 3 * 4.49e-6 / 0.13, abs=10e-6)
+    assert flights["lost_s"][0] == pytest.approx(60e-6 + 3 * 4.49e-6 / 0.13, abs=10e-6)
 
 
 def test_an_atom_that_leaves_the_grid_is_ejected() -> None:
@@ -293,7 +308,7 @@ def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> N
 
 
 MOVE = ([(5, 2), (5, 5)], [(5, 5), (5, 9)])
-"""Segments: 0 pause, 1 pick-up, 2 and 3 transport (one arrives before the other), 4 drop-off."""
+"""Segments: 0 pick-up, 1 and 2 transport (one arrives before the other), 3 drop-off."""
 
 
 def jumps_of(program: ToneProgram) -> NDArray[Any]:
@@ -306,7 +321,7 @@ def test_smooth_motion_has_no_jumps(speed_profile: str) -> None:
     assert len(jumps_of(program_of(*batches, speed_profile=speed_profile))) == 0
 
 
-@pytest.mark.parametrize(("segment", "size_rad"), [(2, -1.0), (3, 2.0), (4, -2.0)])
+@pytest.mark.parametrize(("segment", "size_rad"), [(1, -1.0), (2, 2.0), (3, -2.0)])
 def test_a_phase_jump_is_found_with_its_size_and_place(segment: int, size_rad: float) -> None:
     smooth = program_of(MOVE)
     all_jumps = jumps_of(with_phase_jump(smooth, segment, size_rad))
@@ -364,7 +379,7 @@ class Broken:
 CASES = [
     Broken("900 nm beside the sites", offset_m=900e-9),
     Broken("65 % less depth", depth_k=0.35 * 2.1e-3),
-    Broken("a phase jump of 2 rad at the start", change=lambda p: with_phase_jump(p, 2, 2.0)),
+    Broken("a phase jump of 2 rad at the start", change=lambda p: with_phase_jump(p, 1, 2.0)),
     Broken("a drop-off of no length", motion={"drop_off_s": 1e-9}),
     Broken("twice the speed", motion={"speed_m_s": 0.26}),
 ]
@@ -374,7 +389,7 @@ if "LABSEQ_ATOMS" in os.environ:
             Broken("nothing"),
             Broken("150 nm beside the sites", offset_m=150e-9),
             Broken("10 % less depth", depth_k=0.9 * 2.1e-3),
-            Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 2, 1.0)),
+            Broken("a phase jump of 1 rad at the start", change=lambda p: with_phase_jump(p, 1, 1.0)),
             Broken("a pick-up of no length", motion={"pick_up_s": 1e-9}),
         ]
     )
@@ -389,7 +404,7 @@ class CachedTransport(RfTransport):
 
     def _find_tones(self, pulse: RfPulse) -> Any:
         if id(pulse) not in self.found:
-            self.found[id(pulse)] = super()._find_tones(pulse)
+            self.found[id(pulse)] = list(super()._find_tones(pulse))
         return self.found[id(pulse)]
 
 
@@ -445,7 +460,7 @@ def predicted_loss(case: Broken, n_atoms: int) -> float:
 
 def smoothed(program: ToneProgram) -> tuple[Floats, Floats, Floats]:
     """Times, place of the first column tone (in sites from its first) and depth, as the beams see them."""
-    start_s, end_s = program.joint_s[1] - 30e-6, program.joint_s[-1] + 30e-6
+    start_s, end_s = program.joint_s[0] - 30e-6, program.joint_s[-1] + 30e-6
     t_s = np.arange(start_s, end_s, STEP_S)
     u_s = np.arange(-12.5e-6, 12.5e-6, STEP_S)
     weight = np.exp(-2 * (2 * u_s / TRANSIT_S) ** 2)

@@ -210,6 +210,14 @@ def test_a_driver_states_the_limits_of_its_device_before_it_is_open(address: str
     assert messages(profile="bench", overrides=[f"{address}=1 us"]) == [f"{problem}; choose another exposure"]
 
 
+def test_a_card_that_would_play_a_pause_between_batches_is_refused_one() -> None:
+    write({})
+    key = "profile.mobile_tweezers.overhead_per_batch"
+    what = f"--set {key}=1 us: a dead time before each batch is set for 'spcm', which would play silence"
+    (message,) = messages(profile="bench_awg", overrides=[f"{key}=1 us"])
+    assert message.startswith(f"{what}; expected none: batches follow each other")
+
+
 def test_wrong_options_are_reported_with_the_files() -> None:
     write({"rows: 15": "rows: 0"})
     assert messages(shots=0, overrides=["planr.x=1", "profile.camera.gain=5"]) == [

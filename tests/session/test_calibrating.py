@@ -179,7 +179,7 @@ def test_a_damaged_one_that_is_in_use_is_refused(bench: Bench, kind: Calibration
 def test_a_tone_program_is_made_with_them(bench: Bench) -> None:
     plan = labseq.Plan.from_batches([([(0, 0)], [(0, 3)])])
     profile = bench.folder / "bench.yaml"
-    before = labseq.tone_program(plan, profile=profile).tones_at(560e-6).column.frequency_hz
+    before = labseq.tone_program(plan, profile=profile).tones_at(60e-6).column.frequency_hz
     bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
-    after = labseq.tone_program(plan, profile=profile).tones_at(560e-6).column.frequency_hz
+    after = labseq.tone_program(plan, profile=profile).tones_at(60e-6).column.frequency_hz
     assert after - before == pytest.approx([2e5])
