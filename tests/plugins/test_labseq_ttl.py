@@ -21,6 +21,7 @@ from pydantic import ValidationError
 from labseq import ConfigError, LineProgram, LineSpec, Run, Session
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
 from labseq.plugin import Context
+from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
 
 from .labseq_ttl_rig import make_rig, need_simavr, rig
@@ -148,6 +149,16 @@ def test_programs_come_back_from_their_edges(seed: int, steps: list[tuple[int, i
 def test_no_bytes_make_the_reader_of_lines_fail(line: bytes) -> None:
     said = unframed(line)
     assert said is None or isinstance(said, str)
+
+
+def test_a_step_with_every_line_of_the_box_fits_its_edges() -> None:
+    specs = [
+        LineSpec(f"line_{i}", channel, frozenset({"image"}), lead_s=1e-3 * (i + 1), lag_s=2e-3 * (i + 1))
+        for i, channel in enumerate(CHANNELS)
+    ]
+    program = line_program(specs, "image", 45e-3)
+    assert len(specs) == 10
+    assert 2 * len(specs) <= len(edges_of(program, specs, "lines")) <= MAX_EDGES
 
 
 def test_a_line_on_a_channel_that_the_box_does_not_have_is_refused() -> None:
