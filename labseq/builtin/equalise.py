@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from labseq.plugin import Device, DeviceError, Settings, Shot, Step, StepContext, Text, TimelineEntry
+from labseq.builtin.spot_powers import SpotPowers
+from labseq.config.profile import PowerMeterSettings
+from labseq.errors import DeviceError
+from labseq.model import TimelineEntry
+from labseq.roles import Device, Shot, Step, StepContext
 
 Floats = NDArray[np.float64]
 
@@ -165,15 +169,9 @@ MIN_PROGRESS: Final = 0.9
 PATIENCE: Final = 4
 
 
-class EqualiseSettings(Settings):
+class EqualiseSettings(PowerMeterSettings):
     """``equalise``: make the static tweezers even, in a closed loop."""
 
-    device: Text = Field(
-        default="trap_camera", description="device of the profile that measures the power of each tweezer"
-    )
-    value: Text = Field(
-        default="spot_powers", description="its value with the powers, an array of rows and columns"
-    )
     spread: Annotated[float, Field(gt=0, lt=1)] = Field(
         default=0.005, description="target rms of the part that rows and columns can even out"
     )
@@ -311,6 +309,7 @@ class EqualiseStep(Step):
 
     takes_time = False
     device_setting = "device"
+    device_may_be_camera = True
 
     def __init__(self, settings: EqualiseSettings) -> None:
         self.settings = settings
@@ -325,24 +324,24 @@ class EqualiseStep(Step):
         Raises:
             DeviceError: The loop does not converge, and why; or the device's value is not such an array.
         """
-        settings, tweezers = self.settings, shot.static_tweezers
-        limit_s, device = shot.call_timeout_s, shot.device(settings.device)
+        settings, tweezers, limit_s = self.settings, shot.static_tweezers, shot.call_timeout_s
         shot.call("static_tweezers", limit_s, tweezers.start)
 
         def apply(rows: Floats, cols: Floats) -> None:
             shot.call("static_tweezers", limit_s, tweezers.load, (rows, cols))
 
         before: list[Floats] = []
+        read = self._reader(shot)
 
         def measure() -> Floats:
-            power = self._measure(shot, device)
+            power = read()
             before.append(power) if not before else None
             return power
 
         rows, cols = _in_force(shot)
         with shot.stage("equalise"):
             found = equalise_loop(measure, apply, rows, cols, settings)
-            after = self._measure(shot, device)
+            after = read()
         equalised = found.equalised
         shot.note(READINGS + "row_amplitudes", equalised.row_amplitudes.tolist())
         shot.note(READINGS + "column_amplitudes", equalised.column_amplitudes.tolist())
@@ -354,8 +353,16 @@ class EqualiseStep(Step):
         shot.note(READINGS + "power_before", before[0].tolist())
         shot.note(READINGS + "power_after", after.tolist())
 
-    def _measure(self, shot: Shot, device: Device) -> Floats:
-        """One measurement, float64 (n_rows, n_cols)."""
+    def _reader(self, shot: Shot) -> Callable[[], Floats]:
+        """What measures the powers once, float64 (n_rows, n_cols)."""
+        name, exposure_s = self.settings.device, self.settings.exposure
+        device = None if name == "camera" else shot.device(name)
+        if device is not None and not hasattr(device, "arm"):  # as a camera has it
+            return lambda: self._read(shot, device)
+        spots = SpotPowers(shot.grid, name)
+        return lambda: spots.fit(shot.take_frame(name, exposure_s))
+
+    def _read(self, shot: Shot, device: Device) -> Floats:
         name, value = self.settings.device, self.settings.value
         answer = shot.call(name, shot.call_timeout_s, device.read, value)
         try:

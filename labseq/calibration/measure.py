@@ -162,7 +162,9 @@ def _analysed(
             raise ConfigError(Problem(what, str(source), expected="a run's folder"))
         return None, method.read(source, hardware)
     run = (
-        _measure(method, request, ignoring, observer) if source is None else _open(source, request, hardware)
+        _measure(method, request, hardware, ignoring, observer)
+        if source is None
+        else _open(source, request, hardware)
     )
     try:
         return run, method.analyse(CalibrationData(run, hardware))
@@ -174,8 +176,14 @@ def _analysed(
         raise
 
 
-def _measure(method: Method, request: CalibrationRequest, ignoring: str, observer: RunObserver | None) -> Run:
-    overrides = [*request.overrides, ignoring]
+def _measure(
+    method: Method,
+    request: CalibrationRequest,
+    hardware: ResolvedProfile,
+    ignoring: str,
+    observer: RunObserver | None,
+) -> Run:
+    overrides = [*_meter(method, hardware.profile), *request.overrides, ignoring]
     if not method.uses_detector:  # its settings may be wrong before it is calibrated
         overrides = [one for one in overrides if not one.lstrip().startswith("profile.detector.")]
         overrides.append("profile.detector={use: blind}")
@@ -229,6 +237,15 @@ def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:
     }
     text = json.dumps({"folder": str(folder.resolve()), "use": use}, ensure_ascii=False)
     return f"profile.calibrations={text}"
+
+
+def _meter(method: Method, spec: ProfileSpec) -> list[str]:
+    """The overrides that make the step `equalise` measure with what the profile says."""
+    if method.kind != "tweezers":
+        return []
+    meter = spec.equalise
+    values = {"device": meter.device, "value": meter.value, "exposure": f"{meter.exposure!r} s"}
+    return [f"shot.0.equalise.{key}={json.dumps(values[key])}" for key in sorted(meter.model_fields_set)]
 
 
 def _of_profile(overrides: Sequence[str]) -> list[Override]:

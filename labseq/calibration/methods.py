@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.builtin.equalise import READINGS
-from labseq.calibration.lattice import FoundLattice, find_lattice
 from labseq.calibration.method import AnalysisResult, CalibrationData, ProbeCounts, count_probed
 from labseq.calibration.pictures import draw_powers, draw_sites, draw_survival, draw_tone_offsets
+from labseq.detection.lattice import FoundLattice, find_lattice
 from labseq.detection.sites import read_sites
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.model import MotionSpec, SiteGrid

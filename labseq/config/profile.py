@@ -61,11 +61,39 @@ class BlindingSettings(Settings):
 
 
 class DeviceChoice(Choice):
-    """The plugin of an instrument, and the core's settings for it."""
+    """The plugin of an instrument or further camera, and the core's settings for it."""
 
+    role: Literal["device", "camera"] = Field(
+        default="device",
+        description="kind of plugin: `camera` for a further camera, such as one that "
+        "looks at the light of the tweezers",
+    )
     blinding: BlindingSettings | None = Field(
         default=None,
         description="no exposure with EM gain while its light is on: `{value: state, when: [on]}`",
+    )
+
+    @model_validator(mode="after")
+    def _has_light(self) -> Self:
+        if self.role == "camera" and self.blinding is not None:
+            raise setting_error("a camera is blinding", "a device", at=("blinding",), key=True)
+        return self
+
+
+class PowerMeterSettings(Settings):
+    """What measures the powers of the static tweezers for `labseq calibrate tweezers`."""
+
+    device: Text = Field(
+        default="trap_camera",
+        description="device of the profile that measures the power of each tweezer: one with `role: camera`, "
+        "or another meter; `camera`: the camera of the atoms",
+    )
+    value: Text = Field(
+        default="spot_powers",
+        description="what to read of a device that is no camera: an array of rows and columns",
+    )
+    exposure: PositiveDuration = Field(
+        default=1e-3, description="exposure time of a camera; its brightest pixels must not be saturated"
     )
 
 
@@ -507,6 +535,11 @@ class ProfileSpec(Settings):
     simulation: Annotated[Choice, placed_by_field] | None = Field(
         default=None, description="the simulation that virtual devices act on"
     )
+    equalise: Annotated[PowerMeterSettings, empty_is({})] = Field(
+        default=PowerMeterSettings(),
+        description="what `labseq calibrate tweezers` measures with, in place of the defaults of the step "
+        "`equalise`",
+    )
     calibrations: Annotated[CalibrationSettings, empty_is({})] = Field(
         default=CalibrationSettings(), description="which calibrations to use: a mapping, a folder, or `off`"
     )
@@ -518,6 +551,14 @@ class ProfileSpec(Settings):
     budgets: Annotated[BudgetSettings, empty_is({})] = Field(
         default=BudgetSettings(), description="time budgets of the computer for its part of a shot"
     )
+
+    @model_validator(mode="after")
+    def _has_meter(self) -> Self:
+        named = self.equalise.device
+        if "device" in self.equalise.model_fields_set and named not in (known := ["camera", *self.devices]):
+            expected = ", ".join(f"'{one}'" for one in known)
+            raise setting_error(f"there is no device '{clean(named)}'", expected, at=("equalise", "device"))
+        return self
 
     @property
     def choices(self) -> dict[str, Choice]:

@@ -314,6 +314,19 @@ class Shot(Protocol):
         """Expose, read, detect and record an image."""
         ...
 
+    def take_frame(self, camera: str, exposure_s: float) -> Frame:
+        """Take a frame of anything but atoms: no line is switched, nothing is detected or recorded.
+
+        Args:
+            camera: "camera" for that of the atoms, or a device of the profile with ``role: camera``.
+            exposure_s: Exposure time, in seconds.
+
+        Raises:
+            ConfigError: There is no such camera.
+            DeviceError: It has an EM gain, or only an external trigger.
+        """
+        ...
+
     def record_cycle(self, cycle: CycleRecord) -> None:
         """Add a rearrangement cycle to the shot's record."""
         ...
@@ -380,6 +393,7 @@ class Step(ABC):
             where they are; other steps are only repeated with the whole shot.
         takes_time: Whether a line can be on during it.
         device_setting: Name of its setting that names a device of the profile; "" if it has none.
+        device_may_be_camera: Whether that may be a camera: a device with ``role: camera``, or "camera".
         signal: Start signal of another control system that it waits for ("go"); "" if it waits for none.
         device: Name of the device that receives the signal; "" for the only one there is.
         windows_s: Longest time for the moves of each of its rearrangement cycles, in seconds; `labseq check`
@@ -393,6 +407,7 @@ class Step(ABC):
     repeatable = False
     takes_time = True
     device_setting = ""
+    device_may_be_camera = False
     signal = ""
     device = ""
     windows_s = tuple[float, ...]()

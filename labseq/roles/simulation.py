@@ -86,6 +86,18 @@ class Simulation(ABC):
     def prepare_sensor(self, mode: SensorMode) -> None:
         """Compute, before a run, the values that all frames of a mode share."""
 
+    def seen_by(self, camera: str) -> Simulation:
+        """What a camera receives that is a device of the profile, and not the camera of the atoms.
+
+        Args:
+            camera: Name of the device.
+
+        Returns:
+            Its own view of this simulation, in which ``expose`` and the methods about the sensor differ.
+        """
+        del camera
+        return self
+
     def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
         """Pass the edges of the line that triggers a role to its simulated device, from now on.
 

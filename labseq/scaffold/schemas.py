@@ -278,8 +278,10 @@ class _FileSchema:
         for role, core in _ROLES.items():
             choice = self._choice(role, core)
             self._fill(keys, role, or_empty(choice) if role in _MAY_BE_EMPTY else choice)
-        devices = {"type": "object", "additionalProperties": self._choice("device", DeviceChoice)}
-        self._fill(keys, "devices", or_empty(devices))
+        is_camera = {"type": "object", "properties": {"role": {"const": "camera"}}, "required": ["role"]}
+        camera, device = self._choice("camera", DeviceChoice, "devices"), self._choice("device", DeviceChoice)
+        either = {"if": is_camera, "then": camera, "else": device}
+        self._fill(keys, "devices", or_empty({"type": "object", "additionalProperties": either}))
         calibrations = keys["calibrations"]  # may also be a folder, or `off`
         keys["calibrations"] = {**calibrations, "anyOf": [*calibrations["anyOf"], {"type": "string"}]}
         return self._whole("labseq hardware profile", file)
@@ -299,10 +301,17 @@ class _FileSchema:
         """Replace the schema of a key, but keep the description that the file's model gives it."""
         keys[key] = {"description": keys[key]["description"], **schema}
 
-    def _choice(self, kind: str, core: type[Choice]) -> JsonSchema:
-        """A plugin chosen by name, and the settings of this plugin next to the name."""
+    def _choice(self, kind: str, core: type[Choice], group: str = "") -> JsonSchema:
+        """A plugin chosen by name, and the settings of this plugin next to the name.
+
+        Args:
+            kind: Kind of plugin.
+            core: The core's keys next to them.
+            group: First part of the names of their definitions; by default the kind.
+        """
+        group = group or kind
         entries = [entry for entry in self._registry.entries() if entry.kind == kind]
-        own = model_schema(core, f"{kind}.", self._definitions, expressions=kind != _SCANNER)
+        own = model_schema(core, f"{group}.", self._definitions, expressions=kind != _SCANNER)
         key = core.key
         name = {
             **own["properties"].pop(key),
@@ -311,7 +320,7 @@ class _FileSchema:
         }
         rules: list[JsonSchema] = []
         for entry in entries:
-            defined = f"{kind}.{entry.name}"
+            defined = f"{group}.{entry.name}"
             self._definitions[defined] = self._settings(entry, {key: {}, **own["properties"]})
             is_chosen = {"type": "object", "properties": {key: {"const": entry.name}}, "required": [key]}
             rules.append({"if": is_chosen, "then": {"$ref": _reference(defined)}})

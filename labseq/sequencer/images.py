@@ -6,11 +6,46 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from labseq.model import TimelineEntry
+from labseq.errors import DeviceError
+from labseq.guard import DRIVER_MARGIN_S
+from labseq.model import CameraFacts, Frame, TimelineEntry
 from labseq.model.lines import IDLE
-from labseq.roles import offers
+from labseq.roles import Camera, Trigger, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import blinding_lines, trigger_line
+
+
+def take_frame(
+    camera: Camera, name: str, exposure_s: float, call: Callable[..., Any], max_wait_s: float
+) -> Frame:
+    """Take one frame with a camera, armed for it alone.
+
+    Args:
+        camera: The camera.
+        name: Its name, for messages.
+        exposure_s: Exposure time, in seconds.
+        call: Calls a device: ``call(name, timeout_s, function, *arguments)``.
+        max_wait_s: Longest time of a call beyond the exposure, in seconds.
+
+    Raises:
+        DeviceError: It has an EM gain, only an external trigger, or returned something else than a frame.
+    """
+    facts = camera.facts if offers(camera, "facts") else CameraFacts()
+    if facts.em_gain > 1:
+        text = f"no frame of other light than that of atoms with an EM gain of {facts.em_gain:g}"
+        raise DeviceError(name, f"{text}: it would age the EM register; set `em_gain` of this camera to 1")
+    own: tuple[Trigger, ...] = ("software", "internal")
+    trigger = next((one for one in own if one in facts.triggers), None)
+    if trigger is None:
+        raise DeviceError(name, "it takes frames on an external trigger only; expected a software trigger")
+    limit_s = max_wait_s + exposure_s
+    call(name, limit_s, camera.arm, 1, exposure_s, trigger)
+    if trigger == "software":
+        call(name, limit_s, camera.trigger)
+    frame = call(name, limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
+    if not isinstance(frame, Frame):
+        raise DeviceError(name, f"read() returned {type(frame).__name__}; expected a Frame")
+    return frame
 
 
 class CameraSeries:

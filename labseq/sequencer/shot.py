@@ -26,7 +26,7 @@ from labseq.model import (
 )
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.roles import Device, ReportsSignals, StepContext, offers
-from labseq.sequencer.images import CameraSeries
+from labseq.sequencer.images import CameraSeries, take_frame
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
@@ -246,6 +246,13 @@ class RunningShot:
         except KeyError:
             known = ", ".join(self.lab.devices) or "none"
             raise ConfigError(f"the profile has no device '{name}'; it has: {known}") from None
+
+    def take_frame(self, camera: str, exposure_s: float) -> Frame:
+        """Take a frame of anything but atoms; see ``labseq.plugin.Shot``."""
+        if camera == "camera":
+            self.series.end()
+        chosen: Any = self.lab.camera if camera == "camera" else self.device(camera)
+        return take_frame(chosen, camera, exposure_s, self.call, self.call_timeout_s)
 
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs

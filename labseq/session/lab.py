@@ -15,7 +15,7 @@ from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
-from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, offers
+from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, offers
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
 from labseq.sequencer.lines import blinding_lines, trigger_line
@@ -107,7 +107,10 @@ def construct(
     made: dict[str, Any] = {}
     streams: list[RandomStream] = []
     for role in sorted(chosen, key=lambda role: role != "simulation"):  # the others receive the simulation
-        own = replace(context, name=role, simulation=made.get("simulation", context.simulation))
+        simulation: Simulation | None = made.get("simulation", context.simulation)
+        if simulation is not None and chosen[role].entry.kind == "camera" != role:
+            simulation = simulation.seen_by(role) if offers(simulation, "seen_by") else simulation
+        own = replace(context, name=role, simulation=simulation)
         if role == "simulation":
             stream = RandomStream(seed, "")
             own = replace(own, random=stream, grid=context.grid if true_grid is None else true_grid)

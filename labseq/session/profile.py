@@ -9,9 +9,9 @@ from shlex import quote
 from typing import Any, Final, Literal, NamedTuple
 
 from labseq.calibration.store import Store, Stored, check_grid
-from labseq.config.addresses import ROLES, Override
+from labseq.config.addresses import Override
 from labseq.config.document import Document, StoredText, plugin_paths
-from labseq.config.profile import OFF, ProfileSpec, load_profile
+from labseq.config.profile import OFF, DeviceChoice, ProfileSpec, load_profile
 from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
@@ -203,7 +203,7 @@ def choose_plugins(
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
-        kind = role if role in ROLES else "device"
+        kind = choice.role if isinstance(choice, DeviceChoice) else role
         if repaired and _is_fallback(document, choice):
             refused[role] = ConfigError("what the profile says of it is wrong")
             continue

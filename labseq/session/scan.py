@@ -16,7 +16,7 @@ import numpy as np
 
 from labseq.config.addresses import PROFILE, ROLES, VARIABLES
 from labseq.config.document import Document
-from labseq.config.profile import MobileTweezersChoice
+from labseq.config.profile import DeviceChoice, MobileTweezersChoice
 from labseq.config.scan import Axis, Scan
 from labseq.config.sequence import SequenceSpec, StepSpec
 from labseq.config.yaml_nodes import Node
@@ -233,9 +233,9 @@ class ScanPoints:
 
     def _make_role(self, document: Document, loc: Loc) -> PartSettings:
         role = str(loc[-1])
-        kind = role if loc[0] in ROLES else "device"
         own = {**self.hardware.profile.choices, **self.hardware.profile.devices}[role]
         choice = document.validate(type(own), loc).placed(*map(str, loc))
+        kind = choice.role if isinstance(choice, DeviceChoice) else role
         if kind in HARDWARE_KINDS and choice.use != self.hardware.document.get((*loc, "use")):
             what = f"a scan cannot change the driver of {role}"
             raise document.error((*loc, "use"), what, "one driver for the whole run")
@@ -314,8 +314,8 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
             names; with their place.
     """
     entry = named(hardware.host, document, "step", spec.kind, spec.loc, key=True)
-    known = entry.settings_model.model_fields if entry.settings_model is not None else {}
-    for key in {"name", "policy"}.difference(known):
+    fields = entry.settings_model.model_fields if entry.settings_model is not None else {}
+    for key in {"name", "policy"}.difference(fields):
         if document.root.at((*spec.loc, key)) is not None:
             what, hint = (
                 f"'{key}' is in the settings of '{spec.kind}'",
@@ -329,9 +329,14 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
         raise document.error(spec.loc, str(error)) from error
     key, devices = getattr(step, "device_setting", ""), hardware.profile.devices
     name = getattr(settings, key, None) if key else None
-    if name is not None and name not in devices:
+    may_be_camera = getattr(step, "device_may_be_camera", False)
+    known = [one for one, choice in devices.items() if may_be_camera or choice.role == "device"]
+    known += ["camera"] if may_be_camera else []
+    if name is not None and name not in known:
         what = f"the profile '{hardware.profile.name}' has no device '{name}'"
-        problem = document.problem((*spec.loc, key), what, one_of(sorted(devices)))
+        if name in devices:
+            what = f"'{name}' is a camera, which '{spec.kind}' cannot use"
+        problem = document.problem((*spec.loc, key), what, one_of(sorted(known)))
         raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
     return step, dumped
 

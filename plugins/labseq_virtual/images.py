@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import WHOLE_SENSOR, Occupancy, RandomStream, SensorMode, SiteGrid
-from labseq_virtual.sensors import Emccd, Qcmos, View
+from labseq_virtual.sensors import Emccd, Qcmos, View, normal_below
 from labseq_virtual.settings import ImageSettings, SimulationSettings
 
 
@@ -105,6 +105,28 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[cos, sin], [-sin, cos]])
 
 
+class TweezerSpots:
+    """Draws the light of the static tweezers on the pixels of a frame, one Gaussian spot on each site.
+
+    Vignetting dims it as it does the light of atoms.
+    """
+
+    def __init__(self, view: View, spots: NDArray[np.float64], binning: int) -> None:
+        top, left, height, width = view.region
+        sigma = view.spot / view.pixel_size
+        self._along = [
+            np.diff(normal_below(np.arange(0, n + 1, binning) + first - 0.5 - place.reshape(-1, 1), sigma))
+            for n, first, place in ((height, top, spots[..., 0]), (width, left, spots[..., 1]))
+        ]
+        self._relative = np.maximum(0.0, 1 - view.vignetting * corner_distance(view, spots) ** 2)
+
+    def draw(self, mean: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int32]:
+        """Photoelectrons on each pixel, int32 (height, width), for the mean of each spot (n_rows, n_cols)."""
+        along_y, along_x = self._along
+        on_pixel = (along_y * (mean * self._relative).reshape(-1, 1)).T @ along_x
+        return rng.poisson(on_pixel).astype(np.int32)
+
+
 class Images:
     """Draws frames of atoms on the sites, all in one mode of the sensor; ``seed``: that of the machine.
 
@@ -121,6 +143,7 @@ class Images:
         self._spots = site_spots(view, grid)
         self._brightness = site_brightness(view, self._spots, rng)
         self._sensor = Emccd(view) if view.sensor == "emccd" else Qcmos(view, rng)
+        self._tweezers: TweezerSpots | None = None
 
     def warm(self) -> None:
         """Compute what all frames have in common."""
@@ -133,15 +156,20 @@ class Images:
         shining: NDArray[np.float64],
         exposure_s: float,
         rng: np.random.Generator,
+        tweezer_power: NDArray[np.float64] | None = None,
     ) -> NDArray[np.uint16]:
         """Draw a frame, uint16 (height, width), of atoms that shine for a fraction of the exposure each.
 
-        ``row``, ``col`` and ``shining`` are of shape (n_atoms,).
+        ``row``, ``col`` and ``shining`` are of shape (n_atoms,); ``tweezer_power``, (n_rows, n_cols), is that
+        of the static tweezers on this sensor, relative to the nominal one; None for none.
         """
         view = self._view
-        full = view.photoelectrons * self._sensor.quantum_efficiency * exposure_s / view.exposure
-        mean = full * shining * self._brightness[row, col] * self._is_lit
+        efficiency = self._sensor.quantum_efficiency * exposure_s / view.exposure
+        mean = view.photoelectrons * efficiency * shining * self._brightness[row, col] * self._is_lit
         light = photoelectrons(view, self._spots[row, col], mean, rng, self._sensor.binning)
+        if tweezer_power is not None and view.tweezer_light > 0:
+            self._tweezers = self._tweezers or TweezerSpots(view, self._spots, self._sensor.binning)
+            light += self._tweezers.draw(view.tweezer_light * efficiency * tweezer_power, rng)
         return self._sensor.read(light, exposure_s, rng)
 
 
@@ -170,6 +198,7 @@ class Exposure:
         random: np.random.Generator,
         mode: SensorMode = WHOLE_SENSOR,
         light_on: float = 1.0,
+        tweezer_power: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.uint16], Counter[str]]:
         """Take a frame; imaging light heats some atoms out of their tweezers, and they shine until then.
 
@@ -181,6 +210,8 @@ class Exposure:
             random: Random numbers of the shot.
             mode: How the sensor is exposed and read.
             light_on: Fraction of the exposure with imaging light; at 0 there is no stray light either.
+            tweezer_power: float64 (n_rows, n_cols), power of the static tweezers, which a closed shutter
+                keeps from the sensor, too.
 
         Returns:
             The frame, uint16 (height, width), read-only, and the numbers of atoms lost to imaging and vacuum.
@@ -191,7 +222,8 @@ class Exposure:
         rate_hz = light_hz + 1.0 / self._settings.lifetime
         life_s = random.exponential(1.0 / rate_hz, len(row))
         shining = np.minimum(life_s / exposure_s, 1.0) * light_on
-        image = images.take(row, col, shining, exposure_s, random)
+        power = tweezer_power if mode.shutter_open else None
+        image = images.take(row, col, shining, exposure_s, random, power)
         image.flags.writeable = False
         lost = life_s < exposure_s
         occupied[row[lost], col[lost]] = False

@@ -335,17 +335,17 @@ def _dark_counts(register: Register, output: Output, mean_electrons: float) -> C
     nearest = np.rint(value).astype(np.int64)
     probability = np.zeros(FULL_SCALE + 1)
     n_counts = min(FULL_SCALE, int(nearest[-1]) + reach) + 1  # those above are impossible
-    below = _below(nearest - reach - value - 0.5, spread)
+    below = normal_below(nearest - reach - value - 0.5, spread)
     for distance in range(-reach, reach + 1):
         count = nearest + distance
-        below_next = _below(count - value + 0.5, spread)
+        below_next = normal_below(count - value + 0.5, spread)
         share = (below_next - below) * p
         probability[:n_counts] += np.bincount(np.clip(count, 0, n_counts - 1), share, n_counts)
         below = below_next
     return CountDistribution.of(probability)
 
 
-def _below(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
+def normal_below(distance: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
     """Probability that Gaussian noise of s.d. ``spread`` is below a distance from its mean."""
     return (distance > 0).astype(float) if spread == 0 else np.interp(distance / spread, *_normal())
 

@@ -123,7 +123,12 @@ class ImageSettings(Settings):
         "(ours; an ideal lens of NA 0.5 has a halo times its width of 0.16 um)",
     )
     exposure: PositiveDuration = Field(
-        default=45e-3, description="exposure that photoelectrons and background belong to (paper)"
+        default=45e-3, description="exposure that the photoelectrons belong to (paper)"
+    )
+    tweezer_light: NonNegativeFloat = Field(
+        default=0.0,
+        description="mean photoelectrons of the light of a static tweezer of nominal power in that exposure, "
+        "which the camera's filter lets through (ours: none); its spot is as wide as that of an atom",
     )
     photoelectrons: PositiveFloat = Field(
         default=60.0,
@@ -176,6 +181,45 @@ class ImageSettings(Settings):
     qcmos: QcmosSettings = Field(
         default=QcmosSettings(), description="the camera if `sensor` is qcmos; ignored otherwise"
     )
+
+
+class TweezerImageSettings(Settings):
+    """What a further camera sees: the light of the tweezers, and none of atoms.
+
+    An industrial camera: read noise of 2 electrons, 0.1 electrons per count, wells of 7000 electrons (ours).
+    """
+
+    frame: tuple[PositiveInt, PositiveInt] = Field(
+        default=(512, 512), description="[height, width] of the sensor in pixels (ours)"
+    )
+    pixel_size: PositiveLength = Field(
+        default=0.35e-6, description="size of a pixel in the atom plane (ours)"
+    )
+    centre_px: tuple[float, float] = Field(
+        default=(255.5, 255.5), description="[y, x] of the grid's centre in pixels (ours: the middle)"
+    )
+    angle: Angle = Field(default=0.0, description="rotation of the grid on the frame, clockwise (ours)")
+    spot: PositiveLength = Field(
+        default=0.42e-6, description="width (1 sigma of a Gaussian) of a tweezer in the atom plane (ours)"
+    )
+    exposure: PositiveDuration = Field(
+        default=1e-3, description="exposure that the photoelectrons belong to (ours)"
+    )
+    tweezer_light: NonNegativeFloat = Field(
+        default=20e3,
+        description="mean photoelectrons of the light of a static tweezer of nominal power in that exposure "
+        "(ours: in three times this exposure its pixels are saturated)",
+    )
+    background: NonNegativeFloat = Field(
+        default=5.0, description="mean photoelectrons of stray light per pixel in that exposure (ours)"
+    )
+
+    def image(self) -> ImageSettings:
+        """The settings of a camera of atoms with the same image."""
+        sensor = QcmosSettings(
+            quantum_efficiency=1.0, read_noise=2.0, electrons_per_adu=0.1, full_well=7000.0
+        )
+        return ImageSettings.model_validate({**self.model_dump(), "sensor": "qcmos", "qcmos": sensor})
 
 
 PositiveTemperature = Annotated[Temperature, Field(gt=0)]
@@ -347,6 +391,10 @@ class SimulationSettings(Settings):
         default=LightSettings(), description="which lines each kind of light needs; none: it is always on"
     )
     image: ImageSettings = Field(default=ImageSettings(), description="what the camera sees")
+    tweezer_image: TweezerImageSettings = Field(
+        default=TweezerImageSettings(),
+        description="what a device with `role: camera` sees: the light of the tweezers",
+    )
 
     @model_validator(mode="after")
     def _holds_atoms(self) -> Self:

@@ -38,6 +38,7 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.static_array import StaticArray
 from labseq_virtual.tone_positions import TonePositions
 from labseq_virtual.transport import CAUSES, RunningProgram, Transport
+from labseq_virtual.tweezer_view import TweezerView
 
 ROUNDING_S: Final = 1e-6
 """Tolerance for events out of order, in seconds: sums of times are rounded."""
@@ -81,6 +82,11 @@ class VirtualSimulation(Simulation):
     def readout_fraction(self, mode: SensorMode) -> float:
         """Time to read a frame, relative to that of the whole sensor without binning."""
         return View.of(self._settings.image, mode).readout_fraction
+
+    def seen_by(self, camera: str) -> TweezerView:
+        """What any other camera than that of the atoms receives: the light of the tweezers."""
+        del camera
+        return TweezerView(self, self._grid, self._settings.tweezer_image, self._seed, self._random)
 
     def prepare_sensor(self, mode: SensorMode) -> None:
         """Compute what all frames of a mode have in common, and load the kernels."""
@@ -204,7 +210,8 @@ class VirtualSimulation(Simulation):
             raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
         self._begin_event(t_start_s, "an exposure")
         light_on = self._lights.fraction_on("imaging", t_start_s, t_start_s + exposure_s)
-        image, lost = self._exposure.take(self._occupied, exposure_s, self._random.shot, mode, light_on)
+        power, rng = self._static.depth, self._random.shot
+        image, lost = self._exposure.take(self._occupied, exposure_s, rng, mode, light_on, power)
         self._lost += lost
         self._now_s = t_start_s + exposure_s
         return Frame(image, exposure_s, t_start_s)

@@ -17,9 +17,14 @@ import pytest
 from labseq_aravis import load_library
 from labseq_soapy_sim import build_module
 from labseq_ttl_sim.simavr import runner
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Run, Session
+from labseq.calibration.store import read_entry
 from labseq.cli import main
+from labseq.config.profile import load_profile
+from labseq.plugin import Context, DepthRamp, TweezerAmplitudes
 from labseq.recording.shot import Shot
 from tests.plugins.needs import need_library
 
@@ -29,6 +34,12 @@ MOBILE = "profile.mobile_tweezers"
 TRIGGER = "awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, triggers: mobile_tweezers}"
 TRIGGERED = (f"profile.lines={{use: virtual, channels: {{{TRIGGER}}}}}",)
 DDS = (*TRIGGERED, f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE}.max_column_tones=5")
+
+UNEVEN = tuple(
+    f"profile.simulation.{value}"
+    for value in ("machine_seed=20", "tone_response=12.5 %", "depth_disorder=0 %")
+)
+"""The static tweezers of `bench`."""
 
 RunProfile = Callable[..., Run]
 
@@ -99,9 +110,32 @@ def installed() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_run_through_every_driver_is_the_one_through_virtual_devices(run: RunProfile) -> None:
-    bench, expected = run("bench", shots=1), run("bench_awg", *TRIGGERED)
+    bench, expected = run("bench", shots=1), run("bench_awg", *TRIGGERED, *UNEVEN)
     assert bench.simulated
     compare_flights(bench.shots[0], expected.shots[0])  # depths follow what the radio sent
+
+
+@pytest.mark.usefixtures("installed")
+def test_static_tweezers_of_bench_are_equalised_by_frames_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(["calibrate", "tweezers", "--profile", "bench", "--seed", "1", "--json"])
+    (path,) = Path("hardware_profiles/calibrations/bench").glob("tweezers-*.json")
+    values = read_entry(path).values
+    document, spec = load_profile("bench", beside=tmp_path)
+    physics = document.validate(SimulationSettings, ("simulation",), drop={"use"})
+    simulation = VirtualSimulation(physics, Context("simulation", spec.grid_model()))
+    simulation.open()
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    assert np.std(simulation.spot_powers()) > 0.14
+    amplitudes = TweezerAmplitudes(values["row_amplitudes"], values["column_amplitudes"])
+    simulation.play("static_tweezers", amplitudes, 0.0)
+    after = simulation.spot_powers()
+    print(f"r.m.s. {after.std() / after.mean():.2%}, at most {np.abs(after / after.mean() - 1).max():.2%}")
+    assert after.std() < 0.005 * after.mean()
+    assert np.abs(after / after.mean() - 1).max() < 0.015
 
 
 @pytest.mark.usefixtures("installed")

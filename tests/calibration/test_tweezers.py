@@ -6,13 +6,15 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
+from numpy.typing import NDArray
 from PIL import Image
 
 from labseq.builtin.equalise import factors
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, DeviceError
 from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid, TweezerAmplitudes
 
 PROFILE = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
@@ -21,11 +23,26 @@ devices: {wavemeter: {use: virtual_spot_meter, noise: 1 %}}
 simulation: {use: virtual, machine_seed: 3, tone_response: 8 %}
 """
 METER = ["shot.0.equalise.device=wavemeter"]
+CAMERAS = {
+    "second camera": """devices:
+  trap_camera: {use: virtual, role: camera, region: {y: 150, x: 100, height: 250, width: 300}}
+""",
+    "camera of the atoms": "equalise: {device: camera, exposure: 2 ms}\n",
+}
+SIMULATION = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
+detector: {use: threshold}
+simulation:
+  use: virtual
+  machine_seed: 3
+  tone_response: 8 %
+  depth_disorder: 0 %
+  image: {sensor: qcmos, tweezer_light: 900000}
+"""
 
 
-def true_spread(outcome: Any = None) -> float:
-    """Separable part of the powers themselves, at the amplitudes that were found."""
-    physics = SimulationSettings.model_validate({"machine_seed": 3, "tone_response": 0.08})
+def true_powers(outcome: Any = None, **settings: Any) -> NDArray[np.float64]:
+    """The powers themselves, at the amplitudes that were found."""
+    physics = SimulationSettings.model_validate({"machine_seed": 3, "tone_response": 0.08} | settings)
     context = Context("simulation", SiteGrid(8, 10), random=RandomStream(0))
     simulation = VirtualSimulation(physics, context)
     simulation.open()
@@ -34,7 +51,12 @@ def true_spread(outcome: Any = None) -> float:
         values = outcome.stored.entry.values
         amplitudes = TweezerAmplitudes(values["row_amplitudes"], values["column_amplitudes"])
         simulation.play("static_tweezers", amplitudes, 0.0)
-    return factors(simulation.spot_powers()).separable_spread
+    return simulation.spot_powers()
+
+
+def true_spread(outcome: Any = None) -> float:
+    """Separable part of the powers."""
+    return factors(true_powers(outcome)).separable_spread
 
 
 @pytest.mark.usefixtures("rendered")
@@ -61,3 +83,39 @@ def test_uneven_rows_and_columns_are_made_even_and_stay_so(tmp_path: Path, make_
     assert again.stored.entry.origin["calibrations"] == {"tweezers": entry.id}
     assert true_spread(again) < 0.006
     assert lab.calibrate("tweezers", source=outcome.run.path).stored.entry.id == entry.id
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_tweezers_are_equalised_by_frames_of_a_camera_alone(
+    camera: str, tmp_path: Path, make_lab: Any
+) -> None:
+    lab = make_lab(tmp_path, SIMULATION + CAMERAS[camera])
+    outcome = lab.calibrate("tweezers")
+    powers = true_powers(outcome, depth_disorder=0.0)
+    assert np.std(true_powers(depth_disorder=0.0)) > 0.1
+    assert np.std(powers) < 0.006 * np.mean(powers)
+    assert outcome.stored.entry.quality["n_measured"] < 40
+
+
+@pytest.mark.parametrize(
+    ("camera", "changes", "message"),
+    [
+        (
+            "second camera",
+            ["shot.0.equalise.exposure=20 ms"],
+            r"pixels are saturated \(65535 counts\); shorten",
+        ),
+        ("second camera", ["profile.simulation.tweezer_image.tweezer_light=0"], "no lattice found: "),
+        (
+            "camera of the atoms",
+            ["profile.simulation.image.sensor=emccd", "profile.camera.em_gain=300"],
+            "no frame of other light than that of atoms with an EM gain of 300: .* set `em_gain` .* to 1",
+        ),
+    ],
+)
+def test_frames_without_measurable_spots_end_the_run(
+    camera: str, changes: list[str], message: str, tmp_path: Path, make_lab: Any
+) -> None:
+    lab = make_lab(tmp_path, SIMULATION + CAMERAS[camera])
+    with pytest.raises(DeviceError, match=message):
+        lab.calibrate("tweezers", overrides=changes)

@@ -174,7 +174,7 @@ def test_a_wrong_option_is_named_in_full(address: str, value: str, message: str)
 
 WRONG = """
 static_tweezers: => static_tweezer:
-  12:1: 'static_tweezer' is not a setting of a hardware profile; expected one of labseq, name, grid, camera, static_tweezers, mobile_tweezers, detector, devices, lines, simulation, calibrations, plugin_folders, variables, timeouts, budgets; did you mean 'static_tweezers'?
+  12:1: 'static_tweezer' is not a setting of a hardware profile; expected one of labseq, name, grid, camera, static_tweezers, mobile_tweezers, detector, devices, lines, simulation, equalise, calibrations, plugin_folders, variables, timeouts, budgets; did you mean 'static_tweezers'?
 camera: {use: virtual, readout: 5 ms}⏎ => ∅
   2:1: 'camera' is missing (the camera's plugin)
 camera: {use: virtual, readout: 5 ms} => camera: virtual
@@ -205,6 +205,10 @@ shutter: {use: virtual} => shutter: virtual
   22:12: there is just 'virtual' here; expected a mapping; write '{use: virtual}'
 shutter: {use: virtual} => shutter: {us: virtual}
   22:12: 'use' is missing from 'shutter' (the name of a plugin); did you write 'us' for it?
+shutter: {use: virtual} => shutter: {use: virtual, role: camera, blinding: {}}
+  22:41: a camera is blinding; expected a device
+shutter: {use: virtual} => shutter: {use: virtual}⏎equalise: {device: shuter}
+  23:20: there is no device 'shuter'; expected 'camera', 'shutter'
 {call: 3 s} => {call:3 s}
   25:12: 'call:3 s' is not a setting of 'timeouts'; expected one of call, safe_state, plan, load; put a space after the ':'
 grid: => shot:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from labseq.calibration.lattice import FoundLattice, find_lattice
+from labseq.detection.lattice import FoundLattice, find_lattice
 from labseq.errors import DeviceError
 from labseq.model import SiteGrid
 

@@ -148,6 +148,9 @@ REACH: Final = 2.7
 KNOT_PX: Final = 64
 """Distance of the knots of stray light, in pixels; it changes linearly between them."""
 
+MISSHAPEN: Final = 0.01
+"""How well the shape of spots is known, relative to their peak; bright ones are not fitted by their wings."""
+
 DIM: Final = 0.25
 """Spots with less than this fraction of the usual light do not affect the width, and move little."""
 
@@ -186,12 +189,12 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
 
     start, n, edge = places, len(places), np.array(flat.shape) - 1.0
     light, all_light, glow = np.zeros(n), np.zeros(n), np.zeros(flat.shape)
-    growth = 0.0
+    growth, dark_noise = 0.0, noise
     for _ in range(MAX_PASSES):
         pixels, spots, widening = _spot_columns(flat.shape, places, width_px, light)
         seen = flat.ravel()[pixels]
         matrix: Any = hstack([spots, csr_array(widening[:, None]), _stray_columns(flat.shape, pixels)], "csr")
-        found = _least_squares(matrix, seen, noise**2 + growth * glow.ravel()[pixels])
+        found = _least_squares(matrix, seen, dark_noise**2 + growth * glow.ravel()[pixels])
         all_light, moves = found[:n], found[n : 3 * n].reshape(2, n).T
         usual = max(float(np.median(all_light[all_light >= np.median(all_light)])), 1e-30)
         wider = float(np.clip(found[3 * n], -0.3 * width_px, 0.4 * width_px))
@@ -203,12 +206,39 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
         width_px = float(np.clip(width_px + wider, 0.35, 8.0))
         settled = light.any() and max(abs(wider), np.median(np.abs(places - before))) < SETTLED * width_px
         light = np.where(all_light > DIM * usual, all_light, 0.0)
+        dark_noise = max(noise, MISSHAPEN * usual / (2 * np.pi * width_px**2))
         glow.ravel()[pixels] = spots[:, :n] @ light
         left = seen - matrix @ found
         growth = max(0.0, float((left**2 - noise**2).sum() / max(glow.sum(), 1e-30)))
         if settled:
             break
     return FittedSpots(places, all_light, width_px)
+
+
+class KnownSpots:
+    """Spots whose places and width are known, to fit their light on many frames.
+
+    Args:
+        shape: (height, width) of the frames.
+        places: float64 (n, 2), (y, x) of each spot, in pixels.
+        width_px: Width of all (1 sigma).
+    """
+
+    def __init__(self, shape: tuple[int, int], places: Floats, width_px: float) -> None:
+        from scipy.sparse import hstack
+
+        self._n = len(places)
+        self._pixels, spots, _ = _spot_columns(shape, places, width_px, np.zeros(self._n))
+        self._matrix: Any = hstack([spots[:, : self._n], _stray_columns(shape, self._pixels)], "csr")
+
+    def fit(self, image: NDArray[Any]) -> Floats:
+        """Fit the light of each spot, and stray light that changes slowly, by least squares.
+
+        Returns:
+            The light, float64 (n,), in counts.
+        """
+        seen = np.asarray(image.ravel()[self._pixels], np.float64)
+        return _least_squares(self._matrix, seen, np.ones(len(seen)))[: self._n]
 
 
 def _spot_columns(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.calibration.spots import (
+from labseq.detection.spots import (
     FittedSpots,
     Spots,
     filtered_by_width,
@@ -70,7 +70,7 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
     ``grid`` points from row to row.
 
     Args:
-        flat: float64 (height, width), see :func:`labseq.calibration.spots.flattened`.
+        flat: float64 (height, width), see :func:`labseq.detection.spots.flattened`.
         grid: Lattice and shear.
 
     Returns:

@@ -1,0 +1,108 @@
+"""The simulation as a camera sees it that looks at the light of the tweezers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import (
+    WHOLE_SENSOR,
+    Frame,
+    LimitError,
+    RandomStream,
+    SensorMode,
+    Signal,
+    Simulation,
+    SiteGrid,
+)
+from labseq_virtual.images import Images
+from labseq_virtual.sensors import View
+from labseq_virtual.settings import TweezerImageSettings
+
+
+class TweezerSource(Protocol):
+    """The simulation whose tweezers are seen."""
+
+    def spot_powers(self) -> NDArray[np.float64]:
+        """Power of each static tweezer now relative to the nominal one, float64 (n_rows, n_cols)."""
+        ...
+
+
+class TweezerView(Simulation):
+    """Frames of the static tweezers, with the powers that they have when an exposure begins.
+
+    The camera receives no light of atoms, and its exposures act on none.
+
+    Args:
+        source: The simulation.
+        grid: The grid of sites.
+        settings: What the camera sees.
+        seed: Seed of the machine, for the camera's own patterns.
+        random: The random numbers of the simulation.
+    """
+
+    def __init__(
+        self,
+        source: TweezerSource,
+        grid: SiteGrid,
+        settings: TweezerImageSettings,
+        seed: int,
+        random: RandomStream,
+    ) -> None:
+        self._source, self._grid, self._settings, self._random = source, grid, settings.image(), random
+        self._seed = seed
+        self._images: dict[SensorMode, Images] = {}
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """(height, width) of the sensor in pixels."""
+        return self._settings.frame
+
+    def readout_fraction(self, mode: SensorMode) -> float:
+        """Time to read a frame, relative to that of the whole sensor without binning."""
+        return View.of(self._settings, mode).readout_fraction
+
+    def prepare_sensor(self, mode: SensorMode) -> None:
+        """Compute what all frames of a mode have in common."""
+        self._images_of(mode).warm()
+
+    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
+        """Take a frame.
+
+        Raises:
+            LimitError: The exposure is not longer than 0, or the sensor has no such mode.
+        """
+        if not exposure_s > 0:
+            raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
+        power = self._source.spot_powers() if mode.shutter_open else None
+        none, rng = np.empty(0, np.int64), self._random.shot
+        image = self._images_of(mode).take(none, none, np.empty(0), exposure_s, rng, power)
+        image.flags.writeable = False
+        return Frame(image, exposure_s, t_start_s)
+
+    def describe(self) -> Mapping[str, Any]:
+        """What the camera sees, in SI."""
+        return self._settings.model_dump(mode="json")
+
+    def _images_of(self, mode: SensorMode) -> Images:
+        if mode not in self._images:
+            self._images[mode] = Images(self._settings, self._grid, self._seed, mode)
+        return self._images[mode]
+
+    def open(self) -> None:
+        """Do nothing, like the four methods below: they are the simulation's own."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def begin_shot(self) -> None:
+        """Do nothing."""
+
+    def load(self, t_start_s: float, duration_s: float) -> None:
+        """Do nothing."""
+
+    def play(self, role: str, signal: Signal, t_start_s: float) -> None:
+        """Do nothing."""
