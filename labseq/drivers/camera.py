@@ -27,7 +27,7 @@ class Series:
     Attributes:
         n_frames: Number of exposures.
         exposure_s: Exposure time, in seconds.
-        trigger: What starts each exposure.
+        trigger: What starts each exposure, or all of them.
         em_gain: Mean gain of the EM register; 1 for none.
     """
 
@@ -35,6 +35,10 @@ class Series:
     exposure_s: float
     trigger: Trigger
     em_gain: float = 1.0
+
+
+EDGES: Final = frozenset({"external", "external_start", "bulb"})
+"""Triggers that come by a line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +163,7 @@ class CameraDriver(Camera):
         """Get ready for a series of exposures; frames not yet read are dropped.
 
         Raises:
-            LimitError: No frames, or an exposure that the camera cannot make.
+            LimitError: No frames, or an exposure that the camera cannot make, or not in its cycle.
             DeviceError: Not open, or a trigger that it does not have.
         """
         self._arm(n_frames, exposure_s, trigger, self.facts.em_gain)
@@ -242,6 +246,9 @@ class CameraDriver(Camera):
         if trigger not in facts.triggers:
             text = f"it has no {trigger} trigger; expected {one_of(facts.triggers)}"
             raise DeviceError(self._name, text)
+        if trigger == "external_start" and facts.cycle_s < exposure_s:
+            cycle, least = (format_quantity(s, "time") for s in (facts.cycle_s, exposure_s))
+            raise LimitError(f"{self._name}: cycle_time", cycle, f"at least the exposure of {least}")
         self.disarm()
         series = Series(n_frames, exposure_s, trigger, em_gain)
         try:
@@ -273,7 +280,9 @@ class CameraDriver(Camera):
             reason = f"all {n_read} frames of the series were read"
         elif series.trigger == "software" and n_read >= len(self._fired_s):
             reason = "the next one was not triggered"
-        elif series.trigger == "external":
+        elif series.trigger == "external_start" and n_read:
+            reason = f"frame {n_read} is not ready"
+        elif series.trigger in EDGES:
             reason = f"frame {n_read} waits for its external trigger; check the line"
         else:
             reason = f"frame {n_read} is not ready"
@@ -393,13 +402,16 @@ class SimulatedSensor:
             self._n_exposed = 0
             self._armed_s = self._clock.now()
 
-    def expose(self, late_s: float = 0.0, t_start_s: float | None = None) -> Frame | None:
+    def expose(
+        self, late_s: float = 0.0, t_start_s: float | None = None, exposure_s: float | None = None
+    ) -> Frame | None:
         """Begin the next exposure of the series.
 
         Args:
             late_s: How much later than it should its frame is due, in seconds: a failure to rehearse.
             t_start_s: When it begins, on the session's clock; None: now, or with the internal trigger in
                 its turn.
+            exposure_s: How long it lasts, in seconds; None: as the series says.
 
         Returns:
             Its frame, which can be read when it is due; None if no further exposure is armed.
@@ -415,9 +427,10 @@ class SimulatedSensor:
                 t_start_s = self._armed_s + self._n_exposed * self._period_s
             elif t_start_s is None:
                 t_start_s = self._clock.now()
-            frame = self._world.expose(t_start_s, series.exposure_s, self._mode)
+            exposure_s = series.exposure_s if exposure_s is None else exposure_s
+            frame = self._world.expose(t_start_s, exposure_s, self._mode)
             self._n_exposed += 1
-            self._frames.append((t_start_s + series.exposure_s + self._readout_s + late_s, frame))
+            self._frames.append((t_start_s + exposure_s + self._readout_s + late_s, frame))
             return frame
 
     def skip(self) -> None:

@@ -57,6 +57,16 @@ class CameraSettings(OrientationSettings):
         default=1, description="pixels of the sensor per pixel of a frame, along each axis"
     )
     max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure")
+    line_trigger: Literal["external", "external_start", "bulb"] = Field(
+        default="external",
+        description="what the line with `triggers: camera` does: `external`: each edge starts an exposure; "
+        "`external_start`: one edge starts all exposures of a series, every `cycle_time`; `bulb`: the camera "
+        "exposes as long as the line is on",
+    )
+    cycle_time: PositiveDuration | None = Field(
+        default=None,
+        description="with `external_start`: from the start of one exposure to that of the next",
+    )
     arming_time: Duration = Field(
         default=0.0,
         description=_ARMING_TIME,
@@ -97,6 +107,16 @@ class CameraSettings(OrientationSettings):
         if setting_error := self.sensor_conflict(world.sensor_shape):
             raise ConfigError(setting_error)
         return world
+
+    @model_validator(mode="after")
+    def _cycle_time_is_of_external_start(self) -> Self:
+        if self.line_trigger == "external_start" and self.cycle_time is None:
+            raise ValueError("`external_start` needs a `cycle_time`, at which the camera exposes")
+        if self.line_trigger != "external_start" and self.cycle_time is not None:
+            raise ValueError(
+                "`cycle_time` needs `line_trigger: external_start`; else each exposure has its trigger"
+            )
+        return self
 
     @model_validator(mode="after")
     def _region_can_be_binned(self) -> Self:

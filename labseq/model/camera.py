@@ -77,9 +77,11 @@ class CameraFacts:
         max_exposure_s: Longest exposure, in seconds.
         frame_shape: (height, width) of its images, in their orientation; None if not known.
         em_gain: Mean gain of the EM register in an exposure; 1 for a camera without one.
-        triggers: What may start its exposures: "software", "internal", "external".
+        triggers: What may start its exposures: "software", "internal", "external", "external_start", "bulb".
         min_exposure_s: Shortest exposure, in seconds; 0 if not known.
         arm_s: Time that arming for a series takes, in seconds; 0 if not known.
+        line_trigger: Which of its triggers a line of the timing box gives.
+        cycle_s: With "external_start", from the start of one exposure to that of the next, in seconds.
     """
 
     readout_s: float = 0.0
@@ -89,6 +91,8 @@ class CameraFacts:
     triggers: tuple[str, ...] = ("software",)
     min_exposure_s: float = 0.0
     arm_s: float = 0.0
+    line_trigger: str = "external"
+    cycle_s: float = 0.0
 
     def check_exposure(self, exposure_s: float, camera: str = "camera") -> None:
         """Refuse an exposure that the camera cannot make.

@@ -19,8 +19,12 @@ from labseq.errors import ConfigError, DeviceError, Problem, one_of
 from labseq.messages import clean, did_you_mean
 from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram, TweezersFacts
 
-Trigger = Literal["software", "internal", "external"]
-"""The trigger that starts an exposure."""
+Trigger = Literal["software", "internal", "external", "external_start", "bulb"]
+"""What starts an exposure.
+
+"external": an edge at the trigger input starts each one. "external_start": one edge starts the series, in
+which the camera times the exposures itself and ignores later edges. "bulb": the camera exposes as long as the
+input is on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +134,8 @@ class Camera(Hardware):
     @abstractmethod
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once.
+
+        With "bulb" ``exposure_s`` is how long the line will be on, which the camera is not told.
 
         A shot arms once for all its images with the same exposure time, as many as it may need at most.
         """

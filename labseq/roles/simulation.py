@@ -98,13 +98,13 @@ class Simulation(ABC):
         del camera
         return self
 
-    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
-        """Pass the edges of the line that triggers a role to its simulated device, from now on.
+    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
+        """Pass the pulses of the line that triggers a role to its simulated device, from now on.
 
         Args:
-            role: "camera".
-            on_edge: Called with the time of the edge on the session's clock, by the device that fires the
-                lines.
+            role: "camera" or "mobile_tweezers".
+            on_pulse: Called by the device that fires the lines, for all pulses of a program in order of time:
+                when the line switches on, on the session's clock, and how long it stays on, in seconds.
         """
 
     @property

@@ -61,6 +61,8 @@ class CameraSeries:
 
     Attributes:
         by_line: Whether a line of the timing box triggers the camera.
+        cycle_s: Time from one exposure to the next if the camera starts them by itself, in seconds; else 0.
+        fire_s: When the lines must be fired for such an exposure, on the session's clock; nan for none.
         arm_s: Time that arming takes, in seconds.
     """
 
@@ -75,6 +77,9 @@ class CameraSeries:
         self._is_lit_between = self._has_gain and bool(blinding_lines(lab.line_specs, IDLE))
         self._is_armed, self._n_left, self._exposure_s = False, 0, math.nan
         self._step = self._n_taken = 0
+        self._trigger = facts.line_trigger if self.by_line else "software"
+        self.cycle_s = facts.cycle_s if self._trigger == "external_start" else 0.0
+        self.fire_s = math.nan
 
     def entries(self, number: int) -> Sequence[TimelineEntry]:
         """The timeline of a step; empty if it is not known."""
@@ -93,12 +98,14 @@ class CameraSeries:
     def arm(self, exposure_s: float) -> None:
         """Arm for an image and those like it that follow."""
         n_frames = 1 if self._is_lit_between else max(1, sum(self._alike(exposure_s)))
-        self._n_left, self._is_armed = 0, True
-        self._call(self._camera.arm, n_frames, exposure_s, "external" if self.by_line else "software")
+        self._n_left, self._is_armed, self.fire_s = 0, True, math.nan
+        self._call(self._camera.arm, n_frames, exposure_s, self._trigger)
         self._n_left, self._exposure_s = n_frames, exposure_s
 
-    def taken(self) -> None:
-        """Count an image."""
+    def taken(self, fired_s: float) -> None:
+        """Count an image; ``fired_s`` is when the lines were fired for it, on the session's clock."""
+        if self.cycle_s:
+            self.fire_s = self.cycle_s + (fired_s if math.isnan(self.fire_s) else self.fire_s)
         self._n_left, self._n_taken = self._n_left - 1, self._n_taken + 1
         if self._is_lit_between:
             self.end()

@@ -12,7 +12,14 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from labseq.errors import ConfigError, DeviceError, InterlockError, OverBudgetError, StepTimeoutError
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    InterlockError,
+    OverBudgetError,
+    StepTimeoutError,
+    TransientError,
+)
 from labseq.guard import DRIVER_MARGIN_S, Guard
 from labseq.model import (
     CycleRecord,
@@ -182,7 +189,7 @@ class RunningShot:
         self.start_s = self.stages.start_s
         self.leaders = LeaderAnswers(lab, guard, record, emit)
         self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
-        self._fired_s = 0.0
+        self._fired_s = self._started_s = 0.0
         self._guard = guard
         self._emit = emit
 
@@ -227,6 +234,7 @@ class RunningShot:
         # a timeline leaves out the arming and the detection
         more_s = self.lab.budgets.get("detect", 0.0) * sum(entry.n_images for entry in entries)
         more_s += self.series.arm_s if arms else 0.0
+        more_s += self.series.cycle_s * sum(entry.n_images for entry in entries)
         with self.stage(f"{STEP}{number}_{name}", planned_s + more_s if planned_s else math.nan):
             yield
             durations = self._kept or (planned_s, self.elapsed_s - start_s)
@@ -322,6 +330,7 @@ class RunningShot:
         self._fired_s = self.clock.now()
         self.call("lines", timeout_s, lines.fire)
         fired_s = self.clock.now()  # after the call, which takes a moment
+        self._started_s = fired_s
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
         if start is not None and not is_triggered:
             start()
@@ -375,8 +384,10 @@ class RunningShot:
             DeviceError: Camera or detector returned an object of the wrong type, or a light is on that
                 would damage the camera.
         """
-        timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         check_blinding(self.lab, self._guard)
+        if self.series.is_ready(exposure_s):
+            self._await_exposure()
+        timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         frame = self._expose(exposure_s, cycle)
         if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
@@ -417,8 +428,25 @@ class RunningShot:
                 waited_s = 0.0 if self.clock.virtual else exposure_s
                 self.stage_done("read_out", late_s, max(0.0, host_s - waited_s), readout_s, cycle)
                 self._check_order(exposure_s)
-            self.series.taken()
+            self.series.taken(self._started_s)
         return frame
+
+    def _await_exposure(self) -> None:
+        """If the camera starts the next exposure by itself, wait until the lines must be fired for it.
+
+        Raises:
+            TransientError: It is too late for that.
+        """
+        left_s = self.series.fire_s - self.clock.now()
+        if math.isnan(left_s):
+            return
+        if left_s < 0:
+            late = format_quantity(-left_s, "time")
+            text = (
+                f"with `line_trigger: external_start` the camera exposes by itself, and the step came {late}"
+            )
+            raise TransientError(f"{text} too late for it; set a longer `cycle_time`", "camera")
+        self.clock.sleep(left_s)
 
     def _check_order(self, exposure_s: float) -> None:
         """Refuse a frame that is there before its own exposure can be over: of a trigger too many."""

@@ -21,6 +21,7 @@ from labseq.roles import Detector, Step, StepContext, find_leader, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
+from labseq.session.camera_trigger import unsuitable_exposures
 from labseq.session.lab import WARM_S
 from labseq.session.planning import changed_settings
 from labseq.session.rehearsal import Rehearsal, rehearse, windows_of
@@ -138,6 +139,7 @@ class _Points:
                 except LabseqError as error:
                     self.add(point.document, (*spec.loc, key), str(error))
         if any(bar.exposure_s for _, bars in self.timeline(point) for bar in bars):
+            self._ask_line_trigger(point, lab)
             self._ask_images(point, lab)
             self._ask_timeouts(point, lab)
 
@@ -158,6 +160,16 @@ class _Points:
         except LabseqError as error:
             if error.__cause__ is None:  # it refuses the frame; a failure may be due to the noise on it
                 self.add(document, ("detector", "use"), str(error))
+
+    def _ask_line_trigger(self, point: Point, lab: Lab) -> None:
+        """Exposures must suit what the line that triggers the camera does."""
+        context, shot = lab.step_context, self.session.assembly.sequence.shot
+        if trigger_line(lab.line_specs, "camera") is None:
+            return
+        bars = [(shot[n].loc, bar) for n, (_, own) in enumerate(self.timeline(point)) for bar in own]
+        for loc, one in unsuitable_exposures(context.camera, context.lines_facts, bars):
+            document = point.hardware.document if loc[0] == "camera" else point.document
+            self.add(document, loc, one.what, one.expected, one.hint)
 
     def _ask_lines(self, lab: Lab, kind: str, duration_s: float) -> None:
         if lab.lines is not None and offers(lab.lines, "check_program"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from labseq import motion
 from labseq.config.document import Document
 from labseq.config.profile import MotionSettings, ProfileSpec
-from labseq.errors import ConfigError, LabseqError, PlanError, Problem, one_of
+from labseq.errors import ConfigError, LabseqError, PlanError, Problem
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
@@ -19,6 +19,7 @@ from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, o
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
 from labseq.sequencer.lines import blinding_lines, trigger_line
+from labseq.session.camera_trigger import wiring_of_trigger
 from labseq.session.chosen import ChosenPlugin, construct_one
 from labseq.session.profile import ResolvedProfile
 
@@ -220,12 +221,7 @@ def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
             what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
             loc = ("lines", "channels", name, "on")
             problems.append(document.problem(loc, what, "a line that is off in an exposure"))
-    wired = trigger_line(lab.line_specs, "camera")
-    if wired is not None and "external" not in camera.triggers:
-        what = "the camera takes no external trigger"
-        loc = ("lines", "channels", wired.name, "triggers")
-        expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
-        problems.append(document.problem(loc, what, expected))
+    problems += wiring_of_trigger(document, camera, trigger_line(lab.line_specs, "camera"))
     wired, mobile = trigger_line(lab.line_specs, "mobile_tweezers"), lab.mobile_tweezers
     if wired is not None and not (offers(mobile, "waits_for_trigger") and mobile.waits_for_trigger):
         loc = ("lines", "channels", wired.name, "triggers")

@@ -21,6 +21,7 @@ from labseq.plugin import (
     LimitError,
     Series,
     format_quantity,
+    one_of,
     settle,
 )
 from labseq_andor.codes import (
@@ -43,8 +44,13 @@ TRIGGERS: Final[Mapping[str, tuple[str, int]]] = {
     "software": ("software", Triggers.CONTINUOUS),
     "internal": ("int", Triggers.INTERNAL),
     "external": ("ext", Triggers.EXTERNAL),
+    "external_start": ("ext_start", Triggers.EXTERNALSTART),
+    "bulb": ("ext_exp", Triggers.EXTERNALEXPOSURE),
 }
 """labseq's trigger -> pylablib's name for it, and the flag of a camera that has it."""
+
+BULB_AND_TRANSFER: Final = Features.FTEXTERNALEXPOSURE | Features.KINETICEXTERNALEXPOSURE
+"""Features of a camera that takes series with the bulb trigger and frame transfer."""
 
 ROUNDING: Final = 1e-6
 """Relative error of the SDK's times, which are float32."""
@@ -95,9 +101,17 @@ class AndorCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Limits of the camera; the read-out time is an estimate before ``open()``, then the SDK's value."""
         shape = self._settings.frame_shape(self._sensor_shape)
-        gain = float(self._settings.em_gain)
-        arm_s = self._settings.arming_time
-        return CameraFacts(self._readout_s, self._max_exposure_s, shape, gain, self._triggers, arm_s=arm_s)
+        settings = self._settings
+        return CameraFacts(
+            self._readout_s,
+            self._max_exposure_s,
+            shape,
+            float(settings.em_gain),
+            self._triggers,
+            arm_s=settings.arming_time,
+            line_trigger=settings.line_trigger,
+            cycle_s=settings.cycle_time or 0.0,
+        )
 
     def warm(self) -> None:
         """Import pylablib, which takes seconds."""
@@ -143,9 +157,19 @@ class AndorCamera(CameraDriver):
                 closing_ms, opening_ms = lib.GetShutterMinTimes()
                 self._shutter_times_ms = int(closing_ms), int(opening_ms)
                 self._shutter = "closed"
-        flags = sdk.capabilities.ulTriggerModes
-        self._triggers = tuple(name for name, (_, flag) in TRIGGERS.items() if flags & flag)
+        self._triggers = self._triggers_of(sdk)
         self._open_shutter(sdk)
+
+    def _triggers_of(self, sdk: Sdk) -> tuple[str, ...]:
+        """The triggers that the camera has; with frame transfer, bulb has capabilities of its own."""
+        flags, features = sdk.capabilities.ulTriggerModes, sdk.capabilities.ulFeatures
+        found = [name for name, (_, flag) in TRIGGERS.items() if flags & flag]
+        if self._settings.frame_transfer and features & BULB_AND_TRANSFER != BULB_AND_TRANSFER:
+            found = [name for name in found if name != "bulb"]
+        if (wanted := self._settings.line_trigger) not in found and wanted != "external":
+            text = f"this camera has no {wanted} trigger with these settings; it has {one_of(found)}"
+            raise DeviceError(self._name, f"{text}; set another `line_trigger`")
+        return tuple(found)
 
     def _disconnect(self) -> None:
         sdk, self._sdk = self._sdk, None
@@ -223,11 +247,23 @@ class AndorCamera(CameraDriver):
             if series.trigger == "software":  # works only in the mode "run till abort"
                 sdk.camera.setup_cont_mode(0)
             else:
-                sdk.camera.setup_kinetic_mode(n_frames)
+                cycle_s = self.facts.cycle_s if series.trigger == "external_start" else 0.0
+                sdk.camera.setup_kinetic_mode(n_frames, cycle_s)
             lib.SetExposureTime(series.exposure_s)
-            exposure_s = float(lib.GetAcquisitionTimings()[0])
+            exposure_s, _, cycle_s = map(float, lib.GetAcquisitionTimings())
+            if series.trigger == "external_start":
+                self._check_cycle(cycle_s)
+            if series.trigger == "bulb":  # the line makes it, whatever is set
+                exposure_s = series.exposure_s
             self._set_for, self._exposure_s = wanted, _without_rounding(exposure_s, series.exposure_s)
         return self._exposure_s
+
+    def _check_cycle(self, made_s: float) -> None:
+        wanted_s = self.facts.cycle_s
+        if _without_rounding(made_s, wanted_s) > wanted_s:
+            wanted, least = (format_quantity(s, "time") for s in (wanted_s, made_s))
+            what = f"{self._name}: cycle_time"
+            raise LimitError(what, wanted, f"at least {least} with this exposure and read-out")
 
     def _set_em_gain(self, sdk: Sdk, em_gain: float) -> None:
         if self._reported["em_gain_range"] is not None:

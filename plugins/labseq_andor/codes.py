@@ -55,6 +55,8 @@ class Triggers(IntFlag):
     INTERNAL = 1
     EXTERNAL = 2
     CONTINUOUS = 8
+    EXTERNALSTART = 16
+    EXTERNALEXPOSURE = 32
     INVERTED = 64
 
 
@@ -88,6 +90,8 @@ class Features(IntFlag):
     POLLING = 1
     SHUTTER = 8
     FANCONTROL = 128
+    FTEXTERNALEXPOSURE = 0x1000
+    KINETICEXTERNALEXPOSURE = 0x2000
     METADATA = 0x8000
 
 

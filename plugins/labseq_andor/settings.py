@@ -123,6 +123,13 @@ class AndorSettings(CameraSettings):
         return self
 
     @model_validator(mode="after")
+    def _bulb_is_possible(self) -> Self:
+        if self.line_trigger == "bulb" and self.frame_transfer and "885" not in self.model:
+            text = "no iXon but the 885 has `line_trigger: bulb` with frame transfer"
+            raise ValueError(f"{text}; set `frame_transfer: false`, or `line_trigger: external`")
+        return self
+
+    @model_validator(mode="after")
     def _crop_is_possible(self) -> Self:
         if not self.isolated_crop:
             return self

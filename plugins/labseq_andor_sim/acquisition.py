@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import threading
 import time
 from collections import OrderedDict, deque
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from labseq_andor.codes import Code
 
-from labseq.plugin import Clock, Frame, Series, SimulatedSensor
-from labseq_andor_sim.configuration import EXTERNAL, INTERNAL, SOFTWARE, Timing
+from labseq.plugin import Clock, Frame, Series, SimulatedSensor, Trigger
+from labseq_andor_sim.configuration import (
+    EXTERNAL,
+    EXTERNAL_EXPOSURE,
+    EXTERNAL_START,
+    INTERNAL,
+    SOFTWARE,
+    Timing,
+)
 from labseq_andor_sim.functions import implements, require
 
 ROUNDING_S: Final = 1e-9
 BUFFER_BYTES: Final = 48 * 2**20
 """Size of the ring buffer (ours)."""
-KINDS: Final[dict[int, Literal["software", "internal", "external"]]] = {
+KINDS: Final[dict[int, Trigger]] = {
     INTERNAL: "internal",
     EXTERNAL: "external",
+    EXTERNAL_START: "external_start",
+    EXTERNAL_EXPOSURE: "bulb",
     SOFTWARE: "software",
 }
 COLDEST_C: Final = -100.0
@@ -91,6 +101,7 @@ class Acquisition:
         self._is_cancelled = False
         self._coming: deque[tuple[float, Frame]] = deque()
         self._busy_until_s = self._started_s = 0.0
+        self._cycles_from_s = math.nan
         self._sensor.clear()
         self._empty_buffer()
 
@@ -109,12 +120,15 @@ class Acquisition:
         """Arm the sensor; with the internal trigger the first exposure begins."""
         timing, mode = self._timing, self._timing.sensor_mode
         require(timing.optics.reads_images, Code.INVALID_MODE)
+        is_bulb = timing.trigger == EXTERNAL_EXPOSURE
+        require(not (is_bulb and timing.optics.frame_transfer), Code.INVALID_MODE)
         self._empty_buffer()
         series = Series(timing.n_frames, timing.exposure_s, KINDS[timing.trigger], mode.em_gain or 1.0)
         self._sensor.arm(series, mode, timing.readout_s, timing.kinetic_s, self._arm_s)
         self._n_left = timing.n_frames
         self.is_acquiring, self._fault, self._is_cancelled = True, Code.SUCCESS, False
         self._started_s = self._busy_until_s = self._clock.now()
+        self._cycles_from_s = math.nan
         self._coming.clear()
         self.proceed()
 
@@ -135,13 +149,25 @@ class Acquisition:
         require(not self._is_busy(self._clock.now()), Code.ERROR_CODES)
         self._expose()
 
-    def pulse(self, t_s: float) -> bool:
-        """An edge at the trigger input; False if it started no exposure, since it came too soon."""
-        is_armed = self.is_acquiring and self._timing.trigger == EXTERNAL and self._n_left > 0
-        if not is_armed or self._is_busy(t_s):
+    def pulse(self, t_s: float, width_s: float) -> bool:
+        """A pulse at the trigger input; False if it started no exposure, since it came too soon."""
+        trigger = self._timing.trigger
+        if not self.is_acquiring or self._n_left == 0 or self._is_busy(t_s):
             return False
-        self._expose(t_s)
+        if trigger == EXTERNAL_START and math.isnan(self._cycles_from_s):
+            self._cycles_from_s = t_s
+        elif trigger in (EXTERNAL, EXTERNAL_EXPOSURE):
+            self._expose(t_s, width_s if trigger == EXTERNAL_EXPOSURE else None)
+        else:
+            return False
         return True
+
+    @property
+    def next_cycle_s(self) -> float:
+        """After an external start, when the next exposure begins, on the session's clock; else nan."""
+        if not self.is_acquiring or not self._n_left:
+            return math.nan
+        return self._cycles_from_s + (self._timing.n_frames - self._n_left) * self._timing.kinetic_s
 
     @implements("GetStatus", outputs=1)
     def _get_status(self) -> tuple[int]:
@@ -211,11 +237,13 @@ class Acquisition:
             self._arrived.notify_all()
 
     def proceed(self) -> None:
-        """Do what is due by now: frames arrive; with the internal trigger the next exposure begins."""
+        """Do what is due by now: frames arrive; where the camera times exposures itself the next begins."""
         now_s = self._clock.now() + ROUNDING_S
         while self.is_acquiring:
             if not self._coming and self._timing.trigger == INTERNAL:
                 self._expose()
+            if not self._coming and self.next_cycle_s <= now_s:
+                self._expose(self.next_cycle_s)
             if not self._coming or self._coming[0][0] > now_s:
                 return
             self._arrive(self._coming.popleft()[1])
@@ -223,16 +251,17 @@ class Acquisition:
     def _is_busy(self, t_s: float) -> bool:
         return t_s < self._busy_until_s - ROUNDING_S
 
-    def _expose(self, t_s: float | None = None) -> None:
+    def _expose(self, t_s: float | None = None, exposure_s: float | None = None) -> None:
         self._n_left -= 1
         if self._faults.missed_triggers > 0:
             self._faults.missed_triggers -= 1
             self._sensor.skip()
             return
-        frame = self._sensor.expose(self._faults.late_s, t_s)
+        frame = self._sensor.expose(self._faults.late_s, t_s, exposure_s)
         if frame is None:
             return
-        end_s, readout_s = frame.t_start_s + self._timing.exposure_s, self._timing.readout_s
+        exposure_s = self._timing.exposure_s if exposure_s is None else exposure_s
+        end_s, readout_s = frame.t_start_s + exposure_s, self._timing.readout_s
         self._busy_until_s = end_s if self._timing.optics.frame_transfer else end_s + readout_s
         with self._arrived:
             self._coming.append((end_s + readout_s + self._faults.late_s, frame))

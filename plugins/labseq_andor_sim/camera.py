@@ -110,9 +110,9 @@ class SimulatedCamera:
             return Code.ACQUIRING
         return Code.SUCCESS
 
-    def trigger(self, t_s: float | None = None) -> bool:
-        """An edge at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
-        return self.acquisition.pulse(self._clock.now() if t_s is None else t_s)
+    def trigger(self, t_s: float | None = None, width_s: float = 1e-3) -> bool:
+        """A pulse at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
+        return self.acquisition.pulse(self._clock.now() if t_s is None else t_s, width_s)
 
     @implements("GetCapabilities")
     def _get_capabilities(self, capabilities: Any) -> None:
@@ -124,7 +124,7 @@ class SimulatedCamera:
         caps.ulPixelMode = PIXELS_OF_16_BIT
         caps.ulSetFunctions = sum(SetFunctions)
         caps.ulGetFunctions = sum(GetFunctions)
-        caps.ulFeatures = sum(Features)
+        caps.ulFeatures = sum(Features) - Features.FTEXTERNALEXPOSURE - Features.KINETICEXTERNALEXPOSURE
         caps.ulEMGainCapability = EM_GAIN_REAL
 
 

@@ -28,7 +28,7 @@ MIN_EXPOSURE_S: Final = 10e-6
 """Shortest exposure without frame transfer; with it, that is the read-out (ours)."""
 MAX_EXPOSURE_S: Final = 1000.0
 """Longest exposure (ours)."""
-INTERNAL, EXTERNAL, SOFTWARE = 0, 1, 10
+INTERNAL, EXTERNAL, EXTERNAL_START, EXTERNAL_EXPOSURE, SOFTWARE = 0, 1, 6, 7, 10
 """Modes of ``SetTriggerMode``."""
 KINETIC, RUN_TILL_ABORT = 3, 5
 """Modes of ``SetAcquisitionMode``."""
@@ -276,7 +276,7 @@ class Timing:
     """Exposure, read-out and cycle times; acquisition mode and trigger.
 
     Attributes:
-        trigger: Mode of the trigger: INTERNAL, EXTERNAL or SOFTWARE.
+        trigger: Mode of the trigger, such as INTERNAL.
         optics: Region and frame transfer, which the times depend on.
     """
 
@@ -365,7 +365,7 @@ class Timing:
 
     @implements("SetTriggerMode", only_idle=True)
     def _set_trigger(self, mode: int) -> None:
-        require(mode in (INTERNAL, EXTERNAL, SOFTWARE))
+        require(mode in (INTERNAL, EXTERNAL, EXTERNAL_START, EXTERNAL_EXPOSURE, SOFTWARE))
         self.trigger = mode
 
     @implements("SetTriggerInvert", "SetFastExtTrigger", only_idle=True)

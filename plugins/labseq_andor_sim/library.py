@@ -87,9 +87,12 @@ class SimulatedAndorLibrary(AndorLibrary):
 
     def wait(self, look: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
         """Wait on the session's clock until a frame is due, then in real time until pylablib sees it."""
-        start_s, expected = self._clock.now(), self.camera.acquisition.n_fetched
-        self.camera.acquisition.proceed()
-        frame = self.camera.sensor.take(timeout_s)
+        acquisition, start_s = self.camera.acquisition, self._clock.now()
+        expected, due_s = acquisition.n_fetched, acquisition.next_cycle_s
+        if due_s > start_s:
+            self._clock.sleep(min(due_s - start_s, timeout_s))
+        acquisition.proceed()
+        frame = self.camera.sensor.take(max(0.0, timeout_s - (self._clock.now() - start_s)))
         if frame is None:
             return look(0.0)
         left_s = max(0.0, timeout_s - (self._clock.now() - start_s))

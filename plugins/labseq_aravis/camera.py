@@ -15,7 +15,7 @@ INTERFACES: Final = ("GigEVision", "USB3Vision")
 """Interfaces that are searched. The library's others play back its own patterns, or are not GenICam."""
 
 CHECK_RANGES: Final = 1
-CONTINUOUS: Final = 0
+CONTINUOUS, MULTI_FRAME = 0, 2
 NO_PACKET_SOCKET: Final = 1
 """Numbers of the library's policies for ranges, acquisition modes and streams."""
 
@@ -186,6 +186,13 @@ class Camera:
         """Set a text or an enumeration."""
         self._call("arv_camera_set_string", feature.encode(), value.encode())
 
+    def options(self, feature: str) -> tuple[str, ...]:
+        """Values of an enumeration that can be chosen; none if the camera does not have it."""
+        if not self.is_available(feature):
+            return ()
+        name = "arv_camera_dup_available_enumerations_as_strings"
+        return self._library.texts(name, self._open_handle(), feature.encode())
+
     def set_boolean(self, feature: str, value: bool) -> None:
         """Switch something on or off."""
         self._call("arv_camera_set_boolean", feature.encode(), int(value))
@@ -333,9 +340,11 @@ class Camera:
         stream.allocate(n_buffers, payload)
         return stream
 
-    def start(self) -> None:
-        """Start the acquisition: frames come at the frame rate, or at each trigger."""
-        self._call("arv_camera_set_acquisition_mode", CONTINUOUS)
+    def start(self, n_frames: int | None = None) -> None:
+        """Start the acquisition: frames come at the frame rate, or at each trigger; at most ``n_frames``."""
+        self._call("arv_camera_set_acquisition_mode", CONTINUOUS if n_frames is None else MULTI_FRAME)
+        if n_frames is not None:
+            self.set_integer("AcquisitionFrameCount", n_frames)
         self._call("arv_camera_start_acquisition")
 
     def trigger(self) -> None:

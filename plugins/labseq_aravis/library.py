@@ -141,6 +141,7 @@ SIGNATURES: Final[dict[str, str]] = {
     # a camera
     "arv_camera_clear_triggers": "v pe",
     "arv_camera_create_stream": "p pppe",
+    "arv_camera_dup_available_enumerations_as_strings": "p pspe",
     "arv_camera_dup_available_pixel_formats_as_strings": "p ppe",
     "arv_camera_dup_available_trigger_sources": "p ppe",
     "arv_camera_get_binning": "v pppe",

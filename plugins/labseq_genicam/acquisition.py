@@ -22,8 +22,16 @@ FAULTS: Final[Mapping[str, str]] = {"success": "", "missing packets": INCOMPLETE
 RATE: Final = "AcquisitionFrameRate"
 ROUNDING: Final = 1e-6
 
-Start: TypeAlias = Literal["software", "line", "free"]
-"""What starts the exposures: a software trigger, an edge at an input, or the camera at its frame rate."""
+Start: TypeAlias = Literal["software", "line", "free", "series", "width"]
+"""What starts the exposures: a software trigger, an edge at an input, or the camera at its frame rate; an
+edge that starts a series at the frame rate; a pulse as long as the exposure."""
+
+BURST: Final = "FrameBurstStart"
+SERIES: Final = ("AcquisitionStart", BURST)
+"""Triggers that start a series, by their names in the SFNC; the first that a camera has is used."""
+BURST_COUNT: Final = "AcquisitionBurstFrameCount"
+WIDTH: Final = "TriggerWidth"
+"""Exposure mode in which the trigger's width is the exposure, by its name in the SFNC."""
 
 LAST_ID: Final = 65535
 """GigE cameras count frames from 1 to this and continue with 1, unless they use 64 bits."""
@@ -54,18 +62,23 @@ class Acquisition:
             start: What starts its exposures.
 
         Returns:
-            Time from one exposure to the next with the internal trigger, in seconds; else nan.
+            Time from one exposure to the next where the camera times them, in seconds; else nan.
         """
         continues = start == self._start == "software" and self._has_all_frames()
         if not continues:
             self.stop()
         period_s = math.nan
         with self._link.doing("prepare the series") as camera:
-            self._set_exposure(camera, series.exposure_s)
             if not continues:
                 self._set_trigger(camera, start)
-            if series.trigger == "internal":
-                period_s = self._set_period(camera, series.exposure_s, start)
+            if start == "width":
+                self._exposure_s = series.exposure_s
+            else:
+                self._set_exposure(camera, series.exposure_s)
+            if series.trigger in ("internal", "external_start"):
+                period_s = self._set_period(camera, series, start)
+            if start == "series":
+                self._set_series_trigger(camera, series.n_frames)
             self._provide(camera, series.n_frames)
         self._first, self._n_frames = self._n_triggered, series.n_frames
         return period_s
@@ -74,7 +87,8 @@ class Acquisition:
         """Start the prepared series, unless the camera is already waiting for triggers."""
         if self._start is None:
             with self._link.doing("start the series") as camera:
-                camera.start()
+                is_counted = start == "series" and series_trigger(camera) != BURST
+                camera.start(self._n_frames if is_counted else None)
             self._start = start
 
     @property
@@ -96,7 +110,7 @@ class Acquisition:
         number = self._counter.number(buffer.frame_id if buffer.image is not None else None) - self._first
         if number < 0:  # of an earlier series
             return None
-        if self._start == "free" and number >= self._n_frames - 1:
+        if self._start in ("free", "series") and number >= self._n_frames - 1:
             self.stop()
         time_s = 1e-9 * buffer.camera_time_ns if buffer.camera_time_ns else math.nan
         fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
@@ -136,24 +150,43 @@ class Acquisition:
         self._exposure_s = camera.exposure_s
 
     def _set_trigger(self, camera: Camera, start: Start) -> None:
-        if start == "free":
+        if camera.is_available("ExposureMode"):
+            camera.set_string("ExposureMode", WIDTH if start == "width" else "Timed")
+        if start in ("free", "series"):
             camera.set_trigger(None)
             return
         source = "Software" if start == "software" else self._settings.trigger_line
+        self._check_source(camera, source)
+        camera.set_trigger(source)
+        if start != "software" and self._settings.trigger_edge == "falling":
+            camera.set_string("TriggerActivation", "FallingEdge")
+
+    def _check_source(self, camera: Camera, source: str) -> None:
         if source not in (offered := camera.trigger_sources):
             text = f"its trigger source cannot be {source}; the camera offers {', '.join(offered) or 'none'}"
             raise DeviceError(self._link.name, text)
-        camera.set_trigger(source)
-        if start == "line" and self._settings.trigger_edge == "falling":
-            camera.set_string("TriggerActivation", "FallingEdge")
 
-    def _set_period(self, camera: Camera, exposure_s: float, start: Start) -> float:
-        """Set the frame rate of a camera without a trigger; returns its period."""
-        wanted_hz, natural_s = self._settings.frame_rate, exposure_s + self._settings.readout
+    def _set_series_trigger(self, camera: Camera, n_frames: int) -> None:
+        """Let an edge start the series, whose exposures have no trigger of their own."""
+        trigger, edge = series_trigger(camera), self._settings.trigger_edge
+        camera.set_string("TriggerSelector", trigger)
+        self._check_source(camera, self._settings.trigger_line)
+        camera.set_string("TriggerMode", "On")
+        camera.set_string("TriggerSource", self._settings.trigger_line)
+        camera.set_string("TriggerActivation", "FallingEdge" if edge == "falling" else "RisingEdge")
+        if trigger == BURST:
+            camera.set_integer(BURST_COUNT, n_frames)
+
+    def _set_period(self, camera: Camera, series: Series, start: Start) -> float:
+        """Set the rate at which a camera exposes by itself; returns its period."""
+        exposure_s, setting, wanted_hz = series.exposure_s, "frame_rate", self._settings.frame_rate
+        if series.trigger == "external_start":
+            setting, wanted_hz = "line_trigger: external_start", 1.0 / (self._settings.cycle_time or 1.0)
+        natural_s = exposure_s + self._settings.readout
         if not camera.is_available(RATE):
             if wanted_hz is None:
                 return natural_s
-            text = "the frame rate of the camera cannot be set; leave out `frame_rate`"
+            text = f"the frame rate of the camera cannot be set; leave out `{setting}`"
             raise DeviceError(self._link.name, text)
         low_hz, high_hz = camera.float_bounds(RATE)
         rate_hz = wanted_hz or min(max(1.0 / natural_s, low_hz), high_hz)
@@ -161,7 +194,7 @@ class Acquisition:
         if not low_hz <= rate_hz <= high_hz * (1.0 + ROUNDING):
             limit = f"{low_hz:g} to {high_hz:g} per second at this exposure"
             raise LimitError(f"{self._link.name}: frame rate", f"{rate_hz:g}", limit)
-        if start != "free":
+        if start == "software":  # of the simulated camera
             return 1.0 / rate_hz
         camera.set_frame_rate_hz(rate_hz)
         return 1.0 / camera.frame_rate_hz
@@ -176,6 +209,12 @@ class Acquisition:
         n_missing = max(2, min(n_frames, BUFFER_BYTES // payload)) - self._n_buffers
         self._stream.allocate(n_missing, payload)
         self._n_buffers += max(0, n_missing)
+
+
+def series_trigger(camera: Camera) -> str:
+    """The trigger of a camera that starts a series; empty if it has none."""
+    offered = camera.options("TriggerSelector")
+    return next((name for name in SERIES if name in offered), "")
 
 
 class FrameCounter:

@@ -41,7 +41,7 @@ class GenicamCamera(CameraDriver):
         known = self._connection.min_exposure_s, self._settings.max_exposure
         shortest_s, longest_s = self._reported.get("exposure_bounds_s", known)
         longest_s = min(longest_s, self._settings.max_exposure)
-        triggers = ("software", "internal", "external")
+        triggers = ("software", "internal", "external", "external_start", "bulb")
         return CameraFacts(
             self._settings.readout,
             longest_s,
@@ -49,6 +49,8 @@ class GenicamCamera(CameraDriver):
             triggers=triggers,
             min_exposure_s=shortest_s,
             arm_s=self._settings.arming_time,
+            line_trigger=self._settings.line_trigger,
+            cycle_s=self._settings.cycle_time or 0.0,
         )
 
     def warm(self) -> None:

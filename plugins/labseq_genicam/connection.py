@@ -28,7 +28,13 @@ HINTS: Final = {
 }
 """What to do, by the code of an error."""
 
-STARTS: Final[dict[str, Start]] = {"software": "software", "internal": "free", "external": "line"}
+STARTS: Final[dict[str, Start]] = {
+    "software": "software",
+    "internal": "free",
+    "external": "line",
+    "external_start": "series",
+    "bulb": "width",
+}
 """What starts the exposures of a camera, by trigger."""
 
 
@@ -67,7 +73,7 @@ class CameraConnection:
 
         Args:
             series: The series.
-            period_s: From one exposure to the next with the internal trigger, in seconds; else nan.
+            period_s: From one exposure to the next where the camera times them, in seconds; else nan.
             acquisition: The acquisition.
         """
 

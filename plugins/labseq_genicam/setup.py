@@ -7,6 +7,7 @@ from typing import Any
 from labseq_aravis import Camera
 
 from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, check_step, nearest, one_of
+from labseq_genicam.acquisition import SERIES, WIDTH, series_trigger
 from labseq_genicam.connection import Link
 from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat
 
@@ -47,6 +48,7 @@ def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> di
         for feature in ("ReverseX", "ReverseY"):
             if camera.is_available(feature):
                 camera.set_boolean(feature, False)
+        _check_line_trigger(link.name, camera, settings)
         pixel_format = _set_pixel_format(link.name, camera, settings.pixel_format)
         sensor_shape = _set_binning(link.name, camera, settings.binning)
         frame_shape = _set_region(link.name, camera, settings, sensor_shape)
@@ -59,6 +61,16 @@ def set_up(link: Link, settings: GenicamSettings, packet_size: int | None) -> di
             "gain_now": camera.gain if camera.has_gain else None,
             "exposure_bounds_s": camera.exposure_bounds_s,
         }
+
+
+def _check_line_trigger(name: str, camera: Camera, settings: GenicamSettings) -> None:
+    kind, missing = settings.line_trigger, ""
+    if kind == "external_start" and not series_trigger(camera):
+        missing = f"starts no series by a trigger ({one_of(SERIES)})"
+    elif kind == "bulb" and WIDTH not in camera.options("ExposureMode"):
+        missing = f"has no exposure mode {WIDTH}"
+    if missing:
+        raise DeviceError(name, f"the camera {missing}; leave out `line_trigger: {kind}`")
 
 
 def _firmware(camera: Camera) -> str:

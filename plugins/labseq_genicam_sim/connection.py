@@ -60,6 +60,8 @@ class SimulatedConnection(CameraConnection):
         self._acquisition: Acquisition | None = None
         self._series: Series | None = None
         self._edge_s: float | None = None
+        self._width_s: float | None = None
+        self._cycles_from_s, self._cycle_s = math.nan, settings.cycle_time or 0.0
         self._due: Frame | None = None
         self._n_exposed = self._n_due = 0
 
@@ -84,9 +86,9 @@ class SimulatedConnection(CameraConnection):
         A camera that runs without a trigger does not wait for a virtual clock, and edges of lines come from
         the simulation: in both cases the camera is triggered by software at the right time.
         """
-        if series.trigger == "internal":
-            return "software" if self._clock.virtual else "free"
-        return "line" if series.trigger == "external" and not self._is_wired else "software"
+        if series.trigger in ("software", "internal"):
+            return "free" if series.trigger == "internal" and not self._clock.virtual else "software"
+        return "software" if self._is_wired else super().start_of(series)
 
     def arm(self, series: Series, period_s: float, acquisition: Acquisition) -> None:
         """Get ready for a series, before the camera starts."""
@@ -95,8 +97,8 @@ class SimulatedConnection(CameraConnection):
         arm_s = 0.0 if acquisition.is_running else self._arm_s
         own_period_s = None if math.isnan(period_s) else period_s
         self._sensor.arm(series, self._mode, self._readout_s, own_period_s, arm_s)
-        if series.trigger == "external":
-            self._world.wire("camera", self._on_edge)
+        if series.trigger not in ("software", "internal"):
+            self._world.wire("camera", self._on_pulse)
 
     def fire(self, acquisition: Acquisition) -> None:
         """Trigger an exposure, and return when it has begun on the session's clock.
@@ -106,7 +108,7 @@ class SimulatedConnection(CameraConnection):
         """
         n = self._fake.n_made
         if not self._ignores_triggers:
-            self._made.append(self._sensor.expose(self._late_s, self._edge_s))
+            self._made.append(self._sensor.expose(self._late_s, self._edge_s, self._width_s))
         acquisition.fire()
         if not self._fake.wait_for_image(n, MAX_WAIT_S):
             self._made.clear()  # its frame will be missing
@@ -123,7 +125,8 @@ class SimulatedConnection(CameraConnection):
         """Forget the series."""
         self._sensor.clear()
         self._made.clear()
-        self._series = self._edge_s = self._due = None
+        self._series = self._edge_s = self._width_s = self._due = None
+        self._cycles_from_s = math.nan
         self._n_exposed = self._n_due = 0
 
     def _wait_until_due(self, timeout_s: float) -> float | None:
@@ -133,8 +136,15 @@ class SimulatedConnection(CameraConnection):
             return None
         if self.start_of(series) != "software":
             return timeout_s  # only the camera knows when it exposes
+        start_s = self._clock.now()
         if series.trigger == "internal" and self._n_exposed == self._n_due:
             self.fire(self._acquisition)
+        elif not math.isnan(self._cycles_from_s) and self._n_exposed == self._n_due < series.n_frames:
+            self._edge_s = self._cycles_from_s + self._n_exposed * self._cycle_s
+            self._clock.sleep(max(0.0, min(self._edge_s - start_s, timeout_s)))
+            if self._edge_s <= self._clock.now():
+                self.fire(self._acquisition)
+        timeout_s = max(0.0, timeout_s - (self._clock.now() - start_s))
         if self._due is None:
             self._take(timeout_s)
         return None if self._due is None else max(timeout_s, MAX_WAIT_S)
@@ -150,10 +160,13 @@ class SimulatedConnection(CameraConnection):
         self._due = self._sensor.take(timeout_s)
         self._n_due += self._due is not None
 
-    def _on_edge(self, t_s: float) -> None:
-        """An edge of the line that is connected to the trigger input."""
-        if self._series is not None and self._series.trigger == "external" and self._acquisition is not None:
-            self._edge_s = t_s
+    def _on_pulse(self, t_s: float, width_s: float) -> None:
+        """A pulse of the line that is connected to the trigger input; the start of a series counts once."""
+        trigger = "" if self._series is None else self._series.trigger
+        if trigger == "external_start" and math.isnan(self._cycles_from_s):
+            self._cycles_from_s = t_s
+        elif trigger in ("external", "bulb") and self._acquisition is not None:
+            self._edge_s, self._width_s = t_s, width_s if trigger == "bulb" else None
             self.fire(self._acquisition)
 
     def _expose(self, exposure: Exposure) -> NDArray[np.uint16]:

@@ -34,6 +34,9 @@ REGISTERS: Final = {
     "AcquisitionFramePeriod": 0x138,
     "ReverseX": 0x140,
     "ReverseY": 0x144,
+    "TriggerSelector": 0x148,
+    "ExposureMode": 0x14C,
+    "AcquisitionFrameCount": 0x150,
     "TriggerMode": 0x300,
     "TriggerSource": 0x304,
     "TriggerActivation": 0x308,
@@ -55,6 +58,9 @@ TEXTS: Final = {
 TRIGGERS: Final = {"Software": 1, "Line1": 2}
 """Trigger sources. Line1 is connected to nothing."""
 
+OF_EACH_TRIGGER: Final = frozenset({"TriggerMode", "TriggerSource", "TriggerActivation"})
+"""Features that each trigger has of its own; that of ``TriggerSelector`` is seen."""
+
 CATEGORIES: Final = {
     "DeviceControl": tuple(TEXTS),
     "ImageFormatControl": (
@@ -63,8 +69,8 @@ CATEGORIES: Final = {
     ),
     "AcquisitionControl": (
         *("AcquisitionMode", "AcquisitionStart", "AcquisitionStop", "AcquisitionFrameRate"),
+        *("AcquisitionFrameCount", "ExposureMode", "ExposureTime"),
         *("TriggerSelector", "TriggerMode", "TriggerSource", "TriggerActivation", "TriggerSoftware"),
-        "ExposureTime",
     ),
     "AnalogControl": ("Gain",),
     "TransportLayerControl": ("PayloadSize",),
@@ -119,14 +125,13 @@ def _image_format() -> Iterable[str]:
 
 
 def _acquisition() -> Iterable[str]:
-    yield _enumeration("AcquisitionMode", {"Continuous": 1})
+    yield _enumeration("AcquisitionMode", {"Continuous": 1, "MultiFrame": 3})
+    yield _integer("AcquisitionFrameCount", _value("AcquisitionFrameCount"), "<Min>1</Min><Max>65535</Max>")
+    yield _enumeration("ExposureMode", {"Timed": 0, "TriggerWidth": 1})
     yield _command("AcquisitionStart", "Acquisition", 1)
     yield _command("AcquisitionStop", "Acquisition", 0)
     yield from _float("AcquisitionFrameRate", "AcquisitionFramePeriod", "1000000.0 / {0}", (1000, 10_000_000))
-    yield (
-        '<Enumeration Name="TriggerSelector"><EnumEntry Name="FrameStart"><Value>0</Value></EnumEntry>'
-        "<Value>0</Value></Enumeration>"
-    )
+    yield _enumeration("TriggerSelector", {"FrameStart": 0, "AcquisitionStart": 1})
     yield _enumeration("TriggerMode", {"Off": 0, "On": 1})
     yield _enumeration("TriggerSource", TRIGGERS)
     yield _enumeration("TriggerActivation", {"RisingEdge": 0})
@@ -148,8 +153,9 @@ def _text(name: str, address: int, length: int) -> str:
 
 
 def _register(name: str, address: int) -> str:
+    index = '<pIndex Offset="32">TriggerSelectorRegister</pIndex>' if name in OF_EACH_TRIGGER else ""
     return (
-        f'<IntReg Name="{name}Register"><Address>{address:#x}</Address><Length>4</Length>'
+        f'<IntReg Name="{name}Register"><Address>{address:#x}</Address>{index}<Length>4</Length>'
         "<AccessMode>RW</AccessMode><pPort>Device</pPort><Cachable>NoCache</Cachable>"
         "<Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>"
     )

@@ -15,6 +15,7 @@ from labseq.plugin import (
     LimitError,
     Trigger,
     format_quantity,
+    one_of,
     wait_for,
 )
 from labseq_pylon.library import Nodes, Sdk
@@ -26,6 +27,22 @@ GIGE: Final = "BaslerGigE"
 MAX_GIGE_FRAMES: Final = 65535
 """GigE cameras number their frames from 1, with 16 bits."""
 NO_NUMBER: Final = 2**64 - 1
+
+
+SERIES: Final = (
+    ("FrameBurstStart", "AcquisitionBurstFrameCount"),
+    ("AcquisitionStart", "AcquisitionFrameCount"),
+)
+"""Triggers that start a series, each with the node of its number of frames: USB and ace 2, GigE."""
+WIDTH: Final = "TriggerWidth"
+"""Exposure mode in which the width of the trigger is the exposure."""
+
+
+def series_trigger(nodes: Nodes) -> tuple[str, str] | None:
+    """The trigger of a camera that starts a series, and the node of its number of frames; None for none."""
+    selector = nodes.find("TriggerSelector")
+    offered = () if selector is None else selector.Symbolics
+    return next((pair for pair in SERIES if pair[0] in offered), None)
 
 
 class Acquisition:
@@ -45,9 +62,12 @@ class Acquisition:
         self._ticks_per_s = ticks_per_s(nodes)
         self._exposure_s = math.nan
 
-    def set_exposure(self, exposure_s: float) -> None:
-        """Set the exposure time; frames carry the value that the camera accepted."""
+    def set_exposure(self, exposure_s: float, trigger: Trigger) -> None:
+        """Set the exposure time, which the pulse makes with bulb; frames carry what the camera accepted."""
         self._check_connected()
+        self._exposure_s = exposure_s
+        if trigger == "bulb":
+            return
         node = self._nodes.get("exposure time", "ExposureTime", "ExposureTimeAbs")
         taken_us = self._nodes.set_real(node, "exposure", 1e6 * exposure_s, _microseconds)
         self._exposure_s = 1e-6 * taken_us
@@ -61,14 +81,53 @@ class Acquisition:
             edge: Its edge, "rising" or "falling".
         """
         choose = self._nodes.choose
+        if series := series_trigger(self._nodes):
+            choose("TriggerSelector", "trigger", series[0], if_there=True)
+            choose("TriggerMode", "trigger mode", "On" if trigger == "external_start" else "Off")
+            if trigger == "external_start":
+                self._set_line(line, edge)
+        elif trigger == "external_start":
+            raise DeviceError(
+                self._sdk.name, f"the camera has no trigger {one_of([name for name, _ in SERIES])}"
+            )
         choose("TriggerSelector", "trigger", "FrameStart", if_there=True)
-        choose("TriggerMode", "trigger mode", "Off" if trigger == "internal" else "On")
+        if trigger != "external_start":
+            self._nodes.switch_off("AcquisitionFrameRateEnable")
+        has_none = trigger in ("internal", "external_start")
+        choose("TriggerMode", "trigger mode", "Off" if has_none else "On")
         if trigger == "software":
             choose("TriggerSource", "trigger source", "Software")
-        if trigger == "external":
-            choose("TriggerSource", "trigger source", line)
-            activation = {"rising": "RisingEdge", "falling": "FallingEdge"}[edge]
-            choose("TriggerActivation", "trigger edge", activation)
+        elif trigger in ("external", "bulb"):
+            self._set_line(line, edge)
+        choose(
+            "ExposureMode",
+            "exposure mode",
+            WIDTH if trigger == "bulb" else "Timed",
+            if_there=trigger != "bulb",
+        )
+        if trigger == "bulb" and (
+            node := self._nodes.find("ExposureOverlapTimeMax", "ExposureOverlapTimeMaxAbs")
+        ):
+            self._nodes.set_real(node, "overlap of exposures", node.Min)  # no pulse may be shorter
+
+    def set_cycle(self, n_frames: int, cycle_s: float) -> None:
+        """Set how many exposures an external start begins, and their distance in time."""
+        nodes = self._nodes
+        if series := series_trigger(nodes):
+            nodes.choose("TriggerSelector", "trigger", series[0])
+            nodes.set_integer(
+                nodes.get("number of frames of a start", series[1]), "number of frames", n_frames
+            )
+        enable = nodes.get("frame rate", "AcquisitionFrameRateEnable")
+        with self._sdk.doing("set its frame rate"):
+            enable.SetValue(True)
+        rate = nodes.get("frame rate", "AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+        nodes.set_real(rate, "frame rate", 1.0 / cycle_s)
+
+    def _set_line(self, line: str, edge: str) -> None:
+        self._nodes.choose("TriggerSource", "trigger source", line)
+        activation = {"rising": "RisingEdge", "falling": "FallingEdge"}[edge]
+        self._nodes.choose("TriggerActivation", "trigger edge", activation)
 
     def start(self, n_frames: int) -> None:
         """Queue the buffers and start; with the internal trigger the first exposure begins."""

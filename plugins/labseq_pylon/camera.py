@@ -37,10 +37,17 @@ class PylonCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Read-out time and longest exposure of the settings; shape of the frames as soon as it is known."""
         shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
-        triggers = ("software", "internal", "external")
+        triggers = ("software", "internal", "external", "external_start", "bulb")
         settings = self._settings
         times = settings.readout, settings.max_exposure
-        return CameraFacts(*times, shape, triggers=triggers, arm_s=settings.arming_time)
+        return CameraFacts(
+            *times,
+            shape,
+            triggers=triggers,
+            arm_s=settings.arming_time,
+            line_trigger=settings.line_trigger,
+            cycle_s=settings.cycle_time or 0.0,
+        )
 
     def warm(self) -> None:
         """Import pylon, which takes seconds."""
@@ -86,9 +93,11 @@ class PylonCamera(CameraDriver):
 
     def _start(self, series: Series) -> None:
         acquisition, settings, connection = self._opened(), self._settings, self._connection
-        acquisition.set_exposure(series.exposure_s)
         trigger = connection.trigger_of(series)
         acquisition.set_trigger(trigger, settings.trigger_line, settings.trigger_edge)
+        acquisition.set_exposure(series.exposure_s, trigger)
+        if trigger == "external_start":
+            acquisition.set_cycle(series.n_frames, self.facts.cycle_s)
         connection.arm(series, self._reported["pixel_format"], acquisition)
         acquisition.start(series.n_frames)
 

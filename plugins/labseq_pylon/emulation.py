@@ -8,6 +8,7 @@ is what that exposure sees. A file that was read is not read again in the same s
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import struct
@@ -16,6 +17,7 @@ import weakref
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Final
@@ -66,6 +68,7 @@ class EmulatedCamera(CameraConnection):
         self._nodes: Nodes | None = None
         self._bits = 16
         self._trigger: Trigger = "software"
+        self._cycles_from_s, self._cycle_s = math.nan, settings.cycle_time or 0.0
         self._n_exposed = self._n_due = self._n_frames = 0
         self._is_wired = trigger_line(context.lines, "camera") is not None
 
@@ -95,7 +98,8 @@ class EmulatedCamera(CameraConnection):
 
     def trigger_of(self, series: Series) -> Trigger:
         """The internal trigger and edges of lines are made by software, when there is a picture to take."""
-        return "external" if series.trigger == "external" and not self._is_wired else "software"
+        is_real = series.trigger not in ("software", "internal") and not self._is_wired
+        return series.trigger if is_real else "software"
 
     def arm(self, series: Series, pixel_format: PixelFormat, acquisition: Acquisition) -> None:
         """Get ready for a series, before the camera is started.
@@ -113,16 +117,26 @@ class EmulatedCamera(CameraConnection):
         node = nodes.get("exposure", "ExposureTimeAbs")
         own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
         node.SetValue(node.Min if self._clock.virtual else own_us)
-        if series.trigger == "external":
-            self._world.wire("camera", lambda t_s: self.fire(acquisition, t_s))
+        self._cycles_from_s = math.nan
+        if series.trigger not in ("software", "internal"):
+            self._world.wire("camera", partial(self._on_pulse, acquisition))
         self._sensor.arm(series, self._mode, self._readout_s, arm_s=self._settings.arming_time)
 
-    def fire(self, acquisition: Acquisition, t_s: float | None = None) -> None:
+    def _on_pulse(self, acquisition: Acquisition, t_s: float, width_s: float) -> None:
+        """A pulse of the line at the trigger input; the start of a series counts once."""
+        if self._trigger != "external_start":
+            self.fire(acquisition, t_s, width_s if self._trigger == "bulb" else None)
+        elif math.isnan(self._cycles_from_s):
+            self._cycles_from_s = t_s
+
+    def fire(
+        self, acquisition: Acquisition, t_s: float | None = None, exposure_s: float | None = None
+    ) -> None:
         """Expose, now or at ``t_s`` of the clock, write the picture to the next file, and trigger it."""
         if self._n_exposed == self._n_frames:
             return
         acquisition.wait_until_ready()
-        frame = self._sensor.expose(t_start_s=t_s)
+        frame = self._sensor.expose(t_start_s=t_s, exposure_s=exposure_s)
         if frame is not None:
             self._path(self._n_exposed).write_bytes(tiff(self._picture(frame.image)))
             self._n_exposed += 1
@@ -130,11 +144,17 @@ class EmulatedCamera(CameraConnection):
 
     def wait(self, acquisition: Acquisition, timeout_s: float) -> ExposureResult | None:
         """Wait on the session's clock until the next frame is due, then in real time until it has come."""
-        if self._trigger == "external" and not self._is_wired:
+        if self._trigger not in ("software", "internal") and not self._is_wired:
             return super().wait(acquisition, timeout_s)
+        start_s = self._clock.now()
         if self._trigger == "internal" and self._n_exposed == self._n_due:
             self.fire(acquisition)
-        frame = self._sensor.take(timeout_s)
+        elif not math.isnan(self._cycles_from_s) and self._n_exposed == self._n_due:
+            due_s = self._cycles_from_s + self._n_exposed * self._cycle_s
+            self._clock.sleep(max(0.0, min(due_s - start_s, timeout_s)))
+            if due_s <= self._clock.now():
+                self.fire(acquisition, due_s)
+        frame = self._sensor.take(max(0.0, timeout_s - (self._clock.now() - start_s)))
         if frame is None:
             return None
         self._n_due += 1

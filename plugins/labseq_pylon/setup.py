@@ -21,7 +21,7 @@ def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int])
     for auto in ("ExposureAuto", "GainAuto"):
         nodes.choose(auto, auto, "Off", if_there=True)
     nodes.choose("ExposureMode", "exposure mode", "Timed", if_there=True)
-    for name in ("AcquisitionFrameRateEnable", "ReverseX", "ReverseY"):
+    for name in ("ReverseX", "ReverseY"):
         nodes.switch_off(name)
     pixel_format = _set_pixel_format(nodes, settings.pixel_format)
     frame_shape = _set_sensor(nodes, settings, sensor_shape)

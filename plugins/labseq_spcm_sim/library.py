@@ -321,7 +321,7 @@ class SimulatedLibrary:
         else:
             return self._name
         if self._simulation is not None and offers(self._simulation, "wire"):
-            self._simulation.wire("mobile_tweezers", card.trigger_at)
+            self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: card.trigger_at(t_s))
         if isinstance(self._simulation, ReceivesOutput):
             self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))
         return install(card, name)

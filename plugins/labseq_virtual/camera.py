@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 from labseq.plugin import (
@@ -18,6 +19,7 @@ from labseq.plugin import (
     SensorMode,
     Series,
     SimulatedSensor,
+    Trigger,
     offers,
     settle,
     trigger_line,
@@ -105,6 +107,7 @@ class VirtualCamera(CameraDriver):
         self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)
         self._opened_s = 0.0
         self._is_internal = False
+        self._cycles_from_s = math.nan
         self._pending: deque[tuple[int, bool]] = deque()
         self._n_seen = 0
 
@@ -112,10 +115,18 @@ class VirtualCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Read-out time (less for a part of the sensor), longest exposure, shape of the frames, EM gain."""
         em_gain = 1.0 if self._settings.em_gain is None else self._settings.em_gain
-        triggers = ("software", "internal", "external") if self._is_wired else ("software", "internal")
-        times = self._readout_s, self._settings.max_exposure
-        arm_s = self._settings.arming_time
-        return CameraFacts(*times, self._frame_shape, em_gain, triggers, arm_s=arm_s)
+        settings = self._settings
+        triggers = "software", "internal", *(("external", "external_start", "bulb") if self._is_wired else ())
+        times = self._readout_s, settings.max_exposure
+        return CameraFacts(
+            *times,
+            self._frame_shape,
+            em_gain,
+            triggers,
+            arm_s=settings.arming_time,
+            line_trigger=settings.line_trigger,
+            cycle_s=settings.cycle_time or 0.0,
+        )
 
     def warm(self) -> None:
         """Compute what all frames have in common, and compile or load their kernels."""
@@ -164,8 +175,9 @@ class VirtualCamera(CameraDriver):
         self._is_internal = series.trigger == "internal"
         self._pending.clear()
         self._n_seen = 0
-        if series.trigger == "external":
-            self._simulation.wire("camera", self._expose)
+        self._cycles_from_s = math.nan
+        if series.trigger in ("external", "external_start", "bulb"):
+            self._simulation.wire("camera", partial(self._on_pulse, series.trigger))
 
     def _fire(self) -> None:
         if self._happens(self._settings.faults.missed_trigger):
@@ -178,6 +190,8 @@ class VirtualCamera(CameraDriver):
         while True:
             if self._is_internal and not self._pending:
                 self._expose()
+            if not math.isnan(self._cycles_from_s) and not self._pending:
+                self._expose(self._cycles_from_s + self._n_seen * (self._settings.cycle_time or 0.0))
             frame = self._sensor.take(max(0.0, until_s - self._clock.now()))
             if frame is None:
                 return None
@@ -194,15 +208,22 @@ class VirtualCamera(CameraDriver):
     def _stop(self) -> None:
         self._sensor.clear()
         self._pending.clear()
-        self._is_internal = False
+        self._is_internal, self._cycles_from_s = False, math.nan
         self._current = self._idle
 
-    def _expose(self, t_start_s: float | None = None) -> None:
-        """Begin the next exposure; with the internal trigger, only when a frame is read."""
+    def _on_pulse(self, trigger: Trigger, t_s: float, width_s: float) -> None:
+        """The line at the trigger input switches on, for a time; the start of a series counts only once."""
+        if trigger != "external_start":
+            self._expose(t_s, width_s if trigger == "bulb" else None)
+        elif math.isnan(self._cycles_from_s):
+            self._cycles_from_s = t_s
+
+    def _expose(self, t_start_s: float | None = None, exposure_s: float | None = None) -> None:
+        """Begin the next exposure; where the camera times it by itself, only when a frame is read."""
         faults = self._settings.faults
         late_s = faults.late_by if self._happens(faults.late) else 0.0
         is_lost = self._happens(faults.lost_in_series)
-        if self._sensor.expose(late_s, t_start_s) is not None:
+        if self._sensor.expose(late_s, t_start_s, exposure_s) is not None:
             self._pending.append((self._n_seen, is_lost))
             self._n_seen += 1
 

@@ -30,7 +30,7 @@ class Lights:
                 raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {known}")
         self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
         self._switches = [spec.name for spec in specs if spec.turns_off == "static_tweezers"]
-        self._wires: dict[str, Callable[[float], object]] = {}
+        self._wires: dict[str, Callable[[float, float], object]] = {}
         self._played: deque[tuple[float, LineProgram]] = deque(maxlen=N_REMEMBERED)
 
     def reset(self) -> None:
@@ -38,19 +38,21 @@ class Lights:
         self._played.clear()
         self._wires.clear()
 
-    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
-        """Call ``on_edge`` at every later edge of the line that triggers a role."""
-        self._wires[role] = on_edge
+    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
+        """Call ``on_pulse`` with start and width of every later pulse of the line that triggers a role."""
+        self._wires[role] = on_pulse
 
     def switch(self, program: LineProgram, t_start_s: float) -> None:
         """Start a program, which ends the one before, and trigger the devices wired to its lines."""
         self._played.append((t_start_s, program))
-        edges = [
-            (t_start_s + t_s, role) for line, role in self._triggers.items() for t_s in program.rising(line)
+        pulses = [
+            (t_start_s + on_s, off_s - on_s, role)
+            for line, role in self._triggers.items()
+            for on_s, off_s in program.spans(line)
         ]
-        for t_s, role in sorted(edges):
+        for t_s, width_s, role in sorted(pulses):
             if role in self._wires:
-                self._wires[role](t_s)
+                self._wires[role](t_s, width_s)
 
     def tweezers_off(self, program: LineProgram) -> tuple[list[tuple[float, float]], bool]:
         """When a program turns the static tweezers off, in seconds from its start; whether they stay off."""

@@ -173,9 +173,9 @@ class VirtualSimulation(Simulation):
             text += ", 'static_tweezers' with a DepthRamp or TweezerAmplitudes, or 'lines' with a LineProgram"
             raise DeviceError(self._name, text)
 
-    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
+    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
         """Call ``on_edge`` at every later edge of the line that triggers a role."""
-        self._lights.wire(role, on_edge)
+        self._lights.wire(role, on_pulse)
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
         """Connect the outputs of a driver of tweezers, in place of earlier ones.

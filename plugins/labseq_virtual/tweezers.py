@@ -115,7 +115,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         """Connect to the simulation, and to the line that triggers them."""
         super().open()
         if self._is_wired:
-            self._simulation.wire("mobile_tweezers", self._start)
+            self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: self._start(t_s))
 
     def warm(self) -> None:
         """Compile or load the kernels of transport."""

@@ -41,16 +41,18 @@ class NoisyWorld(RecordingSimulation):
         self._rng = np.random.default_rng(1)
         self.shown: list[NDArray[np.uint16]] = []
         self.modes: list[SensorMode] = []
-        self.edge: Callable[[float], object] = lambda _: None
+        self.exposures: list[tuple[float, float]] = []
+        self.pulse: Callable[[float, float], object] = lambda _t_s, _width_s: None
 
-    def wire(self, role: str, on_edge: Callable[[float], object]) -> None:
+    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
         assert role == "camera"
-        self.edge = on_edge
+        self.pulse = on_pulse
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         frame = super().expose(t_start_s, exposure_s, mode)
         self.shown.append(self._rng.integers(0, 2**16, frame.image.shape).astype(np.uint16))
         self.modes.append(mode)
+        self.exposures.append((t_start_s, exposure_s))
         return Frame(self.shown[-1], exposure_s, t_start_s)
 
 

@@ -121,11 +121,11 @@ def test_a_series_like_the_last_sets_nothing_again(monkeypatch: pytest.MonkeyPat
             assert lab.take(2, exposure_s)[-1].exposure_s == pytest.approx(exposure_s)
         assert set_for == [("software",), (0,)] * 2
         lab.take(2, 0.02, "external")
-        assert set_for[-2:] == [("ext",), (2,)]
+        assert set_for[-2:] == [("ext",), (2, 0.0)]
         lab.camera.close()
         lab.camera.open()
         lab.take(1, 0.02)
-        assert set_for[4:] == [("ext",), (2,)]  # of the camera as it was before
+        assert set_for[4:] == [("ext",), (2, 0.0)]  # of the camera as it was before
         assert lab.sim.timing.exposure_s == pytest.approx(0.02)
 
 
@@ -274,3 +274,20 @@ def test_looking_for_a_serial_number_leaves_other_cameras_cold() -> None:
     with pytest.raises(DeviceError, match="expected 4711"):
         lab.camera.open()
     assert lab.sim.cooler.is_on
+
+
+def test_bulb_with_frame_transfer_is_refused_as_most_heads_do_not_have_it() -> None:
+    both: Final[dict[str, Any]] = {"line_trigger": "bulb", "frame_transfer": True}
+    with pytest.raises(ValueError, match="no iXon but the 885 has `line_trigger: bulb` with frame transfer"):
+        unopened(**both)
+    made = unopened(**both, model="DU-885")  # a simulated 885 does not have it either
+    with pytest.raises(DeviceError, match="has no bulb trigger with these settings; it has one of"):
+        made.camera.open()
+
+
+def test_a_cycle_shorter_than_exposure_and_read_out_is_refused() -> None:
+    with rig(line_trigger="external_start", cycle_time="12 ms") as lab:
+        least = "cycle_time is 12 ms; the limit is at least 13 ms with this exposure and read-out"
+        with pytest.raises(LimitError, match=least):
+            lab.camera.arm(2, 0.0119, "external_start")
+        lab.camera.arm(2, 5e-3, "external_start")

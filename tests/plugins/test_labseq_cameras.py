@@ -14,7 +14,7 @@ import yaml
 
 from labseq import ConfigError, Run, Session
 from labseq.detection.sites import site_pixels
-from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
+from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
 from labseq.model import SiteGrid
 from labseq.plugin import Context
 from labseq.roles import Trigger
@@ -133,15 +133,55 @@ def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure(driver: str) -
         for _ in range(2):
             lab.camera.arm(2, 0.01, "external")
             start_s = lab.clock.now()
-            lab.world.edge(start_s + 0.002)
-            lab.world.edge(start_s + 0.1)
+            lab.world.pulse(start_s + 0.002, 1e-3)
+            lab.world.pulse(start_s + 0.1, 1e-3)
             frames = [lab.camera.read(1.0) for _ in range(2)]
             assert [frame.t_start_s - start_s for frame in frames] == pytest.approx([0.002, 0.1])
             assert lab.clock.now() - start_s == pytest.approx(0.11 + lab.camera.facts.readout_s)
             assert_shown(frames, lab)
-            lab.world.edge(lab.clock.now())
+            lab.world.pulse(lab.clock.now(), 1e-3)
             assert_shown(frames, lab)
             del lab.world.shown[:]
+
+
+def test_bulb_exposes_as_long_as_the_line_is_on(driver: str) -> None:
+    with opened_rig(driver, is_wired=True, line_trigger="bulb") as lab:
+        assert (lab.camera.facts.line_trigger, "bulb" in lab.camera.facts.triggers) == ("bulb", True)
+        for widths_s in ((0.01, 0.01), (0.003, 0.02)):  # the exposure set before has no effect
+            lab.camera.arm(2, 0.01, "bulb")
+            start_s = lab.clock.now()
+            for n, width_s in enumerate(widths_s):
+                lab.world.pulse(start_s + 0.1 * n, width_s)
+            frames = [lab.camera.read(1.0) for _ in range(2)]
+            assert lab.clock.now() - start_s == pytest.approx(0.1 + widths_s[1] + lab.camera.facts.readout_s)
+            made = [(start_s, widths_s[0]), (start_s + 0.1, widths_s[1])]
+            assert lab.world.exposures == [pytest.approx(one) for one in made]
+            assert_shown(frames, lab)
+            del lab.world.shown[:], lab.world.exposures[:]
+        lab.take(1, 0.02)  # by software it lasts as long as it is set to
+        assert lab.world.exposures[-1][1] == pytest.approx(0.02)
+
+
+def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver: str) -> None:
+    settings = {"line_trigger": "external_start", "cycle_time": "50 ms"}
+    with opened_rig(driver, is_wired=True, **settings) as lab:
+        for _ in range(2):
+            lab.camera.arm(3, 0.01, "external_start")
+            start_s = lab.clock.now()
+            with pytest.raises(DeviceTimeoutError, match="frame 0 waits for its external trigger"):
+                lab.camera.read(0.1)
+            lab.world.pulse(start_s + 0.12, 1e-3)
+            frames = [lab.camera.read(1.0)]
+            lab.world.pulse(lab.clock.now(), 1e-3)
+            with pytest.raises(DeviceTimeoutError, match="frame 1 is not ready"):
+                lab.camera.read(1e-3)
+            frames += [lab.camera.read(1.0) for _ in range(2)]
+            starts_s = [start_s + 0.12 + 0.05 * n for n in range(3)]
+            assert [frame.t_start_s for frame in frames] == pytest.approx(starts_s)
+            assert_shown(frames, lab)
+            del lab.world.shown[:]
+        with pytest.raises(LimitError, match="cycle_time is 50 ms; the limit is at least"):
+            lab.camera.arm(2, 0.06, "external_start")
 
 
 def test_two_simulated_cameras_work_side_by_side(driver: str) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from labseq import Frame
 from labseq.errors import DeviceTimeoutError
 from labseq.plugin import SensorMode
-from labseq.roles import NeverStopped
+from labseq.roles import NeverStopped, Trigger
 
 from .labseq_camera_rig import assert_shown, opened_rig, sensors
 from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, plugged_in
@@ -172,3 +172,21 @@ def test_numbers_tell_how_many_frames_never_came(first: int, steps: list[int], i
         if is_ethernet:
             frame_id = (frame_id - 1) % LAST_ID + 1
         assert counter.number(frame_id) == number
+
+
+def test_a_pulse_or_the_start_of_a_series_is_chosen_by_the_features_of_the_standard() -> None:
+    features = ("AcquisitionMode", "ExposureMode", "TriggerMode", "TriggerSource")
+    with rig(line_trigger="external_start", cycle_time="50 ms") as lab:
+        camera = lab.camera._link.camera
+
+        def chosen(trigger: Trigger, selector: str) -> list[str]:
+            lab.camera.arm(3, 0.01, trigger)
+            camera.set_string("TriggerSelector", selector)
+            return [camera.get_string(feature) for feature in features]
+
+        assert chosen("external_start", "AcquisitionStart") == ["MultiFrame", "Timed", "On", "Line1"]
+        assert (camera.get_integer("AcquisitionFrameCount"), camera.frame_rate_hz) == (3, 20.0)
+        assert chosen("external_start", "FrameStart")[2] == "Off"
+        assert chosen("bulb", "FrameStart") == ["Continuous", "TriggerWidth", "On", "Line1"]
+        assert chosen("bulb", "AcquisitionStart")[2] == "Off"
+        assert chosen("software", "FrameStart") == ["Continuous", "Timed", "On", "Software"]

@@ -86,6 +86,21 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
         lab.camera.arm(2, 0.01, "external")
         chosen = [lab.pylon.TriggerSource.Value, lab.pylon.TriggerActivation.Value]
         assert chosen == ["Line2", "FallingEdge"]
+        lab.camera.arm(2, 0.01, "bulb")
+        chosen = [lab.pylon.TriggerSource.Value, lab.pylon.ExposureMode.Value]
+        assert chosen == ["Line2", "TriggerWidth"]
+        lab.camera.arm(1, 0.01, "software")
+        assert lab.pylon.ExposureMode.Value == "Timed"
+    with rig(trigger_line="Line3", line_trigger="external_start", cycle_time="50 ms") as lab:
+        with pytest.raises(DeviceError, match="no number of frames of a start"):  # the emulated camera
+            lab.camera.arm(2, 0.01, "external_start")
+        lab.pylon.TriggerSelector.Value = "FrameBurstStart"
+        assert (lab.pylon.TriggerMode.Value, lab.pylon.TriggerSource.Value) == ("On", "Line3")
+        lab.pylon.TriggerSelector.Value = "FrameStart"
+        assert lab.pylon.TriggerMode.Value == "Off"
+        lab.camera.arm(1, 0.01, "software")
+        lab.pylon.TriggerSelector.Value = "FrameBurstStart"
+        assert lab.pylon.TriggerMode.Value == "Off"
     with rig(trigger_line="Line9") as lab:
         with pytest.raises(DeviceError, match=r"source cannot be Line9; expected one of .*'Line1'"):
             lab.camera.arm(1, 0.01, "external")

@@ -43,6 +43,7 @@ from labseq.plugin import (
     TweezerAmplitudes,
 )
 from labseq.sequencer.lines import line_program
+from labseq.session.check import check
 from labseq.testing import (
     CameraContract,
     DeviceContract,
@@ -398,11 +399,11 @@ def test_an_undeclared_line_is_refused() -> None:
 
 
 def test_an_edge_reaches_the_device_wired_to_it() -> None:
-    lights, seen = Lights(NEEDS, SPECS), list[float]()
-    lights.wire("camera", seen.append)
+    lights, seen = Lights(NEEDS, SPECS), list[tuple[float, float]]()
+    lights.wire("camera", lambda t_s, width_s: seen.append((t_s, width_s)))
     fire(lights, "image", 10e-3, 2.0)
     fire(lights, "load", 10e-3, 3.0)
-    assert seen == [pytest.approx(2.001)]
+    assert seen == [pytest.approx((2.001, 1e-3))]
 
 
 def lit_simulation(load: str) -> VirtualSimulation:
@@ -523,6 +524,74 @@ def test_a_trigger_line_for_a_driver_that_cannot_wait_for_it_is_refused(
     )
     with pytest.raises(ConfigError, match=message):
         run(tmp_path, LINES)
+
+
+WIDE = LINES.replace("on: [image], pulse: 1 ms, triggers", "on: [image], triggers")
+UNWIRED = WIDE.replace(", triggers: camera", "")
+BULB = "profile.camera.line_trigger=bulb"
+START = "profile.camera.line_trigger=external_start"
+TWO_IMAGES = "shot=[{load: {}}, {image: {}}, {wait: {duration: 20 ms}}, {image: {}}]"
+
+
+@pytest.mark.parametrize("box", ["virtual", "ttl\n  port: simulated"])
+def test_a_bulb_camera_sees_what_one_that_is_triggered_sees(tmp_path: Path, box: str) -> None:
+    bulb = run(tmp_path / "a", WIDE.replace("virtual", box, 1), BULB, shots=1).shots[0]
+    by_software = run(tmp_path / "b", UNWIRED, shots=1).shots[0]
+    assert bulb.filling_fraction > 0.9
+    assert np.array_equal(bulb.occupancies, by_software.occupancies)
+
+
+def test_with_an_external_start_the_images_wait_for_the_camera(tmp_path: Path) -> None:
+    (shot,) = run(tmp_path, LINES, START, "profile.camera.cycle_time=90 ms", TWO_IMAGES, shots=1).shots
+    first, second = shot.images
+    assert second.t_start_s - first.t_start_s == pytest.approx(90e-3)
+    assert (first.occupancy & second.occupancy).sum() > 250  # both were lit
+
+
+@pytest.mark.parametrize(
+    ("lines", "overrides", "message"),
+    [
+        (
+            LINES,
+            [BULB],
+            r"lined.yaml:\d+:\d+: the camera exposes as long as 'camera_tr.*no `pulse`",
+        ),
+        (
+            UNWIRED,
+            [BULB],
+            "'bulb', but no line triggers the camera; expected a line with `triggers: camera`",
+        ),
+        (
+            WIDE.replace("  use: virtual", "  use: virtual\n  resolution: 1 ms"),
+            [BULB, "shot.1.image.exposure=45.3 ms"],
+            r"shot.*45.3 ms, and the edges of the line make it .*; expected a multiple of 1 ms",
+        ),
+        (
+            LINES,
+            [START, "profile.camera.cycle_time=90 ms"],
+            "'cycle 0: move' takes 0 s to 60 ms, but .*images at a fixed interval; .*line_trigger: external",
+        ),
+        (
+            LINES,
+            [START, "profile.camera.cycle_time=50 ms", TWO_IMAGES],
+            "cycle_time=50 ms: images follow after 70.2 ms, .* every 50 ms by itself; expected more than",
+        ),
+        (LINES, [START], "`external_start` needs a `cycle_time`"),
+        (LINES, ["profile.camera.cycle_time=50 ms"], "`cycle_time` needs `line_trigger: external_start`"),
+    ],
+)
+def test_a_trigger_that_cannot_work_is_refused_by_the_check(
+    tmp_path: Path, lines: str, overrides: list[str], message: str
+) -> None:
+    profile = tmp_path / "lined.yaml"
+    profile.write_text(PROFILE.replace("simulation:\n", LIT) + lines, "utf-8")
+    with pytest.raises(ConfigError, match=message) as caught:
+        check(
+            labseq.Session.open(
+                ROOT / "sequences" / "compact_225.yaml", profile=str(profile), overrides=overrides
+            )
+        )
+    assert len(caught.value.problems) == 1
 
 
 def test_a_blinding_line_in_an_exposure_with_em_gain_is_refused_before_the_run(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class EdgeCamera(RecordingCamera):
     n_extra = 0
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Any) -> None:
-        assert trigger == "external"
+        assert trigger == self.facts.line_trigger
         super().arm(n_frames, exposure_s, "software")
 
     def read(self, timeout_s: float) -> Any:
@@ -116,3 +116,14 @@ def test_a_frame_of_an_extra_trigger_is_not_taken_for_the_next_image() -> None:
     with pytest.raises(DeviceError, match=r"a frame came 45 ms before its exposure was over, .*second edge"):
         made.run()
     assert "camera" in made.made_safe()
+
+
+def test_a_step_that_comes_after_the_exposure_that_the_camera_began_by_itself_fails() -> None:
+    camera = EdgeCamera()
+    vars(camera)["facts"] = CameraFacts(
+        triggers=("external_start",), line_trigger="external_start", cycle_s=0.05
+    )
+    made = rig(camera, IMAGE, WAIT, IMAGE, line_specs=[TRIGGERED])
+    late = r"the step came 5 ms too late for it; set a longer `cycle_time`"
+    with pytest.raises(TransientError, match=late):
+        made.run()

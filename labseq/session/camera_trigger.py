@@ -1,0 +1,88 @@
+"""Whether wiring and exposures suit the trigger of a camera that a line starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Final
+
+from labseq.config.document import Document
+from labseq.errors import Loc, Problem, one_of
+from labseq.model import CameraFacts, LinesFacts, LineSpec, TimelineEntry
+from labseq.units import format_quantity
+
+ROUNDING: Final = 1e-9
+BULB_ERROR: Final = 1e-3
+"""Largest relative error of an exposure that the edges of a line make."""
+
+
+def wiring_of_trigger(document: Document, camera: CameraFacts, line: LineSpec | None) -> Iterator[Problem]:
+    """Why a line cannot trigger the camera as its ``line_trigger`` says; ``line`` is None if none does."""
+    kind = camera.line_trigger
+    if line is None:
+        if kind != "external":
+            what = f"line_trigger is '{kind}', but no line triggers the camera"
+            yield document.problem(("camera", "line_trigger"), what, "a line with `triggers: camera`")
+        return
+    loc = ("lines", "channels", line.name)
+    if kind not in camera.triggers:
+        what = f"the camera takes no {kind} trigger"
+        expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
+        yield document.problem((*loc, "triggers"), what, expected)
+    changes = {"lead": line.lead_s, "lag": line.lag_s, "pulse": line.pulse_s}
+    for key in (key for key, time_s in changes.items() if time_s and kind == "bulb"):
+        what = f"the camera exposes as long as '{line.name}' is on (`line_trigger: bulb`)"
+        expected = f"no `{key}`, so that it is on during the exposure alone"
+        yield document.problem((*loc, key), what, expected)
+
+
+def unsuitable_exposures(
+    camera: CameraFacts, lines: LinesFacts, bars: Sequence[tuple[Loc, TimelineEntry]]
+) -> Iterator[tuple[Loc, Problem]]:
+    """Exposures of a shot that a line cannot make, or that a camera cannot time by itself.
+
+    Args:
+        camera: The camera, triggered by a line.
+        lines: The timing box.
+        bars: The timeline of the shot, each with the place of its step in the sequence.
+
+    Returns:
+        What is wrong, with its place in the sequence, or in the profile for ("camera", ...).
+    """
+    if camera.line_trigger == "bulb":
+        yield from _between_edges(lines.resolution_s, bars)
+    elif camera.line_trigger == "external_start":
+        yield from _out_of_step(camera.cycle_s, bars)
+
+
+def _between_edges(
+    resolution_s: float, bars: Sequence[tuple[Loc, TimelineEntry]]
+) -> Iterator[tuple[Loc, Problem]]:
+    for loc, bar in bars if resolution_s else ():
+        made_s = round(bar.exposure_s / resolution_s) * resolution_s
+        if abs(made_s - bar.exposure_s) > BULB_ERROR * bar.exposure_s:
+            came, step = (format_quantity(s, "time") for s in (bar.exposure_s, resolution_s))
+            what = f"the exposure is {came}, and the edges of the line make it (`line_trigger: bulb`)"
+            yield (*loc, "exposure"), Problem(what, expected=f"a multiple of {step}")
+
+
+def _out_of_step(cycle_s: float, bars: Sequence[tuple[Loc, TimelineEntry]]) -> Iterator[tuple[Loc, Problem]]:
+    """Images that do not follow one another at a fixed interval, or faster than the camera."""
+    cycle, longest_s = format_quantity(cycle_s, "time"), 0.0
+    for i, j in pairwise(n for n, (_, bar) in enumerate(bars) if bar.n_images):
+        loc, image = bars[j]
+        if image.exposure_s != bars[i][1].exposure_s:
+            continue  # the camera is armed again, and waits for an edge
+        longest_s = max(longest_s, sum(bar.duration_s for _, bar in bars[i:j]))
+        varies = next((bar for _, bar in bars[i + 1 : j + 1] if bar.min_duration_s != bar.duration_s), None)
+        if varies is not None:
+            low, high = (format_quantity(s, "time") for s in (varies.min_duration_s, varies.duration_s))
+            what = f"'{varies.label}' takes {low} to {high}, but the camera exposes every {cycle} by itself"
+            hint = "give the profile's camera `line_trigger: external`"
+            yield loc, Problem(what, expected="images at a fixed interval", hint=hint)
+            return
+    if longest_s > cycle_s * (1.0 + ROUNDING):
+        interval = format_quantity(longest_s, "time")
+        what = f"images follow after {interval}, but the camera exposes every {cycle} by itself"
+        expected = f"more than {interval}, with time to detect the atoms"
+        yield ("camera", "cycle_time"), Problem(what, expected=expected)
