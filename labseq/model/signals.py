@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -126,9 +126,9 @@ class AxisTones:
         offsets = read_only(self.offsets, np.int32, (-1,), "offsets")
         object.__setattr__(self, "offsets", offsets)
         n_tones = int(offsets[-1])
-        for item in fields(self)[1:]:
-            values = read_only(getattr(self, item.name), np.float64, (n_tones,), item.name)
-            object.__setattr__(self, item.name, values)
+        for name in ("start_hz", "end_hz", "start_amplitude", "end_amplitude", "phase_rad"):
+            values = read_only(getattr(self, name), np.float64, (n_tones,), name)
+            object.__setattr__(self, name, values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

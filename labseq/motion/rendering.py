@@ -125,8 +125,8 @@ def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
         return NO_COMB
     origin = float(axis.start_hz.min()) / sample_rate_hz
     if spacing == 0.0:  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
-        spacing = sample_rate_hz / Fraction(origin).limit_denominator(MAX_PERIOD).denominator
-    ratio = Fraction(spacing / sample_rate_hz).limit_denominator(MAX_PERIOD)
+        spacing = sample_rate_hz / _ratio(origin).denominator
+    ratio = _ratio(spacing / sample_rate_hz)
     period, step = ratio.denominator, float(ratio)
     span = (tones_hz[n_tones - 1] - tones_hz[0]) / sample_rate_hz
     near = abs(step * sample_rate_hz - spacing) <= TOLERANCE_HZ
@@ -135,6 +135,12 @@ def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
     n_teeth = round(span / step) + 1
     teeth = _teeth(ratio.numerator, period, 1 << (n_teeth - 1).bit_length())
     return Comb(origin, step, teeth[: 2 * n_teeth], period * math.ceil(BLOCK / period))
+
+
+@lru_cache(maxsize=64)
+def _ratio(value: float) -> Fraction:
+    """The nearest fraction of small numbers; working it out takes 0.04 ms."""
+    return Fraction(value).limit_denominator(MAX_PERIOD)
 
 
 @lru_cache(maxsize=8)

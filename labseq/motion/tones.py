@@ -107,7 +107,7 @@ def tone_program(
             amplitudes, peak voltage, mean power), the amplitudes are not one per site, or the
             speed profile does not exist.
     """
-    from labseq.motion.tone_kernels import N_FIELDS, build_axis
+    from labseq.motion.tone_kernels import N_FIELDS, PHASE, build_axis
 
     grid = grid or default_grid(20, 20)
     motion = motion or MotionSpec()
@@ -116,7 +116,7 @@ def tone_program(
     site_s = site_time_s(grid, motion)
     times_s = np.array([motion.overhead_per_batch_s, motion.pick_up_s, site_s, motion.drop_off_s])
     course = SPEED_PROFILES.index(motion.speed_profile)
-    sizes = np.diff(plan.batch_offsets[: n_batches + 1]).astype(np.int64)
+    sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
     n_segments = 3 * n_batches + 2 * int(sizes.sum())  # a tone may arrive on either axis
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
@@ -144,8 +144,13 @@ def tone_program(
         )
         offsets = offsets[: n + 1]
         check_limits(axis, driven, motion.rf, batch, offsets, values)
-        start_hz, end_hz, start, end, phase = values[:, :n_tones]
-        axes.append(AxisTones(offsets, start_hz, end_hz, start, end, 2 * np.pi * phase))
+        values = values[:, :n_tones]
+        values[PHASE] *= 2 * np.pi
+        for array in (values, offsets):
+            array.flags.writeable = False  # so that they are not copied
+        axes.append(AxisTones(offsets, *values))
+    for array in (labels, batch, duration_s):
+        array.flags.writeable = False
     kind, courses = labels[:, :n]
     return ToneProgram(axes[0], axes[1], duration_s[:n], kind, batch[:n], courses)
 
@@ -154,7 +159,7 @@ def _check_size(plan: Plan, grid: SiteGrid, n_batches: int) -> None:
     if not 0 <= n_batches <= plan.n_batches:
         raise PlanError(f"the plan has {plan.n_batches} batches; {n_batches} cannot be played")
     sources = plan.moves[: plan.batch_offsets[n_batches], :2]
-    if len(sources) and (sources.min() < 0 or np.any(sources.max(axis=0) >= grid.shape)):
+    if len(sources) and (sources.min() < 0 or (sources.max(axis=0) >= grid.shape).any()):
         raise PlanError(
             f"the plan does not fit onto the grid of {grid.n_rows} x {grid.n_cols} sites; check it first"
         )
@@ -185,7 +190,7 @@ def check_limits(
     """
     from labseq.motion.tone_kernels import WITHIN, first_excess
 
-    n_tones = np.diff(offsets)
+    n_tones = offsets[1:] - offsets[:-1]
     if len(n_tones) and n_tones.max() > drive.max_tones:
         worst = int(n_tones.argmax())
         what = f"the number of {AXES[axis]} tones in batch {batch[worst]}"
