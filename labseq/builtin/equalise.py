@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from labseq.builtin.spot_powers import SpotPowers
+from labseq.builtin.spot_powers import TweezerMeter
 from labseq.config.profile import PowerMeterSettings
 from labseq.errors import DeviceError
 from labseq.model import TimelineEntry
-from labseq.roles import Device, Shot, Step, StepContext
+from labseq.roles import Shot, Step, StepContext
 
 Floats = NDArray[np.float64]
 
@@ -250,8 +250,9 @@ def equalise_loop(
 def _average(measure: Callable[[], Floats], wanted: float, max_averages: int) -> tuple[Floats, float, int]:
     """The mean of enough measurements, the noise of its separable part, and how many there were."""
     mean = np.asarray(measure(), np.float64)
-    squares, noise, n = np.zeros_like(mean), math.inf, 1
+    shares, noise = [_shares(mean)], math.inf
     while noise > wanted:
+        n = len(shares)
         if n >= max_averages:
             needed = math.ceil(n * (noise / wanted) ** 2)
             _refuse(
@@ -259,22 +260,29 @@ def _average(measure: Callable[[], Floats], wanted: float, max_averages: int) ->
                 f"about {needed} averages are needed"
             )
         power = np.asarray(measure(), np.float64)
-        n += 1
-        off = power - mean
-        mean = mean + off / n
-        squares = squares + off * (power - mean)
-        noise = _noise(mean, squares / (n - 1) / n)
-    return mean, noise, n
+        mean = mean + (power - mean) / (n + 1)
+        shares.append(_shares(power))
+        noise = _noise(np.array(shares), len(mean))
+    return mean, noise, len(shares)
 
 
-def _noise(mean: Floats, variance: Floats) -> float:
-    """The rms of the separable part of powers of some variance that is due to noise alone."""
-    known = np.isfinite(mean) & (mean > 0)
-    n_rows, n_cols = mean.shape
-    if not known.any():
-        return 0.0  # nothing to average; `factors` refuses it
-    relative = float((variance[known] / mean[known] ** 2).mean())
-    return math.sqrt(relative * (1 / n_rows + 1 / n_cols))
+def _shares(power: Floats) -> Floats:
+    """The part of all light that each row and each column has, float64 (n_rows + n_cols,)."""
+    light = np.where(np.isfinite(power), power, 0.0)
+    return np.concatenate([light.sum(axis=1), light.sum(axis=0)]) / max(float(light.sum()), 1e-300)
+
+
+def _noise(shares: Floats, n_rows: int) -> float:
+    """The rms of the separable part of a mean of measurements that is due to noise, from their scatter.
+
+    Args:
+        shares: float64 (n_measurements, n_rows + n_cols), those of rows and columns in each measurement.
+        n_rows: Number of rows.
+    """
+    mean, variance = shares.mean(axis=0), shares.var(axis=0, ddof=1)
+    lit = mean > DEAD * np.median(mean)  # `factors` refuses the others
+    relative = np.where(lit, variance, 0.0) / np.where(lit, mean, 1.0) ** 2
+    return math.sqrt(float(relative[:n_rows].mean() + relative[n_rows:].mean()) / len(shares))
 
 
 def _refuse_standstill(spreads: list[float], power: Floats, rows: Floats, cols: Floats) -> None:
@@ -303,8 +311,7 @@ READINGS: Final = "equalise."
 class EqualiseStep(Step):
     """Measures the power of each static tweezer, and corrects the rows' and columns' tones until it is even.
 
-    A device of the profile measures: its value is an array (n_rows, n_cols) of spot powers on a camera, light
-    shifts, or anything else proportional to the depth; nan where it has no value.
+    A camera measures, or another device of the profile; see :class:`labseq.builtin.spot_powers.TweezerMeter`.
     """
 
     takes_time = False
@@ -327,21 +334,18 @@ class EqualiseStep(Step):
         settings, tweezers, limit_s = self.settings, shot.static_tweezers, shot.call_timeout_s
         shot.call("static_tweezers", limit_s, tweezers.start)
 
-        def apply(rows: Floats, cols: Floats) -> None:
-            shot.call("static_tweezers", limit_s, tweezers.load, (rows, cols))
-
         before: list[Floats] = []
-        read = self._reader(shot)
+        meter = TweezerMeter(shot, settings)
 
         def measure() -> Floats:
-            power = read()
+            power = meter.measure()
             before.append(power) if not before else None
             return power
 
         rows, cols = _in_force(shot)
         with shot.stage("equalise"):
-            found = equalise_loop(measure, apply, rows, cols, settings)
-            after = read()
+            found = equalise_loop(measure, meter.apply, rows, cols, settings)
+            after = meter.measure()
         equalised = found.equalised
         shot.note(READINGS + "row_amplitudes", equalised.row_amplitudes.tolist())
         shot.note(READINGS + "column_amplitudes", equalised.column_amplitudes.tolist())
@@ -352,28 +356,6 @@ class EqualiseStep(Step):
         shot.note(READINGS + "n_measured", found.n_measured)
         shot.note(READINGS + "power_before", before[0].tolist())
         shot.note(READINGS + "power_after", after.tolist())
-
-    def _reader(self, shot: Shot) -> Callable[[], Floats]:
-        """What measures the powers once, float64 (n_rows, n_cols)."""
-        name, exposure_s = self.settings.device, self.settings.exposure
-        device = None if name == "camera" else shot.device(name)
-        if device is not None and not hasattr(device, "arm"):  # as a camera has it
-            return lambda: self._read(shot, device)
-        spots = SpotPowers(shot.grid, name)
-        return lambda: spots.fit(shot.take_frame(name, exposure_s))
-
-    def _read(self, shot: Shot, device: Device) -> Floats:
-        name, value = self.settings.device, self.settings.value
-        answer = shot.call(name, shot.call_timeout_s, device.read, value)
-        try:
-            power = np.asarray(answer, np.float64)
-        except (TypeError, ValueError):
-            power = np.array(np.nan)
-        if power.shape != shot.grid.shape:
-            came = power.shape if power.ndim else type(answer).__name__
-            text = f"its value '{value}' is {came}; expected the power of each of {shot.grid.shape} tweezers"
-            raise DeviceError(name, text)
-        return power
 
 
 def _in_force(shot: Shot) -> tuple[Floats, Floats]:

@@ -1,16 +1,18 @@
-"""The power of each static tweezer, fitted on frames of a camera that looks at their light."""
+"""The power of each static tweezer: fitted on frames of a camera, or measured by another device."""
 
 from __future__ import annotations
 
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.config.profile import PowerMeterSettings
 from labseq.detection.lattice import find_lattice
 from labseq.detection.spots import KnownSpots, without_hot_pixels
 from labseq.errors import DeviceError
 from labseq.model import Frame, SiteGrid
+from labseq.roles import Shot
 
 Floats = NDArray[np.float64]
 
@@ -84,3 +86,77 @@ class SpotPowers:
 
     def _refuse(self, why: str) -> NoReturn:
         raise DeviceError(self._camera, f"no powers from its frame of the static tweezers: {why}")
+
+
+class TweezerMeter:
+    """Plays amplitudes of the static tweezers' tones, and measures the powers of the tweezers.
+
+    A camera measures by its frames. The value of any other device is an array (n_rows, n_cols) proportional
+    to the depths, nan where it has none; or one number proportional to the light of all tweezers. In that
+    case each row is on alone with all columns, then each column with all rows, which gives the factors of
+    rows and columns, but nothing of single tweezers.
+
+    Args:
+        shot: The devices.
+        settings: What measures.
+    """
+
+    def __init__(self, shot: Shot, settings: PowerMeterSettings) -> None:
+        self._shot, self._settings = shot, settings
+        self._device: Any = None if settings.device == "camera" else shot.device(settings.device)
+        is_camera = self._device is None or hasattr(self._device, "arm")
+        self._spots = SpotPowers(shot.grid, settings.device) if is_camera else None
+        self._is_total = False
+        self._playing: tuple[Floats, Floats] | None = None
+
+    def apply(self, rows: Floats, cols: Floats) -> None:
+        """Play amplitudes of rows and columns, fractions of full scale."""
+        shot = self._shot
+        shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.load, (rows, cols))
+        shot.clock.sleep(self._settings.settle)
+        self._playing = rows, cols
+
+    def measure(self) -> Floats:
+        """Measure the powers once, float64 (n_rows, n_cols), in any unit.
+
+        Raises:
+            DeviceError: The frame shows no measurable spots, or the value is neither an array nor a number.
+        """
+        if self._spots is not None:
+            return self._spots.fit(self._shot.take_frame(self._settings.device, self._settings.exposure))
+        if not self._is_total:
+            power = self._read()
+            self._is_total = power.ndim == 0
+            if power.ndim:
+                return power
+        return self._by_tone()
+
+    def _by_tone(self) -> Floats:
+        """The products of the light of each row and of each column, less that without any."""
+        assert self._playing is not None
+        rows, cols = self._playing
+        each_row, each_col = np.diag(rows), np.diag(cols)
+        dark = self._total(0 * rows, 0 * cols)
+        of_row = np.maximum(0.0, [self._total(row, cols) - dark for row in each_row])
+        of_col = np.maximum(0.0, [self._total(rows, col) - dark for col in each_col])
+        self.apply(rows, cols)
+        return np.outer(of_row, of_col) / max(float(of_col.sum()), 1e-300)
+
+    def _total(self, rows: Floats, cols: Floats) -> float:
+        self.apply(rows, cols)
+        return float(self._read())
+
+    def _read(self) -> Floats:
+        """The value of the device, float64 (n_rows, n_cols) or ()."""
+        name, value, shape = self._settings.device, self._settings.value, self._shot.grid.shape
+        answer = self._shot.call(name, self._shot.call_timeout_s, self._device.read, value)
+        try:
+            power = np.asarray(answer, np.float64)
+        except (TypeError, ValueError):
+            power = np.array(np.nan)
+        is_number = isinstance(answer, int | float | np.number) and np.isfinite(power)
+        if not (is_number or power.shape == shape) or (self._is_total and power.ndim):
+            came = power.shape if power.ndim else type(answer).__name__
+            text = f"its value '{value}' is {came}; expected the power of each of {shape} tweezers"
+            raise DeviceError(name, f"{text}, or one number, the power of all")
+        return power

@@ -244,7 +244,8 @@ def _meter(method: Method, spec: ProfileSpec) -> list[str]:
     if method.kind != "tweezers":
         return []
     meter = spec.equalise
-    values = {"device": meter.device, "value": meter.value, "exposure": f"{meter.exposure!r} s"}
+    times = {"exposure": f"{meter.exposure!r} s", "settle": f"{meter.settle!r} s"}
+    values = {"device": meter.device, "value": meter.value, **times}
     return [f"shot.0.equalise.{key}={json.dumps(values[key])}" for key in sorted(meter.model_fields_set)]
 
 

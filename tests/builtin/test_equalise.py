@@ -99,6 +99,27 @@ def test_rows_and_columns_become_even_and_the_record_shows_it() -> None:
     assert factors(before).separable_spread > 10 * factors(after).separable_spread
 
 
+def test_a_meter_of_the_total_light_measures_each_tone_alone() -> None:
+    meter = Meter(lambda power: float(power.sum()) + 500.0)
+    lab = lab_with(meter)
+    found = found_in(run(lab, settle=0.25))
+    assert factors(meter.powers()).separable_spread < 0.006
+    assert found["noise"] <= 0.005 / 3
+    assert found["residual_spread"] < 1e-4
+    played = amplitudes_of(lab)
+    assert (found["row_amplitudes"], found["column_amplitudes"]) == tuple(
+        each.tolist() for each in played[-1]
+    )
+    assert {int((rows > 0).sum()) for rows, _ in played} == {0, 1, 6}
+    assert lab.clock.now() >= 0.25 * len(played)
+
+
+def test_a_tone_without_light_is_named_by_a_meter_of_the_total_light() -> None:
+    lab = lab_with(Meter(lambda power: float(power[:, 1:].sum()) + 500.0, noise=0.0))
+    with pytest.raises(DeviceError, match="no light on column 0: is its tone on"):
+        run(lab)
+
+
 def test_it_begins_at_the_calibration_in_use() -> None:
     rows, cols = ROW_BIAS**-0.5, COLUMN_BIAS**-0.5
     values = {"row_amplitudes": 0.9 * rows / rows.sum(), "column_amplitudes": cols / cols.sum()}

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
+import pty
+import sys
+import threading
+import tty
 from pathlib import Path
 from typing import Any
 
@@ -119,3 +124,48 @@ def test_frames_without_measurable_spots_end_the_run(
     lab = make_lab(tmp_path, SIMULATION + CAMERAS[camera])
     with pytest.raises(DeviceError, match=message):
         lab.calibrate("tweezers", overrides=changes)
+
+
+class PowerMeter:
+    """A power meter on a pseudo-terminal, which sees the light of all simulated tweezers."""
+
+    def __init__(self, simulations: list[VirtualSimulation]) -> None:
+        self.simulations, self.rng = simulations, np.random.default_rng(4)
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.port, self.n_asked = os.ttyname(slave), 0
+        threading.Thread(target=self.serve, daemon=True).start()
+
+    def serve(self) -> None:
+        with os.fdopen(self.master, "r+b", buffering=0) as line:
+            while line.readline() == b"MEAS:POW?\r\n":
+                self.n_asked += 1
+                power_w = 30e-6 * self.simulations[-1].spot_powers().sum() * self.rng.normal(1, 0.002) + 2e-6
+                line.write(f"{power_w:.6E}\r\n".encode())
+
+
+SERIAL = """devices:
+  power_meter:
+    use: serial
+    port: PORT
+    baud_rate: 115200
+    write_ends_with: "\\r\\n"
+    read_ends_with: "\\r\\n"
+    values: {power: {ask: "MEAS:POW?", unit: W}}
+equalise: {device: power_meter, value: power}
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_tweezers_are_equalised_by_a_power_meter_on_a_serial_line(
+    tmp_path: Path, make_lab: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulations: list[VirtualSimulation] = []
+    opened = VirtualSimulation.open
+    monkeypatch.setattr(VirtualSimulation, "open", lambda self: (simulations.append(self), opened(self))[1])
+    meter = PowerMeter(simulations)
+    lab = make_lab(tmp_path, SIMULATION + SERIAL.replace("PORT", meter.port))
+    outcome = lab.calibrate("tweezers")
+    assert meter.n_asked > 19 * outcome.stored.entry.quality["n_measured"]
+    powers = true_powers(outcome, depth_disorder=0.0)
+    assert np.std(powers) < 0.006 * np.mean(powers)
