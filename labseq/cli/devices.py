@@ -71,6 +71,11 @@ def table(report: DevicesReport) -> list[str]:
         for what, (here, tried) in found.versions.items()
         for differs in [bool(tried) and here not in tried.split(", ")]
     ]
+    versions += [
+        (found.name, "-", f"cannot be read: {clean(str(found.unversioned))}", "-", "")
+        for found in report.devices
+        if found.unversioned is not None
+    ]
     below = ["", *columns([("device", "version of", "here", "tried with", ""), *versions])]
     return [*columns(rows, right=(_HEADER.index("latency"),)), *(below if versions else ())]
 
@@ -103,6 +108,7 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
             "versions": {
                 what: {"here": here, "tried": tried} for what, (here, tried) in found.versions.items()
             },
+            "versions_failure": None if found.unversioned is None else str(found.unversioned),
             "latency_s": found.latency_s,
             "self_test": found.tested,
             "described": found.described,

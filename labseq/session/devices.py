@@ -40,6 +40,7 @@ class CheckedDevice:
         name: Its role, or its name in the profile.
         described: The device's own description; empty if the check failed before it.
         versions: See ``Hardware.versions``.
+        unversioned: Why they could not be read, or None.
         tested: Whether it passed its self test; False also if it has none.
         latency_s: Time of a ``describe()``, from the call to the answer; None if the check failed before it.
         constructed: Whether its plugin could construct it; if not, ``failure`` says why.
@@ -51,6 +52,7 @@ class CheckedDevice:
     name: str
     described: Mapping[str, Any] = field(default_factory=dict[str, Any])
     versions: Mapping[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
+    unversioned: LabseqError | None = None
     tested: bool = False
     latency_s: float | None = None
     constructed: bool = True
@@ -187,7 +189,7 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts, watchdog
             raise DeviceError(name, text)
         found = replace(found, described=described)
         if offers(device, "versions"):
-            found = replace(found, versions=dict(guard.call(name, timeouts.call_s, device.versions)))
+            found = _versions_read(guard, found, device, timeouts.call_s)
         if offers(device, "self_test"):
             guard.call(name, timeouts.call_s, device.self_test)
             found = replace(found, tested=True)
@@ -197,6 +199,20 @@ def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts, watchdog
         return replace(found, failure=failure)
     except Exception as failure:  # noqa: BLE001 - of the driver's class
         return replace(found, failure=DeviceError(name, format_error(failure)))
+
+
+def _versions_read(guard: Guard, found: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
+    """Read the versions of a device; that this fails says nothing about whether the device works."""
+    try:
+        given = dict(guard.call(found.name, timeout_s, device.versions))
+        versions = {str(what): (str(here), str(tried)) for what, (here, tried) in given.items()}
+        return replace(found, versions=versions)
+    except StopRequested:
+        raise
+    except LabseqError as failure:
+        return replace(found, unversioned=failure)
+    except Exception as failure:  # noqa: BLE001 - of the driver's class
+        return replace(found, unversioned=DeviceError(found.name, f"versions(): {format_error(failure)}"))
 
 
 def _reading_s(guard: Guard, name: str, device: Hardware | Simulation, timeout_s: float) -> float:

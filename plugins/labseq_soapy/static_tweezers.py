@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from labseq_soapy_stream.messages import Facts, Setup
+from labseq_soapy_stream.messages import REF_LOCKED, Facts, Setup, unlocked
 
 from labseq.plugin import (
     Context,
@@ -258,16 +258,28 @@ class SoapyStaticTweezers(StaticTweezers):
         self._checked()
 
     def self_test(self) -> None:
-        """Check that the stream runs and that the calibrated amplitudes are possible; the light stays off.
+        """Check that the stream runs, the radio is locked, and the calibrated amplitudes are possible.
+
+        The light stays off.
 
         Raises:
             DeviceError: Not open, or something is wrong.
         """
         self._checked()
+        self._check_locks()
         try:
             self._tones.samples(self._calibrated)
         except LimitError as error:
             raise DeviceError(self._name, f"it cannot play the calibrated amplitudes: {error}") from error
+
+    def _check_locks(self) -> None:
+        locks, source = {} if self._facts is None else self._facts.locks, self._settings.clock_source
+        if not (found := unlocked(locks, source)):
+            return
+        hint = "can it tune to `local_oscillator`?"
+        if REF_LOCKED in found:
+            hint = f"is the reference of `clock_source: {source}` connected, and of the right frequency?"
+        raise DeviceError(self._name, f"the radio is not locked ({', '.join(found)}): {hint}")
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
         """Those that SoapySDR and the radio's module report; no real radio was tried."""

@@ -8,7 +8,8 @@
 // Arguments: folder (where its files are), channels, buffer (s), patience (s: how long its clock waits for
 // samples that are late), speed (of its clock), coerce_rate (Hz), record (samples kept in files), leakage (of
 // its local oscillators, part of full scale), time (0: no hardware time; 2: no timed packets), delay (s: of the
-// first packet), components (1: no digital tuning), fault=absent.
+// first packet), components (1: no digital tuning), unlocked (ref: its clocks, lo: its local oscillators),
+// fault=absent.
 //
 // With record, the file "trace" gets a line for each change of the transmitters, also by later processes:
 // time in s (CLOCK_MONOTONIC), name, two numbers. A process that is killed leaves them as they are.
@@ -80,7 +81,7 @@ public:
         : folder_(text(args, "folder", ".")), n_channels_(size_t(number(args, "channels", CHANNELS))),
           buffer_s_(number(args, "buffer", 0.05)), coerced_hz_(number(args, "coerce_rate", 0.0)),
           delay_s_(number(args, "delay", 0.0)), time_(number(args, "time", 1.0)), tunes_digitally_(number(args, "components", 2.0) > 1.0),
-          n_record_(size_t(number(args, "record", 0.0))) {
+          n_record_(size_t(number(args, "record", 0.0))), unlocked_(text(args, "unlocked", "")) {
         const std::string path = folder_ + "/ring";
         const size_t size = sizeof(Header) + CHANNELS * RING * sizeof(Sample);
         file_ = open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0600);
@@ -143,6 +144,13 @@ public:
     double getFrequency(const int, const size_t channel, const std::string &name) const override {
         const double oscillator = header_->oscillator_hz[channel];
         return name == "RF" ? oscillator : header_->frequency_hz[channel] - oscillator;
+    }
+
+    std::vector<std::string> listSensors() const override { return {"ref_locked"}; }
+    std::string readSensor(const std::string &) const override { return unlocked_ == "ref" ? "false" : "true"; }
+    std::vector<std::string> listSensors(const int, const size_t) const override { return {"lo_locked"}; }
+    std::string readSensor(const int, const size_t, const std::string &) const override {
+        return unlocked_ == "lo" ? "false" : "true";
     }
 
     bool hasHardwareTime(const std::string &) const override { return time_ > 0.0; }
@@ -299,6 +307,7 @@ private:
     double time_;
     bool tunes_digitally_;
     size_t n_record_;
+    std::string unlocked_;
     int file_ = -1;
     Header *header_ = nullptr;
     Sample *ring_ = nullptr;

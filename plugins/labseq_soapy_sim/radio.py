@@ -34,7 +34,7 @@ LEAST: Final[Mapping[str, float]] = {
     "components": 1.0,
 }
 """Arguments that are numbers, and their lowest values."""
-WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": ()}
+WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": (), "unlocked": ("ref", "lo")}
 """Arguments that are texts, and their allowed values; none: any."""
 
 

@@ -26,6 +26,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+REF_LOCKED, LO_LOCKED = "ref_locked", "lo_locked"
+"""Sensors of a radio for its clocks and its local oscillators, by their names in UHD."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setup:
@@ -74,6 +77,7 @@ class Facts:
         zero_hz: Frequency at which constant samples are played, of the row and the column channel.
         oscillator_hz: Their local oscillators.
         gain_db: Their gains.
+        locks: Which clocks and local oscillators are locked, where the radio has sensors for that.
         buffered: Number of samples in its buffer when it takes no more.
         starts_together: Whether both channels started at one time.
         no_real_time: Why the process has no real-time priority; "" if it has.
@@ -84,9 +88,16 @@ class Facts:
     zero_hz: Sequence[float]
     oscillator_hz: Sequence[float]
     gain_db: Sequence[float]
+    locks: Mapping[str, bool]
     buffered: int = 0
     starts_together: bool = True
     no_real_time: str = ""
+
+
+def unlocked(locks: Mapping[str, bool], clock_source: str) -> list[str]:
+    """Which of the radio's locks are open that must not be; its own clock follows no reference."""
+    own = (REF_LOCKED,) if clock_source in ("", "internal") else ()
+    return [name for name, is_locked in locks.items() if not is_locked and name not in own]
 
 
 def send(pipe: int, message: Mapping[str, Any]) -> None:

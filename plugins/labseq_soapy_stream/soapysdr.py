@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_soapy_stream.messages import Facts, Setup
+from labseq_soapy_stream.messages import LO_LOCKED, REF_LOCKED, Facts, Setup, unlocked
 
 TX: Final = 0
 FORMAT: Final = b"CF32"
@@ -23,6 +23,8 @@ NOT_SUPPORTED: Final = -5
 ERRORS: Final = {-7: "underflows", -3: "sequence_errors", -6: "late_packets"}
 """Errors that a stream survives: UNDERFLOW, CORRUPTION and TIME_ERROR -> key of the counts."""
 HAS_TIME: Final = 1 << 2
+LOCK_S: Final = 2.0
+"""How long they may take to lock."""
 START_S: Final = 0.1
 """From setting the time of a start to the start."""
 
@@ -78,6 +80,10 @@ _SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
     "Device_getFrequency": (c_double, _CHANNEL),
     "Device_listFrequencies": (c_void_p, (*_CHANNEL, POINTER(c_size_t))),
     "Device_getFrequencyComponent": (c_double, (*_CHANNEL, c_char_p)),
+    "Device_listSensors": (c_void_p, (c_void_p, POINTER(c_size_t))),
+    "Device_readSensor": (c_void_p, (c_void_p, c_char_p)),
+    "Device_listChannelSensors": (c_void_p, (*_CHANNEL, POINTER(c_size_t))),
+    "Device_readChannelSensor": (c_void_p, (*_CHANNEL, c_char_p)),
     "Device_hasHardwareTime": (c_bool, (c_void_p, c_char_p)),
     "Device_getHardwareTime": (c_longlong, (c_void_p, c_char_p)),
     "Device_setGain": (c_int, (*_CHANNEL, c_double)),
@@ -204,12 +210,28 @@ class Radio:
             return float(_call("getFrequencyComponent", self._device, TX, channel, b"RF"))
         return self.get("Frequency", channel)
 
+    def locks(self, channels: Sequence[int]) -> dict[str, bool]:
+        """Whether its clocks are locked to their reference, and the local oscillators of channels to them.
+
+        Only sensors that the radio has, by the names of UHD: "ref_locked", "lo_locked" with its channel.
+        """
+        found: dict[str, bool] = {}
+        if REF_LOCKED.encode() in self._names("listSensors"):
+            found[REF_LOCKED] = self._text("readSensor", REF_LOCKED.encode()) == "true"
+        for channel in channels:
+            if LO_LOCKED.encode() in self._names("listChannelSensors", TX, channel):
+                text = self._text("readChannelSensor", TX, channel, LO_LOCKED.encode())
+                found[f"{LO_LOCKED} {channel}"] = text == "true"
+        return found
+
     def _tunes_digitally(self, channel: int) -> bool:
+        return {b"RF", b"BB"} <= self._names("listFrequencies", TX, channel)
+
+    def _names(self, getter: str, *place: int) -> set[bytes]:
         n_names = c_size_t()
-        names = c_void_p(_call("listFrequencies", self._device, TX, channel, byref(n_names)))
+        names = c_void_p(_call(getter, self._device, *place, byref(n_names)))
         try:
-            found = ctypes.cast(names, POINTER(c_char_p))[: n_names.value] if names else []
-            return {b"RF", b"BB"} <= {*found}
+            return {*ctypes.cast(names, POINTER(c_char_p))[: n_names.value]} if names else set()
         finally:
             library().SoapySDRStrings_clear(byref(names), n_names)
 
@@ -231,8 +253,8 @@ class Radio:
         """Close the radio."""
         _call("unmake", self._device)
 
-    def _text(self, getter: str) -> str:
-        place = _call(getter, self._device)
+    def _text(self, getter: str, *arguments: int | bytes) -> str:
+        place = _call(getter, self._device, *arguments)
         text = ctypes.string_at(place).decode() if place else ""
         library().SoapySDR_free(place)
         return text
@@ -374,10 +396,14 @@ def read_back(radio: Radio, setup: Setup) -> Facts:
     rates = [radio.get("SampleRate", channel) for channel in setup.channels]
     if rates[0] != rates[1]:
         raise SoapyError(f"its channels have different sample rates: {rates[0]:.10g} and {rates[1]:.10g} Hz")
+    end_s = time.monotonic() + LOCK_S
+    while unlocked(locks := radio.locks(setup.channels), setup.clock_source) and time.monotonic() < end_s:
+        time.sleep(LOCK_S / 100)
     return Facts(
         radio=radio.identify(),
         rate_hz=rates[0],
         zero_hz=[radio.get("Frequency", channel) for channel in setup.channels],
         oscillator_hz=[radio.oscillator_hz(channel) for channel in setup.channels],
         gain_db=[radio.get("Gain", channel) for channel in setup.channels],
+        locks=locks,
     )

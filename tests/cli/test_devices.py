@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def refuse(self, settings, context):
 def labseq_register(registry):
     registry.device("fine", Fine, DeviceSettings)
     registry.device("refusing", type("Refusing", (Fine,), {"__init__": refuse}), DeviceSettings)
-    for method in ("open", "describe", "self_test", "safe_state", "close"):
+    for method in ("open", "describe", "self_test", "safe_state", "close", "versions"):
         broken = type("Broken", (Fine,), {method: jam})
         registry.device(f"no_{method}", broken, DeviceSettings)
 """
@@ -96,6 +97,21 @@ def test_a_device_that_works_is_reported_with_model_serial_number_and_firmware(c
         ["shutter", "firmware", "2.4", "2.3", "differs"],
         ["shutter", "board", "unknown", "none"],
     ]
+
+
+def test_versions_that_cannot_be_read_cost_a_row_and_not_the_self_test(call: Any) -> None:
+    write("no_versions")
+    code, out, _ = call("devices", "./p.yaml")
+    assert (code, rows(out)["shutter"].split()[-1]) == (0, "ok")
+    (below,) = [line for line in out.splitlines() if line.startswith("shutter")][1:]
+    assert re.search(r"shutter +- +cannot be read: shutter: .*OSError: jammed", below)
+    (shutter,) = [
+        one
+        for one in json.loads(call("devices", "./p.yaml", "--json")[1])["devices"]
+        if one["name"] == "shutter"
+    ]
+    assert (shutter["ok"], shutter["self_test"], shutter["versions"]) == (True, True, {})
+    assert "OSError: jammed" in shutter["versions_failure"]
 
 
 @pytest.mark.parametrize(
@@ -155,6 +171,7 @@ def test_json_holds_all_that_a_device_says_of_itself(call: Any) -> None:
             "firmware": {"here": "2.4", "tried": "2.3"},
             "board": {"here": "", "tried": ""},
         },
+        "versions_failure": None,
         "latency_s": None,
         "self_test": False,
         "described": {"model": "SH-1", "serial_number": 17, "firmware": "2.4", "odd": None},

@@ -49,6 +49,7 @@ def test_it_tests_itself_in_the_dark_and_describes_the_radio_and_the_tones() -> 
         assert rig.clock.now() == pytest.approx(before_s + 0.01)
     assert described["radio"]["driver"] == "capture"
     assert described["gain_db"] == [12.0, 0.0], "the lowest where none is given"
+    assert described["locks"] == {"ref_locked": True, "lo_locked 0": True, "lo_locked 1": True}
     assert (described["loop_samples"], described["underflows"]) == (80, 0)
     assert all(1.0 < crest < 1.5 for crest in described["crest_factor"])
 

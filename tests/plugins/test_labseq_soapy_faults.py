@@ -369,3 +369,24 @@ def test_a_loop_that_cannot_be_read_ends_the_stream_by_a_ramp() -> None:
         until(raised(DeviceError, rig.tweezers.check_interlocks))
         with pytest.raises(DeviceError, match=r"a loop cannot be read: .*none\.npy.*; the array is dark"):
             rig.tweezers.check_interlocks()
+
+
+@pytest.mark.parametrize(
+    ("loop", "source", "why"),
+    [
+        ("lo", "", r"not locked \(lo_locked 0, lo_locked 1\): can it tune to `local_oscillator`\?"),
+        (
+            "ref",
+            "external",
+            r"not locked \(ref_locked\): is the reference of `clock_source: external` connected",
+        ),
+        ("ref", "", ""),
+    ],
+)
+def test_a_radio_that_is_not_locked_fails_its_self_test(loop: str, source: str, why: str) -> None:
+    with opened(device=f"simulated,unlocked={loop}", clock_source=source) as rig:
+        if not why:  # its own clock has no reference
+            rig.tweezers.self_test()
+            return
+        with pytest.raises(DeviceError, match=why):
+            rig.tweezers.self_test()
