@@ -15,11 +15,10 @@ from labseq.plugin import (
     LimitError,
     Trigger,
     format_quantity,
-    one_of,
     wait_for,
 )
 from labseq_pylon.library import Nodes, Sdk
-from labseq_pylon.setup import ticks_per_s
+from labseq_pylon.setup import WIDTH, series_trigger, ticks_per_s
 
 BUFFER_BYTES: Final = 256 * 2**20
 """Memory for frames that were not read yet; a series that needs more reuses its buffers."""
@@ -27,22 +26,6 @@ GIGE: Final = "BaslerGigE"
 MAX_GIGE_FRAMES: Final = 65535
 """GigE cameras number their frames from 1, with 16 bits."""
 NO_NUMBER: Final = 2**64 - 1
-
-
-SERIES: Final = (
-    ("FrameBurstStart", "AcquisitionBurstFrameCount"),
-    ("AcquisitionStart", "AcquisitionFrameCount"),
-)
-"""Triggers that start a series, each with the node of its number of frames: USB and ace 2, GigE."""
-WIDTH: Final = "TriggerWidth"
-"""Exposure mode in which the width of the trigger is the exposure."""
-
-
-def series_trigger(nodes: Nodes) -> tuple[str, str] | None:
-    """The trigger of a camera that starts a series, and the node of its number of frames; None for none."""
-    selector = nodes.find("TriggerSelector")
-    offered = () if selector is None else selector.Symbolics
-    return next((pair for pair in SERIES if pair[0] in offered), None)
 
 
 class Acquisition:
@@ -86,10 +69,6 @@ class Acquisition:
             choose("TriggerMode", "trigger mode", "On" if trigger == "external_start" else "Off")
             if trigger == "external_start":
                 self._set_line(line, edge)
-        elif trigger == "external_start":
-            raise DeviceError(
-                self._sdk.name, f"the camera has no trigger {one_of([name for name, _ in SERIES])}"
-            )
         choose("TriggerSelector", "trigger", "FrameStart", if_there=True)
         if trigger != "external_start":
             self._nodes.switch_off("AcquisitionFrameRateEnable")

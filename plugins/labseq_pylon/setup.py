@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
-from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest
+from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest, one_of
 from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.settings import BITS, PixelFormat, PylonSettings
 
 NANOSECONDS_PER_S = 1_000_000_000
 """Ticks per second of cameras that do not report their frequency."""
+
+
+SERIES: Final = (
+    ("FrameBurstStart", "AcquisitionBurstFrameCount"),
+    ("AcquisitionStart", "AcquisitionFrameCount"),
+)
+"""Triggers that start a series, each with the node of its number of frames: USB and ace 2, GigE."""
+WIDTH: Final = "TriggerWidth"
+"""Exposure mode in which the width of the trigger is the exposure."""
+
+
+def series_trigger(nodes: Nodes) -> tuple[str, str] | None:
+    """The trigger of a camera that starts a series, and the node of its number of frames; None for none."""
+    selector = nodes.find("TriggerSelector")
+    offered = () if selector is None else selector.Symbolics
+    return next((pair for pair in SERIES if pair[0] in offered), None)
 
 
 def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int]) -> dict[str, Any]:
@@ -23,6 +39,7 @@ def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int])
     nodes.choose("ExposureMode", "exposure mode", "Timed", if_there=True)
     for name in ("ReverseX", "ReverseY"):
         nodes.switch_off(name)
+    _check_line_trigger(nodes, settings)
     pixel_format = _set_pixel_format(nodes, settings.pixel_format)
     frame_shape = _set_sensor(nodes, settings, sensor_shape)
     _set_gain(nodes, settings)
@@ -36,6 +53,17 @@ def set_up(nodes: Nodes, settings: PylonSettings, sensor_shape: tuple[int, int])
         "packet_size_now": nodes.read("GevSCPSPacketSize"),
         "sensor_readout_s": _microseconds(nodes.read("SensorReadoutTime", "ReadoutTimeAbs")),
     }
+
+
+def _check_line_trigger(nodes: Nodes, settings: PylonSettings) -> None:
+    kind, missing = settings.line_trigger, ""
+    if kind == "external_start" and series_trigger(nodes) is None:
+        missing = f"starts no series by a trigger ({one_of([name for name, _ in SERIES])})"
+    modes = nodes.find("ExposureMode")
+    if kind == "bulb" and (modes is None or WIDTH not in modes.Symbolics):
+        missing = f"has no exposure mode {WIDTH}"
+    if missing:
+        raise DeviceError(nodes.name, f"the camera {missing}; leave out `line_trigger: {kind}`")
 
 
 def ticks_per_s(nodes: Nodes) -> int:

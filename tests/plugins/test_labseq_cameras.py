@@ -184,6 +184,24 @@ def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver
             lab.camera.arm(2, 0.06, "external_start")
 
 
+@pytest.mark.parametrize("name", ["genicam", "pylon"])
+def test_a_trigger_that_the_camera_lacks_is_refused_when_it_is_opened(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    need_library(DRIVERS[name][2])
+    monkeypatch.setattr(f"labseq_{name}.setup.WIDTH", "NoSuchMode")
+    monkeypatch.setattr(f"labseq_{name}.setup.series_trigger", lambda _: None)
+    cases: dict[str, dict[str, Any]] = {
+        "has no exposure mode NoSuchMode; leave out `line_trigger: bulb`": {"line_trigger": "bulb"},
+        "starts no series by a trigger": {"line_trigger": "external_start", "cycle_time": "50 ms"},
+    }
+    for lacking, settings in cases.items():
+        lab = Rig(name, **settings)
+        with pytest.raises(DeviceError, match=lacking):
+            lab.camera.open()
+        lab.camera.close()
+
+
 def test_two_simulated_cameras_work_side_by_side(driver: str) -> None:
     with opened_rig(driver, sensor_shape=(64, 64)) as one, opened_rig(driver, sensor_shape=(32, 96)) as other:
         for lab in (one, other, one):

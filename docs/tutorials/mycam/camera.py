@@ -14,13 +14,13 @@ from labseq.plugin import (
     DeviceError,
     Duration,
     ExposureResult,
+    OrientationSettings,
     Series,
-    Settings,
     wait_for,
 )
 
 
-class MycamSettings(Settings):
+class MycamSettings(OrientationSettings):
     """Settings in the profile, next to `use: mycam`."""
 
     serial: str = Field(description="serial number printed on the camera")
@@ -36,7 +36,7 @@ class MycamCamera(CameraDriver):
     """
 
     def __init__(self, settings: MycamSettings, context: Context) -> None:
-        super().__init__(context)
+        super().__init__(context, settings.orientation)
         self._settings = settings
         self._camera: Any = None
         self._exposure_s = self._due_s = 0.0
@@ -47,7 +47,7 @@ class MycamCamera(CameraDriver):
         return CameraFacts(
             self._settings.readout,
             max_exposure_s=60.0,
-            frame_shape=(512, 512),
+            frame_shape=self._settings.orientation.shape((512, 512)),
             triggers=("software",),
         )
 
