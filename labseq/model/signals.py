@@ -35,13 +35,9 @@ class FrequencyCourse(IntEnum):
         MINIMUM_JERK: s(u) = 10 u^3 - 15 u^4 + 6 u^5, the course with the least
             mean square jerk that starts and ends at rest without acceleration
             (Flash and Hogan, J. Neurosci. 5, 1688, 1985). The greatest speed is 15/8 of the mean.
-        CONSTANT_JERK: jerk +j in the first quarter, -j in the two quarters of the
-            middle, +j in the last. Integrated three times from rest, the first
-            quarter is j u^3 / 6 and ends with acceleration j/4, speed j/32 and
-            place j/384; going on from there, the middle reaches j/64, which
-            must be s(1/2) = 1/2, so j = 32: s(u) = 16/3 u^3 for u <= 1/4,
-            s(u) = 1/6 - 2 u + 8 u^2 - 16/3 u^3 for 1/4 <= u <= 3/4, and
-            s(u) = 1 - 16/3 (1 - u)^3 above. The greatest speed is twice the mean.
+        CONSTANT_JERK: s(u) = 3 u^2 - 2 u^3, the cubic with constant negative jerk that
+            starts and ends at rest (Bluvstein et al., Nature 604, 451, 2022). The greatest
+            speed is 3/2 of the mean.
     """
 
     LINEAR = 0
@@ -51,7 +47,7 @@ class FrequencyCourse(IntEnum):
     @property
     def fastest(self) -> float:
         """Greatest speed relative to the mean speed: the greatest slope of s(u)."""
-        return (1.0, 15 / 8, 2.0)[self]
+        return (1.0, 15 / 8, 3 / 2)[self]
 
     def fraction(self, u: float) -> float:
         """The course s(u): the fraction of its path that a tone has completed.
@@ -61,17 +57,13 @@ class FrequencyCourse(IntEnum):
 
         Example:
             >>> FrequencyCourse.CONSTANT_JERK.fraction(0.25)
-            0.08333333333333333
+            0.15625
         """
         if self is FrequencyCourse.LINEAR:
             return u
         if self is FrequencyCourse.MINIMUM_JERK:
             return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
-        if u > 0.5:
-            return 1.0 - self.fraction(1.0 - u)
-        if u <= 0.25:
-            return 16.0 / 3.0 * u**3
-        return 1.0 / 6.0 - 2.0 * u + 8.0 * u**2 - 16.0 / 3.0 * u**3
+        return u**2 * (3.0 - 2.0 * u)
 
     def integral(self, u: float) -> float:
         """Integral of the course from 0 to u; 1/2 at 1 for every course.
@@ -90,11 +82,7 @@ class FrequencyCourse(IntEnum):
             return 0.5 * u**2
         if self is FrequencyCourse.MINIMUM_JERK:
             return u**4 * (2.5 - 3.0 * u + u**2)
-        if u > 0.5:
-            return u - 0.5 + self.integral(1.0 - u)
-        if u <= 0.25:
-            return 4.0 / 3.0 * u**4
-        return -1.0 / 96.0 + u / 6.0 - u**2 + 8.0 / 3.0 * u**3 - 4.0 / 3.0 * u**4
+        return u**3 * (1.0 - 0.5 * u)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

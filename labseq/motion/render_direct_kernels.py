@@ -82,15 +82,9 @@ def minimum_jerk(u: float) -> tuple[float, float, float, float]:
 
 @helper_kernel("UniTuple(float64, 4)(float64)")
 def constant_jerk(u: float) -> tuple[float, float, float, float]:
-    """See :func:`course`; the third derivative is 32, changes by -64 at 1/4 and by 64 at 3/4."""
-    v, w = max(0.0, u - 0.25), max(0.0, u - 0.75)
-    uu, vv, ww = u * u, v * v, w * w
-    return (
-        4.0 / 3.0 * uu * uu - 8.0 / 3.0 * (vv * vv - ww * ww),
-        16.0 / 3.0 * uu * u - 32.0 / 3.0 * (vv * v - ww * w),
-        16.0 * uu - 32.0 * (vv - ww),
-        32.0 * u - 64.0 * (v - w),
-    )
+    """See :func:`course`."""
+    v = u * u
+    return v * u * (1.0 - 0.5 * u), v * (3.0 - 2.0 * u), 6.0 * u * (1.0 - u), 6.0 - 12.0 * u
 
 
 @kernel("UniTuple(float64, 4)(int64, float64)")

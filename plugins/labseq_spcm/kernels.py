@@ -75,9 +75,7 @@ def course_at(course: int, u: float) -> float:
         return u
     if course == 1:
         return u * u * u * (10.0 - 15.0 * u + 6.0 * u * u)
-    v = min(u, 1.0 - u)
-    s = 16.0 / 3.0 * v**3 if v <= 0.25 else 1.0 / 6.0 - 2.0 * v + 8.0 * v * v - 16.0 / 3.0 * v**3
-    return s if u <= 0.5 else 1.0 - s
+    return u * u * (3.0 - 2.0 * u)
 
 
 @helper_kernel(f"float64({TONES}, int64, float64)")

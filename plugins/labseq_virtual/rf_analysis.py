@@ -181,7 +181,7 @@ MIN_TURNS: Final = 2.0
 """Smallest number of beats of two tones within a transit time: with fewer, their peaks merge."""
 MAX_SITES: Final = 0.6
 """Largest motion of a tweezer in a transit time: a faster chirp is as broad as the gap to the next tone."""
-PEAK_SPEED: Final = {"constant": 1.0, "minimum_jerk": 15 / 8, "constant_jerk": 2.0}
+PEAK_SPEED: Final = {"constant": 1.0, "minimum_jerk": 15 / 8, "constant_jerk": 3 / 2}
 """Greatest speed over the mean, see :class:`labseq.plugin.FrequencyCourse`."""
 
 
