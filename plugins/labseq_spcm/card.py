@@ -53,6 +53,7 @@ class AwgCard:
 
     Attributes:
         spcm: The vendor's package.
+        library: Where the card comes from.
 
     Raises:
         DeviceError: No package or driver library, no such card, or another program holds it. Every method
@@ -63,7 +64,7 @@ class AwgCard:
         self.name = name
         self.clock = clock
         self.spcm = spcm = load_spcm(name, library)
-        self._library = library
+        self.library = library
         identifier = library.connect()
         self._card: Any = spcm.Card(identifier)
         try:
@@ -83,7 +84,7 @@ class AwgCard:
     def _forget(self) -> None:
         """Keep ``spcm`` from closing the handle again when it collects the object, which would fail."""
         vars(self._card)["_closed"] = True
-        self._library.disconnect()
+        self.library.disconnect()
 
     def close(self) -> None:
         """Close the card; errors of a card that is gone are ignored."""
@@ -186,13 +187,13 @@ class AwgCard:
         if spcm.spcm_dwDefTransfer_i64(handle, kind, direction, notify_bytes, address, 0, frames.nbytes):
             raise DeviceError(self.name, f"naming the transfer buffer: {self.clear_error()}")
 
-    def upload(self, frames: NDArray[np.int16]) -> None:
+    def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> None:
         """Transfer samples to the on-board memory, and wait until they have arrived."""
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
         limit_s = frames.nbytes / SLOW_BUS + TRANSFER_TIMEOUT_S
         text = f"{frames.nbytes} bytes were not uploaded"
-        self.wait_until(lambda: bool(self.status & self.spcm.M2STAT_DATA_END), text, limit_s)
+        self.wait_until(lambda: bool(self.status & self.spcm.M2STAT_DATA_END), text, limit_s, poll_s)
 
     def wait_until(
         self,

@@ -259,6 +259,9 @@ class Dds:
         card.command(spcm.M2CMD_CARD_DISABLETRIGGER, "disabling the trigger")
         self._is_at_rest = True
 
+    def halt(self) -> None:
+        """Nothing supplies the card beside the calls."""
+
     def _start_triggered(self, command: int) -> None:
         """Start the card if it stands still; enable triggers only when the first block waits for one."""
         card, spcm = self._card, self._card.spcm

@@ -81,6 +81,18 @@ def _check_parking(
     raise LimitError(what, f"{hz / 1e6:.6g} MHz", limit, setting=("keep_warm", key))
 
 
+def tone_samples(
+    tones: KeepWarm, sample_rate_hz: float, row_channel: int, n_samples: int
+) -> NDArray[np.int16]:
+    """Samples of both outputs that can be repeated, int16 (n_samples, 2): with a whole number of periods."""
+    frames = np.empty((n_samples, 2), np.int16)
+    for axis, channel in enumerate((row_channel, 1 - row_channel)):
+        periods = round(tones.hz[axis] / sample_rate_hz * n_samples)
+        turns = np.arange(n_samples) * periods % n_samples / n_samples
+        frames[:, channel] = np.rint(FULL_SCALE * tones.amplitude[axis] * np.cos(2 * np.pi * turns))
+    return frames
+
+
 class Loop:
     """Plays the tones from the card's memory, over and over, until the card is stopped.
 
@@ -94,10 +106,7 @@ class Loop:
     def __init__(self, card: AwgCard, tones: KeepWarm, sample_rate_hz: float, row_channel: int) -> None:
         self._card = card
         self._frames = Buffer().reserve(PERIOD)
-        for axis, channel in enumerate((row_channel, 1 - row_channel)):
-            periods = round(tones.hz[axis] / sample_rate_hz * PERIOD)
-            turns = np.arange(PERIOD) * periods % PERIOD / PERIOD
-            self._frames[:, channel] = np.rint(FULL_SCALE * tones.amplitude[axis] * np.cos(2 * np.pi * turns))
+        self._frames[:] = tone_samples(tones, sample_rate_hz, row_channel, PERIOD)
 
     def start(self) -> None:
         """Start it, in the mode STD_SINGLE; the card stands still."""

@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -45,6 +45,15 @@ class VendorLibrary:
 
     def disconnect(self) -> None:
         """Release the card; no effect if it is not connected."""
+
+    def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:  # noqa: ARG002
+        """Whether time is virtual, so that no thread is needed for what goes on beside the calls: never.
+
+        Args:
+            step: One step of it, which returns after how many seconds it is to be called again, or None for
+                the last; None: no more steps.
+        """
+        return False
 
     def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
         """How another process switches the card off: the driver's script, with the vendor's library."""

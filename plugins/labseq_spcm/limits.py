@@ -25,6 +25,10 @@ RATE_STEP_HZ: Final = 8
 REFERENCE_HZ: Final = (10e6, 1.25e9)
 FIFO_RATE_HZ: Final = 700e6
 """2.8 GB/s over PCIe x8 Gen 2 (the vendor's page on generator modes), for two channels of 2 bytes."""
+FRAME_BYTES: Final = 4
+"""Bytes of one sample of both outputs."""
+OUTPUT_FIFO_BYTES: Final = 192 * 1024
+"""Of the FIFO between the on-board memory and the outputs, whose size is fixed (manual, "Output latency")."""
 
 AMPLITUDE_MV: Final = (80, 2000)
 """Peak voltage into 50 Ohm of an M4i.663x, in steps of 1 mV."""

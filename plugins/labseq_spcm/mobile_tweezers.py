@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from labseq.plugin import (
+    ConfigError,
     Context,
     DeviceError,
     DeviceTimeoutError,
@@ -35,7 +36,8 @@ from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output, versions
-from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
+from labseq_spcm.stream import Stream
 
 RAMP_S: Final = 0.3e-3
 """How long the amplifiers take to ramp down a program that is cut short."""
@@ -77,7 +79,11 @@ class PlayMode(Protocol):
         ...
 
     def rest(self) -> None:
-        """Start the keep-warm tones if there are any."""
+        """Start what plays between programs, if anything does."""
+        ...
+
+    def halt(self) -> None:
+        """End what supplies the card beside the calls; the card itself is stopped by the caller."""
         ...
 
     def finished(self) -> bool:
@@ -113,6 +119,8 @@ class SpcmMobileTweezers(MobileTweezers):
     def __init__(self, settings: SpcmSettings, context: Context) -> None:
         self._name = context.name or "mobile_tweezers"
         if trigger_line(context.lines, "mobile_tweezers") is not None:
+            if settings.mode == "stream":
+                raise ConfigError(f"{self._name}: a line triggers it, but mode: stream {NO_TRIGGER}")
             settings = settings.model_copy(update={"trigger": "external"})
         self._settings = settings
         self._clock = context.clock
@@ -148,7 +156,7 @@ class SpcmMobileTweezers(MobileTweezers):
             f"{hz / 1e6:.6g} MHz ({format_quantity(a**2 * self._rf.full_scale_power_w, 'power')})"
             for hz, a in zip(tones.hz, tones.amplitude, strict=True)
         )
-        dark = "" if self._cores is not None else ", dark from upload to start"
+        dark = ", dark from upload to start" if self._settings.mode in ("replay", "fifo") else ""
         return f"keep-warm tones off the atoms: {' and '.join(each)}{dark}"
 
     def warm(self) -> None:
@@ -184,8 +192,13 @@ class SpcmMobileTweezers(MobileTweezers):
     def _new_mode(self, card: AwgCard) -> PlayMode:
         if self._cores is not None:
             return Dds(card, self._cores, self._keep_warm)
+        rate_hz = self._facts["sample_rate_hz"]
+        if self._settings.mode == "stream":
+            stream = Stream(card, self._settings, rate_hz, self._keep_warm)
+            self._facts["trigger_delay_s"] = stream.delay_s
+            return stream
         mode = Replay if self._settings.mode == "replay" else Fifo
-        return mode(card, self._settings, self._facts["sample_rate_hz"], self._keep_warm)
+        return mode(card, self._settings, rate_hz, self._keep_warm)
 
     @property
     def settling_timeout_s(self) -> float:
@@ -195,7 +208,7 @@ class SpcmMobileTweezers(MobileTweezers):
     def settle(self) -> None:
         """Close the output relays and let them settle, once per run, before there are atoms.
 
-        The keep-warm tones begin. After ``safe_state``, ``prepare`` does it again.
+        The keep-warm tones begin, and the stream. After ``safe_state``, ``prepare`` does it again.
         """
         card, mode = self._opened()
         if close_relays(card):
@@ -203,8 +216,8 @@ class SpcmMobileTweezers(MobileTweezers):
         self._rest(card, mode)
 
     def _rest(self, card: AwgCard, mode: PlayMode) -> None:
-        """Have the keep-warm tones play."""
-        if self._keep_warm is not None and not card.running:
+        """Have the keep-warm tones play, or the stream."""
+        if (self._keep_warm is not None or self._settings.mode == "stream") and not card.running:
             mode.rest()
 
     def close(self) -> None:
@@ -242,11 +255,13 @@ class SpcmMobileTweezers(MobileTweezers):
         mode = self._opened()[1]
         self._check_idle("prepare()")
         self._duration_s = None
+        start_s = time.perf_counter()
         limits.check_program(self._name, program, self._rf)
+        took_s = time.perf_counter() - start_s
         self.settle()
         start_s = time.perf_counter()
         playing_s = mode.prepare(program)
-        took_s = time.perf_counter() - start_s
+        took_s += time.perf_counter() - start_s
         self._timings = {"render": mode.render_s, "upload": took_s - mode.render_s}
         duration_s = max(playing_s, program.total_duration_s) + float(self._facts["trigger_delay_s"])
         self._duration_s = duration_s
@@ -328,13 +343,15 @@ class SpcmMobileTweezers(MobileTweezers):
             DeviceError: The card refused a step; all other steps were done.
         """
         self._duration_s = self._due_s = None
-        card = self._card
+        card, mode = self._card, self._mode
         if card is None:
             return
         with suppress(LabseqError):
             card.clear_error()  # a pending error would block everything else
             if card.running:
                 self._ramp_down(card)
+        if mode is not None:
+            mode.halt()
         steps: list[Callable[[], None]] = [
             card.stop,
             partial(switch_output, card, 0, on=False),
@@ -368,9 +385,10 @@ class SpcmMobileTweezers(MobileTweezers):
         Raises:
             DeviceError: Not open, still playing, or a check failed.
         """
-        card, _ = self._opened()
+        card, mode = self._opened()
         self._check_idle("self_test()")
         self._duration_s = None
+        mode.halt()
         card.stop()
         spcm = card.spcm
         if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == RECOVERY:
@@ -398,7 +416,10 @@ class SpcmMobileTweezers(MobileTweezers):
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also the card and every value that it read back."""
-        return {"model": "Spectrum M4i.66xx", **self._settings.model_dump(mode="json"), **self._facts}
+        facts = dict(self._facts)
+        if isinstance(self._mode, Stream):
+            facts["silent_underruns"] = self._mode.n_underruns
+        return {"model": "Spectrum M4i.66xx", **self._settings.model_dump(mode="json"), **facts}
 
     def _opened(self) -> tuple[AwgCard, PlayMode]:
         if self._card is None or self._mode is None:

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, Renderer, ToneProgram, TransientError
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, Loop
-from labseq_spcm.limits import SAMPLE_STEP
+from labseq_spcm.limits import FRAME_BYTES, SAMPLE_STEP
 from labseq_spcm.settings import SpcmSettings
 
 CHUNK: Final = 1 << 18
 """Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
 RING_CHUNKS: Final = 4
-FRAME_BYTES: Final = 4
-"""Bytes of one sample of both outputs."""
 MIN_FILL: Final = 1 << 20
 """Smallest part of the on-board memory that is used as a FIFO, in bytes."""
 
@@ -93,6 +91,9 @@ class SampleMode:
             spcm = self._card.spcm
             self._card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
             self._loop.start()
+
+    def halt(self) -> None:
+        """Nothing supplies the card beside the calls."""
 
     def _stop(self) -> None:
         """Stop what plays, also the keep-warm tones."""

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
 from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
 
-Mode: TypeAlias = Literal["replay", "fifo", "dds"]
+Mode: TypeAlias = Literal["replay", "fifo", "stream", "dds"]
 Channel: TypeAlias = Literal[0, 1]
+
+LOOK_AHEAD_S: Final = 250e-6
+NO_TRIGGER: Final = (
+    "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
+)
 
 
 class KeepWarmSettings(Settings):
@@ -38,10 +43,11 @@ class SpcmSettings(Settings):
     mode: Mode = Field(
         default="replay",
         description="replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
+        "stream: the same, spliced into silence that the card plays all the time; "
         "dds: the card's own tones, at most 20 + 1 or 16 + 5",
     )
     sample_rate: Frequency = Field(
-        default=625e6, description="samples per second of replay and fifo; the card rounds it to 8 Hz"
+        default=625e6, description="samples per second; the card rounds it to 8 Hz"
     )
     row_channel: Channel = Field(default=0, description="output that drives the row axis")
     column_channel: Channel = Field(default=1, description="output that drives the column axis")
@@ -65,7 +71,25 @@ class SpcmSettings(Settings):
     )
     fill: Annotated[Duration, Field(ge=1e-3, le=1.0)] = Field(
         default=8e-3,
-        description="fifo: playing time that is rendered ahead, about: the card takes powers of two",
+        description="playing time that is rendered ahead; fifo: about, because the card takes powers of two",
+    )
+    look_ahead: Annotated[Duration, Field(gt=0, le=10e-3)] | None = Field(
+        default=None,
+        description="stream: how far ahead of the outputs silence is handed over, which is how long a "
+        "program takes to them; none: 0.25 ms, or more if the card's buffers hold more at this sample rate",
+    )
+    notify_size: int = Field(
+        default=1 << 16,
+        ge=1 << 12,
+        le=1 << 19,
+        description="stream: bytes after which the card reports what it has fetched, a power of two; "
+        "programs begin at multiples of it",
+    )
+    card_buffer: int = Field(
+        default=1 << 16,
+        ge=1 << 12,
+        le=1 << 24,
+        description="stream: bytes of on-board memory that are used, a power of two, at least notify_size",
     )
     keep_warm: KeepWarmSettings | None = Field(
         default=None, description="tones off the atoms between programs; none: silence"
@@ -92,13 +116,47 @@ class SpcmSettings(Settings):
     def _check_channels_and_rate(self) -> Self:
         if self.row_channel == self.column_channel:
             raise ValueError(f"row_channel and column_channel are both {self.row_channel}; expected 0 and 1")
-        if self.mode == "fifo" and self.sample_rate > limits.FIFO_RATE_HZ:
+        if self.mode in ("fifo", "stream") and self.sample_rate > limits.FIFO_RATE_HZ:
             rate, most = _hz(self.sample_rate), _hz(limits.FIFO_RATE_HZ)
             raise ValueError(
                 f"sample_rate is {rate}, but the bus carries at most {most} on two channels; lower it, or "
                 "use mode: replay"
             )
         return self
+
+    @field_validator("notify_size", "card_buffer")
+    @classmethod
+    def _check_power_of_two(cls, n_bytes: int) -> int:
+        if n_bytes & (n_bytes - 1):
+            raise ValueError("expected a power of two")
+        return n_bytes
+
+    @model_validator(mode="after")
+    def _check_stream(self) -> Self:
+        if self.mode != "stream":
+            return self
+        if self.trigger == "external":
+            raise ValueError(f"mode: stream {NO_TRIGGER}")
+        if self.card_buffer < self.notify_size:
+            raise ValueError(
+                f"card_buffer is {self.card_buffer}; expected at least notify_size, {self.notify_size}"
+            )
+        least_s = self._buffered_s(self.sample_rate)
+        if self.look_ahead is not None and self.look_ahead < least_s:
+            came, least = (format_quantity(s, "time") for s in (self.look_ahead, least_s))
+            raise ValueError(
+                f"look_ahead is {came}; expected at least {least}: the card's own buffers and two blocks of "
+                "notify_size at this sample_rate"
+            )
+        return self
+
+    def _buffered_s(self, sample_rate_hz: float) -> float:
+        n_bytes = self.card_buffer + limits.OUTPUT_FIFO_BYTES + 2 * self.notify_size
+        return n_bytes / limits.FRAME_BYTES / sample_rate_hz
+
+    def look_ahead_s(self, sample_rate_hz: float) -> float:
+        """The look-ahead at the rate that the card's clock really makes."""
+        return self.look_ahead or max(LOOK_AHEAD_S, self._buffered_s(sample_rate_hz))
 
 
 def _hz(value: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,6 +23,8 @@ LIST_PARAM: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
 """A version that ``spcm`` accepts; the vendor has no such version."""
 LOG_SIZE: Final = 100_000
+KEPT_S: Final = 1.0
+"""How long a stream is kept where nothing receives it."""
 EDGE_V: Final = 3.3
 """Height of a pulse at Ext0, of LVTTL."""
 
@@ -59,7 +61,8 @@ class SimulatedCard:
         clock: The session's time.
         model: What card it is.
         serial_number: Its serial number.
-        keep_history: Keep what was played until ``forget``; otherwise each start of the card drops it.
+        keep_history: Keep what was played until ``forget``; otherwise each start of the card drops it, and
+            a stream what was played some time ago.
 
     Attributes:
         log: The latest register writes, in order.
@@ -89,6 +92,9 @@ class SimulatedCard:
         self._machine = Machine(model)
         self._error = ErrorInfo()
         self._edges_s: list[float] = []
+        self._step: Callable[[], float | None] | None = None
+        self._step_s = 0.0
+        self._within_step_s: float | None = None
         self._is_open = False
         self._identity: dict[int, int] = {
             r.SPC_PCISERIALNO: serial_number,
@@ -114,6 +120,20 @@ class SimulatedCard:
         with self._lock:
             self._edges_s.append(time_s)
             self._edges_s.sort()
+
+    def call(self, step: Callable[[], float | None] | None) -> None:
+        """Call a step of the driver's whenever it is due, as a thread of its own would; for virtual clocks.
+
+        Args:
+            step: Returns after how many seconds it is due again, None if never. None: no more steps.
+        """
+        with self._lock:
+            self._step, self._step_s = step, self._now()
+
+    def hold_up(self, duration_s: float) -> None:
+        """Call no step for some time from now on, as if the computer were busy with something else."""
+        with self._lock:
+            self._step_s = self._advance() + duration_s
 
     def played(self, channel: int) -> list[Span]:
         """The output of a channel up to now, in time's order; between the spans there is silence."""
@@ -167,8 +187,26 @@ class SimulatedCard:
             self._machine.buffer = None
             self._is_open = False
 
+    def _now(self) -> float:
+        return self._clock.now() if self._within_step_s is None else self._within_step_s
+
+    def _do_steps(self, now_s: float) -> None:
+        """Call the steps that are due by now, each at its time."""
+        while self._step is not None and self._step_s <= now_s:
+            self._within_step_s = self._step_s
+            try:
+                pause_s = self._step()
+            finally:
+                self._within_step_s = None
+            if pause_s is None:
+                self._step = None
+            else:
+                self._step_s += pause_s
+
     def _advance(self) -> float:
-        now_s = self._clock.now()
+        now_s = self._now()
+        if self._within_step_s is None:
+            self._do_steps(now_s)
         while self._edges_s and self._edges_s[0] <= now_s:
             edge_s = self._edges_s.pop(0)
             self._machine.advance(edge_s)
@@ -206,6 +244,8 @@ class SimulatedCard:
                 self.log.append(LogEntry(now_s, register, value))
                 if register == r.SPC_M2CMD and int(value) & r.M2CMD_CARD_START and not self._keep_history:
                     self._machine.forget(now_s)
+                elif register == r.SPC_DATA_AVAIL_CARD_LEN and not self._keep_history:
+                    self._machine.forget(now_s - KEPT_S)
                 try:
                     self._machine.write(register, value, now_s)
                 except Refusal as refusal:

@@ -335,6 +335,14 @@ class SimulatedLibrary:
             self._shared.disconnect()
         self.card = self._shared = None
 
+    def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:
+        """Have the card call a driver's step whenever it is due; False if time is real."""
+        card = self.card or _library().cards.get(self._name)
+        if not self._clock.virtual or not isinstance(card, SimulatedCard):
+            return False
+        card.call(step)
+        return True
+
     def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
         """The driver's script, for a card in a process of its own; one in this process dies with it."""
         if not self._name.startswith(SHARED):

@@ -63,6 +63,7 @@ class Machine:
         self.triggered = False
         self.trigger_enabled = False
         self.underrun = False
+        self.free_bytes = 0
 
     def advance(self, now_s: float) -> None:
         """Do everything that is due, in time's order."""
@@ -83,6 +84,7 @@ class Machine:
     def _end_run(self, now_s: float) -> None:
         self.samples += self._run_samples(now_s)
         self.tones += self.dds.stop(now_s)
+        self.free_bytes = self.fifo.user_bytes if self.fifo else 0
         self.run = self.fifo = None
         self.running = self.trigger_enabled = False
 
@@ -139,7 +141,7 @@ class Machine:
         if register == r.SPC_CHCOUNT:
             return len(self.setup.channels)
         if register == r.SPC_DATA_AVAIL_USER_LEN:
-            return self.fifo.user_bytes if self.fifo else 0
+            return self.fifo.user_bytes if self.fifo else self.free_bytes
         if register not in self.setup:
             raise Refusal(r.ERR_REG, UNKNOWN)
         return self.setup[register]
@@ -265,7 +267,7 @@ class Machine:
         if self.fifo is not None:
             self.fifo.switch_dma(on=True, now_s=now_s)
             return
-        self.memory.send(now_s, self.buffer.fetch(0, self.buffer.n_bytes))
+        self.memory.send(now_s, self.buffer.fetch(0, self.buffer.n_bytes).copy())
         self.buffer = None  # it is used only once
 
     def stop_dma(self, now_s: float) -> None:

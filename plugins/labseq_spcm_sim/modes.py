@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.output import ROUNDING
-from labseq_spcm_sim.setup import Refusal, refuse
+from labseq_spcm_sim.setup import OUTPUT_FIFO_BYTES, Refusal, refuse
 
 Samples = NDArray[np.int16]
 
@@ -52,12 +52,13 @@ class Buffer:
             raise Refusal(r.ERR_INVALIDPARAM, f"the buffer must be aligned to {PAGE} bytes")
 
     def fetch(self, start: int, n_bytes: int) -> Samples:
-        """A copy of some of its samples, int16 (n_bytes / 2,), from byte ``start`` on and around its end."""
+        """Some of its samples, int16 (n_bytes / 2,), from byte ``start`` on and around its end."""
         whole = (ctypes.c_char * self.n_bytes).from_address(self.address)
         samples = np.frombuffer(memoryview(whole), np.int16)
         first = start % self.n_bytes // 2
         head = samples[first : first + n_bytes // 2]
-        return np.concatenate([head, samples[: n_bytes // 2 - len(head)]])
+        missing = n_bytes // 2 - len(head)
+        return np.concatenate([head, samples[:missing]]) if missing else head
 
 
 class Memory:
@@ -227,8 +228,9 @@ class Fifo:
         self.finished = False
 
     def set_length(self, n_samples: int) -> None:
-        """Set the number of samples per channel to play; 0: until the stop."""
+        """The card is started, with the number of samples per channel to play; 0: until the stop."""
         self._total = n_samples * self._frame if n_samples else math.inf
+        self._room += OUTPUT_FIFO_BYTES
 
     def hand_over(self, n_bytes: int) -> None:
         """The user has filled bytes, which the card may now fetch."""
@@ -237,9 +239,24 @@ class Fifo:
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
         if n_bytes:
-            data = self._buffer.fetch(self._handed, n_bytes).reshape(-1, self._frame // 2)
-            self._pieces.append((self._handed // self._frame, Stretch(0.0, data, len(data))))
+            self._keep(self._buffer.fetch(self._handed, n_bytes))
             self._handed += n_bytes
+
+    def _keep(self, data: Samples) -> None:
+        """Remember samples that will be played: no silence, and of equal blocks only the first."""
+        if not (data.view(np.uint64) if data.nbytes % 8 == 0 else data).any():
+            return
+        data = data.reshape(-1, self._frame // 2)
+        first, n_samples = self._handed // self._frame, len(data)
+        block = self._buffer.notify_bytes // self._frame
+        if block and not n_samples % block and (data.reshape(-1, block, data.shape[1]) == data[:block]).all():
+            data = data[:block]
+            if self._pieces:
+                start, last = self._pieces[-1]
+                if start + last.n_samples == first and np.array_equal(last.samples, data):
+                    self._pieces[-1] = start, replace(last, n_samples=last.n_samples + n_samples)
+                    return
+        self._pieces.append((first, Stretch(0.0, data.copy(), n_samples)))
 
     def switch_dma(self, on: bool, now_s: float) -> None:
         """Whether the bus fetches what was handed over."""

@@ -180,5 +180,5 @@ class Amplifier:
 
     def forget(self, before_s: float) -> None:
         """Drop the changes that no longer matter after a time."""
-        last = max(i for i, (start_s, _) in enumerate(self.changes) if start_s <= before_s)
+        last = max((i for i, (start_s, _) in enumerate(self.changes) if start_s <= before_s), default=0)
         self.changes = self.changes[last:]

@@ -62,6 +62,8 @@ M4I6631: Final = CardModel()
 
 FIRMWARE: Final = 1
 """Version of the main control's firmware (ours)."""
+OUTPUT_FIFO_BYTES: Final = 192 * 1024
+"""Of the FIFO between the on-board memory and the outputs (manual, "Output latency")."""
 MEMORY_STEP: Final = 32
 """Step and minimum of the memory size, in samples per channel."""
 MAX_LOOPS: Final = 2**32 - 1

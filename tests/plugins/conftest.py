@@ -90,9 +90,13 @@ class Lab:
         self.tweezers.wait(duration_s + 1.0)
 
     def samples(self, channel: int) -> NDArray[np.int16]:
-        spans = self.card.played(channel)
-        assert all(isinstance(span, SampleSpan) for span in spans)
-        return np.concatenate([span.values() for span in spans if isinstance(span, SampleSpan)])
+        """From the first span to the last, with the silence between them."""
+        spans = [span for span in self.card.played(channel) if isinstance(span, SampleSpan)]
+        starts = [round((span.start_s - spans[0].start_s) * self.rate_hz) for span in spans]
+        samples = np.zeros(starts[-1] + spans[-1].n_samples, np.int16)
+        for start, span in zip(starts, spans, strict=True):
+            samples[start : start + span.n_samples] = span.values()
+        return samples
 
     def written(self, register: int) -> list[float]:
         return [entry.value for entry in self.card.log if entry.register == register]

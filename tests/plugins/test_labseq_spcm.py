@@ -49,7 +49,8 @@ from labseq.testing.fakes import FakeClock
 
 from .conftest import RATE_HZ
 
-MODES = ["replay", "fifo", "dds"]
+MODES = ["replay", "fifo", "stream", "dds"]
+TRIGGERED = ["replay", "fifo", "dds"]
 
 
 class TestReplayContract(MobileTweezersContract):
@@ -62,6 +63,12 @@ class TestFifoContract(MobileTweezersContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
         return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="fifo"))
+
+
+class TestStreamContract(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="stream"))
 
 
 class TestDdsContract(MobileTweezersContract):
@@ -100,7 +107,7 @@ class TestPlaying:
         with driver(mode) as lab:
             program = lab.program(3)
             delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
-            assert 0.1e-6 < delay_s < 10e-6
+            assert 0.1e-6 < delay_s < (500e-6 if mode == "stream" else 10e-6)
             assert lab.tweezers.prepare(program) == pytest.approx(
                 program.total_duration_s + delay_s, abs=1.5 / lab.rate_hz * 32
             )
@@ -110,7 +117,7 @@ class TestPlaying:
             with pytest.raises(DeviceError, match="without a prepared program"):
                 lab.tweezers.play()
 
-    @pytest.mark.parametrize("mode", MODES)
+    @pytest.mark.parametrize("mode", TRIGGERED)
     def test_starts_at_the_external_trigger(self, driver: Any, mode: str) -> None:
         with driver(mode, trigger="external") as lab:
             duration_s = lab.tweezers.prepare(lab.program())
@@ -556,7 +563,7 @@ def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) 
         assert np.array_equal(out, wanted[start : start + n_samples])
 
 
-@pytest.mark.parametrize("mode", ["replay", "fifo", "dds"])
+@pytest.mark.parametrize("mode", MODES)
 def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> None:
     with driver(mode) as lab:
         assert offers(lab.tweezers, "self_test")

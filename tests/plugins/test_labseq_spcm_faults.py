@@ -25,6 +25,7 @@ from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.stream import Stream
 from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, vendor_library_found
 from labseq_spcm_sim.emergency import Connection
 
@@ -45,7 +46,8 @@ from labseq.testing.fakes import FakeClock
 
 from .small_run import run
 
-MODES = ["replay", "fifo", "dds"]
+MODES = ["replay", "fifo", "stream", "dds"]
+TRIGGERED = ["replay", "fifo", "dds"]
 
 
 def context(motion: MotionSpec | None = None) -> Context:
@@ -105,7 +107,9 @@ def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
         lab.tweezers.prepare(lab.program())
 
 
-@pytest.mark.parametrize(("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("dds", Dds)])
+@pytest.mark.parametrize(
+    ("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("stream", Stream), ("dds", Dds)]
+)
 def test_a_wait_during_which_another_thread_makes_the_card_safe_is_no_end_of_the_program(
     driver: Any, mode: str, player: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,7 +350,7 @@ def test_a_line_starts_a_card_that_outlives_the_process(tmp_path: Path) -> None:
         Connection(str(card))("power_off")
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", TRIGGERED)
 @pytest.mark.parametrize(
     ("n_edges", "text"),
     [
@@ -386,6 +390,24 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         ("card: simulated, sample_rate: 150 MHz", 2, "sample_rate is 150 MHz; the limit is above 236 MHz"),
         ("card: simulated, sample_rate: .nan", 2, "p.yaml:6:60: sample_rate is .nan; expected a finite"),
         ("card: simulated, mode: fifo, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
+        ("card: simulated, mode: stream, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
+        (
+            "card: simulated, mode: stream, trigger: external",
+            2,
+            "takes no external trigger, because the card",
+        ),
+        (
+            "card: simulated, mode: stream, look_ahead: 0.1 ms",
+            2,
+            "look_ahead is 100 us; expected at least 157",
+        ),
+        (
+            "card: simulated, mode: stream, notify_size: 5000",
+            2,
+            "notify_size is 5000; expected a power of two",
+        ),
+        ("card: simulated, mode: stream, card_buffer: 8192", 2, "expected at least notify_size, 65536"),
+        (f"card: simulated, mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream takes no"),
         ("card: simulated, mode: dds", 2, "set max_row_tones and max_column_tones to at most 16 and 5"),
         ("card: simulated, rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; the limit is the card's 80 mV"),
         ("card: simulated, row_channel: 1", 2, "row_channel and column_channel are both 1; expected 0 and 1"),
@@ -470,7 +492,8 @@ class TestSafeState:
             program = lab.program(1)
             lab.play(program)
             spans = lab.card.played(0)
-            assert spans[-1].end_s - spans[0].start_s <= program.total_duration_s + 1e-6
+            silent_s = 70e-6 if mode == "stream" else 1e-6  # to the end of a block
+            assert spans[-1].end_s - spans[0].start_s <= program.total_duration_s + silent_s
 
 
 class Calls(RuleBasedStateMachine):
@@ -487,11 +510,14 @@ class Calls(RuleBasedStateMachine):
         self.stack = ExitStack()
         self.lab = self.stack.enter_context(driver(mode, trigger=trigger, fill=1e-3))
         self.is_open = self.safe = self.idle = True
+        self.streams = mode == "stream"
+        self.streams = mode == "stream"
 
     @rule(n_batches=st.sampled_from([1, 2, 24]))
     def prepare(self, n_batches: int) -> None:
         with suppress(LabseqError):
             self.safe = False
+            self.idle = self.idle and not self.streams
             self.lab.tweezers.prepare(self.lab.program(n_batches))
 
     @rule()
@@ -564,8 +590,10 @@ class Calls(RuleBasedStateMachine):
             self.stack.close()
 
 
-@pytest.mark.parametrize("trigger", ["software", "external"])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("mode", "trigger"),
+    [*((mode, "software") for mode in MODES), *((mode, "external") for mode in TRIGGERED)],
+)
 def test_any_calls_end_in_silence(driver: Any, mode: str, trigger: str) -> None:
     few = settings(max_examples=8, stateful_step_count=20)
     run_state_machine_as_test(lambda: Calls(driver, mode, trigger), settings=few)  # type: ignore[no-untyped-call]

@@ -398,6 +398,7 @@ def test_an_underrun_stops_the_output_until_a_new_stream_is_played() -> None:
     assert stream.refusal(r.SPC_M2CMD, START) == r.ERR_SEQUENCE
     stream.define(8 * NOTIFY, 4 * NOTIFY)
     assert not stream.status() & r.M2STAT_DATA_OVERRUN
+    stream.n_sent = 0
     stream.start(8)
     stream.clock.sleep(5 * NOTIFY / 500e6)
     assert stream.running

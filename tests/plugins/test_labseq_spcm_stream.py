@@ -1,0 +1,204 @@
+"""The Spectrum driver's mode ``stream``: programs spliced into silence, and a computer that is held up."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
+
+from labseq.motion import render, tone_program
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    MotionSpec,
+    Plan,
+    RfSpec,
+    SiteGrid,
+    ToneProgram,
+    TransientError,
+)
+
+from .conftest import RATE_HZ, Lab
+
+PARKED = {"row_frequency": 82.2e6, "column_frequency": 117.9e6}
+
+
+def start_s(lab: Lab, program: ToneProgram, row_channel: int = 0) -> float:
+    """When the only program since ``forget`` began, whose samples must be all that was not silent."""
+    begun = set[int]()
+    rendered = render(program, lab.rate_hz).samples
+    for samples, channel in zip(rendered, (row_channel, 1 - row_channel), strict=True):
+        played, first = lab.samples(channel), lab.card.played(channel)[0].start_s
+        assert np.array_equal(np.trim_zeros(played), np.trim_zeros(samples))
+        begun.add(round(first * lab.rate_hz) + int(played.nonzero()[0][0] - samples.nonzero()[0][0]))
+    assert len(begun) == 1, "both axes at once"
+    return begun.pop() / lab.rate_hz
+
+
+@pytest.mark.parametrize("row_channel", [0, 1])
+@pytest.mark.parametrize(("rate_hz", "notify_size"), [(RATE_HZ, 1 << 16), (624e6, 1 << 12)])
+def test_programs_are_played_to_the_sample_within_the_look_ahead(
+    driver: Any, row_channel: int, rate_hz: float, notify_size: int
+) -> None:
+    outputs = {"row_channel": row_channel, "column_channel": 1 - row_channel}
+    with driver("stream", sample_rate=rate_hz, notify_size=notify_size, fill=3e-3, **outputs) as lab:
+        lab.tweezers.settle()
+        lab.clock.sleep(1e-3)
+        ahead_s = lab.tweezers.describe()["trigger_delay_s"]
+        assert 0.9 * ahead_s < max(250e-6, 0.4e-3 * RATE_HZ / rate_hz)
+        for n_batches, pause_s in [(5, 0.0), (1, 1.234e-3), (30, 0.1), (2, 1e-6)]:
+            lab.clock.sleep(pause_s)
+            lab.card.forget(lab.clock.now())
+            program = lab.program(n_batches)
+            duration_s = lab.tweezers.prepare(program)
+            played_s = lab.clock.now()
+            lab.tweezers.play()
+            lab.tweezers.wait(duration_s + 1e-3)
+            lab.clock.sleep(1e-3)
+            assert 0.4 * ahead_s < start_s(lab, program, row_channel) - played_s <= ahead_s
+        assert lab.tweezers.describe()["silent_underruns"] == 0
+        assert lab.written(registers.SPC_M2CMD).count(registers.M2CMD_CARD_STOP) <= 1
+
+
+def test_the_ring_is_short_in_silence_and_full_within_the_first_batches(driver: Any) -> None:
+    with driver("stream", sample_rate=624e6) as lab:
+
+        def ahead_s() -> float:
+            lab.card.running  # noqa: B018 - lets the card come to the present
+            fifo = lab.card._machine.fifo
+            return (fifo._handed - fifo._consumed) / 4 / lab.rate_hz
+
+        duration_s = lab.tweezers.prepare(lab.program(20))
+        lab.clock.sleep(10e-3)
+        assert 0.1e-3 < ahead_s() <= 0.25e-3
+        lab.tweezers.play()
+        lab.clock.sleep(1e-3)
+        assert ahead_s() > 7e-3
+        lab.tweezers.wait(duration_s + 1e-3)
+        lab.clock.sleep(1e-3)
+        assert ahead_s() <= 0.25e-3
+
+
+@pytest.mark.parametrize("keep_warm", [None, PARKED])
+def test_an_underrun_in_silence_is_counted_and_the_stream_begins_again(driver: Any, keep_warm: Any) -> None:
+    with driver("stream", keep_warm=keep_warm) as lab:
+        lab.play(lab.program(1))
+        for n in range(3):
+            lab.card.hold_up(5e-3)
+            lab.clock.sleep(4e-3)
+            assert not lab.card.running, "dry"
+            lab.clock.sleep(n * 1e-3)  # the program is spliced in before or after the thread is back
+            lab.card.forget(lab.clock.now())
+            program = lab.program(2)
+            lab.play(program)
+            if keep_warm is None:
+                start_s(lab, program)
+            lab.clock.sleep(2e-3)
+            assert lab.tweezers.describe()["silent_underruns"] == n + 1
+            assert lab.card.running
+
+
+@pytest.mark.parametrize(("held_s", "is_survived"), [(6e-3, True), (12e-3, False)])
+def test_a_computer_that_is_held_up_in_motion(driver: Any, held_s: float, is_survived: bool) -> None:
+    with driver("stream", fill=8e-3) as lab:
+        program = lab.program(30)
+        duration_s = lab.tweezers.prepare(program)
+        lab.card.forget(lab.clock.now())
+        lab.tweezers.play()
+        lab.clock.sleep(1e-3)
+        lab.card.hold_up(held_s)
+        if is_survived:
+            lab.tweezers.wait(duration_s + 1e-3)
+            start_s(lab, program)
+            return
+        with pytest.raises(
+            TransientError, match=r"underrun: .* \(\d\d% of the program was played\); raise `fill`"
+        ):
+            lab.tweezers.wait(duration_s + 1e-3)
+        assert lab.card.outputs_on == (False, False)
+        assert not lab.card.running
+        lab.card.forget(lab.clock.now())
+        program = lab.program(2)
+        lab.play(program)
+        start_s(lab, program)
+        assert lab.tweezers.describe()["silent_underruns"] == 0
+
+
+def test_a_computer_that_is_held_up_after_the_last_samples_were_handed_over(driver: Any) -> None:
+    with driver("stream") as lab:
+        program = lab.program(4)
+        duration_s = lab.tweezers.prepare(program)
+        lab.card.forget(lab.clock.now())
+        lab.tweezers.play()
+        lab.clock.sleep(duration_s / 2)
+        lab.card.hold_up(duration_s)
+        lab.tweezers.wait(1.0)
+        start_s(lab, program)
+
+
+def test_a_bus_that_cannot_stream_is_reported_when_the_card_is_opened(driver: Any) -> None:
+    slow = replace(M4I6631, bus_bytes_per_s=1.4e9)  # four lanes
+    text = (
+        r"the bus carries 1\.4 GB/s, but mode: stream at 624 MHz needs 2\.5 GB/s; .* below 350 MHz, or mode"
+    )
+    with pytest.raises(DeviceError, match=text), driver("stream", model=slow, sample_rate=624e6):
+        pass
+    with driver("stream", model=slow, sample_rate=300e6) as lab:
+        lab.play(lab.program(1))
+
+
+def test_an_error_of_the_card_in_silence_ends_the_stream_and_is_raised_by_the_next_call(driver: Any) -> None:
+    with driver("stream") as lab:
+        lab.tweezers.settle()
+        lab.card.break_down("for this test")
+        lab.clock.sleep(10e-3)
+        with pytest.raises(DeviceError, match="for this test"):
+            lab.tweezers.prepare(lab.program(1))
+        lab.tweezers.safe_state()
+        assert lab.card.outputs_on == (False, False)
+        lab.card.forget(lab.clock.now())
+        lab.play(program := lab.program(1))
+        start_s(lab, program)
+
+
+def streaming() -> int:
+    return sum(thread.name == "spcm stream" for thread in threading.enumerate())
+
+
+def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
+    tones_hz, band = np.linspace(12e6, 18e6, 5), (10e6, 20e6)
+    grid = SiteGrid(5, 5, row_frequency_hz=tones_hz, column_frequency_hz=tones_hz)
+    motion = MotionSpec(rf=RfSpec(row_band_hz=band, column_band_hz=band))
+    plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 4)
+    program = tone_program(plan, grid, motion)
+    context = Context("mobile_tweezers", grid, motion=motion)
+    card = SimulatedCard(context.clock)
+    assert not context.clock.virtual
+    with installed(card) as name:
+        settings = SpcmSettings(card=name, mode="stream", sample_rate=50e6, fill=0.2)
+        tweezers = SpcmMobileTweezers(settings, context)
+        tweezers.warm()
+        tweezers.open()
+        lab = Lab(tweezers, card, context.clock, motion)  # type: ignore[arg-type]
+        try:
+            for _ in range(2):
+                tweezers.settle()
+                assert streaming() == 1
+                card.forget(context.clock.now())
+                lab.play(program)
+                start_s(lab, program)
+                tweezers.safe_state()
+                until_s = time.monotonic() + 5.0
+                while streaming() and time.monotonic() < until_s:
+                    time.sleep(1e-3)
+                assert not streaming()
+                assert (card.running, card.outputs_on) == (False, (False, False))
+        finally:
+            tweezers.close()
