@@ -8,9 +8,9 @@ from typing import Any
 
 from labseq.errors import DeviceError
 from labseq.guard import DRIVER_MARGIN_S
-from labseq.model import CameraFacts, Frame, TimelineEntry
+from labseq.model import CameraFacts, Frame, TimedBy, TimelineEntry
 from labseq.model.lines import IDLE
-from labseq.roles import Camera, Trigger, offers
+from labseq.roles import Camera, StepContext, Trigger, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import blinding_lines, trigger_line
 
@@ -46,6 +46,29 @@ def take_frame(
     if not isinstance(frame, Frame):
         raise DeviceError(name, f"read() returned {type(frame).__name__}; expected a Frame")
     return frame
+
+
+def with_waits(
+    timelines: Sequence[Sequence[TimelineEntry]], context: StepContext
+) -> list[list[TimelineEntry]]:
+    """The timelines of a shot's steps, with the waits for a camera that starts its exposures by itself."""
+    camera, since_s, exposure_s = context.camera, math.inf, math.nan
+    found = [[*entries] for entries in timelines]
+    if camera.line_trigger != "external_start" or trigger_line(context.lines, "camera") is None:
+        return found
+    for number, entries in enumerate(timelines):
+        found[number] = []
+        for entry in entries:
+            wait_s = camera.cycle_s - since_s
+            if entry.n_images and entry.exposure_s == exposure_s and wait_s > 0:
+                by = TimedBy("camera")
+                wait = TimelineEntry("wait for the camera", wait_s, wait_s, kind=IDLE, timed_by=by)
+                found[number].append(wait)
+            if entry.n_images:
+                since_s, exposure_s = 0.0, entry.exposure_s
+            since_s += entry.duration_s
+            found[number].append(entry)
+    return found
 
 
 class CameraSeries:

@@ -21,6 +21,7 @@ from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
 from labseq.plain import now_utc
 from labseq.roles import RunObserver, Step, StepContext, offers
+from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of, open_device
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
@@ -145,7 +146,8 @@ def plan_timelines(
     Raises:
         LabseqError: A step fails; the error names it.
     """
-    return [plan_timeline(lab, guard, number, *step, context) for number, step in enumerate(steps)]
+    planned = [plan_timeline(lab, guard, number, *step, context) for number, step in enumerate(steps)]
+    return with_waits(planned, context or lab.step_context)
 
 
 def plan_timeline(

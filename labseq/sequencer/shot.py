@@ -234,7 +234,6 @@ class RunningShot:
         # a timeline leaves out the arming and the detection
         more_s = self.lab.budgets.get("detect", 0.0) * sum(entry.n_images for entry in entries)
         more_s += self.series.arm_s if arms else 0.0
-        more_s += self.series.cycle_s * sum(entry.n_images for entry in entries)
         with self.stage(f"{STEP}{number}_{name}", planned_s + more_s if planned_s else math.nan):
             yield
             durations = self._kept or (planned_s, self.elapsed_s - start_s)

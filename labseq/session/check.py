@@ -18,6 +18,7 @@ from labseq.guard import Guard
 from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
 from labseq.motion import tone_program
 from labseq.roles import Detector, Step, StepContext, find_leader, offers
+from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
@@ -87,7 +88,8 @@ class _Points:
                 except LimitError as error:
                     self.add(point.document, self.session.assembly.sequence.shot[number].loc, str(error))
             self.raise_problems()
-            self._timelines[key] = point, named
+            bars = with_waits([own for _, own in named], lab.step_context)
+            self._timelines[key] = point, [(name, own) for (name, _), own in zip(named, bars, strict=True)]
         return self._timelines[key][1]
 
     def add(self, document: Document, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:

@@ -544,6 +544,8 @@ def test_a_bulb_camera_sees_what_one_that_is_triggered_sees(tmp_path: Path, box:
 def test_with_an_external_start_the_images_wait_for_the_camera(tmp_path: Path) -> None:
     (shot,) = run(tmp_path, LINES, START, "profile.camera.cycle_time=90 ms", TWO_IMAGES, shots=1).shots
     first, second = shot.images
+    step = shot.steps[3]
+    assert (step.planned_s, step.achieved_s) == pytest.approx((70e-3, 70e-3))  # it waits for 19.8 ms
     assert second.t_start_s - first.t_start_s == pytest.approx(90e-3)
     assert (first.occupancy & second.occupancy).sum() > 250  # both were lit
 
