@@ -18,7 +18,7 @@ from labseq.errors import ConfigError, LimitError, Problem
 from labseq.guard import stop_on_signals
 from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
 from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
-from labseq.roles import Detection, Detector, Planner, Shot, Step, StepContext
+from labseq.roles import Detection, Detector, Planner, Shot, Step, StepContext, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
@@ -267,6 +267,10 @@ class _Measured(Step):
         occupancy = shot.occupancy
         assert occupancy is not None
         mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
+        if offers(mobile, "settle"):
+            start_s = time.perf_counter()
+            mobile.settle()  # a simulated device does here what was due while the virtual clock advanced
+            self._watch.frame_s += time.perf_counter() - start_s
         with shot.stage("plan"):
             seen = occupancy.copy()
             plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, seen, shot.target)

@@ -64,7 +64,8 @@ class Stream:
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
-        self._first = np.empty((FIRST, 2), np.int16)
+        self._first = np.zeros((FIRST, 2), np.int16)
+        self._chunk = np.zeros((2, CHUNK), np.int16)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._streams = self._fills = False
@@ -123,7 +124,7 @@ class Stream:
     def prepare(self, program: ToneProgram) -> float:
         """Render the beginning of a program; returns its playing time in seconds."""
         start_s = time.perf_counter()
-        renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
+        renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel, self._chunk)
         renderer.write(0, self._first[: self._whole_blocks(renderer.n_samples)])
         self._prepared = renderer
         self.render_s = time.perf_counter() - start_s

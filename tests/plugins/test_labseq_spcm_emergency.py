@@ -35,7 +35,9 @@ from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.stream import Stream
 
+Stream._check_bus = lambda self: None  # samples go through a pipe, which may be slow
 tones = np.linspace(12e6, 18e6, 5)
 grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
@@ -60,6 +62,7 @@ devices = {
     "dds": tweezers("dds", "dds", 1e-5, 50),
     "replay": tweezers("replay", "replay", 1.5e-5, 1),
     "fifo": tweezers("fifo", "fifo", 1e-5, 50),
+    "stream": tweezers("stream", "stream", 1e-5, 50),
 }
 parked = {"row_frequency": 10e6, "column_frequency": 10e6}
 idle = {
@@ -85,7 +88,7 @@ assert card.spcm.spcm_dwSetParam_i64(card._card.handle(), 30010, 9000) == 0x101 
 print("on", flush=True)
 sys.stdin.read()
 """
-STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "dds", "warm", "warm_dds"}
+STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "stream", "dds", "warm", "warm_dds"}
 ENDLESS = ("dds", "locked", "warm", "warm_dds")
 
 
@@ -130,6 +133,7 @@ def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
     assert {scope.after_death[state] for state in ENDLESS} == {(True, (True, True))}
     assert scope.after_death["replay"] == (True, (True, True))
     assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
+    assert scope.after_death["stream"][1] == (True, True), "its relays, whether it has run dry or not"
     assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"
     assert scope.after_death["prepared"] == (False, (True, True)), "likewise"
 
