@@ -75,7 +75,7 @@ def test_the_ring_is_short_in_silence_and_full_within_the_first_batches(driver: 
             fifo = lab.card._machine.fifo
             return (fifo._handed - fifo._consumed) / 4 / lab.rate_hz
 
-        duration_s = lab.tweezers.prepare(lab.program(20))
+        duration_s = lab.tweezers.prepare(lab.program(100))
         lab.clock.sleep(10e-3)
         assert 0.1e-3 < ahead_s() <= 0.25e-3
         lab.tweezers.play()
@@ -108,7 +108,7 @@ def test_an_underrun_in_silence_is_counted_and_the_stream_begins_again(driver: A
 @pytest.mark.parametrize(("held_s", "is_survived"), [(6e-3, True), (12e-3, False)])
 def test_a_computer_that_is_held_up_in_motion(driver: Any, held_s: float, is_survived: bool) -> None:
     with driver("stream", fill=8e-3) as lab:
-        program = lab.program(30)
+        program = lab.program(100)
         duration_s = lab.tweezers.prepare(program)
         lab.card.forget(lab.clock.now())
         lab.tweezers.play()
@@ -176,7 +176,7 @@ def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
     tones_hz, band = np.linspace(12e6, 18e6, 5), (10e6, 20e6)
     grid = SiteGrid(5, 5, row_frequency_hz=tones_hz, column_frequency_hz=tones_hz)
     motion = MotionSpec(rf=RfSpec(row_band_hz=band, column_band_hz=band))
-    plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 4)
+    plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])])  # handed over as a whole by play()
     program = tone_program(plan, grid, motion)
     context = Context("mobile_tweezers", grid, motion=motion)
     card = SimulatedCard(context.clock)
