@@ -15,7 +15,7 @@ from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
 from labseq.session.chosen import ChosenPlugin, construct_one, construct_target, load_plugins
-from labseq.session.profile import calibrated_grid
+from labseq.session.profile import calibrated_machine
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""
@@ -120,7 +120,8 @@ def tone_program(
     """
     if profile is not None:
         document, spec = load_profile(profile, beside=Path())
-        grid, motion = grid or calibrated_grid(document, spec), motion or spec.motion
+        own_grid, own_motion = calibrated_machine(document, spec)
+        grid, motion = grid or own_grid, motion or own_motion
     return _motion.tone_program(plan, grid, motion, n_batches)
 
 

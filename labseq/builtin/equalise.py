@@ -10,16 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, NoReturn
+from typing import Annotated, Final, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from labseq.builtin.spot_powers import TweezerMeter
+from labseq.builtin.spot_powers import MobileTweezerMeter, TweezerMeter
 from labseq.config.profile import PowerMeterSettings
 from labseq.errors import DeviceError
 from labseq.model import TimelineEntry
+from labseq.motion import drive
 from labseq.roles import Shot, Step, StepContext
 
 Floats = NDArray[np.float64]
@@ -170,8 +171,12 @@ PATIENCE: Final = 4
 
 
 class EqualiseSettings(PowerMeterSettings):
-    """``equalise``: make the static tweezers even, in a closed loop."""
+    """``equalise``: make the static or the mobile tweezers even, in a closed loop."""
 
+    tweezers: Literal["static", "mobile"] = Field(
+        default="static",
+        description="which tweezers; all tones of the mobile ones are on for each frame of a camera",
+    )
     spread: Annotated[float, Field(gt=0, lt=1)] = Field(
         default=0.005, description="target rms of the part that rows and columns can even out"
     )
@@ -331,18 +336,18 @@ class EqualiseStep(Step):
         Raises:
             DeviceError: The loop does not converge, and why; or the device's value is not such an array.
         """
-        settings, tweezers, limit_s = self.settings, shot.static_tweezers, shot.call_timeout_s
-        shot.call("static_tweezers", limit_s, tweezers.start)
-
-        before: list[Floats] = []
-        meter = TweezerMeter(shot, settings)
+        settings, before = self.settings, list[Floats]()
+        is_mobile = settings.tweezers == "mobile"
+        if not is_mobile:
+            shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.start)
+        meter = (MobileTweezerMeter if is_mobile else TweezerMeter)(shot, settings)
 
         def measure() -> Floats:
             power = meter.measure()
             before.append(power) if not before else None
             return power
 
-        rows, cols = _in_force(shot)
+        rows, cols = _mobile_in_force(shot) if is_mobile else _in_force(shot)
         with shot.stage("equalise"):
             found = equalise_loop(measure, meter.apply, rows, cols, settings)
             after = meter.measure()
@@ -365,3 +370,8 @@ def _in_force(shot: Shot) -> tuple[Floats, Floats]:
         return entry.values["row_amplitudes"], entry.values["column_amplitudes"]
     n_rows, n_cols = shot.grid.shape
     return np.full(n_rows, 1 / n_rows), np.full(n_cols, 1 / n_cols)
+
+
+def _mobile_in_force(shot: Shot) -> tuple[Floats, Floats]:
+    """The amplitudes of the mobile tweezers' tones: calibrated, of the profile, or all equal."""
+    return drive(shot.grid, shot.motion, 0).amplitude, drive(shot.grid, shot.motion, 1).amplitude

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -10,8 +14,9 @@ from numpy.typing import NDArray
 from labseq.config.profile import PowerMeterSettings
 from labseq.detection.lattice import find_lattice
 from labseq.detection.spots import KnownSpots, without_hot_pixels
-from labseq.errors import DeviceError
+from labseq.errors import ConfigError, DeviceError
 from labseq.model import Frame, SiteGrid
+from labseq.motion import all_on_program
 from labseq.roles import Shot
 
 Floats = NDArray[np.float64]
@@ -21,6 +26,9 @@ MISSING: Final = 0.2
 
 MIN_CONTRAST: Final = 100
 """Counts above the median from which equal counts of several pixels mean that they are saturated."""
+
+OFF_S: Final = 1e-3
+"""Duration of the ramp that turns the static tweezers off, in seconds."""
 
 NAMED: Final = 5
 """Maximum number of sites that a message names."""
@@ -86,6 +94,60 @@ class SpotPowers:
 
     def _refuse(self, why: str) -> NoReturn:
         raise DeviceError(self._camera, f"no powers from its frame of the static tweezers: {why}")
+
+
+class MobileTweezerMeter:
+    """Plays all tones of the mobile tweezers, and measures the powers on frames of a camera.
+
+    Each frame is taken during a program of its own, with the static tweezers off.
+
+    Args:
+        shot: The devices.
+        settings: Which camera, and how long it exposes.
+
+    Raises:
+        ConfigError: The device is no camera.
+    """
+
+    def __init__(self, shot: Shot, settings: PowerMeterSettings) -> None:
+        self._shot, self._settings, name = shot, settings, settings.device
+        if name != "camera" and not hasattr(shot.device(name), "arm"):
+            raise ConfigError(f"'{name}' is no camera; mobile tweezers are measured on frames")
+        self._spots = SpotPowers(shot.grid, name)
+        self._motion = shot.motion
+        shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.ramp, 0.0, OFF_S)
+
+    def apply(self, rows: Floats, cols: Floats) -> None:
+        """Use amplitudes of rows and columns from now on, fractions of full scale."""
+        rf = replace(self._shot.motion.rf, row_amplitudes=tuple(rows), column_amplitudes=tuple(cols))
+        self._motion = replace(self._shot.motion, rf=rf)
+
+    def measure(self) -> Floats:
+        """Measure the powers once, float64 (n_rows, n_cols), in counts.
+
+        Raises:
+            DeviceError: The frame shows no measurable spots, or the mobile tweezers fail.
+            LimitError: The tones break a limit.
+        """
+        shot, settings = self._shot, self._settings
+        on_s = 2 * settings.lead + settings.mobile_exposure
+        program = all_on_program(shot.grid, self._motion, on_s)
+        with shot.stage("prepare"):
+            shot.call("mobile_tweezers", shot.call_timeout_s, shot.mobile_tweezers.prepare, program)
+        light = self._light(program.total_duration_s)
+        frame = shot.take_frame(settings.device, settings.mobile_exposure, light)
+        return self._spots.fit(frame)
+
+    @contextmanager
+    def _light(self, duration_s: float) -> Generator[None]:
+        """Play the prepared program; within, all tones are on."""
+        shot, mobile, limit_s = self._shot, self._shot.mobile_tweezers, self._shot.call_timeout_s
+        shot.check_interlocks()
+        start = partial(shot.call, "mobile_tweezers", limit_s, mobile.play)
+        with shot.lines_on("rearrange", duration_s, start):
+            shot.clock.sleep(self._motion.pick_up_s + self._settings.lead)
+            yield
+            shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
 
 
 class TweezerMeter:

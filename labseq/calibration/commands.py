@@ -112,7 +112,7 @@ def calibrate(
         str,
         typer.Argument(
             metavar="KIND",
-            help="What to calibrate: sites, thresholds, tweezers, frequencies or overlay.",
+            help="What to calibrate: sites, thresholds, tweezers, amplitudes, frequencies or overlay.",
             show_default=False,
         ),
     ],

@@ -47,6 +47,7 @@ METHODS: Final[Mapping[str, Method]] = {
         Method("sites", analyse_sites, read_site_file, ignored=("sites", "thresholds"), uses_detector=False),
         Method("thresholds", analyse_thresholds, ignored=("thresholds",), uses_detector=False),
         Method("tweezers", analyse_tweezers, uses_detector=False),
+        Method("amplitudes", analyse_tweezers, uses_detector=False),
         Method("frequencies", analyse_frequencies),
         Method("overlay", analyse_overlay),
     )
@@ -241,12 +242,12 @@ def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:
 
 def _meter(method: Method, spec: ProfileSpec) -> list[str]:
     """The overrides that make the step `equalise` measure with what the profile says."""
-    if method.kind != "tweezers":
+    if method.kind not in ("tweezers", "amplitudes"):
         return []
     meter = spec.equalise
-    times = {"exposure": f"{meter.exposure!r} s", "settle": f"{meter.settle!r} s"}
-    values = {"device": meter.device, "value": meter.value, **times}
-    return [f"shot.0.equalise.{key}={json.dumps(values[key])}" for key in sorted(meter.model_fields_set)]
+    values = {key: getattr(meter, key) for key in sorted(meter.model_fields_set)}
+    texts = {key: value if isinstance(value, str) else f"{value!r} s" for key, value in values.items()}
+    return [f"shot.0.equalise.{key}={json.dumps(text)}" for key, text in texts.items()]
 
 
 def _of_profile(overrides: Sequence[str]) -> list[Override]:

@@ -177,6 +177,7 @@ DECIDING: Final[Mapping[str, QualityFigure]] = {
     "thresholds": QualityFigure("error", 1e-3, "expected error"),
     # The goal of the step `equalise`.
     "tweezers": QualityFigure("separable_spread", 5e-3, "separable spread"),
+    "amplitudes": QualityFigure("separable_spread", 5e-3, "separable spread"),
     # A twentieth of the mobile tweezers' waist: the losses that it causes are too few to measure.
     "frequencies": QualityFigure("error_m", 50e-9, "error"),
     "overlay": QualityFigure("error_m", 50e-9, "error"),

@@ -81,7 +81,7 @@ class DeviceChoice(Choice):
 
 
 class PowerMeterSettings(Settings):
-    """What measures the powers of the static tweezers for `labseq calibrate tweezers`."""
+    """What measures the powers of tweezers for `labseq calibrate tweezers` and `amplitudes`."""
 
     device: Text = Field(
         default="trap_camera",
@@ -99,6 +99,14 @@ class PowerMeterSettings(Settings):
     settle: Duration = Field(
         default=0.0,
         description="how long to wait after a change of the tones, until the meter shows it",
+    )
+    mobile_exposure: PositiveDuration = Field(
+        default=0.1e-3, description="exposure time of a camera for the mobile tweezers, which are brighter"
+    )
+    lead: Duration = Field(
+        default=5e-3,
+        description="how long the mobile tweezers are on before and after an exposure; longer than the delay "
+        "of a camera",
     )
 
 
@@ -133,6 +141,9 @@ class CalibrationChoices(Settings):
     thresholds: Text | None = Field(default=None, description="the detector's thresholds: an id, or `off`")
     tweezers: Text | None = Field(
         default=None, description="amplitudes of the static tweezers' tones: an id, or `off`"
+    )
+    amplitudes: Text | None = Field(
+        default=None, description="amplitudes of the mobile tweezers' tones: an id, or `off`"
     )
     frequencies: Text | None = Field(
         default=None, description="tones of the mobile tweezers: an id, or `off`"
@@ -542,8 +553,8 @@ class ProfileSpec(Settings):
     )
     equalise: Annotated[PowerMeterSettings, empty_is({})] = Field(
         default=PowerMeterSettings(),
-        description="what `labseq calibrate tweezers` measures with, in place of the defaults of the step "
-        "`equalise`",
+        description="what `labseq calibrate tweezers` and `amplitudes` measure with, in place of the "
+        "defaults of the step `equalise`",
     )
     calibrations: Annotated[CalibrationSettings, empty_is({})] = Field(
         default=CalibrationSettings(), description="which calibrations to use: a mapping, a folder, or `off`"

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from labseq.model.arrays import read_only
 from labseq.model.grid import SiteGrid
 
-CalibrationKind = Literal["sites", "thresholds", "tweezers", "frequencies", "overlay"]
+CalibrationKind = Literal["sites", "thresholds", "tweezers", "amplitudes", "frequencies", "overlay"]
 CALIBRATION_KINDS: Final[tuple[CalibrationKind, ...]] = get_args(CalibrationKind)
 
 ID_DIGITS: Final = 12
@@ -28,6 +28,7 @@ VALUE_SHAPES: Final[Mapping[str, Mapping[str, tuple[str | int, ...]]]] = Mapping
         "sites": {"positions_px": ("rows", "cols", 2), "frame": (2,)},
         "thresholds": {"thresholds": ("rows", "cols")},
         "tweezers": {"row_amplitudes": ("rows",), "column_amplitudes": ("cols",)},
+        "amplitudes": {"row_amplitudes": ("rows",), "column_amplitudes": ("cols",)},
         "frequencies": {"row_hz": ("rows",), "column_hz": ("cols",)},
         "overlay": {"offset_m": (2,)},
     }
@@ -48,6 +49,7 @@ class CalibrationEntry:
       offset, or log-odds.
     - tweezers: ``row_amplitudes`` (n_rows,), ``column_amplitudes`` (n_cols,) of the static tweezers' tones,
       fractions of full scale.
+    - amplitudes: the same of the mobile tweezers' tones at the sites, above 0.
     - frequencies: ``row_hz`` (n_rows,), ``column_hz`` (n_cols,): the mobile tweezers' tones at the sites.
     - overlay: ``offset_m`` (2,): offset of the mobile tweezers from the sites, along a1 (along a
       row) and a2 (from row to row).
@@ -111,6 +113,10 @@ class CalibrationEntry:
         for name, value in self.values.items():
             if name.endswith("_amplitudes") and not np.all((value >= 0) & (value <= 1)):
                 raise ValueError(f"'{name}' has values outside of 0 to 1")
+        if self.kind == "amplitudes" and any(
+            not np.all(self.values[name] > 0) for name in VALUE_SHAPES[self.kind]
+        ):
+            raise ValueError("an amplitude is not above 0")
         if self.kind == "frequencies":
             for name in VALUE_SHAPES[self.kind]:
                 steps = np.diff(self.values[name])

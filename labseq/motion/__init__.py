@@ -18,7 +18,7 @@ from labseq.motion.axes import (
     standing_on_sites,
 )
 from labseq.motion.check import RULES, check_plan
-from labseq.motion.hold import cross_offsets_m, hold_program, hold_time_s
+from labseq.motion.hold import all_on_program, cross_offsets_m, hold_program, hold_time_s
 from labseq.motion.overlay import (
     FastOffset,
     OverlayFit,
@@ -43,6 +43,7 @@ __all__ = [
     "Renderer",
     "SurvivalShape",
     "TableCalibration",
+    "all_on_program",
     "calibrated",
     "check_plan",
     "comb_sample_rate",

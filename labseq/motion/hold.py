@@ -1,4 +1,4 @@
-"""Programs that pick atoms up, hold them displaced from their sites and drop them, to probe the overlay."""
+"""Programs whose tones stand still: to probe the overlay with atoms, and to measure the tweezers' light."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Batch:
-    """Sites of one row that are held together; ``offset_m`` float64 (2,) along a1 and a2."""
+    """Tones that are on together, those of rows and of columns; ``offset_m`` float64 (2,) along a1 and a2."""
 
-    row: int
+    rows: Ints
     columns: Ints
     offset_m: Floats
 
@@ -73,6 +73,34 @@ def hold_program(
         for axis in AXIS_INDICES
     ]
     return ToneProgram(axes[0], axes[1], duration_s, kind, batch)
+
+
+def all_on_program(grid: SiteGrid, motion: MotionSpec, on_s: float) -> ToneProgram:
+    """Switch the tones of all rows and all columns on, at their sites, and off again.
+
+    Args:
+        grid: The grid of sites.
+        motion: How the tweezers move: ramps, amplitudes and limits.
+        on_s: Time between the ramps, in seconds, more than 0.
+
+    Returns:
+        The tones of both axes, in one batch.
+
+    Raises:
+        LimitError: The motion does not allow as many tones at once, or a tone breaks another limit.
+    """
+    for name, n, most in zip(AXES, grid.shape, (motion.max_row_tones, motion.max_column_tones), strict=True):
+        if n > most:
+            text = f"{most}, `max_{name}_tones` of the profile"
+            raise LimitError(f"the number of {name} tones at once, to measure all of them", n, text)
+    every = _Batch(np.arange(grid.n_rows), np.arange(grid.n_cols), np.zeros(2))
+    kinds = np.array([SegmentKind.PICK_UP, SegmentKind.TRANSPORT, SegmentKind.DROP_OFF], np.int8)
+    times_s, batch = np.array([motion.pick_up_s, on_s, motion.drop_off_s]), np.zeros(3, np.int32)
+    axes = [
+        _axis(axis, drive(grid, motion, axis), motion, grid.spacing_m, [every], kinds, times_s, batch)
+        for axis in AXIS_INDICES
+    ]
+    return ToneProgram(axes[0], axes[1], times_s, kinds, batch)
 
 
 def hold_time_s(
@@ -150,7 +178,7 @@ def _batches(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLik
         for i, offset in enumerate(kinds):
             together = columns[of_kind.ravel() == i]
             for first in range(0, len(together), most):
-                yield _Batch(row, together[first : first + most], offset)
+                yield _Batch(np.array([row]), together[first : first + most], offset)
 
 
 def _phase_times_s(
@@ -189,7 +217,7 @@ def _axis(
     columns: list[Floats] = [np.empty((5, 0))]
     n_tones: list[int] = [0]
     for one in batches:
-        tones = np.array([one.row]) if axis == 0 else one.columns
+        tones = one.rows if axis == 0 else one.columns
         shift_hz = driven.step_hz * one.offset_m[1 - axis] / spacing_m  # offsets are along a1, a2
         hz = driven.site_hz[tones] + shift_hz
         first = _first_phases(tones, driven, motion)

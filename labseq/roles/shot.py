@@ -314,12 +314,15 @@ class Shot(Protocol):
         """Expose, read, detect and record an image."""
         ...
 
-    def take_frame(self, camera: str, exposure_s: float) -> Frame:
+    def take_frame(
+        self, camera: str, exposure_s: float, light: AbstractContextManager[object] | None = None
+    ) -> Frame:
         """Take a frame of anything but atoms: no line is switched, nothing is detected or recorded.
 
         Args:
             camera: "camera" for that of the atoms, or a device of the profile with ``role: camera``.
             exposure_s: Exposure time, in seconds.
+            light: Entered when the camera is ready, before the exposure, and left after the frame has come.
 
         Raises:
             ConfigError: There is no such camera.

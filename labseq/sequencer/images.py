@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any
 
 from labseq.errors import DeviceError
@@ -16,7 +18,12 @@ from labseq.sequencer.lines import blinding_lines, trigger_line
 
 
 def take_frame(
-    camera: Camera, name: str, exposure_s: float, call: Callable[..., Any], max_wait_s: float
+    camera: Camera,
+    name: str,
+    exposure_s: float,
+    call: Callable[..., Any],
+    max_wait_s: float,
+    light: AbstractContextManager[object],
 ) -> Frame:
     """Take one frame with a camera, armed for it alone.
 
@@ -26,6 +33,7 @@ def take_frame(
         exposure_s: Exposure time, in seconds.
         call: Calls a device: ``call(name, timeout_s, function, *arguments)``.
         max_wait_s: Longest time of a call beyond the exposure, in seconds.
+        light: Entered before the exposure, once the camera is ready, and left after the frame has come.
 
     Raises:
         DeviceError: It has an EM gain, only an external trigger, or returned something else than a frame.
@@ -39,10 +47,15 @@ def take_frame(
     if trigger is None:
         raise DeviceError(name, "it takes frames on an external trigger only; expected a software trigger")
     limit_s = max_wait_s + exposure_s
-    call(name, limit_s, camera.arm, 1, exposure_s, trigger)
+    arm = partial(call, name, limit_s, camera.arm, 1, exposure_s, trigger)
     if trigger == "software":
-        call(name, limit_s, camera.trigger)
-    frame = call(name, limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
+        arm()
+    with light:
+        if trigger == "software":
+            call(name, limit_s, camera.trigger)
+        else:
+            arm()
+        frame = call(name, limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
     if not isinstance(frame, Frame):
         raise DeviceError(name, f"read() returned {type(frame).__name__}; expected a Frame")
     return frame

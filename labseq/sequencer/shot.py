@@ -6,7 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -254,12 +254,14 @@ class RunningShot:
             known = ", ".join(self.lab.devices) or "none"
             raise ConfigError(f"the profile has no device '{name}'; it has: {known}") from None
 
-    def take_frame(self, camera: str, exposure_s: float) -> Frame:
+    def take_frame(
+        self, camera: str, exposure_s: float, light: AbstractContextManager[object] | None = None
+    ) -> Frame:
         """Take a frame of anything but atoms; see ``labseq.plugin.Shot``."""
         if camera == "camera":
             self.series.end()
         chosen: Any = self.lab.camera if camera == "camera" else self.device(camera)
-        return take_frame(chosen, camera, exposure_s, self.call, self.call_timeout_s)
+        return take_frame(chosen, camera, exposure_s, self.call, self.call_timeout_s, light or nullcontext())
 
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs

@@ -287,6 +287,10 @@ def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
     core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
     roles = {role: chosen.dump() for role, chosen in hardware.chosen.items() if role in ROLES}
     roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
+    if "amplitudes" in hardware.calibrations:
+        rf = hardware.motion.rf
+        amplitudes = {"row_amplitudes": [*rf.row_amplitudes], "column_amplitudes": [*rf.column_amplitudes]}
+        roles["mobile_tweezers"] |= {"rf": roles["mobile_tweezers"]["rf"] | amplitudes}
     devices = {name: hardware.chosen[name].dump() for name in spec.devices}
     grid = with_tones(core["grid"], hardware.grid, spec.grid_model())
     return {**core, "grid": grid, **roles, "devices": devices}
@@ -365,9 +369,7 @@ def make_analyses(
         prefix, made = f"{PREFIX}{choice.use}.", None
         with found:
             chosen = resolve(hardware.host, document, "analysis", choice)
-            context = Context(
-                choice.use, hardware.grid, hardware.profile.motion, calibrations=hardware.calibrations
-            )
+            context = Context(choice.use, hardware.grid, hardware.motion, calibrations=hardware.calibrations)
             made = construct_one(chosen, context)
             dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
         results += [f"{prefix}{name}" for name in getattr(made, "results", ("",))]

@@ -50,9 +50,11 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         ConfigError: A constructor refuses its settings, or the lines conflict with the devices.
     """
     hardware = point.hardware
-    profile, motion = hardware.profile, hardware.profile.motion
+    profile, motion = hardware.profile, hardware.motion
     chosen = {**hardware.chosen, "planner": point.planner}
-    made, streams = construct(chosen, hardware.context(clock), seed, true_grid=profile.grid_model())
+    made, streams = construct(
+        chosen, hardware.context(clock), seed, truth=(profile.grid_model(), profile.motion)
+    )
     lab = Lab(
         grid=hardware.grid,
         motion=motion,
@@ -84,7 +86,7 @@ def construct(
     context: Context,
     seed: int,
     *,
-    true_grid: SiteGrid | None = None,
+    truth: tuple[SiteGrid, MotionSpec] | None = None,
     refused: dict[str, LabseqError] | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
@@ -94,7 +96,7 @@ def construct(
         context: Their common context; name and random numbers are added for each, and the simulation if it
             is among the chosen.
         seed: The run's seed.
-        true_grid: The grid without calibrations, for the simulation, in which they are measured; None
+        truth: Grid and motion without calibrations, for the simulation, in which they are measured; None
             without calibrations.
         refused: Receives the errors, role -> error; without it they are raised.
 
@@ -114,7 +116,8 @@ def construct(
         own = replace(context, name=role, simulation=simulation)
         if role == "simulation":
             stream = RandomStream(seed, "")
-            own = replace(own, random=stream, grid=context.grid if true_grid is None else true_grid)
+            grid, motion = (context.grid, context.motion) if truth is None else truth
+            own = replace(own, random=stream, grid=grid, motion=motion)
         else:
             stream = RandomStream(seed, role)
             own = replace(own, random=stream)
@@ -146,7 +149,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         The lab, and the names of the devices that must be reopened, "simulation" among them.
     """
     reopened = _reopened(lab, before.hardware, after.hardware)
-    motion = after.hardware.profile.motion
+    motion = after.hardware.motion
     names = {*reopened, "planner"}
     if _differs(before.hardware, after.hardware, "detector"):
         names.add("detector")
@@ -155,7 +158,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         {name: chosen[name] for name in chosen if name in names},
         replace(after.hardware.context(lab.clock), simulation=lab.simulation),
         seed,
-        true_grid=after.hardware.profile.grid_model(),
+        truth=(after.hardware.profile.grid_model(), after.hardware.profile.motion),
     )
     roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
     return replace(

@@ -29,7 +29,7 @@ from labseq.roles import Context, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, load_plugins, resolve
 from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import Source, read_source
-from labseq.session.profile import calibrated_grid
+from labseq.session.profile import calibrated_machine
 from labseq.session.recorded import Machine, recorded_machine
 from labseq.settings import Choice, PatternChoice, Settings
 from labseq.text_files import YAML_SUFFIXES
@@ -119,12 +119,12 @@ def read_machine(
             raise ConfigError(Problem("there is no --profile to change", overrides[0].source))
         return _default_machine(source), []
     document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
-    grid = calibrated_grid(document, spec)
+    grid, motion = calibrated_machine(document, spec)
     if grid.shape != shape:
         what = f"the occupancy has {shape[0]} x {shape[1]} sites"
         expected = f"{grid.n_rows} x {grid.n_cols}, as in {visible(str(document.path))}"
         raise ConfigError(Problem(what, visible(source.label), expected=expected))
-    return Machine(grid, spec.motion), plugin_paths(document, spec.plugin_folders)
+    return Machine(grid, motion), plugin_paths(document, spec.plugin_folders)
 
 
 def _default_machine(source: Source) -> Machine:

@@ -21,7 +21,7 @@ from labseq.errors import (
 )
 from labseq.files import profile_dir
 from labseq.messages import clean, did_you_mean
-from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
+from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, MotionSpec, SiteGrid
 from labseq.model.lines import IDLE
 from labseq.motion import standing_on_sites
 from labseq.plugins import PluginHost
@@ -61,11 +61,16 @@ class ResolvedProfile:
         profile = self.profile
         return Context(
             grid=self.grid,
-            motion=profile.motion,
+            motion=self.motion,
             clock=clock,
             calibrations=self.calibrations,
             lines=profile.line_specs,
         )
+
+    @property
+    def motion(self) -> MotionSpec:
+        """How the mobile tweezers move, with calibrated amplitudes."""
+        return with_amplitudes(self.profile.motion, self.calibrations)
 
     @property
     def key(self) -> str:
@@ -336,16 +341,24 @@ def calibrated(
     return ActiveCalibrations(entries, tones, tuple(warnings))
 
 
-def calibrated_grid(document: Document, profile: ProfileSpec) -> SiteGrid:
-    """The grid of a profile with calibrated tones.
+def calibrated_machine(document: Document, profile: ProfileSpec) -> tuple[SiteGrid, MotionSpec]:
+    """The grid and the motion of a profile with calibrated tones.
 
     Raises:
         ConfigError: A calibration in use is missing or damaged.
     """
     found = ProblemCollector()
-    grid = calibrated(document, profile, found).grid
+    active = calibrated(document, profile, found)
     found.raise_any()
-    return grid
+    return active.grid, with_amplitudes(profile.motion, active.entries)
+
+
+def with_amplitudes(motion: MotionSpec, entries: Mapping[str, CalibrationEntry]) -> MotionSpec:
+    """Apply the calibrated amplitudes of the mobile tweezers' tones, if there are any."""
+    if (entry := entries.get("amplitudes")) is None:
+        return motion
+    rows, columns = (tuple(entry.values[f"{axis}_amplitudes"].tolist()) for axis in ("row", "column"))
+    return replace(motion, rf=replace(motion.rf, row_amplitudes=rows, column_amplitudes=columns))
 
 
 def with_tones(resolved: dict[str, Any], grid: SiteGrid, own: SiteGrid) -> dict[str, Any]:

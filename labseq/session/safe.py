@@ -128,8 +128,8 @@ def construct_hardware(
     """
     chosen = {role: c for role, c in hardware.chosen.items() if c.entry.kind in _NEEDED_KINDS}
     failures: dict[str, LabseqError] = {}
-    true_grid = hardware.profile.grid_model()
-    made, _ = construct(chosen, hardware.context(clock), 0, true_grid=true_grid, refused=failures)
+    truth = hardware.profile.grid_model(), hardware.profile.motion
+    made, _ = construct(chosen, hardware.context(clock), 0, truth=truth, refused=failures)
     return made, {role: chosen[role].placed(error) for role, error in failures.items()}
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,27 @@ from labseq_virtual.settings import ImageSettings, SimulationSettings
 
 
 def site_spots(settings: ImageSettings, grid: SiteGrid) -> NDArray[np.float64]:
-    """Centres of the sites' spots on the full sensor.
+    """Centres of the sites' spots on the full sensor, float64 (n_rows, n_cols, 2), (y, x) in pixels."""
+    return on_sensor(settings, grid.positions_m)
 
-    The grid is rotated, stretched along an axis of the frame, shifted to its centre, and distorted
+
+def on_sensor(settings: ImageSettings, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Images of places in the atom plane on the full sensor.
+
+    The plane is rotated, stretched along an axis of the frame, shifted to the grid's centre, and distorted
     radially by the lenses.
 
+    Args:
+        settings: Constants of the optics.
+        positions_m: float64 (..., 2), (x, y) from the grid's centre.
+
     Returns:
-        float64 (n_rows, n_cols, 2), (y, x) in pixels.
+        float64 (..., 2), (y, x) in pixels.
     """
     to_axis, ratio = settings.stretch_angle, math.sqrt(1 + settings.stretch)
     stretched = _rotation(to_axis) @ np.diag([1 / ratio, ratio]) @ _rotation(-to_axis)
     to_frame = stretched @ _rotation(settings.angle)
-    straight = grid.positions_m[..., ::-1] @ to_frame.T / settings.pixel_size + settings.centre_px
+    straight = positions_m[..., ::-1] @ to_frame.T / settings.pixel_size + settings.centre_px
     bent = 1 - settings.barrel * corner_distance(settings, straight) ** 2
     return middle(settings) + (straight - middle(settings)) * bent[..., None]
 
@@ -105,26 +115,46 @@ def _rotation(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[cos, sin], [-sin, cos]])
 
 
-class TweezerSpots:
-    """Draws the light of the static tweezers on the pixels of a frame, one Gaussian spot on each site.
+@dataclass(frozen=True, slots=True, eq=False)
+class Light:
+    """The light of tweezers on a sensor.
 
-    Vignetting dims it as it does the light of atoms.
+    Attributes:
+        positions_m: float64 (..., 2), (x, y) in the atom plane, from the grid's centre.
+        mean: float64 (...), mean photoelectrons of each in the exposure of the settings.
     """
 
-    def __init__(self, view: View, spots: NDArray[np.float64], binning: int) -> None:
-        top, left, height, width = view.region
-        sigma = view.spot / view.pixel_size
-        self._along = [
-            np.diff(normal_below(np.arange(0, n + 1, binning) + first - 0.5 - place.reshape(-1, 1), sigma))
-            for n, first, place in ((height, top, spots[..., 0]), (width, left, spots[..., 1]))
-        ]
-        self._relative = np.maximum(0.0, 1 - view.vignetting * corner_distance(view, spots) ** 2)
+    positions_m: NDArray[np.float64]
+    mean: NDArray[np.float64]
 
-    def draw(self, mean: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int32]:
-        """Photoelectrons on each pixel, int32 (height, width), for the mean of each spot (n_rows, n_cols)."""
-        along_y, along_x = self._along
-        on_pixel = (along_y * (mean * self._relative).reshape(-1, 1)).T @ along_x
-        return rng.poisson(on_pixel).astype(np.int32)
+
+def tweezer_photoelectrons(
+    view: View, light: Light, fraction: float, rng: np.random.Generator, binning: int = 1
+) -> NDArray[np.int32]:
+    """Draw the photoelectrons of tweezers on each pixel that is read: Gaussian spots, with shot noise.
+
+    Vignetting dims them as it does the light of atoms.
+
+    Args:
+        view: Constants of the optics, and the part of the sensor that is read.
+        light: The tweezers.
+        fraction: What of their light is detected, relative to ``light.mean``.
+        rng: Random numbers of the shot.
+        binning: Pixels of the sensor per pixel of the frame, along each axis.
+
+    Returns:
+        int32 (height, width).
+    """
+    places = on_sensor(view, light.positions_m)
+    relative = np.maximum(0.0, 1 - view.vignetting * corner_distance(view, places) ** 2)
+    top, left, height, width = view.region
+    sigma = view.spot / view.pixel_size
+    along_y, along_x = (
+        np.diff(normal_below(np.arange(0, n + 1, binning) + first - 0.5 - place.reshape(-1, 1), sigma))
+        for n, first, place in ((height, top, places[..., 0]), (width, left, places[..., 1]))
+    )
+    on_pixel = (along_y * (fraction * light.mean * relative).reshape(-1, 1)).T @ along_x
+    return rng.poisson(on_pixel).astype(np.int32)
 
 
 class Images:
@@ -143,7 +173,6 @@ class Images:
         self._spots = site_spots(view, grid)
         self._brightness = site_brightness(view, self._spots, rng)
         self._sensor = Emccd(view) if view.sensor == "emccd" else Qcmos(view, rng)
-        self._tweezers: TweezerSpots | None = None
 
     def warm(self) -> None:
         """Compute what all frames have in common."""
@@ -156,20 +185,18 @@ class Images:
         shining: NDArray[np.float64],
         exposure_s: float,
         rng: np.random.Generator,
-        tweezer_power: NDArray[np.float64] | None = None,
+        tweezers: Sequence[Light] = (),
     ) -> NDArray[np.uint16]:
         """Draw a frame, uint16 (height, width), of atoms that shine for a fraction of the exposure each.
 
-        ``row``, ``col`` and ``shining`` are of shape (n_atoms,); ``tweezer_power``, (n_rows, n_cols), is that
-        of the static tweezers on this sensor, relative to the nominal one; None for none.
+        ``row``, ``col`` and ``shining`` are of shape (n_atoms,); ``tweezers`` is other light on the sensor.
         """
         view = self._view
         efficiency = self._sensor.quantum_efficiency * exposure_s / view.exposure
         mean = view.photoelectrons * efficiency * shining * self._brightness[row, col] * self._is_lit
         light = photoelectrons(view, self._spots[row, col], mean, rng, self._sensor.binning)
-        if tweezer_power is not None and view.tweezer_light > 0:
-            self._tweezers = self._tweezers or TweezerSpots(view, self._spots, self._sensor.binning)
-            light += self._tweezers.draw(view.tweezer_light * efficiency * tweezer_power, rng)
+        for one in tweezers:
+            light += tweezer_photoelectrons(view, one, efficiency, rng, self._sensor.binning)
         return self._sensor.read(light, exposure_s, rng)
 
 
@@ -222,8 +249,10 @@ class Exposure:
         rate_hz = light_hz + 1.0 / self._settings.lifetime
         life_s = random.exponential(1.0 / rate_hz, len(row))
         shining = np.minimum(life_s / exposure_s, 1.0) * light_on
-        power = tweezer_power if mode.shutter_open else None
-        image = images.take(row, col, shining, exposure_s, random, power)
+        full, tweezers = self._settings.image.tweezer_light, list[Light]()
+        if tweezer_power is not None and mode.shutter_open and full > 0:
+            tweezers.append(Light(self._grid.positions_m, full * tweezer_power))
+        image = images.take(row, col, shining, exposure_s, random, tweezers)
         image.flags.writeable = False
         lost = life_s < exposure_s
         occupied[row[lost], col[lost]] = False

@@ -340,10 +340,27 @@ class PulseReceiver:
         self._silence_s = silence_s
         self._reach_hz = reach_hz
         self._cut_s = -math.inf
+        self._seen: tuple[list[RfSpan], list[RfSpan]] = [], []
+
+    def look(self, until_s: float) -> tuple[Sequence[RfSpan], Sequence[RfSpan], bool]:
+        """What rows and columns played since the last pulse was received, and whether light is on at a time.
+
+        It stays to be received.
+        """
+        for seen, spans in zip(self._seen, self._source.played(until_s), strict=True):
+            seen += spans
+        is_on = any(
+            end_s > until_s - self._silence_s
+            for spans, reach_hz in zip(self._seen, self._reach_hz, strict=True)
+            for span in spans
+            for _, end_s in active_spans(span, reach_hz)
+        )
+        return *self._seen, is_on
 
     def receive_until(self, until_s: float) -> Iterator[RfPulse]:
         """The pulses played until a time; the last one is cut off there if it has not ended."""
-        played = self._source.played(until_s)
+        self.look(until_s)
+        played, self._seen = self._seen, ([], [])
         cut_s, self._cut_s = self._cut_s, until_s
         times = [
             times

@@ -210,6 +210,11 @@ class TweezerImageSettings(Settings):
         description="mean photoelectrons of the light of a static tweezer of nominal power in that exposure "
         "(ours: in three times this exposure its pixels are saturated)",
     )
+    mobile_light: NonNegativeFloat = Field(
+        default=140e3,
+        description="the same of a mobile tweezer whose tones have their intended amplitudes (ours: seven "
+        "times as deep)",
+    )
     background: NonNegativeFloat = Field(
         default=5.0, description="mean photoelectrons of stray light per pixel in that exposure (ours)"
     )
@@ -219,7 +224,8 @@ class TweezerImageSettings(Settings):
         sensor = QcmosSettings(
             quantum_efficiency=1.0, read_noise=2.0, electrons_per_adu=0.1, full_well=7000.0
         )
-        return ImageSettings.model_validate({**self.model_dump(), "sensor": "qcmos", "qcmos": sensor})
+        optics = self.model_dump(exclude={"mobile_light"})
+        return ImageSettings.model_validate({**optics, "sensor": "qcmos", "qcmos": sensor})
 
 
 PositiveTemperature = Annotated[Temperature, Field(gt=0)]
@@ -244,6 +250,12 @@ class MobileLightSettings(Settings):
         default=None,
         description="peak voltage of a tone at the driver's output that gives the depth (ours; none: that "
         "of the profile, `rf.full_scale` times the site's preassigned amplitude or over its axis' tones)",
+    )
+    tone_response: Fraction = Field(
+        default=0.0,
+        lt=0.5,
+        description="relative s.d. of the depth that each row's and each column's tone gives at the "
+        "profile's amplitude, fixed for a seed: what a calibration of amplitudes can equalise (ours)",
     )
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),

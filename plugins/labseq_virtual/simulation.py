@@ -32,6 +32,7 @@ from labseq.plugin import (
 from labseq_virtual.flight import RfTransport
 from labseq_virtual.images import Exposure
 from labseq_virtual.lights import Lights
+from labseq_virtual.mobile_light import MobileLight, MobileTones, with_true_response
 from labseq_virtual.rf_analysis import PulseReceiver
 from labseq_virtual.sensors import View
 from labseq_virtual.settings import SimulationSettings
@@ -64,11 +65,13 @@ class VirtualSimulation(Simulation):
         self._random = context.random
         self._clock = context.clock
         self._positions = TonePositions(context.grid, settings.mobile_light)
-        self._transport = Transport(context.grid, context.motion, settings, self._positions)
-        self._flight = RfTransport(context.grid, context.motion, settings, self._positions)
+        self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
+        motion = with_true_response(context.grid, context.motion, settings.mobile_light, self._seed)
+        self._transport = Transport(context.grid, motion, settings, self._positions)
+        self._flight = RfTransport(context.grid, motion, settings, self._positions)
+        self._mobile_light = MobileLight(context.grid, motion, settings.mobile_light, self._positions)
         self._static = StaticArray(context.grid, settings)
         self._pulse_receiver: PulseReceiver | None = None
-        self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
         self._lights = Lights(settings.lights, context.lines)
         self._exposure = Exposure(context.grid, settings, self._seed)
         self._is_open = False
@@ -86,7 +89,8 @@ class VirtualSimulation(Simulation):
     def seen_by(self, camera: str) -> TweezerView:
         """What any other camera than that of the atoms receives: the light of the tweezers."""
         del camera
-        return TweezerView(self, self._grid, self._settings.tweezer_image, self._seed, self._random)
+        settings, seed = self._settings.tweezer_image, self._seed
+        return TweezerView(self, self._mobile_light, self._grid, settings, seed, self._random)
 
     def prepare_sensor(self, mode: SensorMode) -> None:
         """Compute what all frames of a mode have in common, and load the kernels."""
@@ -232,6 +236,25 @@ class VirtualSimulation(Simulation):
         self._apply_output(self._clock.now())
         return self._static.depth
 
+    def tweezer_light(self) -> tuple[NDArray[np.float64], MobileTones | None]:
+        """Power of each static tweezer now, as ``spot_powers``, and the mobile tweezers' tones that are on.
+
+        It may be asked for while a program of the mobile tweezers is played.
+        """
+        self._check_open()
+        now_s = self._clock.now()
+        if self._playing is not None:
+            playing = self._playing
+            tones = self._mobile_light.of_program(playing.program, now_s - playing.t_start_s)
+            return self._static.depth, tones
+        if self._pulse_receiver is None:
+            return self.spot_powers(), None
+        rows, columns, is_on = self._pulse_receiver.look(now_s)
+        if not is_on:
+            return self.spot_powers(), None
+        self._lost += self._static.receive_until(now_s, self._occupied, self._random.shot)
+        return self._static.depth, self._mobile_light.of_outputs(rows, columns, now_s)
+
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
         """What the mobile tweezers did to atoms in this shot, if their outputs are connected.
 
@@ -287,7 +310,8 @@ class VirtualSimulation(Simulation):
             self._lose_to_vacuum(pulse.start_s)
             factor = self._loss_factor * self._heating(pulse.start_s, pulse.end_s)
             depth, rng = self._static.depth, self._random.shot
-            self._lost += self._flight.carry(self._occupied, pulse, depth, rng, factor)
+            if self._occupied.any():
+                self._lost += self._flight.carry(self._occupied, pulse, depth, rng, factor)
             self._lose_to_vacuum(pulse.end_s)
         self._lost += self._static.receive_until(until_s, self._occupied, self._random.shot)
 

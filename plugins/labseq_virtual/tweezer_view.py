@@ -18,7 +18,8 @@ from labseq.plugin import (
     Simulation,
     SiteGrid,
 )
-from labseq_virtual.images import Images
+from labseq_virtual.images import Images, Light
+from labseq_virtual.mobile_light import MobileLight, MobileTones
 from labseq_virtual.sensors import View
 from labseq_virtual.settings import TweezerImageSettings
 
@@ -26,18 +27,19 @@ from labseq_virtual.settings import TweezerImageSettings
 class TweezerSource(Protocol):
     """The simulation whose tweezers are seen."""
 
-    def spot_powers(self) -> NDArray[np.float64]:
-        """Power of each static tweezer now relative to the nominal one, float64 (n_rows, n_cols)."""
+    def tweezer_light(self) -> tuple[NDArray[np.float64], MobileTones | None]:
+        """Power of each static tweezer now, float64 (n_rows, n_cols), and the tones of the mobile ones."""
         ...
 
 
 class TweezerView(Simulation):
-    """Frames of the static tweezers, with the powers that they have when an exposure begins.
+    """Frames of the tweezers, with the places and powers that they have when an exposure begins.
 
     The camera receives no light of atoms, and its exposures act on none.
 
     Args:
         source: The simulation.
+        mobile: Where the mobile tweezers are.
         grid: The grid of sites.
         settings: What the camera sees.
         seed: Seed of the machine, for the camera's own patterns.
@@ -47,13 +49,14 @@ class TweezerView(Simulation):
     def __init__(
         self,
         source: TweezerSource,
+        mobile: MobileLight,
         grid: SiteGrid,
         settings: TweezerImageSettings,
         seed: int,
         random: RandomStream,
     ) -> None:
-        self._source, self._grid, self._settings, self._random = source, grid, settings.image(), random
-        self._seed = seed
+        self._source, self._mobile, self._grid, self._random = source, mobile, grid, random
+        self._settings, self._mobile_light, self._seed = settings.image(), settings.mobile_light, seed
         self._images: dict[SensorMode, Images] = {}
 
     @property
@@ -77,15 +80,23 @@ class TweezerView(Simulation):
         """
         if not exposure_s > 0:
             raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
-        power = self._source.spot_powers() if mode.shutter_open else None
+        tweezers = self._light() if mode.shutter_open else ()
         none, rng = np.empty(0, np.int64), self._random.shot
-        image = self._images_of(mode).take(none, none, np.empty(0), exposure_s, rng, power)
+        image = self._images_of(mode).take(none, none, np.empty(0), exposure_s, rng, tweezers)
         image.flags.writeable = False
         return Frame(image, exposure_s, t_start_s)
 
     def describe(self) -> Mapping[str, Any]:
         """What the camera sees, in SI."""
         return self._settings.model_dump(mode="json")
+
+    def _light(self) -> list[Light]:
+        static, tones = self._source.tweezer_light()
+        light = [Light(self._grid.positions_m, self._settings.tweezer_light * static)]
+        if tones is not None:
+            power = tones.row_power[:, None] * tones.column_power
+            light.append(Light(self._mobile.positions_m(tones), self._mobile_light * power))
+        return light
 
     def _images_of(self, mode: SensorMode) -> Images:
         if mode not in self._images:

@@ -37,9 +37,14 @@ DDS = (*TRIGGERED, f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE
 
 UNEVEN = tuple(
     f"profile.simulation.{value}"
-    for value in ("machine_seed=20", "tone_response=12.5 %", "depth_disorder=0 %")
+    for value in (
+        "machine_seed=20",
+        "tone_response=12.5 %",
+        "depth_disorder=0 %",
+        "mobile_light.tone_response=12 %",
+    )
 )
-"""The static tweezers of `bench`."""
+"""The uneven tweezers of `bench`."""
 
 RunProfile = Callable[..., Run]
 
@@ -136,6 +141,30 @@ def test_static_tweezers_of_bench_are_equalised_by_frames_alone(
     print(f"r.m.s. {after.std() / after.mean():.2%}, at most {np.abs(after / after.mean() - 1).max():.2%}")
     assert after.std() < 0.005 * after.mean()
     assert np.abs(after / after.mean() - 1).max() < 0.015
+
+
+def spread_of_depths(done: Run) -> float:
+    """Of what atoms have seen on their way to the next site, between two calibrated places."""
+    flights = done.shots[0].atom_events["flights"]
+    n_sites = abs(flights["to_row"] - flights["from_row"]) + abs(flights["to_col"] - flights["from_col"])
+    depth = flights["depth_K"][(flights["fate"] == b"kept") & (n_sites == 1)]
+    assert len(depth) > 50
+    return float(np.std(depth) / np.mean(depth))
+
+
+@pytest.mark.usefixtures("installed")
+def test_mobile_tweezers_of_bench_are_equalised_by_frames_alone(
+    run: RunProfile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = spread_of_depths(run("bench", shots=1))
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(["calibrate", "amplitudes", "--profile", "bench", "--seed", "1", "--json"])
+    found = json.loads(capfd.readouterr().out)["id"]
+    after = spread_of_depths(run("bench", f"profile.calibrations.use.amplitudes={found}", shots=1))
+    print(f"depths in moves differ by {before:.1%} before and {after:.2%} after")
+    assert before > 0.1
+    assert after < 0.01
 
 
 @pytest.mark.usefixtures("installed")

@@ -235,7 +235,8 @@ def test_a_choice_in_the_profile_is_reported(lab: Any, measured: Any) -> None:
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def test_every_sequence_can_be_run_on_every_profile_with_virtual_devices(method: Any) -> None:
-    assembly = assemble(method.sequence, Options("practice" if method.kind == "tweezers" else "virtual"))
+    needs_meter = method.kind in ("tweezers", "amplitudes")
+    assembly = assemble(method.sequence, Options("practice" if needs_meter else "virtual"))
     assert assembly.sequence.name == f"calibrate-{method.kind}"
-    assert assembly.sequence.record_frames == ("none" if method.kind == "tweezers" else "all")
+    assert assembly.sequence.record_frames == ("none" if needs_meter else "all")
     assert not assembly.warnings

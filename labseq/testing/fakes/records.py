@@ -136,6 +136,7 @@ _FIGURES = {
     "sites": {"residual_px": 0.02, "n_sites_found": 0.0},
     "thresholds": {"error": 5e-4},
     "tweezers": {"separable_spread": 3e-3},
+    "amplitudes": {"separable_spread": 3e-3},
     "frequencies": {"error_m": 2e-8},
     "overlay": {"error_m": 2e-8},
 }
@@ -187,6 +188,10 @@ def _values(kind: CalibrationKind, grid: SiteGrid) -> Mapping[str, ArrayLike]:
         },
         "thresholds": {"thresholds": np.full(grid.shape, 1630.0)},
         "tweezers": {
+            "row_amplitudes": np.full(n_rows, 1 / n_rows),
+            "column_amplitudes": np.full(n_cols, 1 / n_cols),
+        },
+        "amplitudes": {
             "row_amplitudes": np.full(n_rows, 1 / n_rows),
             "column_amplitudes": np.full(n_cols, 1 / n_cols),
         },
