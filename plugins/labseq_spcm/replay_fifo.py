@@ -179,7 +179,7 @@ class Fifo(SampleMode):
         self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
         self._renderer: InterleavedRenderer | None = None
         self._n_rendered = self._n_samples = 0
-        ahead = int(settings.fill * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
+        ahead = int(settings.fill_s * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
         self._fill = 1 << round(math.log2(max(MIN_FILL, ahead)))
         self._set_mode()
 

@@ -13,6 +13,7 @@ Mode: TypeAlias = Literal["replay", "fifo", "stream", "dds"]
 Channel: TypeAlias = Literal[0, 1]
 
 LOOK_AHEAD_S: Final = 250e-6
+FILL_S: Final = {"fifo": 8e-3, "stream": 20e-3}
 NO_TRIGGER: Final = (
     "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
 )
@@ -69,9 +70,10 @@ class SpcmSettings(Settings):
         le=limits.REFERENCE_HZ[1],
         description="external reference of the sample clock; none: the card's own",
     )
-    fill: Annotated[Duration, Field(ge=1e-3, le=1.0)] = Field(
-        default=8e-3,
-        description="playing time that is rendered ahead; fifo: about, because the card takes powers of two",
+    fill: Annotated[Duration, Field(ge=1e-3, le=1.0)] | None = Field(
+        default=None,
+        description="playing time that is rendered ahead; none: 20 ms for stream, 8 ms for fifo; fifo takes "
+        "it roughly, because the card takes powers of two",
     )
     look_ahead: Annotated[Duration, Field(gt=0, le=10e-3)] | None = Field(
         default=None,
@@ -153,6 +155,11 @@ class SpcmSettings(Settings):
     def _buffered_s(self, sample_rate_hz: float) -> float:
         n_bytes = self.card_buffer + limits.OUTPUT_FIFO_BYTES + 2 * self.notify_size
         return n_bytes / limits.FRAME_BYTES / sample_rate_hz
+
+    @property
+    def fill_s(self) -> float:
+        """Playing time that is rendered ahead, of the modes that render while they play."""
+        return self.fill or FILL_S[self.mode]
 
     def look_ahead_s(self, sample_rate_hz: float) -> float:
         """The look-ahead at the rate that the card's clock really makes."""

@@ -59,7 +59,7 @@ class Stream:
         self._ahead = max(2, int(ahead / block)) * block
         self.delay_s = (self._ahead + self._on_card) / sample_rate_hz
         least = 2 * self._whole_blocks(self._ahead + self._on_card)
-        n_samples = max(self._whole_blocks(math.ceil(settings.fill * sample_rate_hz)), least)
+        n_samples = max(self._whole_blocks(math.ceil(settings.fill_s * sample_rate_hz)), least)
         self._ring = Buffer().reserve(n_samples)
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
