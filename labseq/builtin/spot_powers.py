@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from labseq.config.profile import PowerMeterSettings
 from labseq.detection.lattice import find_lattice
 from labseq.detection.spots import KnownSpots, without_hot_pixels
-from labseq.errors import ConfigError, DeviceError
+from labseq.errors import ConfigError, DeviceError, TransientError
 from labseq.model import Frame, SiteGrid
 from labseq.motion import all_on_program
 from labseq.roles import Shot
@@ -29,6 +29,9 @@ MIN_CONTRAST: Final = 100
 
 OFF_S: Final = 1e-3
 """Duration of the ramp that turns the static tweezers off, in seconds."""
+
+N_LOST: Final = 3
+"""How often a frame that was lost is taken again."""
 
 NAMED: Final = 5
 """Maximum number of sites that a message names."""
@@ -96,6 +99,16 @@ class SpotPowers:
         raise DeviceError(self._camera, f"no powers from its frame of the static tweezers: {why}")
 
 
+def without_losses(take: Callable[[], Frame]) -> Frame:
+    """Take a frame, and again if it was lost on its way: there are no atoms that a shot must load anew."""
+    for _ in range(N_LOST):
+        try:
+            return take()
+        except TransientError:
+            continue
+    return take()
+
+
 class MobileTweezerMeter:
     """Plays all tones of the mobile tweezers, and measures the powers on frames of a camera.
 
@@ -129,25 +142,33 @@ class MobileTweezerMeter:
             DeviceError: The frame shows no measurable spots, or the mobile tweezers fail.
             LimitError: The tones break a limit.
         """
+        return self._spots.fit(without_losses(self._frame))
+
+    def _frame(self) -> Frame:
         shot, settings = self._shot, self._settings
         on_s = 2 * settings.lead + settings.mobile_exposure
         program = all_on_program(shot.grid, self._motion, on_s)
         with shot.stage("prepare"):
             shot.call("mobile_tweezers", shot.call_timeout_s, shot.mobile_tweezers.prepare, program)
         light = self._light(program.total_duration_s)
-        frame = shot.take_frame(settings.device, settings.mobile_exposure, light)
-        return self._spots.fit(frame)
+        return shot.take_frame(settings.device, settings.mobile_exposure, light)
 
     @contextmanager
     def _light(self, duration_s: float) -> Generator[None]:
-        """Play the prepared program; within, all tones are on."""
+        """Play the prepared program to its end; within, all tones are on."""
+        lost: TransientError | None = None
         shot, mobile, limit_s = self._shot, self._shot.mobile_tweezers, self._shot.call_timeout_s
         shot.check_interlocks()
         start = partial(shot.call, "mobile_tweezers", limit_s, mobile.play)
         with shot.lines_on("rearrange", duration_s, start):
             shot.clock.sleep(self._motion.pick_up_s + self._settings.lead)
-            yield
+            try:
+                yield
+            except TransientError as error:
+                lost = error
             shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
+        if lost is not None:
+            raise lost
 
 
 class TweezerMeter:
@@ -185,7 +206,8 @@ class TweezerMeter:
             DeviceError: The frame shows no measurable spots, or the value is neither an array nor a number.
         """
         if self._spots is not None:
-            return self._spots.fit(self._shot.take_frame(self._settings.device, self._settings.exposure))
+            name, exposure_s = self._settings.device, self._settings.exposure
+            return self._spots.fit(without_losses(lambda: self._shot.take_frame(name, exposure_s)))
         if not self._is_total:
             power = self._read()
             self._is_total = power.ndim == 0

@@ -111,9 +111,10 @@ def construct(
     streams: list[RandomStream] = []
     for role in sorted(chosen, key=lambda role: role != "simulation"):  # the others receive the simulation
         simulation: Simulation | None = made.get("simulation", context.simulation)
-        if simulation is not None and chosen[role].entry.kind == "camera" != role:
-            simulation = simulation.seen_by(role) if offers(simulation, "seen_by") else simulation
         own = replace(context, name=role, simulation=simulation)
+        if chosen[role].entry.kind == "camera" != role:  # no line triggers it
+            seen = simulation.seen_by(role) if simulation and offers(simulation, "seen_by") else simulation
+            own = replace(own, simulation=seen, lines=())
         if role == "simulation":
             stream = RandomStream(seed, "")
             grid, motion = (context.grid, context.motion) if truth is None else truth

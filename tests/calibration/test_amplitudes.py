@@ -19,7 +19,9 @@ from labseq.model import Plan, SegmentKind
 
 PROFILE = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
 detector: {use: threshold}
-devices: {trap_camera: {use: virtual, role: camera}, meter: {use: virtual_spot_meter}}
+devices:
+  trap_camera: {use: virtual, role: camera, faults: {transient: 10 %}}
+  meter: {use: virtual_spot_meter}
 simulation:
   use: virtual
   machine_seed: 5

@@ -30,7 +30,11 @@ simulation: {use: virtual, machine_seed: 3, tone_response: 8 %}
 METER = ["shot.0.equalise.device=wavemeter"]
 CAMERAS = {
     "second camera": """devices:
-  trap_camera: {use: virtual, role: camera, region: {y: 150, x: 100, height: 250, width: 300}}
+  trap_camera:
+    use: virtual
+    role: camera
+    region: {y: 150, x: 100, height: 250, width: 300}
+    faults: {transient: 10 %}
 """,
     "camera of the atoms": "equalise: {device: camera, exposure: 2 ms}\n",
 }

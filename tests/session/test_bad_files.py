@@ -223,7 +223,7 @@ def test_wrong_options_are_reported_with_the_files() -> None:
     assert messages(shots=0, overrides=["planr.x=1", "profile.camera.gain=5"]) == [
         "--set planr.x=1: there is no 'planr' in s.yaml; expected one of labseq, name, profile, shots, target, planner, shot; did you mean 'planner'?",
         "--shots 0: shots is 0; expected at least 1",
-        "--set profile.camera.gain=5: 'gain' is not a setting of camera 'virtual'; expected one of region, binning, max_exposure, arming_time, readout, em_gain, cooling, faults; did you mean 'em_gain'?",
+        "--set profile.camera.gain=5: 'gain' is not a setting of camera 'virtual'; expected one of transpose, flip, region, binning, max_exposure, line_trigger, cycle_time, arming_time, readout, em_gain, cooling, faults; did you mean 'em_gain'?",
         "s.yaml:7:34: rows is 0; expected at least 1",
     ]
 
