@@ -33,6 +33,7 @@ N_SHOTS = int(os.environ.get("LABSEQ_SHOTS", "1"))
 MOBILE = "profile.mobile_tweezers"
 TRIGGER = "awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, triggers: mobile_tweezers}"
 TRIGGERED = (f"profile.lines={{use: virtual, channels: {{{TRIGGER}}}}}",)
+STREAM = (f"{MOBILE}.mode=stream",)
 DDS = (*TRIGGERED, f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE}.max_column_tones=5")
 
 UNEVEN = tuple(
@@ -71,7 +72,7 @@ def filled_once(shot: Shot, done: Run) -> float:
     return done.target.filling_fraction(shot.occupancies[first])
 
 
-@pytest.mark.parametrize("overrides", [TRIGGERED, DDS], ids=["replay", "dds"])
+@pytest.mark.parametrize("overrides", [TRIGGERED, STREAM, DDS], ids=["replay", "stream", "dds"])
 def test_filling_agrees_with_the_virtual_profile(run: RunProfile, overrides: tuple[str, ...]) -> None:
     played = run("bench_awg", *overrides)
     motion = [text for text in overrides if "max_" in text]
