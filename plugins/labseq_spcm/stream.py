@@ -194,6 +194,7 @@ class Stream:
             return 0.0
 
     def _fill(self, in_ring: int) -> float:
+        """The same, where so many samples are in the ring. Parts of a program grow with what is ahead of them."""
         if self._program is not None and self._handed < self._end:
             room = min(len(self._ring) - in_ring, self._end - self._handed)
             if room:
@@ -236,12 +237,15 @@ class Stream:
         self._end = self._handed + (self._whole_blocks(program.n_samples) if program else 0)
 
     def _recover(self, fetched: int) -> None:
-        """The card has run dry, or was stopped: begin again, with the program if nothing of it was played.
+        """The card has run dry, or was stopped: begin again, with the program if nothing of it can have been played.
 
         Raises:
             TransientError: In the middle of a program.
         """
-        if self._program is not None and self._start < fetched < self._end:
+        may_have_begun = (
+            self._start <= fetched and self._start < self._handed
+        )  # a part of a block is not reported
+        if self._program is not None and may_have_begun and fetched < self._end:
             share = f"{(fetched - self._start) / (self._end - self._start):.0%} of the program was played"
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
             raise TransientError(f"{text} the mode replay", self._card.name)
