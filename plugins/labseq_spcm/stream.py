@@ -194,7 +194,7 @@ class Stream:
             return 0.0
 
     def _fill(self, in_ring: int) -> float:
-        """The same, where so many samples are in the ring. Parts of a program grow with what is ahead of them."""
+        """The same, with ``in_ring`` samples in the ring; parts of a program grow with what precedes them."""
         if self._program is not None and self._handed < self._end:
             room = min(len(self._ring) - in_ring, self._end - self._handed)
             if room:
@@ -237,14 +237,13 @@ class Stream:
         self._end = self._handed + (self._whole_blocks(program.n_samples) if program else 0)
 
     def _recover(self, fetched: int) -> None:
-        """The card has run dry, or was stopped: begin again, with the program if nothing of it can have been played.
+        """The card has run dry, or was stopped: begin again, with the program if it cannot have begun.
 
         Raises:
             TransientError: In the middle of a program.
         """
-        may_have_begun = (
-            self._start <= fetched and self._start < self._handed
-        )  # a part of a block is not reported
+        # only whole blocks are reported as fetched: a part of the first one may have been played
+        may_have_begun = self._start <= fetched and self._start < self._handed
         if self._program is not None and may_have_begun and fetched < self._end:
             share = f"{(fetched - self._start) / (self._end - self._start):.0%} of the program was played"
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
