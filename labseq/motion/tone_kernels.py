@@ -77,20 +77,10 @@ def frequency(site_hz: Floats, step_hz: float, site: int) -> float:
     return site_hz[last] + (site_hz[last] - site_hz[last - 1]) * (site - last)
 
 
-@kernel(f"float64({SITES}, int64, int64, int64)")
-def amplitude(site_amplitude: Floats, site: int, goal: int, travelled: int) -> float:
-    """Amplitude of a tone after ``travelled`` sites: its square changes linearly from site to goal.
-
-    Beyond the grid it is that of the outermost site.
-    """
-    last = len(site_amplitude) - 1
-    start, end = site_amplitude[site], site_amplitude[min(max(goal, 0), last)]
-    way = abs(goal - site)
-    if travelled <= 0 or start == end:
-        return start
-    if travelled >= way:
-        return end
-    return np.sqrt(start**2 + (end**2 - start**2) * travelled / way)
+@helper_kernel(f"float64({SITES}, int64)")
+def amplitude(site_amplitude: Floats, site: int) -> float:
+    """Amplitude of the tone of a site; beyond the grid that of the outermost one."""
+    return site_amplitude[min(max(site, 0), len(site_amplitude) - 1)]
 
 
 @kernel(f"void({TONES}, int64, {SITES}, boolean, {SITES}, float64[::1])")
@@ -180,12 +170,12 @@ def add_tones(
         site, goal = tones[0, k], tones[1, k]
         way = goal - site
         sign = 1 if way >= 0 else -1
-        start_hz = frequency(site_hz, step_hz, site + sign * min(abs(way), travelled))
-        end_hz = frequency(site_hz, step_hz, site + sign * min(abs(way), arriving))
+        start, end = site + sign * min(abs(way), travelled), site + sign * min(abs(way), arriving)
+        start_hz, end_hz = frequency(site_hz, step_hz, start), frequency(site_hz, step_hz, end)
         values[START_HZ, n + k] = start_hz
         values[END_HZ, n + k] = end_hz
-        values[START_AMPLITUDE, n + k] = on_start * amplitude(site_amplitude, site, goal, travelled)
-        values[END_AMPLITUDE, n + k] = on_end * amplitude(site_amplitude, site, goal, arriving)
+        values[START_AMPLITUDE, n + k] = on_start * amplitude(site_amplitude, start)
+        values[END_AMPLITUDE, n + k] = on_end * amplitude(site_amplitude, end)
         values[PHASE, n + k] = phase[k]
         phase[k] = (phase[k] + 0.5 * (start_hz + end_hz) * duration_s) % 1.0  # holds for every course
     return n + n_tones
@@ -205,17 +195,21 @@ def add_segment(
     return n + 1
 
 
-@helper_kernel(f"int64({TONES}, int64, {TONES}, int64, int64, int64)")
-def next_joint(tones: Ints, n_tones: int, others: Ints, n_others: int, travelled: int, course: int) -> int:
+@helper_kernel(f"int64({TONES}, int64, {TONES}, int64, int64, int64, boolean)")
+def next_joint(
+    tones: Ints, n_tones: int, others: Ints, n_others: int, travelled: int, course: int, is_uneven: bool
+) -> int:
     """Distance, in sites, at which a transport is cut next; ``travelled`` if it is over.
 
-    At constant speed that is where tones of either axis arrive; otherwise all start and
-    stop together.
+    At constant speed that is where tones of either axis arrive, or at every site if amplitudes differ
+    from site to site; otherwise all start and stop together.
     """
     if course != LINEAR:
         return max(last_arrival(tones, n_tones), last_arrival(others, n_others))
     arriving = next_arrival(tones, n_tones, travelled)
     other = next_arrival(others, n_others, travelled)
+    if is_uneven:
+        return min(travelled + 1, max(arriving, other))
     if arriving == travelled or (travelled < other < arriving):
         return other
     return arriving
@@ -223,7 +217,7 @@ def next_joint(tones: Ints, n_tones: int, others: Ints, n_others: int, travelled
 
 @kernel(
     f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64,"
-    f" {SITES_OF_AXIS}, {SITES}, boolean, int64, {SITES}, {SEGMENTS}, float64[:, ::1])"
+    f" {SITES_OF_AXIS}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS}, float64[:, ::1])"
 )
 def build_axis(
     moves: Moves,
@@ -236,6 +230,7 @@ def build_axis(
     preassigned: Floats,
     low_crest: bool,
     course: int,
+    is_uneven: bool,
     times_s: Floats,
     segments: Segments,
     values: Floats,
@@ -244,9 +239,10 @@ def build_axis(
 
     At constant speed, tones with a shorter way arrive earlier; the transport is cut
     there, so that each tone's frequency changes linearly, or not at all, within a
-    segment. With another course a transport is one segment. The axis that moves is
-    ramped at pick-up and drop-off; the other one is on before and off after. A batch
-    in which no atom moves counts as moving along its row.
+    segment. Where amplitudes differ, it is cut at every site. With another course a
+    transport is one segment. The axis that moves is ramped at pick-up and drop-off; the
+    other one is on before and off after. A batch in which no atom moves counts as moving
+    along its row.
 
     Args:
         moves: int16 (n, 4), sources on the grid.
@@ -259,6 +255,7 @@ def build_axis(
         preassigned: float64 (n_sites,), phase of each site's tone at pick-up, in cycles.
         low_crest: See :func:`first_phases`.
         course: Of the transports, a value of :class:`labseq.model.FrequencyCourse`.
+        is_uneven: Whether amplitudes differ from site to site, on either axis.
         times_s: float64 (4,): the pause before each batch that is not linked, the pick-up
             ramp, the move by one site, the drop-off ramp.
         segments: Result, arrays of sufficient length.
@@ -290,7 +287,7 @@ def build_axis(
                 m = add_segment(segments, m, PICK_UP, LINEAR, batch, pick_up_s, n)
         at = 0
         while True:
-            goal = next_joint(tones, n_tones, others, n_others, at, course)
+            goal = next_joint(tones, n_tones, others, n_others, at, course, is_uneven)
             if goal == at:
                 break
             took_s = (goal - at) * site_s

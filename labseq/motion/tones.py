@@ -85,8 +85,9 @@ def tone_program(
     Between linked batches there is no drop-off, pause and pick-up.
 
     Each site's tone has a preassigned amplitude; by default all are equal, such that
-    the most tones an axis may have reach full scale together. During a transport the
-    amplitude squared goes evenly from that of the source to that of the goal. Phases
+    the most tones an axis may have reach full scale together. During a transport at constant
+    speed the amplitude squared goes evenly from that of each site to that of the next; with
+    another speed profile from that of the source to that of the goal. Phases
     start as preassigned or chosen and are continuous within a batch and a chain. Beyond
     the grid's edge frequencies go on linearly, amplitudes stay. Calibrated tones that are
     all within ``rf.snap_within_m`` of a comb are played on it (see
@@ -117,16 +118,21 @@ def tone_program(
     times_s = np.array([motion.overhead_per_batch_s, motion.pick_up_s, site_s, motion.drop_off_s])
     course = SPEED_PROFILES.index(motion.speed_profile)
     sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
-    n_segments = 3 * n_batches + 2 * int(sizes.sum())  # a tone may arrive on either axis
+    drives = [drive(grid, motion, axis) for axis in AXIS_INDICES]
+    is_uneven = any(driven.amplitude.min() < driven.amplitude.max() for driven in drives)
+    n_cuts = 2 * sizes  # a tone may arrive on either axis
+    if is_uneven:
+        n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)
+    n_segments = 3 * n_batches + int(n_cuts.sum())
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
     duration_s = np.empty(n_segments, np.float64)
     axes: list[AxisTones] = []
     n = 0
     for axis in AXIS_INDICES:
-        driven = drive(grid, motion, axis)
+        driven = drives[axis]
         offsets = np.empty(n_segments + 1, np.int32)
-        values = np.empty((N_FIELDS, int(((2 * sizes + 2) * sizes).sum())), np.float64)
+        values = np.empty((N_FIELDS, int(((n_cuts + 2) * sizes).sum())), np.float64)
         n, n_tones = build_axis(
             plan.moves,
             plan.batch_offsets,
@@ -138,6 +144,7 @@ def tone_program(
             driven.phase,
             motion.rf.phases == "low_crest",
             course,
+            is_uneven,
             times_s,
             (labels, batch, duration_s, offsets),
             values,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ offsets = st.tuples(*[st.floats(-1.4e-6, 1.4e-6)] * 2)
 
 
 def spec(**changes: Any) -> MotionSpec:
-    return MotionSpec(**{"overhead_per_batch_s": 0.5e-3, **changes})
+    return replace(MotionSpec(overhead_per_batch_s=0.5e-3), **changes)
 
 
 def places(program: ToneProgram, grid: SiteGrid, segment: int) -> tuple[NDArray[Any], NDArray[Any]]:
