@@ -278,7 +278,7 @@ _T = TypeVar("_T", Images, Cycles)
 
 
 def _columns(kind: type[_T], table: Mapping[str, Any]) -> _T:
-    columns = [tuple(map(_number, table[field.name])) for field in fields(kind)]
+    columns = [tuple(map(_number, table[name])) for name in kind.__match_args__]
     if len({*map(len, columns)}) > 1:
         raise ValueError(kind.__name__)
     return kind(*columns)
@@ -286,10 +286,11 @@ def _columns(kind: type[_T], table: Mapping[str, Any]) -> _T:
 
 def _number(value: Any) -> Any:
     """A number of the index; JSON has null for nan and infinities."""
+    kind = type(value)
+    if kind is float or (kind is int and -_MAX_INT <= value < _MAX_INT):
+        return value
     if value is None:
         return math.nan
-    if type(value) is float or (type(value) is int and -_MAX_INT <= value < _MAX_INT):
-        return value
     raise TypeError(value)
 
 
@@ -334,7 +335,8 @@ def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[
             yield f"{prefix}{name}", value
 
 
-_KINDS: Final = {"int64": int, "bool": bool | None, "text": str, "float64": float | int | None}
+_NONE: Final = type(None)
+_KINDS: Final = {"int64": int, "bool": (bool, _NONE), "text": str, "float64": (float, int, _NONE)}
 _KINDS_IN_INDEX: Final = tuple((field.name, _KINDS[field.dtype]) for field in schema.SHOT if field.in_index)
 _ALWAYS: Final = ("shot", "attempt", "status", "success", "filling_fraction", "seen_defect_free_cycle")
 _NEEDED_IN_INDEX: Final = (
