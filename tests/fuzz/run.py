@@ -28,8 +28,8 @@ from labseq.errors import LabseqError
 from labseq.recording.doctor import Report, examine
 from tests.fuzz.cases import KINDS, Templates, damage_run, make_case
 
-LIMIT_S: Final = 10.0
-"""Longest time of the processor for a file, which the doctor reads three times before the readers do.
+LIMIT_S: Final = 20.0
+"""Longest time of the processor for a file: 5 s for each of the four times that a run is read.
 
 A file for which a process waits has ten times as long.
 """
