@@ -42,8 +42,8 @@ INNER: Final = 3 * HOPS // 4
 OUTER: Final = 2 * HOPS
 """A jump is found by extrapolating fits to the frames from OUTER to INNER before it and from INNER to
 OUTER after it; nearer frames are blurred by the jump itself."""
-MIN_RAD: Final = 0.5
-"""Smallest phase jump that is reported (ours)."""
+MIN_RAD: Final = 0.75
+"""Smallest phase jump that is reported (ours): a chirp that changes all the time looks like 0.6 rad."""
 RESIDUAL_RAD: Final = 0.02
 """Largest residual of the fits; where it is larger, something else happens, such as a second start."""
 CHIRP_RAD: Final = 0.3
