@@ -1,4 +1,4 @@
-"""The power of each static tweezer: fitted on frames of a camera, or measured by another device."""
+"""The power of each tweezer: fitted on frames of a camera, or measured by another device."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class SpotPowers:
         )
 
     def _refuse(self, why: str) -> NoReturn:
-        raise DeviceError(self._camera, f"no powers from its frame of the static tweezers: {why}")
+        raise DeviceError(self._camera, f"no powers from its frame of the tweezers: {why}")
 
 
 def without_losses(take: Callable[[], Frame]) -> Frame:

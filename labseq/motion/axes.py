@@ -237,6 +237,7 @@ class Drive:
         comb_error_m: float64 (n_sites,), how far tones were moved to be on the comb, in the atom
             plane; zeros if they were not moved.
         amplitude: float64 (n_sites,), amplitude of each site's tone, as a fraction of full scale.
+        is_uneven: Whether the amplitudes differ from site to site.
         phase: float64 (n_sites,), preassigned phase of each site's tone, in cycles.
         max_tones: Most tones at once.
         limits: float64 (6,), see :func:`labseq.motion.tone_kernels.first_excess`.
@@ -246,6 +247,7 @@ class Drive:
     step_hz: float
     comb_error_m: Floats
     amplitude: Floats
+    is_uneven: bool
     phase: Floats
     max_tones: int
     limits: Floats
@@ -278,6 +280,7 @@ def drive(grid: SiteGrid, motion: MotionSpec, axis: AxisIndex) -> Drive:
         step_hz=step_hz,
         comb_error_m=comb.error_m if snapped else np.zeros_like(comb.error_m),
         amplitude=amplitude,
+        is_uneven=bool(amplitude.min() < amplitude.max()),
         phase=preassigned_phases(*grid.shape, rf.phase_seed)[axis],
         max_tones=max_tones,
         limits=_limits(rf, axis, np.sign(step_hz)),

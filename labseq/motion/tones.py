@@ -119,7 +119,7 @@ def tone_program(
     course = SPEED_PROFILES.index(motion.speed_profile)
     sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
     drives = [drive(grid, motion, axis) for axis in AXIS_INDICES]
-    is_uneven = any(driven.amplitude.min() < driven.amplitude.max() for driven in drives)
+    is_uneven = any(driven.is_uneven for driven in drives)
     n_cuts = 2 * sizes  # a tone may arrive on either axis
     if is_uneven:
         n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)

@@ -61,7 +61,7 @@ def without(row: int, col: int) -> Floats:
         (lambda: frame(without(2, 3)), r"1 of 48 spots are missing .* others: \(2, 3\); are all tones on"),
         (
             lambda: frame(0 * POWER),
-            "no powers from its frame of the static tweezers: (no lattice found: |.* spots are missing)",
+            "no powers from its frame of the tweezers: (no lattice found: |.* spots are missing)",
         ),
     ],
     ids=["full scale", "plateau", "missing", "dark"],
