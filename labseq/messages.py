@@ -26,6 +26,19 @@ def install_hint(extra: str, package: str = "labseq") -> str:
     return f"{'pip' if find_spec('pip') else 'uv pip'} install {what}"
 
 
+def missing_package(package: str, extra: str = "") -> str:
+    """Why a device cannot be simulated without a Python package; "" if the package is installed.
+
+    Args:
+        package: Its name when it is imported.
+        extra: The extra of labseq that installs it; "" if it is installed by its own name.
+    """
+    if find_spec(package) is not None:
+        return ""
+    install = install_hint(extra) if extra else install_hint("", package)
+    return f"the Python package '{package}' is not installed, which the simulated device needs ({install})"
+
+
 def visible(text: str) -> str:
     """A text with unprintable characters as escapes."""
     return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)

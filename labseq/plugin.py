@@ -45,7 +45,7 @@ from labseq.files import cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
 from labseq.kernel import const, helper_kernel, kernel
-from labseq.messages import clean, closest, install_hint, visible
+from labseq.messages import clean, closest, install_hint, missing_package, visible
 from labseq.model import (
     COMPUTER,
     AxisTones,
@@ -288,6 +288,7 @@ __all__ = [
     "is_network_port",
     "is_write_timeout",
     "kernel",
+    "missing_package",
     "nearest",
     "nearest_to_centre",
     "off_program",

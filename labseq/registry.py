@@ -93,8 +93,10 @@ class Entry:
             need not wait in real time.
         simulated: Settings that make a driver use its simulated device, for
             example ``{"card": "simulated"}``; None if it has none. A dry run gives them;
-            a driver that has them keeps to the session's clock.
+            a driver that has them keeps to the session's clock. A place may be that of a function
+            that returns them, or a text: why the device cannot be simulated on this computer.
         owner: The plugin that registered it.
+        no_simulator: That text.
     """
 
     kind: str
@@ -105,6 +107,7 @@ class Entry:
     virtual_time: bool = False
     simulated: Mapping[str, Any] | None = None
     owner: Owner = field(default=Owner("labseq"), compare=False, repr=False)
+    no_simulator: str = ""
 
     @property
     def is_place(self) -> bool:
@@ -187,7 +190,10 @@ class Registry:
             what = f"the import of {entry.kind} '{entry.name}'"
             factory, model, simulated = self._call(entry.owner, what, lambda: [*map(_import_place, parts)])
             simulated = simulated() if callable(simulated) else simulated
-            entry = replace(entry, factory=factory, settings_model=model, simulated=simulated)
+            reason, simulated = (simulated, None) if isinstance(simulated, str) else ("", simulated)
+            entry = replace(
+                entry, factory=factory, settings_model=model, simulated=simulated, no_simulator=reason
+            )
             _check(entry)
             self._entries[key] = entry
         return entry

@@ -209,7 +209,8 @@ def choose(
     if chosen.entry.simulated is not None and chosen.settings is not None:
         settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
         return replace(chosen, settings=settings), ""
-    return twin, ""
+    reason = chosen.entry.no_simulator
+    return twin, f"{reason}; its virtual twin takes its place" if reason else ""
 
 
 def _absence(host: PluginHost, kind: str, name: str) -> str:

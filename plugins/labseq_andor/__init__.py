@@ -7,7 +7,6 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Register the camera ``andor``; in a dry run the simulated camera is used."""
-    simulated = {"camera": "simulated", "serial": 0}
+    """Register the camera ``andor``; in a dry run the simulated camera, if pylablib is installed."""
     camera, settings = "labseq_andor.camera:AndorCamera", "labseq_andor.settings:AndorSettings"
-    registry.camera("andor", camera, settings, simulated=simulated)
+    registry.camera("andor", camera, settings, simulated="labseq_andor.library:simulated_settings")

@@ -12,7 +12,7 @@ from importlib import metadata
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq.plugin import Context, DeviceError, ExposureResult, install_hint, wait_for
+from labseq.plugin import Context, DeviceError, ExposureResult, install_hint, missing_package, wait_for
 from labseq_andor.settings import SIMULATED, AndorSettings
 
 OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"
@@ -74,6 +74,11 @@ def library_for(settings: AndorSettings, context: Context) -> AndorLibrary:
 
         return SimulatedAndorLibrary(settings, context)
     return AndorLibrary(settings, context)
+
+
+def simulated_settings() -> dict[str, str | int] | str:
+    """Settings of a simulated camera, or why there is none here."""
+    return missing_package("pylablib", "andor") or {"camera": "simulated", "serial": 0}
 
 
 def load_pylablib(name: str) -> Any:

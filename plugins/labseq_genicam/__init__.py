@@ -8,6 +8,5 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Register the camera ``genicam``; in a dry run a simulated GigE camera sees the simulated atoms."""
-    simulated = {"camera": "simulated", "model": None, "serial": None}
     camera, settings = "labseq_genicam.camera:GenicamCamera", "labseq_genicam.settings:GenicamSettings"
-    registry.camera("genicam", camera, settings, simulated=simulated)
+    registry.camera("genicam", camera, settings, simulated="labseq_genicam.connection:simulated_settings")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
-from labseq_aravis import AravisError, Camera, LibraryMissingError
+from labseq_aravis import AravisError, Camera, LibraryMissingError, load_library
 
 from labseq.plugin import Context, DeviceError, ExposureResult, Series
 from labseq_genicam.settings import SIMULATED, GenicamSettings
@@ -36,6 +36,15 @@ STARTS: Final[dict[str, Start]] = {
     "bulb": "width",
 }
 """What starts the exposures of a camera, by trigger."""
+
+
+def simulated_settings() -> dict[str, str | None] | str:
+    """Settings of a simulated camera, which Aravis talks to, or why there is none here."""
+    try:
+        load_library()
+    except LibraryMissingError as error:
+        return f"{error}, which the simulated camera needs"
+    return {"camera": "simulated", "model": None, "serial": None}
 
 
 class CameraConnection:

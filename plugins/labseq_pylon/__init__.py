@@ -8,6 +8,5 @@ LABSEQ_API = 1
 @hookimpl
 def labseq_register(registry: Registry) -> None:
     """Register the camera ``pylon``; in a dry run pylon's emulated camera sees the simulated atoms."""
-    simulated = {"camera": "simulated", "model": None}
     camera, settings = "labseq_pylon.camera:PylonCamera", "labseq_pylon.settings:PylonSettings"
-    registry.camera("pylon", camera, settings, simulated=simulated)
+    registry.camera("pylon", camera, settings, simulated="labseq_pylon.library:simulated_settings")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
-from labseq.plugin import DeviceError, LimitError, check_step, install_hint, one_of
+from labseq.plugin import DeviceError, LimitError, check_step, install_hint, missing_package, one_of
 
 OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
 
@@ -36,6 +36,11 @@ class Sdk:
         except self.genicam.GenericException as error:
             text = f"cannot {what}: {_reason(error)}"
             raise DeviceError(self.name, f"{text}; {hint}" if hint else text) from error
+
+
+def simulated_settings() -> dict[str, str | None] | str:
+    """Settings of pylon's emulated camera, or why there is none here."""
+    return missing_package("pypylon", "pylon") or {"camera": "simulated", "model": None}
 
 
 def load_pypylon(name: str) -> Sdk:

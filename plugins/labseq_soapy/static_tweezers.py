@@ -47,11 +47,12 @@ NO_REAL_TIME: Final = (
 )
 
 
-def simulated_settings() -> dict[str, str] | None:
-    """Settings of a simulated radio; None if it cannot be compiled."""
+def simulated_settings() -> dict[str, str] | str:
+    """Settings of a simulated radio, or why it cannot be compiled here."""
     from labseq_soapy_sim import can_build
 
-    return {"device": "simulated"} if can_build() else None
+    without = "the simulated radio needs a C++ compiler and SoapySDR's headers (libsoapysdr-dev)"
+    return {"device": "simulated"} if can_build() else without
 
 
 class SoapyStaticTweezers(StaticTweezers):

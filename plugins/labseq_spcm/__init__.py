@@ -9,5 +9,5 @@ LABSEQ_API = 1
 def labseq_register(registry: Registry) -> None:
     """Offer the mobile tweezers ``spcm``; in a dry run they play on a simulated card."""
     tweezers, settings = "labseq_spcm.mobile_tweezers:SpcmMobileTweezers", "labseq_spcm.settings:SpcmSettings"
-    simulated = {"card": "simulated", "trigger": "software", "serial": 0}
+    simulated = "labseq_spcm.library:simulated_settings"
     registry.mobile_tweezers("spcm", tweezers, settings, simulated=simulated)

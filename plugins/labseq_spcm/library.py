@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from labseq.plugin import Context, DeviceError, Emergency, install_hint
+from labseq.plugin import Context, DeviceError, Emergency, install_hint, missing_package
 from labseq_spcm.settings import SpcmSettings
 
 if TYPE_CHECKING:
@@ -20,6 +20,12 @@ SIMULATED: Final = "simulated"
 """Device names that begin like this belong to simulated cards; the vendor's never do."""
 LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
 WITHOUT_A_CARD: Final = "to try things without a card, set `card: simulated`"
+
+
+def simulated_settings() -> dict[str, str | int] | str:
+    """Settings of a simulated card, which the vendor's Python package plays on, or why there is none here."""
+    simulated: dict[str, str | int] = {"card": "simulated", "trigger": "software", "serial": 0}
+    return missing_package("spcm") or simulated
 
 
 class VendorLibrary:

@@ -1,5 +1,6 @@
 """Whole runs in this process, on the virtual lab."""
 
+import importlib.util
 from typing import Any
 
 import h5py
@@ -7,6 +8,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError
+from labseq.session.profile import resolve_profile
 from labseq.testing.fakes import RecordingObserver
 
 from .whole_runs import COMPACT, run
@@ -119,6 +121,17 @@ def test_a_missing_plugin_is_replaced_in_a_dry_run_with_a_warning(tmp_path):
     run(tmp_path, observer=seen, shots=1, overrides=["profile.camera={use: cannon}"], dry_run="full")
     warnings = [v["text"] for v in seen.of("warning")]
     assert any("cannon" in w and "settings were not checked" in w for w in warnings)
+
+
+def test_a_dry_run_needs_no_vendors_package(monkeypatch):
+    missing = {"camera": "pylablib", "mobile_tweezers": "spcm"}
+    find = importlib.util.find_spec
+    find_some = lambda name: None if name in missing.values() else find(name)  # noqa: E731
+    monkeypatch.setattr("labseq.messages.find_spec", find_some)
+    lab = resolve_profile("lab", dry_run="full")
+    for role, package in missing.items():
+        assert lab.chosen[role].entry.name == "virtual"
+        assert any(role in text and package in text and "virtual twin" in text for text in lab.warnings)
 
 
 def test_a_rehearsed_loss_of_frames_repeats_shots(tmp_path):
