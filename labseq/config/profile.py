@@ -428,6 +428,16 @@ class MotionSettings(Settings):
         le=100,
         description="how many sites beyond the grid the tones reach, on each side",
     )
+    clearance: Annotated[Length, Field(gt=0, le=1e-3)] = Field(
+        default=_MOTION.clearance_m,
+        description="least distance of a moving tweezer from atoms that stand, and of neighbouring lines of "
+        "tweezers, where rows and columns move at once",
+    )
+    empty_tweezers_may_land: bool = Field(
+        default=_MOTION.empty_tweezers_may_land,
+        description="whether a tweezer without an atom may end on a site that holds one, where rows and "
+        "columns move at once",
+    )
     rf: Annotated[RfSettings, empty_is({})] = Field(
         default=RfSettings(), description="the RF drive of the AODs, and its limits"
     )
@@ -445,6 +455,8 @@ class MotionSettings(Settings):
             max_row_tones=self.max_row_tones,
             max_column_tones=self.max_column_tones,
             eject_slots=self.eject_slots,
+            clearance_m=self.clearance,
+            empty_tweezers_may_land=self.empty_tweezers_may_land,
             rf=self.rf.spec(),
         )
 

@@ -12,7 +12,7 @@ from labseq.model.camera import CameraFacts, Flip, Frame, Orientation, SensorMod
 from labseq.model.grid import SiteGrid, TargetPattern
 from labseq.model.lines import LineProgram, LinesFacts, LineSpec
 from labseq.model.motion import MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
-from labseq.model.plan import Batch, Plan, PlanReport
+from labseq.model.plan import Batch, Plan, PlanReport, TonePaths
 from labseq.model.records import (
     COMPUTER,
     CycleRecord,
@@ -78,6 +78,7 @@ __all__ = [
     "TargetPattern",
     "TimedBy",
     "TimelineEntry",
+    "TonePaths",
     "ToneProgram",
     "TonesAt",
     "TonesNow",

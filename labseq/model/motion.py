@@ -102,6 +102,10 @@ class MotionSpec:
         max_row_tones: Most tones on the row axis at once.
         max_column_tones: Most tones on the column axis at once.
         eject_slots: Sites beyond the grid that the AOD band reaches, each side.
+        clearance_m: Least distance of a tweezer from standing atoms, and of neighbouring lines of
+            tweezers from one another, in batches with paths of tones. Half-way between two rows of the
+            paper's lattice it is 1.944 um; a mobile tweezer of the paper has 1.1 uK left at 1.9 um (ours).
+        empty_tweezers_may_land: Whether a tweezer without an atom may end on a site that holds one.
         rf: What drives the AODs.
     """
 
@@ -115,6 +119,8 @@ class MotionSpec:
     max_row_tones: int = 20
     max_column_tones: int = 20
     eject_slots: int = 1
+    clearance_m: float = 1.9e-6
+    empty_tweezers_may_land: bool = False
     rf: RfSpec = field(default_factory=RfSpec)
 
     def __post_init__(self) -> None:
@@ -127,6 +133,8 @@ class MotionSpec:
             raise ValueError("at least one tweezer and one tone per axis are needed")
         if self.eject_slots < 0:
             raise ValueError("eject_slots cannot be negative")
+        if not 0 < self.clearance_m < math.inf:
+            raise ValueError(f"the clearance is {self.clearance_m} m; expected more than 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,29 +13,133 @@ from labseq.model.arrays import read_only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TonePaths:
+    """Where the tones of a batch go, and where each is ramped down.
+
+    All tones are ramped up at knot 0. From one knot to the next each tone goes straight, and all have
+    made the same fraction of their ways at any time. Positions are in sites, counted as rows and columns
+    are; a *lane* is at a fraction, between two rows or columns. At a knot where tones are ramped down,
+    the others stand and wait.
+
+    Attributes:
+        row: float64 (n_knots, n_row_tones), position of each row tone at each knot, at least two knots.
+        column: float64 (n_knots, n_column_tones), the same for the column tones.
+        row_off: int32 (n_row_tones,), the knot at which each row tone is ramped down; by default the last.
+        column_off: int32 (n_column_tones,), the same for the column tones. Some tone of either axis
+            stays on until the last knot.
+
+    Raises:
+        ValueError: Positions that are not finite, fewer than two knots, an axis without tones, or
+            tones that all go off before the last knot, or at knot 0, or after the last.
+
+    Example:
+        >>> paths = TonePaths([[0.0, 2.0], [0.5, 2.5]], [[3.0], [3.0]])
+        >>> paths.shape, paths.row_off.tolist()
+        ((2, 2, 1), [1, 1])
+    """
+
+    row: NDArray[np.float64]
+    column: NDArray[np.float64]
+    row_off: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    column_off: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        row = read_only(self.row, np.float64, (-1, -1), "row")
+        column = read_only(self.column, np.float64, (len(row), -1), "column")
+        if len(row) < 2 or not row.shape[1] or not column.shape[1]:
+            raise ValueError(f"paths have two knots and one tone of each axis at least, not {self._text()}")
+        if not (np.isfinite(row).all() and np.isfinite(column).all()):
+            raise ValueError("a position of a tone is not finite")
+        object.__setattr__(self, "row", row)
+        object.__setattr__(self, "column", column)
+        last = len(row) - 1
+        for name, path in (("row_off", row), ("column_off", column)):
+            n_tones = path.shape[1]
+            given = getattr(self, name)
+            off = read_only(given if len(given) else np.full(n_tones, last), np.int32, (n_tones,), name)
+            if off.min() < 1 or off.max() != last:
+                raise ValueError(
+                    f"{name} holds knots from 1 to the last, {last}, and at least one is the last"
+                )
+            object.__setattr__(self, name, off)
+
+    def _text(self) -> str:
+        return f"{np.shape(self.row)} and {np.shape(self.column)} positions"
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of knots, of row tones and of column tones."""
+        return *self.row.shape, self.column.shape[1]
+
+    def tones_of(self, sites: ArrayLike) -> NDArray[np.intp]:
+        """The tones whose crossings start on sites.
+
+        Args:
+            sites: (n, 2), (row, col) of each.
+
+        Returns:
+            int (n, 2), row tone and column tone of each; -1 where none starts there.
+        """
+        wanted = np.asarray(sites).reshape(-1, 2)
+        found = np.full(wanted.shape, -1)
+        for axis, path in enumerate((self.row, self.column)):
+            site, tone = np.nonzero(wanted[:, axis, None] == path[0])
+            found[site, axis] = tone
+        return found
+
+    def path_of(self, row_tone: int, column_tone: int) -> NDArray[np.float64]:
+        """Positions of a crossing at each knot until it goes off, float64 (n, 2), in sites."""
+        end = min(self.row_off[row_tone], self.column_off[column_tone]) + 1
+        return np.stack([self.row[:end, row_tone], self.column[:end, column_tone]], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Batch:
     """Atom moves that are carried out at the same time.
+
+    Without ``tones`` it is a *line batch*: each atom goes straight along its row or column, all of them
+    along the same axis, at one speed. With ``tones`` the tones of both axes take any paths; every
+    crossing of theirs that starts on an atom must be named.
 
     Attributes:
         from_sites: int16 (n, 2), (row, col) of each atom before.
         to_sites: int16 (n, 2), (row, col) of each atom after; a site outside the
             grid ejects the atom.
         linked: Whether the tweezers stay on from the batch before, so that there
-            is no drop-off and pick-up between the two.
+            is no drop-off and pick-up between the two. Only line batches are linked.
+        tones: The paths of the tones; None for a line batch.
+
+    Example:
+        Two atoms of row 0 go to row 2, each to another column, between the columns on the way.
+
+        >>> paths = TonePaths(
+        ...     row=[[0.0], [0.5], [1.5], [2.0]],
+        ...     column=[[0.0, 2.0], [0.5, 2.5], [0.5, 2.5], [1.0, 3.0]],
+        ... )
+        >>> len(Batch([(0, 0), (0, 2)], [(2, 1), (2, 3)], tones=paths))
+        2
     """
 
     from_sites: NDArray[np.int16]
     to_sites: NDArray[np.int16]
     linked: bool = False
+    tones: TonePaths | None = None
 
     def __post_init__(self) -> None:
         from_sites = read_only(self.from_sites, np.int16, (-1, 2), "from_sites")
         object.__setattr__(self, "from_sites", from_sites)
         to_sites = read_only(self.to_sites, np.int16, (len(from_sites), 2), "to_sites")
         object.__setattr__(self, "to_sites", to_sites)
+        if self.linked and self.tones is not None:
+            raise ValueError("only line batches are linked; paths of tones have any number of knots instead")
 
     def __len__(self) -> int:
         return len(self.from_sites)
+
+
+NO_SHAPES: Final[NDArray[np.int32]] = read_only([], np.int32, (-1, 3), "path_shapes")
+NO_POSITIONS: Final[NDArray[np.float64]] = read_only([], np.float64, (-1,), "path_positions")
+NO_KNOTS: Final[NDArray[np.int32]] = read_only([], np.int32, (-1,), "path_off")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,17 +147,25 @@ class Plan:
     """Batches in order, held as flat arrays.
 
     Predicted occupancy and duration are worked out by :func:`labseq.check_plan`,
-    never by the planner.
+    never by the planner. What the arrays say of paths is tested there, too.
 
     Attributes:
         moves: int16 (n_atom_moves, 4), (from row, from col, to row, to col).
         batch_offsets: int32 (n_batches + 1,); batch i is ``moves[o[i]:o[i + 1]]``.
         linked: bool (n_batches,), see :class:`Batch`.
+        path_shapes: int32 (n_batches, 3), numbers of knots, row tones and column tones of each batch,
+            0 for a line batch; (0, 3) for a plan of line batches alone.
+        path_positions: float64, for each batch with paths ``row.ravel()``, then ``column.ravel()``, see
+            :class:`TonePaths`.
+        path_off: int32, for each batch with paths ``row_off``, then ``column_off``.
     """
 
     moves: NDArray[np.int16]
     batch_offsets: NDArray[np.int32]
     linked: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    path_shapes: NDArray[np.int32] = field(default_factory=lambda: NO_SHAPES)
+    path_positions: NDArray[np.float64] = field(default_factory=lambda: NO_POSITIONS)
+    path_off: NDArray[np.int32] = field(default_factory=lambda: NO_KNOTS)
 
     def __post_init__(self) -> None:
         moves = read_only(self.moves, np.int16, (-1, 4), "moves")
@@ -67,6 +179,22 @@ class Plan:
         object.__setattr__(self, "moves", moves)
         object.__setattr__(self, "batch_offsets", offsets)
         object.__setattr__(self, "linked", read_only(linked, np.bool_, (n_batches,), "linked"))
+        if self.path_shapes is not NO_SHAPES or len(self.path_positions) or len(self.path_off):
+            self._check_paths(n_batches)
+
+    def _check_paths(self, n_batches: int) -> None:
+        shapes = read_only(self.path_shapes, np.int32, (-1, 3), "path_shapes")
+        positions = read_only(self.path_positions, np.float64, (-1,), "path_positions")
+        off = read_only(self.path_off, np.int32, (-1,), "path_off")
+        if len(shapes) not in (0, n_batches):
+            raise ValueError(f"path_shapes has {len(shapes)} rows; the plan has {n_batches} batches")
+        stop, off_stop = _path_ends(shapes)
+        if (shapes < 0).any() or (len(positions), len(off)) != (stop, off_stop):
+            came = f"{len(positions)} and {len(off)} came"
+            raise ValueError(f"path_shapes asks for {stop} positions and {off_stop} knots; {came}")
+        object.__setattr__(self, "path_shapes", shapes)
+        object.__setattr__(self, "path_positions", positions)
+        object.__setattr__(self, "path_off", off)
 
     @classmethod
     def from_batches(cls, batches: Sequence[Batch | tuple[ArrayLike, ArrayLike]]) -> Plan:
@@ -82,7 +210,8 @@ class Plan:
         for batch, start in zip(made, offsets, strict=False):
             moves[start : start + len(batch), :2] = batch.from_sites
             moves[start : start + len(batch), 2:] = batch.to_sites
-        return cls(moves, offsets, np.array([batch.linked for batch in made], np.bool_))
+        linked = np.array([batch.linked for batch in made], np.bool_)
+        return cls(moves, offsets, linked, *_flat_paths([batch.tones for batch in made]))
 
     @property
     def n_batches(self) -> int:
@@ -103,12 +232,33 @@ class Plan:
         """One batch, as a view of the flat arrays."""
         start, stop = self.batch_offsets[index : index + 2]
         moves = self.moves[start:stop]
-        return Batch(moves[:, :2], moves[:, 2:], bool(self.linked[index]))
+        return Batch(moves[:, :2], moves[:, 2:], bool(self.linked[index]), self.paths(index))
+
+    @property
+    def has_paths(self) -> bool:
+        """Whether any batch has paths of tones."""
+        return len(self.path_positions) > 0
+
+    def paths(self, index: int) -> TonePaths | None:
+        """Paths of the tones of one batch, as views of the flat arrays; None for a line batch."""
+        if not len(self.path_shapes) or not self.path_shapes[index].any():
+            return None
+        start, off_start = _path_ends(self.path_shapes[:index])
+        n_knots, n_rows, n_cols = self.path_shapes[index].tolist()
+        rows = self.path_positions[start : start + n_knots * n_rows]
+        columns = self.path_positions[start + len(rows) : start + len(rows) + n_knots * n_cols]
+        off = self.path_off[off_start : off_start + n_rows + n_cols]
+        return TonePaths(
+            rows.reshape(n_knots, n_rows), columns.reshape(n_knots, n_cols), off[:n_rows], off[n_rows:]
+        )
 
     def first(self, n_batches: int) -> Plan:
         """The plan cut after its first ``n_batches`` batches."""
         offsets = self.batch_offsets[: n_batches + 1]
-        return Plan(self.moves[: offsets[-1]], offsets, self.linked[:n_batches])
+        shapes = self.path_shapes[:n_batches]
+        stop, off_stop = _path_ends(shapes)
+        paths = shapes, self.path_positions[:stop], self.path_off[:off_stop]
+        return Plan(self.moves[: offsets[-1]], offsets, self.linked[:n_batches], *paths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,3 +295,23 @@ class PlanReport:
 def _sites(values: ArrayLike) -> NDArray[Any]:
     array: NDArray[Any] = np.asarray(values)
     return array.reshape(-1, 2) if array.size == 0 else array
+
+
+def _path_ends(shapes: NDArray[np.int32]) -> tuple[int, int]:
+    """How many positions and how many knots of :class:`Plan` belong to the given batches."""
+    if not len(shapes):
+        return 0, 0
+    n_tones = shapes[:, 1].astype(np.int64) + shapes[:, 2]
+    return int(shapes[:, 0] @ n_tones), int(n_tones.sum())
+
+
+def _flat_paths(
+    paths: Sequence[TonePaths | None],
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
+    """The last three arrays of a :class:`Plan`."""
+    if not any(paths):
+        return NO_SHAPES, NO_POSITIONS, NO_KNOTS
+    shapes = np.array([(0, 0, 0) if one is None else one.shape for one in paths], np.int32)
+    positions = [part.ravel() for one in paths if one for part in (one.row, one.column)]
+    off = [part for one in paths if one for part in (one.row_off, one.column_off)]
+    return shapes, np.concatenate(positions), np.concatenate(off)

@@ -110,6 +110,8 @@ def test_defaults_are_those_of_the_core() -> None:
 
 CHANGES: dict[str, Any] = {
     "speed_profile": "minimum_jerk",
+    "clearance": "1.5 um",
+    "empty_tweezers_may_land": True,
     "rf": {"phases": "low_crest"},
     "row_band": ["90 MHz", "110 MHz"],
     "column_band": ["90 MHz", "110 MHz"],

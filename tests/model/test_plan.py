@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.model import Batch, Plan
+from labseq.model import Batch, Plan, TonePaths
 
 SITES = st.lists(st.tuples(st.integers(-1, 20), st.integers(-1, 20)), max_size=5)
 
@@ -50,3 +50,77 @@ def test_a_plan_can_be_cut():
 def test_arrays_that_are_no_plan_are_refused(moves, offsets, message):
     with pytest.raises(ValueError, match=message):
         Plan(np.array(moves), np.array(offsets))
+
+
+def grid_batch(n_knots: int = 3) -> Batch:
+    """Two rows of two tweezers; the first row is put down one knot before the second."""
+    steps = np.arange(n_knots)[:, None] * 0.5
+    row_off = np.array([n_knots - 2, n_knots - 1])
+    paths = TonePaths(np.add(steps, [0.0, 2.0]), np.subtract([1.0, 4.0], steps), row_off)
+    return Batch(np.array([(0, 1), (2, 4)]), np.array([(0, 1), (3, 3)]), tones=paths)
+
+
+def test_paths_come_back_from_the_flat_arrays():
+    first = Batch(np.array([[0, 0]]), np.array([[0, 3]]))
+    given = [
+        first,
+        grid_batch(),
+        Batch(np.array([[5, 5]]), np.array([[6, 5]])),
+        grid_batch(5),
+    ]
+    plan = Plan.from_batches(given)
+    assert [batch.tones is None for batch in plan.batches] == [True, False, True, False]
+    cut = plan.first(2)
+    assert len(cut.path_positions) == 3 * 4
+    for made, wanted in ((plan.paths(1), given[1]), (plan.paths(3), given[3]), (cut.paths(1), given[1])):
+        assert made
+        assert wanted.tones
+        for name in ("row", "column", "row_off", "column_off"):
+            np.testing.assert_array_equal(getattr(made, name), getattr(wanted.tones, name))
+    assert not plan.first(1).has_paths
+    assert (paths := plan.paths(3))
+    assert paths.tones_of([(2, 4), (2, 2)]).tolist() == [[1, 1], [1, -1]]
+    assert paths.path_of(0, 1).tolist() == [[0, 4], [0.5, 3.5], [1, 3], [1.5, 2.5]]
+
+
+@pytest.mark.parametrize(
+    ("paths", "message"),
+    [
+        (([[0.0]], [[0.0]]), "two knots"),
+        (([[0.0], [1.0]], np.empty((2, 0))), "one tone of each axis"),
+        (([[0.0], [1.0]], [[0.0]]), "column has shape"),
+        (([[0.0], [np.nan]], [[0.0], [0.0]]), "not finite"),
+        (([[0.0], [1.0]], [[0.0], [0.0]], [0]), "row_off holds knots from 1"),
+        (([[0.0, 1.0]] * 3, [[0.0]] * 3, [1, 1]), "row_off holds knots from 1"),
+        (([[0.0, 1.0]] * 3, [[0.0]] * 3, [1, 2], [3]), "column_off"),
+    ],
+)
+def test_what_is_no_path_is_refused(paths, message):
+    with pytest.raises(ValueError, match=message):
+        TonePaths(*paths)
+
+
+def test_only_line_batches_are_linked():
+    sites = np.array([[0, 0]])
+    with pytest.raises(ValueError, match="only line batches are linked"):
+        Batch(sites, sites + 1, linked=True, tones=TonePaths(np.zeros((2, 1)), np.array([[0.0], [1.0]])))
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        ([[2, 1, 1]] * 2, "has 2 rows"),
+        ([[2, 1, 2]], "asks for 6 positions and 3 knots; 4 and 2 came"),
+        ([[-2, 1, 1]], "asks for"),
+        ([], "asks for 0"),
+    ],
+)
+def test_flat_arrays_of_paths_belong_together(shapes, message):
+    with pytest.raises(ValueError, match=message):
+        Plan(
+            np.array([[0, 0, 0, 1]]),
+            np.array([0, 1]),
+            path_shapes=np.array(shapes),
+            path_positions=np.array([0.0, 0.0, 0.0, 1.0]),
+            path_off=np.array([1, 1]),
+        )
