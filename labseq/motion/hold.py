@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from labseq.errors import LimitError
 from labseq.model import AxisTones, MotionSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.motion.axes import AXES, AxisIndex, Drive, drive
-from labseq.motion.tones import AXIS_INDICES, check_limits
+from labseq.motion.tones import AXIS_INDICES, check_limits, keyed_time_s
 from labseq.units import format_quantity
 
 Floats = NDArray[np.float64]
@@ -26,6 +27,16 @@ class _Batch:
     rows: Ints
     columns: Ints
     offset_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class _Segment:
+    """A segment of each batch; the amplitudes at its two ends are fractions of the full one."""
+
+    kind: SegmentKind
+    time_s: float
+    row: tuple[float, float]
+    column: tuple[float, float]
 
 
 def hold_program(
@@ -63,16 +74,7 @@ def hold_program(
     """
     _check_band(grid, motion, sites, offset_m)
     batches = list(_batches(grid, motion, sites, offset_m))
-    phase_s = _phase_times_s(motion, hold_s, drop_off_s)
-    kinds = np.array([kind for kind, _ in phase_s], np.int8)
-    times_s = np.array([time_s for _, time_s in phase_s])
-    kind, duration_s = np.tile(kinds, len(batches)), np.tile(times_s, len(batches))
-    batch = np.repeat(np.arange(len(batches), dtype=np.int32), len(kinds))
-    axes = [
-        _axis(axis, drive(grid, motion, axis), motion, grid.spacing_m, batches, kinds, times_s, batch)
-        for axis in AXIS_INDICES
-    ]
-    return ToneProgram(axes[0], axes[1], duration_s, kind, batch)
+    return _program(grid, motion, batches, _segments(motion, hold_s, drop_off_s))
 
 
 def all_on_program(grid: SiteGrid, motion: MotionSpec, on_s: float) -> ToneProgram:
@@ -94,13 +96,7 @@ def all_on_program(grid: SiteGrid, motion: MotionSpec, on_s: float) -> ToneProgr
             text = f"{most}, `max_{name}_tones` of the profile"
             raise LimitError(f"the number of {name} tones at once, to measure all of them", n, text)
     every = _Batch(np.arange(grid.n_rows), np.arange(grid.n_cols), np.zeros(2))
-    kinds = np.array([SegmentKind.PICK_UP, SegmentKind.TRANSPORT, SegmentKind.DROP_OFF], np.int8)
-    times_s, batch = np.array([motion.pick_up_s, on_s, motion.drop_off_s]), np.zeros(3, np.int32)
-    axes = [
-        _axis(axis, drive(grid, motion, axis), motion, grid.spacing_m, [every], kinds, times_s, batch)
-        for axis in AXIS_INDICES
-    ]
-    return ToneProgram(axes[0], axes[1], times_s, kinds, batch)
+    return _program(grid, replace(motion, overhead_per_batch_s=0.0), [every], _segments(motion, on_s))
 
 
 def hold_time_s(
@@ -118,7 +114,7 @@ def hold_time_s(
     every = np.ones(grid.shape, np.bool_)
     _check_band(grid, motion, every, offset_m)
     n_batches = sum(1 for _ in _batches(grid, motion, every, offset_m))
-    return n_batches * sum(time_s for _, time_s in _phase_times_s(motion, hold_s, drop_off_s))
+    return n_batches * sum(one.time_s for one in _segments(motion, hold_s, drop_off_s))
 
 
 def cross_offsets_m(shape: tuple[int, int], offset_m: ArrayLike) -> Floats:
@@ -181,22 +177,41 @@ def _batches(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLik
                 yield _Batch(np.array([row]), together[first : first + most], offset)
 
 
-def _phase_times_s(
-    motion: MotionSpec, hold_s: float, drop_off_s: float | None
-) -> list[tuple[SegmentKind, float]]:
-    """The segments of a batch and their durations."""
+def _segments(motion: MotionSpec, hold_s: float, drop_off_s: float | None = None) -> list[_Segment]:
+    """The segments of a batch; the rows' tones are keyed, as those of the parked axis of a move."""
     drop_off_s = motion.drop_off_s if drop_off_s is None else drop_off_s
     for name, time_s in (("hold", hold_s), ("drop off", drop_off_s)):
         if not 0 <= time_s < float("inf"):
             raise ValueError(f"the time to {name} is {time_s} s; expected 0 or more")
+    up_s, down_s = (keyed_time_s(time_s) for time_s in (motion.pick_up_s, drop_off_s))
+    up, down = (
+        math.sqrt(part_s / time_s) if time_s > 0 else 1.0
+        for part_s, time_s in ((up_s, motion.pick_up_s), (down_s, drop_off_s))
+    )
     segments = [
-        (SegmentKind.IDLE, motion.overhead_per_batch_s),
-        (SegmentKind.PICK_UP, motion.pick_up_s),
-        (SegmentKind.TRANSPORT, hold_s),
-        (SegmentKind.DROP_OFF, drop_off_s),
+        _Segment(SegmentKind.IDLE, motion.overhead_per_batch_s, (0.0, 0.0), (0.0, 0.0)),
+        _Segment(SegmentKind.PICK_UP, up_s, (0.0, 1.0), (0.0, up)),
+        _Segment(SegmentKind.PICK_UP, motion.pick_up_s - up_s, (1.0, 1.0), (up, 1.0)),
+        _Segment(SegmentKind.TRANSPORT, hold_s, (1.0, 1.0), (1.0, 1.0)),
+        _Segment(SegmentKind.DROP_OFF, drop_off_s - down_s, (1.0, 1.0), (1.0, down)),
+        _Segment(SegmentKind.DROP_OFF, down_s, (1.0, 0.0), (down, 0.0)),
     ]
     optional = SegmentKind.IDLE, SegmentKind.TRANSPORT
-    return [(kind, time_s) for kind, time_s in segments if time_s > 0 or kind not in optional]
+    return [one for one in segments if one.time_s > 0 or one.kind not in optional]
+
+
+def _program(
+    grid: SiteGrid, motion: MotionSpec, batches: list[_Batch], segments: list[_Segment]
+) -> ToneProgram:
+    """The program that plays the same segments for each batch."""
+    kinds, times_s = np.array([one.kind for one in segments], np.int8), [one.time_s for one in segments]
+    batch = np.repeat(np.arange(len(batches), dtype=np.int32), len(segments))
+    rows, columns = (
+        _axis(axis, drive(grid, motion, axis), motion, grid.spacing_m, batches, segments, batch)
+        for axis in AXIS_INDICES
+    )
+    n = len(batches)
+    return ToneProgram(rows, columns, np.tile(times_s, n), np.tile(kinds, n), batch)
 
 
 def _axis(
@@ -205,14 +220,12 @@ def _axis(
     motion: MotionSpec,
     spacing_m: float,
     batches: list[_Batch],
-    kinds: NDArray[np.int8],
-    times_s: Floats,
+    segments: list[_Segment],
     batch: NDArray[np.int32],
 ) -> AxisTones:
     """The tones of an axis over all batches, checked against its limits."""
-    starts_off = (axis == 1) & (kinds == SegmentKind.PICK_UP)
-    ends_off = (axis == 1) & (kinds == SegmentKind.DROP_OFF)
-    sounding = kinds != SegmentKind.IDLE
+    sounding = np.array([one.kind != SegmentKind.IDLE for one in segments])
+    times_s = np.array([one.time_s for one in segments])
     before_s = np.cumsum(np.where(sounding, times_s, 0.0)) - times_s
     columns: list[Floats] = [np.empty((5, 0))]
     n_tones: list[int] = [0]
@@ -221,12 +234,12 @@ def _axis(
         shift_hz = driven.step_hz * one.offset_m[1 - axis] / spacing_m  # offsets are along a1, a2
         hz = driven.site_hz[tones] + shift_hz
         first = _first_phases(tones, driven, motion)
-        for segment in range(len(kinds)):
-            n_tones.append(n_tones[-1] + (len(tones) if sounding[segment] else 0))
-            if sounding[segment]:
-                amplitude = driven.amplitude[tones]
-                start, end = amplitude * (not starts_off[segment]), amplitude * (not ends_off[segment])
-                columns.append(np.stack([hz, hz, start, end, (first + hz * before_s[segment]) % 1.0]))
+        for i, segment in enumerate(segments):
+            n_tones.append(n_tones[-1] + (len(tones) if sounding[i] else 0))
+            if sounding[i]:
+                level = segment.column if axis else segment.row
+                start, end = (driven.amplitude[tones] * one for one in level)
+                columns.append(np.stack([hz, hz, start, end, (first + hz * before_s[i]) % 1.0]))
     values, offsets = np.ascontiguousarray(np.hstack(columns)), np.array(n_tones, np.int32)
     check_limits(axis, driven, motion.rf, batch, offsets, values)
     start_hz, end_hz, start, end, phase = values

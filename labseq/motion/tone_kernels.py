@@ -215,6 +215,12 @@ def next_joint(
     return arriving
 
 
+@helper_kernel("float64(float64, float64, boolean)")
+def level(keyed_s: float, ramp_s: float, is_ramped: bool) -> float:
+    """Amplitude of an axis when the parked one is fully on: the depth changes evenly over the ramp."""
+    return float(np.sqrt(keyed_s / ramp_s)) if is_ramped else 1.0
+
+
 @kernel(
     f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64,"
     f" {SITES_OF_AXIS}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS}, float64[:, ::1])"
@@ -241,8 +247,9 @@ def build_axis(
     there, so that each tone's frequency changes linearly, or not at all, within a
     segment. Where amplitudes differ, it is cut at every site. With another course a
     transport is one segment. The axis that moves is ramped at pick-up and drop-off; the
-    other one is on before and off after. A batch in which no atom moves counts as moving
-    along its row.
+    other one is switched on in the first microseconds of the pick-up, and off in the last of
+    the drop-off, which are segments of their own. A batch in which no atom moves counts as
+    moving along its row.
 
     Args:
         moves: int16 (n, 4), sources on the grid.
@@ -256,8 +263,9 @@ def build_axis(
         low_crest: See :func:`first_phases`.
         course: Of the transports, a value of :class:`labseq.model.FrequencyCourse`.
         is_uneven: Whether amplitudes differ from site to site, on either axis.
-        times_s: float64 (4,): the pause before each batch that is not linked, the pick-up
-            ramp, the move by one site, the drop-off ramp.
+        times_s: float64 (6,): the pause before each batch that is not linked, the pick-up
+            ramp, the move by one site, the drop-off ramp, and how long the parked axis is
+            switched within the two ramps.
         segments: Result, arrays of sufficient length.
         values: Result, float64 (5, >= n_tones), the tones.
 
@@ -265,6 +273,7 @@ def build_axis(
         Number of segments and number of tones.
     """
     pause_s, pick_up_s, site_s, drop_off_s = times_s[0], times_s[1], times_s[2], times_s[3]
+    keyed_up_s, keyed_down_s = times_s[4], times_s[5]
     n_sites = len(preassigned)
     tones = np.empty((2, n_sites), np.int64)
     others = np.empty((2, n_other_sites), np.int64)
@@ -277,14 +286,16 @@ def build_axis(
         n_others = collect_tones(moves, start, stop, 1 - axis, n_other_sites, others)
         moving = last_arrival(tones, n_tones) > 0
         ramped = moving or (axis == 1 and last_arrival(others, n_others) == 0)
-        off = 0.0 if ramped else 1.0
         if not linked[batch]:
             first_phases(tones, n_tones, preassigned, low_crest, sites[2], phase)
             if pause_s > 0.0:
                 m = add_segment(segments, m, IDLE, LINEAR, batch, pause_s, n)
             if pick_up_s > 0.0:
-                n = add_tones(values, n, sites, tones, n_tones, 0, 0, off, 1.0, pick_up_s, phase)
-                m = add_segment(segments, m, PICK_UP, LINEAR, batch, pick_up_s, n)
+                keyed_s, part = keyed_up_s, level(keyed_up_s, pick_up_s, ramped)
+                n = add_tones(values, n, sites, tones, n_tones, 0, 0, 0.0, part, keyed_s, phase)
+                m = add_segment(segments, m, PICK_UP, LINEAR, batch, keyed_s, n)
+                n = add_tones(values, n, sites, tones, n_tones, 0, 0, part, 1.0, pick_up_s - keyed_s, phase)
+                m = add_segment(segments, m, PICK_UP, LINEAR, batch, pick_up_s - keyed_s, n)
         at = 0
         while True:
             goal = next_joint(tones, n_tones, others, n_others, at, course, is_uneven)
@@ -295,8 +306,11 @@ def build_axis(
             m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)
             at = goal
         if drop_off_s > 0.0 and not (batch + 1 < n_batches and linked[batch + 1]):
-            n = add_tones(values, n, sites, tones, n_tones, at, at, 1.0, off, drop_off_s, phase)
-            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, drop_off_s, n)
+            keyed_s, part = keyed_down_s, level(keyed_down_s, drop_off_s, ramped)
+            n = add_tones(values, n, sites, tones, n_tones, at, at, 1.0, part, drop_off_s - keyed_s, phase)
+            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, drop_off_s - keyed_s, n)
+            n = add_tones(values, n, sites, tones, n_tones, at, at, part, 0.0, keyed_s, phase)
+            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, keyed_s, n)
     return m, n
 
 

@@ -20,6 +20,10 @@ AXIS_INDICES: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
 SPEED_PROFILES: Final[tuple[SpeedProfile, ...]] = get_args(SpeedProfile)
 """The speed profiles; the index is the :class:`labseq.model.FrequencyCourse`."""
 
+KEYED_S: Final = 2e-6
+"""Time over which the axis that does not move is switched on and off: at once, it would put more than a
+hundred times as much power outside the AOD's band."""
+
 WINDOW_TOLERANCE_S = 1e-9
 """Excess over the time window that rounding of sums can cause, in seconds."""
 
@@ -40,6 +44,11 @@ def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     if motion.speed_profile not in SPEED_PROFILES:
         raise LimitError("the speed profile", f"'{motion.speed_profile}'", one_of(SPEED_PROFILES))
     return grid.spacing_m / motion.speed_m_s
+
+
+def keyed_time_s(ramp_s: float) -> float:
+    """Time over which the tones of the parked axis are switched, within a ramp of the other axis."""
+    return min(KEYED_S, 0.5 * ramp_s)
 
 
 def fitting_batches(report: PlanReport, plan: Plan, window_s: float) -> int:
@@ -81,7 +90,7 @@ def tone_program(
     profile all tones start and arrive together, each with its own way; the longest way of
     the batch has the mean speed of the setting, so that the batch lasts as long as at
     constant speed. At pick-up and drop-off the tones of the axis that moves are ramped,
-    linearly in trap depth; those of the other axis are on before and off after.
+    linearly in trap depth; those of the other axis are switched on and off over 2 us at its two ends.
     Between linked batches there is no drop-off, pause and pick-up.
 
     Each site's tone has a preassigned amplitude; by default all are equal, such that
@@ -115,7 +124,10 @@ def tone_program(
     n_batches = plan.n_batches if n_batches is None else n_batches
     _check_size(plan, grid, n_batches)
     site_s = site_time_s(grid, motion)
-    times_s = np.array([motion.overhead_per_batch_s, motion.pick_up_s, site_s, motion.drop_off_s])
+    ramps_s = motion.pick_up_s, motion.drop_off_s
+    times_s = np.array(
+        [motion.overhead_per_batch_s, ramps_s[0], site_s, ramps_s[1], *map(keyed_time_s, ramps_s)]
+    )
     course = SPEED_PROFILES.index(motion.speed_profile)
     sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
     drives = [drive(grid, motion, axis) for axis in AXIS_INDICES]
@@ -123,7 +135,7 @@ def tone_program(
     n_cuts = 2 * sizes  # a tone may arrive on either axis
     if is_uneven:
         n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)
-    n_segments = 3 * n_batches + int(n_cuts.sum())
+    n_segments = 5 * n_batches + int(n_cuts.sum())
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
     duration_s = np.empty(n_segments, np.float64)
@@ -132,7 +144,7 @@ def tone_program(
     for axis in AXIS_INDICES:
         driven = drives[axis]
         offsets = np.empty(n_segments + 1, np.int32)
-        values = np.empty((N_FIELDS, int(((n_cuts + 2) * sizes).sum())), np.float64)
+        values = np.empty((N_FIELDS, int(((n_cuts + 4) * sizes).sum())), np.float64)
         n, n_tones = build_axis(
             plan.moves,
             plan.batch_offsets,

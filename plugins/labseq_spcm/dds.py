@@ -142,8 +142,7 @@ def compile_commands(
         raise LimitError(what, f"{program.duration_s[segment]:.4g} s", limit)
     ends = ends[:n_blocks]
     registers, values = registers[: ends[-1]], values[: ends[-1]]
-    _check_slope(name, "frequency", kernels.FREQUENCY_SLOPE, limits.DDS_FREQUENCY_SLOPE, registers, values)
-    _check_slope(name, "amplitude", kernels.AMPLITUDE_SLOPE, limits.DDS_AMPLITUDE_SLOPE, registers, values)
+    _check_slope(name, registers, values)
     entries = np.empty(len(registers), ENTRY)
     entries["register"] = registers
     whole = (registers == kernels.SOURCE) | (registers == kernels.COMMAND)
@@ -157,18 +156,13 @@ def _tones(axis: AxisTones) -> NDArray[np.float64]:
     return np.stack([axis.start_hz, axis.end_hz, axis.start_amplitude, axis.end_amplitude, turns])
 
 
-def _check_slope(
-    name: str,
-    quantity: str,
-    register: int,
-    most: float,
-    registers: NDArray[np.int32],
-    values: NDArray[np.float64],
-) -> None:
-    of_kind = registers // 1000 * 1000 == register
-    steepest = float(np.abs(values[of_kind]).max(initial=0.0))
-    if steepest > most:
-        raise LimitError(f"{name}: slope of a tone's {quantity}", f"{steepest:.4g} per second", f"{most:.4g}")
+def _check_slope(name: str, registers: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+    from labseq_spcm.kernels import FREQUENCY_SLOPE
+
+    steepest = float(np.abs(values[registers // 1000 * 1000 == FREQUENCY_SLOPE]).max(initial=0.0))
+    if steepest > limits.DDS_FREQUENCY_SLOPE:
+        limit = f"{limits.DDS_FREQUENCY_SLOPE:.4g}"
+        raise LimitError(f"{name}: slope of a tone's frequency", f"{steepest:.4g} per second", limit)
 
 
 def _too_many_tones(name: str, program: ToneProgram, cores: Cores, segment: int) -> LimitError:

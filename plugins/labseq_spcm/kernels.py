@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
-from labseq_spcm.limits import DDS_MIN_TICKS, DDS_TICK_S
+from labseq_spcm.limits import DDS_AMPLITUDE_SLOPE, DDS_MIN_TICKS, DDS_TICK_S
 
 Words = NDArray[np.uint16]
 Reals = NDArray[np.float64]
@@ -24,6 +24,8 @@ Shorts = NDArray[np.int32]
 
 RAMP_STEPS: Final = 8
 """Steps of a depth ramp: within 1 / (4 n^2), 0.4 % of the full depth, of a linear ramp."""
+SHORT_STEPS: Final = 8
+"""Duration of the first step of a ramp, at least, in shortest times of the DDS: one step in 2 us."""
 COURSE_STEPS: Final = 16
 """Steps of a transport: the frequency is within 0.3 % of its change."""
 SAME_HZ: Final = 1.0
@@ -100,7 +102,7 @@ def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
     start, end = widest[0], widest[1]
     room = duration_s / ((DDS_MIN_TICKS + 1) * DDS_TICK_S)
     if abs(end - start) > 0.05 * max(start, end):
-        n_steps = max(1, min(RAMP_STEPS, int(np.sqrt(room))))
+        n_steps = max(1, min(RAMP_STEPS, int(np.sqrt(room / SHORT_STEPS))))  # the first is the shortest
         for k in range(n_steps + 1):
             a = start + (end - start) * k / n_steps
             knots[k] = (a * a - start * start) / (end * end - start * start)
@@ -212,6 +214,7 @@ def drive_tones(
         hz = tones[START_HZ, tone] + way * s0
         a0, a1 = amplitude_at(tones, tone, u), amplitude_at(tones, tone, until)
         hz_per_s, amp_per_s = way * (s1 - s0) / step_s, (a1 - a0) / step_s
+        amp_per_s = min(max(amp_per_s, -DDS_AMPLITUDE_SLOPE), DDS_AMPLITUDE_SLOPE)  # the next step sets it
         n = drive_core(cores, at, hz, hz_per_s, a0, amp_per_s, now, registers, values, n)
         if begins and set_phase[tone]:
             turns = tones[TURNS, tone] + hz * late_s + 0.25  # the card's tones are sines

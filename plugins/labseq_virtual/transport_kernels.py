@@ -6,8 +6,8 @@ Arguments that occur in several kernels:
 - ``merging``: the logarithm of the ratio of mobile to static depth, and the distance in metres below which
   the two wells are one (2, n).
 - ``row``, ``col``: the tones of a segment, with the columns of ``handover.py`` (n_tones, N_COLUMNS).
-- ``state``, ``depth``, ``risk``: the state of each crossing of these tones, its depth in kelvin, and the
-  probability that an atom fell out of it during the motion; at least as many rows and columns as tones.
+- ``state``, ``depth``, ``course``: the state of each crossing of these tones, its depth in kelvin, and its
+  course since it switched on (N_COURSE numbers); at least as many rows and columns as tones.
 - ``work``: scratch space, one integer for each crossing; ``paths``: N_PATH numbers for each.
 """
 
@@ -59,6 +59,13 @@ Mask = NDArray[np.bool_]
 
 TABLE = const("float64", 2)
 
+RISK, PEAK, RISE_S, FALL_S = range(4)
+"""Columns of a course: the probability that an atom fell out, the greatest depth in kelvin, and the durations
+of the ramps at its start and at its end."""
+N_COURSE = 4
+RAMP = 0.7
+"""Ratio of the powers at the two ends of a segment below which it is part of a ramp: tones that give depths
+that differ from site to site change less."""
 N_PATH = 5
 """Columns of a path: row and column at its start, the displacement along both, and its length squared."""
 
@@ -197,6 +204,7 @@ VECTOR = const("float64", 1)
 SITES = "boolean[:, ::1]"
 STATES = "int8[:, ::1]"
 NUMBERS = "int64[::1]"
+COURSES = "float64[:, :, ::1]"
 
 
 @helper_kernel(f"float64(float64, {TABLE})")
@@ -341,12 +349,13 @@ def pick_up(
     constants: Floats,
     merging: Floats,
 ) -> None:
-    """Rule 2: crossings that switch on take the atoms of the sites close to them, row by row."""
+    """Rule 2: crossings that are ramped up take the atoms of the sites close to them, row by row."""
     for i in range(len(row)):
         for j in range(len(col)):
             if state[i, j] != NEW:
                 continue
-            state[i, j] = EMPTY
+            rises = row[i, POWER_START] * col[j, POWER_START] < RAMP * row[i, POWER_END] * col[j, POWER_END]
+            state[i, j] = NEW if rises else EMPTY  # it may become deep enough in the next segment
             r, c, away_m, inside = nearest_site(row[i, START], col[j, START], static, constants)
             if inside and occupied[r, c] and takes(depth[i, j], static[r, c], away_m, merging):
                 state[i, j] = HELD
@@ -373,8 +382,8 @@ def land(occupied: Mask, sites: Ints, n: int) -> int:
 
 
 @helper_kernel(
-    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {TABLE}, int64, float64, float64, "
-    f"{TABLE}, int64, {VECTOR}, {NUMBERS}, {NUMBERS})"
+    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {COURSES}, int64, float64, {TABLE}, int64, "
+    f"{VECTOR}, {NUMBERS}, {NUMBERS})"
 )
 def set_down(
     occupied: Mask,
@@ -382,10 +391,8 @@ def set_down(
     row: Floats,
     col: Floats,
     state: States,
-    depth: Floats,
-    risk: Floats,
+    course: Floats,
     n_further: int,
-    ramp_s: float,
     factor: float,
     draws: Floats,
     n_drawn: int,
@@ -404,8 +411,9 @@ def set_down(
                 continue
             r, c, away_m, inside = nearest_site(row[i, END], col[j, END], static, constants)
             spilled, hand_over, transport = risks(
-                static[r, c], depth[i, j], away_m, risk[i, j], n_further, ramp_s, factor, constants
-            )
+                static[r, c], course[i, j, PEAK], away_m, course[i, j, RISK], n_further,
+                course[i, j, FALL_S], factor, constants,
+            )  # fmt: skip
             draw = draws[n_drawn]
             n_drawn += 1
             if not inside:
@@ -510,16 +518,16 @@ def match(before: Floats, now: Floats, tolerance: float) -> Ints:
     return nearest
 
 
-@helper_kernel(f"void({TABLE}, {TABLE}, {STATES}, {OUTPUT}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, float64)")
+@helper_kernel(f"void({TABLE}, {TABLE}, {STATES}, {COURSES}, {TABLE}, {TABLE}, {STATES}, {COURSES}, float64)")
 def follow(
     old_row: Floats,
     old_col: Floats,
     old_state: States,
-    old_risk: Floats,
+    old_course: Floats,
     row: Floats,
     col: Floats,
     state: States,
-    risk: Floats,
+    course: Floats,
     tolerance: float,
 ) -> None:
     """Rule 1: tweezers that stay on keep their atoms; other crossings are new or dark."""
@@ -532,32 +540,36 @@ def follow(
             on = row[i, ON_START] * col[j, ON_START] > 0.0
             m, n = from_row[i], from_col[j]
             if on and m >= 0 and n >= 0 and old_state[m, n] != DARK:
-                state[i, j], risk[i, j] = old_state[m, n], old_risk[m, n]
+                state[i, j], course[i, j] = old_state[m, n], old_course[m, n]
             else:
                 lit = on or row[i, ON_END] * col[j, ON_END] > 0.0
-                state[i, j], risk[i, j] = NEW if lit else DARK, 0.0
+                state[i, j], course[i, j] = NEW if lit else DARK, 0.0
 
 
-@helper_kernel(f"void({TABLE}, {TABLE}, {STATES}, {TABLE}, {OUTPUT}, int64, float64, {VECTOR})")
-def run_risks(
+@helper_kernel(f"void({TABLE}, {TABLE}, {TABLE}, {COURSES}, int64, float64, float64, {VECTOR})")
+def run_courses(
     row: Floats,
     col: Floats,
-    state: States,
     depth: Floats,
-    risk: Floats,
+    course: Floats,
     n_further: int,
-    speed: float,
+    duration_s: float,
+    fastest: float,
     constants: Floats,
 ) -> None:
-    """Risk of tweezers too shallow for their speed; ``speed``: peak speed per metre of displacement."""
+    """Continue the courses of crossings; ``fastest``: peak speed relative to the mean one."""
+    speed = fastest * constants[SPACING] / max(duration_s, INSTANT_S)
     for i in range(len(row)):
         for j in range(len(col)):
-            if state[i, j] != HELD:
-                continue
+            start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
+            course[i, j, PEAK] = max(course[i, j, PEAK], depth[i, j])
+            if start < RAMP * end:
+                course[i, j, RISE_S] += duration_s
+            course[i, j, FALL_S] = course[i, j, FALL_S] + duration_s if end < RAMP * start else 0.0
             down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
-            speed_m_s = math.hypot(down, right) * constants[SPACING] * speed
-            if speed_m_s > 0.0:
-                risk[i, j] = max(risk[i, j], shallow(depth[i, j], speed_m_s, n_further, constants))
+            if down != 0.0 or right != 0.0:
+                risk = shallow(depth[i, j], math.hypot(down, right) * speed, n_further, constants)
+                course[i, j, RISK] = max(course[i, j, RISK], risk)
 
 
 @helper_kernel(f"int64({OFFSETS}, int64)")
@@ -570,7 +582,7 @@ def max_tones(offsets: Offsets, n_segments: int) -> int:
 
 
 @helper_kernel(
-    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {OUTPUT}, float64, float64, float64, "
+    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {COURSES}, float64, float64, float64, "
     f"{TABLE}, int64, {VECTOR}, {TABLE}, {OUTPUT}, {NUMBERS}, {NUMBERS})"
 )
 def play(
@@ -580,7 +592,7 @@ def play(
     col: Floats,
     state: States,
     depth: Floats,
-    risk: Floats,
+    course: Floats,
     duration_s: float,
     fastest: float,
     factor: float,
@@ -604,12 +616,10 @@ def play(
         lost[COLLISION] += sweep(
             occupied, row, col, state, depth, constants[STATIC_DEPTH], constants[TOLERANCE], paths, work
         )
-        speed = fastest / max(duration_s, INSTANT_S)
-        run_risks(row, col, state, depth, risk, n_further, speed, constants)
+    run_courses(row, col, depth, course, n_further, duration_s, fastest, constants)
     return set_down(
-        occupied, static, row, col, state, depth, risk, n_further, duration_s, factor, draws, n_drawn,
-        constants, work, lost,
-    )  # fmt: skip
+        occupied, static, row, col, state, course, n_further, factor, draws, n_drawn, constants, work, lost
+    )
 
 
 @kernel(
@@ -653,7 +663,11 @@ def carry_atoms(
     """
     shape = max_tones(row_offsets, n_segments), max_tones(col_offsets, n_segments)
     old_state, state = np.zeros(shape, np.int8), np.zeros(shape, np.int8)
-    old_risk, risk, depth = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    old_course, course, depth = (
+        np.zeros((shape[0], shape[1], N_COURSE)),
+        np.zeros((shape[0], shape[1], N_COURSE)),
+        np.zeros(shape),
+    )
     paths = np.zeros((shape[0] * shape[1], N_PATH))
     work, lost, n_drawn = np.zeros(shape[0] * shape[1], np.int64), np.zeros(5, np.int64), 0
     old_row, old_col = rows[:0], cols[:0]
@@ -661,13 +675,14 @@ def carry_atoms(
         row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
         lost[PROGRAM] += count_held(old_state, old_row, old_col)
         if any_lit(row, col):
-            follow(old_row, old_col, old_state, old_risk, row, col, state, risk, constants[TOLERANCE])
+            follow(old_row, old_col, old_state, old_course, row, col, state, course, constants[TOLERANCE])
             lost[PROGRAM] -= count_held(state, row, col)
             n_drawn = play(
-                occupied, static, row, col, state, depth, risk, duration_s[k], fastest[k], factor, draws,
+                occupied, static, row, col, state, depth, course, duration_s[k], fastest[k], factor, draws,
                 n_drawn, constants, merging, paths, work, lost,
             )  # fmt: skip
-            old_row, old_col, old_state, old_risk, state, risk = row, col, state, risk, old_state, old_risk
+            old_row, old_col, old_state, state = row, col, state, old_state
+            old_course, course = course, old_course
         else:
             old_row, old_col = row[:0], col[:0]
     lost[PROGRAM] += count_held(old_state, old_row, old_col)

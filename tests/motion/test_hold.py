@@ -63,16 +63,16 @@ def test_every_site_is_held_once_beside_its_place_and_no_other(
 
 def test_a_batch_is_a_pause_a_pick_up_a_hold_and_a_drop_off() -> None:
     program = hold_program(GRID, spec(), ALL, (0.3e-6, 0.0), HOLD_S, 5e-6)
-    assert program.kind.tolist() == [IDLE, PICK_UP, TRANSPORT, DROP_OFF] * 5
-    assert program.batch.tolist() == np.repeat(range(5), 4).tolist()
-    assert program.duration_s[:4] == pytest.approx([0.5e-3, 60e-6, HOLD_S, 5e-6])
-    assert np.diff(program.row.offsets)[:4].tolist() == [0, 1, 1, 1]
-    assert np.diff(program.column.offsets)[:4].tolist() == [0, 6, 6, 6]
+    assert program.kind.tolist() == [IDLE, PICK_UP, PICK_UP, TRANSPORT, DROP_OFF, DROP_OFF] * 5
+    assert program.batch.tolist() == np.repeat(range(5), 6).tolist()
+    assert program.duration_s[:6] == pytest.approx([0.5e-3, 2e-6, 58e-6, HOLD_S, 3e-6, 2e-6])
+    assert np.diff(program.row.offsets)[:6].tolist() == [0, 1, 1, 1, 1, 1]
+    assert np.diff(program.column.offsets)[:6].tolist() == [0, 6, 6, 6, 6, 6]
 
 
 def test_without_a_time_to_hold_or_a_pause_there_is_no_segment_for_it() -> None:
     program = hold_program(GRID, spec(overhead_per_batch_s=0.0), ALL, (0.0, 0.0), 0.0)
-    assert program.kind.tolist() == [PICK_UP, DROP_OFF] * 5
+    assert program.kind.tolist() == [PICK_UP, PICK_UP, DROP_OFF, DROP_OFF] * 5
     assert (program.duration_s > 0).all()
 
 
@@ -86,13 +86,14 @@ def test_ramps_amplitudes_and_first_phases_are_those_of_a_move(phases: Any) -> N
     move = np.array([[2, 0, 2, 1], [2, 2, 2, 3]], np.int16)
     moved = tone_program(Plan.from_batches([Batch(move[:, :2], move[:, 2:])]), GRID, motion)
     for mine, theirs in ((held.row, moved.row), (held.column, moved.column)):
-        first = slice(mine.offsets[1], mine.offsets[2])
+        first = slice(mine.offsets[1], mine.offsets[3])
         for name in ("start_hz", "end_hz", "start_amplitude", "end_amplitude", "phase_rad"):
             assert getattr(mine, name)[first] == pytest.approx(getattr(theirs, name)[first])
-    last = slice(*held.column.offsets[3:5])
-    assert held.column.start_amplitude[last] == pytest.approx([0.1, 0.12])
-    assert held.column.end_amplitude[last].tolist() == [0.0, 0.0]
-    assert held.row.end_amplitude[-1] == 0.03
+    last = slice(*held.column.offsets[4:7:2])
+    level = np.sqrt(2 / 60)
+    assert held.column.start_amplitude[last] == pytest.approx([0.1, 0.12, 0.1 * level, 0.12 * level])
+    assert held.column.end_amplitude[last] == pytest.approx([0.1 * level, 0.12 * level, 0.0, 0.0])
+    assert held.row.start_amplitude[-1] == 0.03
 
 
 @settings(max_examples=15, deadline=None)
@@ -141,7 +142,7 @@ def test_tweezers_that_come_too_near_are_refused() -> None:
     opposite = np.zeros((*GRID.shape, 2))
     opposite[..., 0] = 1.9e-6 * (1 - 2 * (np.arange(6) % 2))
     each = hold_program(GRID, spec(), ALL, opposite, HOLD_S)
-    assert each.n_segments == 2 * 20  # those with another offset come in another batch
+    assert each.n_segments == 2 * 30  # those with another offset come in another batch
     with pytest.raises(LimitError, match="the distance of column tones"):
         hold_program(GRID, spec(rf=RfSpec(min_spacing_hz=2e6)), ALL, (0.0, 0.0), HOLD_S)
 

@@ -30,6 +30,7 @@ from labseq.model import (
 from labseq.model.motion import SpeedProfile
 from labseq.motion import check_plan, fitting_batches, tone_program
 from labseq.motion.axes import preassigned_phases
+from labseq.motion.render_reference import render_reference
 from labseq.motion.tone_kernels import (
     AMPLITUDES,
     BAND,
@@ -108,22 +109,23 @@ def sites(hz: NDArray[np.float64], site_hz: NDArray[np.float64]) -> list[float]:
 
 def test_a_row_move_segment_by_segment() -> None:
     program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)))
-    assert program.kind.tolist() == [IDLE, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF]
-    assert program.batch.tolist() == [0] * 5
-    assert program.duration_s == pytest.approx([0.5e-3, 60e-6, SITE_S, 2 * SITE_S, 60e-6])
-    assert program.row.offsets.tolist() == [0, 0, 1, 2, 3, 4]
-    assert program.column.offsets.tolist() == [0, 0, 2, 4, 6, 8]
+    assert program.kind.tolist() == [IDLE, PICK_UP, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF, DROP_OFF]
+    assert program.batch.tolist() == [0] * 7
+    ramps = [2e-6, 58e-6, SITE_S, 2 * SITE_S, 58e-6, 2e-6]
+    assert program.duration_s == pytest.approx([0.5e-3, *ramps])
+    assert program.row.offsets.tolist() == [0, *range(7)]
+    assert program.column.offsets.tolist() == [0, *range(0, 14, 2)]
 
-    way = [sites(segment(program.column, i)["start_hz"], GRID.column_frequency_hz) for i in range(1, 5)]
+    way = [sites(segment(program.column, i)["start_hz"], GRID.column_frequency_hz) for i in range(2, 6)]
     assert way == [pytest.approx(at) for at in ([0, 2], [0, 2], [1, 3], [1, 5])]
-    assert sites(segment(program.column, 4)["end_hz"], GRID.column_frequency_hz) == pytest.approx([1, 5])
-    for i in range(1, 5):
+    assert sites(segment(program.column, 6)["end_hz"], GRID.column_frequency_hz) == pytest.approx([1, 5])
+    for i in range(1, 7):
         row = segment(program.row, i)
         assert sites(row["start_hz"], GRID.row_frequency_hz) == pytest.approx([1])
         assert row["end_hz"].tolist() == row["start_hz"].tolist()
 
 
-def test_only_the_axis_that_moves_is_ramped() -> None:
+def test_the_axis_that_moves_is_ramped_and_the_other_one_keyed_over_2_us() -> None:
     program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), batch((0, 0, 2, 0)), max_row_tones=10)
     full = {"row": 1 / 10, "column": 1 / 20}
     for i, kind in enumerate(program.kind.tolist()):
@@ -131,25 +133,40 @@ def test_only_the_axis_that_moves_is_ramped() -> None:
         for name, axis in (("row", program.row), ("column", program.column)):
             tones = segment(axis, i)
             start, end = tones["start_amplitude"], tones["end_amplitude"]
-            low = kind in (PICK_UP, DROP_OFF) and name == ramped
-            assert start == pytest.approx(0.0 if low and kind == PICK_UP else full[name])
-            assert end == pytest.approx(0.0 if low and kind == DROP_OFF else full[name])
+            after = np.sqrt(2 / 60) if name == ramped else 1.0
+            is_keyed = program.duration_s[i] < 3e-6
+            rises, falls = (after, 1.0), (1.0, after)
+            if is_keyed:
+                rises, falls = (0.0, after), (after, 0.0)
+            expected = {PICK_UP: rises, DROP_OFF: falls}.get(SegmentKind(kind), (1.0, 1.0))
+            assert start == pytest.approx(expected[0] * full[name])
+            assert end == pytest.approx(expected[1] * full[name])
+
+
+def test_little_power_leaves_the_band_of_the_parked_axis() -> None:
+    program = program_of(batch((1, 0, 1, 1)), grid=SiteGrid(4, 6), overhead_per_batch_s=0.0)
+    power = np.abs(np.fft.rfft(render_reference(program, 500e6)[0])) ** 2
+    hz = np.fft.rfftfreq(2 * len(power) - 2, 1 / 500e6)
+    assert 10 * np.log10(power[np.abs(hz - 100e6) > 18e6].sum() / power.sum()) < -60
 
 
 def test_linked_batches_keep_their_tones_on() -> None:
     program = program_of(batch((0, 0, 0, 2)), batch((0, 2, 3, 2), linked=True), batch((3, 2, 3, 1)))
-    assert program.kind.tolist() == [IDLE, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF, *range(4)]
-    assert program.batch.tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 2]
-    assert program.duration_s[3] == pytest.approx(3 * SITE_S)
+    assert program.kind.tolist() == [
+        IDLE, PICK_UP, PICK_UP, TRANSPORT, TRANSPORT, DROP_OFF, DROP_OFF,
+        IDLE, PICK_UP, PICK_UP, TRANSPORT, DROP_OFF, DROP_OFF,
+    ]  # fmt: skip
+    assert program.batch.tolist() == [0] * 4 + [1] * 3 + [2] * 6
+    assert program.duration_s[4] == pytest.approx(3 * SITE_S)
     check_joints(program)
     assert segment(program.column, 1)["start_amplitude"] == [0.0]
-    assert segment(program.row, 4)["end_amplitude"] == [0.0]
-    assert segment(program.column, 4)["end_amplitude"] == [1 / 20]
+    assert segment(program.row, 5)["end_amplitude"] == pytest.approx([np.sqrt(2 / 60) / 20])
+    assert segment(program.column, 5)["end_amplitude"] == [1 / 20]
 
 
 def test_a_waiting_tone_stays() -> None:
     program = program_of(batch((0, 0, 0, 1), (0, 3, 0, 3)), batch((0, 1, 2, 1), (0, 3, 2, 3), linked=True))
-    end = segment(program.column, 2)["end_hz"]
+    end = segment(program.column, 3)["end_hz"]
     assert sites(end, GRID.column_frequency_hz) == pytest.approx([1, 3])
 
 
@@ -157,9 +174,9 @@ def test_ejection_goes_on_beyond_the_edge() -> None:
     program = program_of(batch((0, 0, 0, -1), (0, 5, 0, 6)))
     step = 1.6e6
     first, last = GRID.column_frequency_hz[[0, -1]]
-    assert segment(program.column, 2)["end_hz"] == pytest.approx([first - step, last + step])
+    assert segment(program.column, 3)["end_hz"] == pytest.approx([first - step, last + step])
     program = program_of(batch((2, 1, 4, 1)))
-    assert segment(program.row, 2)["end_hz"] == pytest.approx([GRID.row_frequency_hz[-1] + step])
+    assert segment(program.row, 3)["end_hz"] == pytest.approx([GRID.row_frequency_hz[-1] + step])
 
 
 @pytest.mark.parametrize(
@@ -179,7 +196,7 @@ def test_calibrated_frequencies_are_met_at_every_site_where_a_tone_starts_or_end
     site_hz = np.array([90e6, 91e6, 93e6, 96e6])
     grid = SiteGrid(1, 4, column_frequency_hz=site_hz)
     program = program_of(batch((0, 1, 0, 2)), batch((0, 0, 0, -1), (0, 3, 0, 4)), grid=grid)
-    assert program.column.end_hz[1] == 93e6
+    assert program.column.end_hz[2] == 93e6
     assert program.column.end_hz[-2:].tolist() == [89e6, 99e6]
 
 
@@ -188,7 +205,7 @@ def test_phases_start_as_preassigned() -> None:
     rows, columns = preassigned_phases(4, 6)
     assert segment(program.column, 1)["phase_rad"] == pytest.approx(2 * np.pi * columns[[0, 2]])
     assert segment(program.row, 1)["phase_rad"] == pytest.approx(2 * np.pi * rows[[1]])
-    assert segment(program.row, 6)["phase_rad"] == pytest.approx(2 * np.pi * rows[[0]])
+    assert segment(program.row, 8)["phase_rad"] == pytest.approx(2 * np.pi * rows[[0]])
     assert preassigned_phases(20, 20)[1][:6].tolist() == columns.tolist()
     assert len({*rows, *columns}) == 10
 
@@ -261,7 +278,7 @@ def test_the_first_batches_only() -> None:
     whole = tone_program(plan, GRID)
     part = tone_program(plan, GRID, n_batches=2)
     n = part.n_segments
-    assert part.batch.tolist() == [0, 0, 0, 1, 1, 1]
+    assert part.batch.tolist() == [0] * 5 + [1] * 5
     assert part.duration_s.tolist() == whole.duration_s[:n].tolist()
     assert part.column.phase_rad.tolist() == whole.column.phase_rad[: part.column.offsets[n]].tolist()
     for wrong in (-1, 4):
@@ -320,10 +337,10 @@ def test_frequency_amplitude_and_phase_go_on_at_every_joint_within_a_batch(progr
 def test_with_a_jerk_profile_all_tones_start_and_arrive_together(profile: SpeedProfile) -> None:
     program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), speed_profile=profile)
     course = FrequencyCourse[profile.upper()]
-    assert program.kind.tolist() == [*SegmentKind]
-    assert program.course.tolist() == [0, 0, course, 0]
-    assert program.duration_s[2] == pytest.approx(3 * SITE_S)
-    middle_s = float(program.joint_s[2] + 1.5 * SITE_S)
+    assert program.kind.tolist() == [IDLE, PICK_UP, PICK_UP, TRANSPORT, DROP_OFF, DROP_OFF]
+    assert program.course.tolist() == [0, 0, 0, course, 0, 0]
+    assert program.duration_s[3] == pytest.approx(3 * SITE_S)
+    middle_s = float(program.joint_s[3] + 1.5 * SITE_S)
     first = GRID.column_frequency_hz[0]
     for t_s, made in ((middle_s, 0.5), (middle_s - 0.75 * SITE_S, course.fraction(0.25))):
         sites = (program.tones_at(t_s).column.frequency_hz - first) / 1.6e6
@@ -332,7 +349,7 @@ def test_with_a_jerk_profile_all_tones_start_and_arrive_together(profile: SpeedP
 
 def test_depth_goes_evenly_from_site_to_site() -> None:
     program = program_of(batch((1, 0, 1, 1), (1, 2, 1, 5)), rf=UNEVEN)
-    start_s = float(program.joint_s[2])
+    start_s = float(program.joint_s[3])
     squares = np.array(UNEVEN.column_amplitudes) ** 2
     for sites in (0.0, 0.5, 1.0, 1.7, 2.999):
         depth = program.tones_at(start_s + sites * SITE_S).column.amplitude ** 2

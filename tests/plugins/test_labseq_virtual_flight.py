@@ -321,7 +321,7 @@ def test_smooth_motion_has_no_jumps(speed_profile: str) -> None:
     assert len(jumps_of(program_of(*batches, speed_profile=speed_profile))) == 0
 
 
-@pytest.mark.parametrize(("segment", "size_rad"), [(1, -1.0), (2, 2.0), (3, -2.0)])
+@pytest.mark.parametrize(("segment", "size_rad"), [(2, -1.0), (3, 2.0), (4, -2.0)])
 def test_a_phase_jump_is_found_with_its_size_and_place(segment: int, size_rad: float) -> None:
     smooth = program_of(MOVE)
     all_jumps = jumps_of(with_phase_jump(smooth, segment, size_rad))
