@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from labseq.errors import InvalidPlanError, LimitError
 from labseq.model import MotionSpec, Plan, PlanReport, SiteGrid, TargetPattern, as_occupancy
+from labseq.motion.axes import AXES
 from labseq.motion.tones import default_grid, site_time_s
+from labseq.units import format_quantity
 
 RULES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "shape": "plan, occupancy, target and grid belong together, and no batch is empty",
         "grid": "atoms come from the grid, and go to a site of it or to an ejection slot",
-        "straight": "an atom moves along one row or one column, and all atoms of a batch along the same axis",
-        "linked": "a linked batch starts from exactly the goals of the batch before it, none of them outside",
+        "straight": "an atom of a line batch moves along one row or one column, all along the same axis",
+        "linked": "a linked batch starts from exactly the goals of the line batch before, none outside",
         "source": "an atom that is moved is there, and is moved once in a batch",
         "goal": "a goal is free once the batch's own atoms are lifted, and no two atoms share one",
         "tones": "one trajectory per tone, and no more tones than an axis can play",
-        "order": "the tones of an axis keep their order and at least one site of distance",
+        "order": "the tones of an axis keep their order and least distance: a site, with paths the clearance",
         "parallelism": "every crossing of a row tone and a column tone counts as a tweezer",
         "crossing": "a crossing that the plan does not name picks up no atom",
-        "path": "no crossing, named or not, passes over or ends on an atom that stands",
+        "path": "no crossing, named or not, passes over, comes too near to or ends on an atom that stands",
         "ejection": "only the outermost atoms of a line are ejected",
     }
 )
@@ -58,6 +62,35 @@ FAULTS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "CROSSING_ON_ATOM": ("crossing", "its tones cross on the atom on {site} too, which it does not name"),
     "PATH_OVER_ATOM": ("path", "its tones cross the atom that stands on {site} on their way or at its end"),
+    "LINKED_AFTER_PATHS": (
+        "linked",
+        "it or the batch before has paths of tones; only line batches are linked",
+    ),
+    "PATH_SHAPE": ("tones", "its paths have fewer than two knots, or an axis has no tone"),
+    "PATH_POSITION": ("tones", "a position of {axis} tone {b} is not finite"),
+    "PATH_OFF": (
+        "tones",
+        "the {axis} tones go off at knot 1 or later, one of them at the last; see tone {b}",
+    ),
+    "PATH_OUTSIDE": ("grid", "{axis} tone {b} goes further than {slots} site(s) beyond the grid's edge"),
+    "PATH_ORDER": (
+        "order",
+        "{axis} tone {b} comes closer than {least} sites to the one before, or passes it",
+    ),
+    "PATH_NO_TONE": ("tones", "no {axis} tone starts at {source}"),
+    "PATH_END": (
+        "tones",
+        "{source} -> {goal}, but its {axis} tone is elsewhere at knot {b}, where it is let go",
+    ),
+    "PATH_PICKS_UP": (
+        "crossing",
+        "a tweezer that it does not name comes on at the atom on {site} or too near to it",
+    ),
+    "PATH_NEAR_ATOM": ("path", "a tweezer comes closer than {clearance} to the atom that stands on {site}"),
+    "PATH_LANDS": (
+        "path",
+        "a tweezer without an atom ends on the atom on {site}, and empty_tweezers_may_land is off",
+    ),
     "INNER_EJECTION": ("ejection", "an atom would be ejected over the one on {site}; eject that one first"),
 }
 """Faults of :mod:`labseq.motion.check_kernels`: name -> rule, wording."""
@@ -88,8 +121,9 @@ def check_plan(
     constant until the first arrival and monotonic from then on. So the gap is
     monotonic from start to end and never below the smaller of the two, which are
     whole numbers of sites: it is at least one site if the order is kept. With a course
-    of the speed other than constant all tones have made the same fraction of their
-    ways at any time, so the gap goes evenly from the one at the start to the one at the end.
+    of the speed other than constant, and on paths from one knot to the next, all tones have made
+    the same fraction of their ways at any time, so the gap goes evenly from the one at the start
+    to the one at the end.
 
     Args:
         plan: The plan.
@@ -141,21 +175,34 @@ def check_plan(
         plan.moves,
         plan.batch_offsets,
         plan.linked,
+        (plan.path_shapes, plan.path_positions, plan.path_off),
         atoms,
         max_tweezers,
         motion.max_row_tones,
         motion.max_column_tones,
         motion.eject_slots,
+        path_geometry(grid, motion),
         times_s,
         end_s,
         n_tweezers,
     )
     if fault:
-        _raise_plan_error(fault, where, plan, atoms.shape, max_tweezers, motion.eject_slots, planner)
+        _raise_plan_error(fault, where, plan, grid, max_tweezers, motion, planner)
     n_defects, n_surplus = count_wrong(atoms, target.fill, target.clear)
     for array in (atoms, end_s, n_tweezers):
         array.flags.writeable = False
     return PlanReport(atoms, end_s, n_tweezers, n_defects, n_surplus)
+
+
+@lru_cache(maxsize=16)
+def path_geometry(grid: SiteGrid, motion: MotionSpec) -> NDArray[np.float64]:
+    """What the kernels need to know of a grid and the clearance, see :func:`check_kernels.check`."""
+    a1, a2 = grid.axes / grid.spacing_m
+    clearance, cosine = motion.clearance_m / grid.spacing_m, float(a1 @ a2)
+    across = clearance / math.sqrt(1.0 - cosine**2)  # lines are nearer to one another than their sites
+    geometry = np.array([clearance, cosine, across, motion.empty_tweezers_may_land], np.float64)
+    geometry.flags.writeable = False
+    return geometry
 
 
 def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, planner: str) -> None:
@@ -179,16 +226,16 @@ def _raise_plan_error(
     fault: int,
     where: list[int],
     plan: Plan,
-    shape: tuple[int, ...],
+    grid: SiteGrid,
     max_tweezers: int,
-    slots: int,
+    motion: MotionSpec,
     planner: str,
 ) -> NoReturn:
     """Raise the error for a fault."""
-    from labseq.motion import check_kernels
+    from labseq.motion import check_kernels, path_kernels
 
     batch, move, a, b = (int(number) for number in where)
-    name = next(name for name in FAULTS if getattr(check_kernels, name) == fault)
+    name = next(name for name in FAULTS if (vars(path_kernels) | vars(check_kernels)).get(name) == fault)
     rule, wording = FAULTS[name]
     row = col = to_row = to_col = -1  # only used in messages about an atom move
     if move >= 0:
@@ -201,9 +248,12 @@ def _raise_plan_error(
         b=b,
         n_tweezers=a * b,
         limit=max_tweezers,
-        n_rows=shape[0],
-        n_cols=shape[1],
-        slots=slots,
+        n_rows=grid.n_rows,
+        n_cols=grid.n_cols,
+        slots=motion.eject_slots,
+        axis=AXES[a] if a in (0, 1) else "",
+        least=f"{path_geometry(grid, motion)[2]:.3g}",
+        clearance=format_quantity(motion.clearance_m, "length"),
     )
     site = (a, b) if name in _AT_A_SITE else None
     raise InvalidPlanError(rule, detail, batch=batch, move=move, planner=planner, site=site)

@@ -16,6 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.kernel import const, helper_kernel, kernel
+from labseq.motion.path_kernels import (
+    KNOTS,
+    PATH_SHAPE,
+    POSITIONS,
+    Floats,
+    Shape,
+    check_axis,
+    check_ends,
+    check_motion,
+    leg_way,
+)
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -49,6 +60,7 @@ TWEEZERS: Final = 21
 INNER_EJECTION: Final = 22
 CROSSING_ON_ATOM: Final = 23
 PATH_OVER_ATOM: Final = 24
+LINKED_AFTER_PATHS: Final = 35
 
 NO_TONE: Final = 1 << 20  # no int16
 FAULT: Final = "UniTuple(int64, 4)"
@@ -242,19 +254,115 @@ def count_wrong(atoms: Bools, fill: Bools, clear: Bools) -> tuple[int, int]:
     return n_defects, n_surplus
 
 
+PATHS: Final = f"Tuple(({const('int32', 2)}, {POSITIONS}, {KNOTS}))"
+Paths = tuple[NDArray[np.int32], Floats, NDArray[np.int32]]
+
+
+@helper_kernel(f"Tuple(({POSITIONS}, {KNOTS}, UniTuple(int64, 3)))({PATHS}, int64, int64, int64)")
+def paths_of(paths: Paths, number: int, start: int, off_start: int) -> tuple[Floats, Stamps, Shape]:
+    """The positions of a batch from ``start`` on, its knots from ``off_start`` on, and its shape.
+
+    For a line batch they are empty, and the shape is (0, 0, 0).
+    """
+    shapes, positions, off = paths
+    n_knots = n_rows = n_cols = 0
+    if number < len(shapes):
+        n_knots, n_rows, n_cols = shapes[number, 0], shapes[number, 1], shapes[number, 2]
+    n_tones = n_rows + n_cols
+    return positions[start : start + n_knots * n_tones], off[off_start : off_start + n_tones], (
+        n_knots, n_rows, n_cols,
+    )  # fmt: skip
+
+
+@helper_kernel(f"{FAULT}(UniTuple(int64, 3), int64, int64, int64)")
+def count_tones(shape: Shape, max_tweezers: int, max_row_tones: int, max_column_tones: int) -> Fault:
+    """Test how many tones the paths of a batch have; without a fault the last number is that of tweezers."""
+    if shape[0] < 2 or shape[1] < 1 or shape[2] < 1:
+        return PATH_SHAPE, -1, 0, 0
+    if shape[1] > max_row_tones:
+        return ROW_TONES, -1, shape[1], max_row_tones
+    if shape[2] > max_column_tones:
+        return COLUMN_TONES, -1, shape[2], max_column_tones
+    if shape[1] * shape[2] > max_tweezers:
+        return TWEEZERS, -1, shape[1], shape[2]
+    return RIGHT, -1, 0, shape[1] * shape[2]
+
+
+@helper_kernel(f"{FAULT}({MOVES}, int64, int64)")
+def check_sources(batch: Moves, n_rows: int, n_cols: int) -> Fault:
+    """Test that the sources of a batch with paths lie on the grid."""
+    for i in range(len(batch)):
+        row, col = batch[i, 0], batch[i, 1]
+        if not (0 <= row < n_rows and 0 <= col < n_cols):
+            return SOURCE_OUTSIDE, i, row, col
+    return RIGHT, -1, 0, 0
+
+
+@helper_kernel(
+    f"{FAULT}({MOVES}, {POSITIONS}, {KNOTS}, UniTuple(int64, 3), {ATOMS}, {STAMPS}, {STAMPS}, {STAMPS},"
+    f" int64, int64, int64, int64, int64, {POSITIONS})"
+)
+def check_paths_of_batch(
+    batch: Moves,
+    positions: Floats,
+    off: Stamps,
+    shape: Shape,
+    atoms: Bools,
+    lifted: Stamps,
+    goals: Stamps,
+    dropped: Stamps,
+    stamp: int,
+    max_tweezers: int,
+    max_row_tones: int,
+    max_column_tones: int,
+    slots: int,
+    geometry: Floats,
+) -> Fault:
+    """Test a batch with paths of tones; without a fault the last number is that of tweezers."""
+    counted = count_tones(shape, max_tweezers, max_row_tones, max_column_tones)
+    fault = counted
+    for axis in range(2):
+        if fault[0] == RIGHT:
+            fault = check_axis(positions, off, shape, axis, atoms.shape[axis], slots, geometry[2])
+    if fault[0] == RIGHT:
+        fault = check_sources(batch, atoms.shape[0], atoms.shape[1])
+    if fault[0] == RIGHT:
+        fault = check_sites(batch, 0, atoms, lifted, goals, stamp, False)
+    if fault[0] == RIGHT:
+        fault = check_ends(batch, positions, off, shape, dropped)
+    if fault[0] == RIGHT:
+        fault = check_motion(
+            positions, off, shape, atoms, lifted, goals, dropped, stamp,
+            geometry[0], geometry[1], geometry[3] > 0.0,
+        )  # fmt: skip
+    return fault if fault[0] != RIGHT else counted
+
+
+@helper_kernel(f"UniTuple(float64, 2)({POSITIONS}, {KNOTS}, UniTuple(int64, 3), float64)")
+def path_lengths(positions: Floats, off: Stamps, shape: Shape, cosine: float) -> tuple[float, float]:
+    """Sum of the longest ways of all legs, in sites, and the number of knots at which tones go off."""
+    ways, drops = 0.0, 0.0
+    for leg in range(shape[0] - 1):
+        ways += leg_way(positions, off, shape, cosine, leg)
+        drops += (off == leg + 1).any()
+    return ways, drops
+
+
 @kernel(
-    f"UniTuple(int64, 5)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, {GRID}, int64, int64, int64,"
-    " int64, float64[::1], float64[::1], int32[::1])"
+    f"UniTuple(int64, 5)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, {PATHS}, {GRID}, int64, int64,"
+    f" int64, int64, {POSITIONS}, float64[::1], float64[::1], int32[::1])"
 )
 def check(
     moves: Moves,
     offsets: Stamps,
     linked: Bools,
+    paths: Paths,
     atoms: Bools,
     max_tweezers: int,
     max_row_tones: int,
     max_column_tones: int,
     slots: int,
+    geometry: Floats,
     times_s: NDArray[np.float64],
     end_s: NDArray[np.float64],
     n_tweezers: Stamps,
@@ -265,11 +373,15 @@ def check(
         moves: int16 (n_moves, 4).
         offsets: int32 (n_batches + 1,), from 0 to n_moves, not decreasing.
         linked: bool (n_batches,).
+        paths: ``path_shapes``, ``path_positions`` and ``path_off`` of :class:`labseq.model.Plan`, whose
+            lengths fit together.
         atoms: bool (n_rows, n_cols), before the plan; holds the occupancy after it.
         max_tweezers: Maximum number of tweezers on at once.
         max_row_tones: Maximum number of row tones on at once.
         max_column_tones: Maximum number of column tones on at once.
         slots: Ejection slots on each side.
+        geometry: float64 (4,): clearance in sites, cosine of the angle between rows and columns, least
+            distance of two tones of an axis with paths, in sites, and 1 if empty tweezers may land.
         times_s: float64 (5,): before the first batch, before each batch that is not linked,
             pick-up ramp, move by one site, drop-off ramp.
         end_s: Result, float64 (n_batches,), end of each batch.
@@ -282,10 +394,12 @@ def check(
     n_batches, n_before = len(linked), 0
     lifted = np.zeros(atoms.shape, np.int32)
     goals = np.zeros(atoms.shape, np.int32)
+    dropped = np.zeros(atoms.shape if len(paths[0]) else (0, 0), np.int32)
     row_goal = np.empty(atoms.shape[0], np.int64)
     column_goal = np.empty(atoms.shape[1], np.int64)
-    ejected = False
+    ejected = had_paths = False
     time_s = times_s[0]
+    start = off_start = 0
     for number in range(n_batches):
         batch = moves[offsets[number] : offsets[number + 1]]
         follows = linked[number]
@@ -297,6 +411,24 @@ def check(
         if follows and ejected:
             return LINKED_AFTER_EJECTION, number, -1, 0, 0
         stamp = number + 1
+        positions, off, shape = paths_of(paths, number, start, off_start)
+        if follows and (had_paths or shape[0] > 0):
+            return LINKED_AFTER_PATHS, number, -1, 0, 0
+        had_paths = shape[0] + shape[1] + shape[2] > 0
+        if had_paths:
+            start, off_start = start + len(positions), off_start + len(off)
+            fault = check_paths_of_batch(
+                batch, positions, off, shape, atoms, lifted, goals, dropped, stamp,
+                max_tweezers, max_row_tones, max_column_tones, slots, geometry,
+            )  # fmt: skip
+            n_tweezers[number] = fault[3]
+            if fault[0] != RIGHT:
+                return fault[0], number, fault[1], fault[2], fault[3]
+            ejected = move_atoms(batch, atoms)
+            ways, drops = path_lengths(positions, off, shape, geometry[1])
+            time_s += times_s[1] + times_s[2] + ways * times_s[3] + drops * times_s[4]
+            end_s[number] = time_s
+            continue
         fault = check_shapes(batch, atoms.shape[0], atoms.shape[1], slots, follows or leads)
         if fault[0] == RIGHT:
             fault = check_sites(batch, n_before, atoms, lifted, goals, stamp, follows)

@@ -6,13 +6,17 @@ from collections import Counter
 from itertools import pairwise, product
 
 import numpy as np
+from numpy.typing import NDArray
 
-from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid
+from labseq.model import Batch, MotionSpec, Occupancy, Plan, SiteGrid
 
 Site = tuple[int, int]
 Moves = list[tuple[Site, Site]]
 
+Floats = NDArray[np.float64]
+
 INSTANTS_PER_SITE = 4
+INSTANTS_PER_LEG = 33
 
 
 class Illegal(Exception):  # noqa: N818 - a verdict
@@ -27,13 +31,16 @@ def require(condition: bool) -> None:
 class NaiveChecker:
     """Keeps the atoms as a set of sites and the tones as dicts from start to goal."""
 
-    def __init__(self, occupancy: Occupancy, dop: int, motion: MotionSpec) -> None:
+    def __init__(
+        self, occupancy: Occupancy, dop: int, motion: MotionSpec, grid: SiteGrid | None = None
+    ) -> None:
+        self.grid = grid or SiteGrid(*occupancy.shape)
         self.n_rows, self.n_cols = occupancy.shape
         self.atoms: set[Site] = {(int(r), int(c)) for r, c in np.argwhere(occupancy)}
         self.dop, self.motion = dop, motion
         self.held: Counter[Site] = Counter()
         self.time_s = motion.overhead_per_cycle_s
-        self.site_s = SiteGrid().spacing_m / motion.speed_m_s
+        self.site_s = self.grid.spacing_m / motion.speed_m_s
 
     def on_grid(self, site: Site) -> bool:
         return site[0] in range(self.n_rows) and site[1] in range(self.n_cols)
@@ -88,6 +95,85 @@ class NaiveChecker:
         self.time_s += longest * self.site_s + (0 if leads else motion.drop_off_s)
         return n_tweezers
 
+    def play_paths(self, batch: Batch) -> int:
+        """Play one batch with paths of tones, instant by instant; returns the number of tweezers."""
+        paths, motion = batch.tones, self.motion
+        assert paths is not None
+        n_knots, n_rows, n_cols = paths.shape
+        require(n_rows <= motion.max_row_tones and n_cols <= motion.max_column_tones)
+        require(n_rows * n_cols <= min(self.dop, motion.max_tweezers))
+        goals = dict(
+            zip(map(tuple, batch.from_sites.tolist()), map(tuple, batch.to_sites.tolist()), strict=True)
+        )
+        require(0 < len(batch) == len(goals) == len(set(goals.values())) and set(goals) <= self.atoms)
+        standing = self.atoms - set(goals)
+        require(not standing & set(goals.values()))
+        carried: dict[tuple[int, int], Site] = {}  # crossing -> the atom's goal
+        for i, j in product(range(n_rows), range(n_cols)):
+            if (at := (paths.row[0, i], paths.column[0, j])) in goals:
+                carried[i, j] = goals[at]
+        require(len(carried) == len(goals))
+        end = {
+            (i, j): min(paths.row_off[i], paths.column_off[j]) for i in range(n_rows) for j in range(n_cols)
+        }
+        self.time_s += motion.overhead_per_batch_s + motion.pick_up_s
+        for leg in range(n_knots - 1):
+            tones = [(off > leg).nonzero()[0] for off in (paths.row_off, paths.column_off)]
+            legs = [
+                path[leg : leg + 2, on] for path, on in zip((paths.row, paths.column), tones, strict=True)
+            ]
+            spared = {
+                (i, j): site
+                for i, j in end
+                if motion.empty_tweezers_may_land and end[i, j] == leg + 1 and (i, j) not in carried
+                if self.on_grid(site := (paths.row[leg + 1, i], paths.column[leg + 1, j]))
+            }
+            self.fly(legs, tones, standing, spared)
+            dropped = [crossing for crossing, knot in end.items() if knot == leg + 1]
+            for i, j in dropped:
+                if (i, j) in carried:
+                    goal = carried.pop((i, j))
+                    require(goal == (paths.row[leg + 1, i], paths.column[leg + 1, j]))
+                    standing |= {goal} & {(r, c) for r in range(self.n_rows) for c in range(self.n_cols)}
+            if any((off == leg + 1).any() for off in (paths.row_off, paths.column_off)):
+                self.time_s += motion.drop_off_s
+        self.atoms = standing
+        self.held = Counter()
+        return n_rows * n_cols
+
+    def place_m(self, row: Floats, col: Floats) -> Floats:
+        a1, a2 = self.grid.axes
+        return row[..., None] * a2 + col[..., None] * a1
+
+    def fly(
+        self, legs: list[Floats], tones: list[NDArray[np.intp]], standing: set[Site], spared: dict[Site, Site]
+    ) -> None:
+        """Fly all tweezers along one leg: legs[axis] is (2, n_tones)."""
+        slots, clearance_m = self.motion.eject_slots, self.motion.clearance_m
+        ways_m = self.place_m(*np.meshgrid(*(leg[1] - leg[0] for leg in legs), indexing="ij"))
+        self.time_s += float(np.hypot(*ways_m.T).max()) / self.motion.speed_m_s
+        a1, a2 = self.grid.axes / self.grid.spacing_m
+        least = clearance_m / self.grid.spacing_m / abs(a1[0] * a2[1] - a1[1] * a2[0])
+        for part in np.linspace(0, 1, INSTANTS_PER_LEG):
+            for axis, leg in enumerate(legs):
+                at = leg[0] + part * (leg[1] - leg[0])
+                require(bool(((at >= -slots) & (at <= (self.n_rows, self.n_cols)[axis] - 1 + slots)).all()))
+                require(bool((np.diff(at) > least - 1e-6).all()))
+        for (a, i), (b, j) in product(enumerate(tones[0]), enumerate(tones[1])):
+            sites = np.array(sorted(standing - {spared.get((int(i), int(j)), (-9, -9))})).reshape(-1, 2)
+            n = INSTANTS_PER_LEG
+            while True:  # the finer, the closer it was
+                part = np.linspace(0, 1, n)
+                row, col = (
+                    leg[0, k] + part * (leg[1, k] - leg[0, k]) for leg, k in zip(legs, (a, b), strict=True)
+                )
+                away_m = self.place_m(row[:, None] - sites[:, 0], col[:, None] - sites[:, 1])
+                margin = np.hypot(away_m[..., 0], away_m[..., 1]).min(initial=np.inf) / clearance_m - 1
+                if not 1e-8 < margin < 20 / n**2 or n > 20_000:
+                    break
+                n *= 8
+            require(bool(margin > -1e-8))
+
     @staticmethod
     def trajectories(moves: Moves, axis: int) -> dict[int, set[int]]:
         ends: dict[int, set[int]] = {}
@@ -101,10 +187,10 @@ class NaiveChecker:
 
 
 def naive(
-    plan: Plan, occupancy: Occupancy, dop: int, motion: MotionSpec
+    plan: Plan, occupancy: Occupancy, dop: int, motion: MotionSpec, grid: SiteGrid | None = None
 ) -> tuple[set[Site], list[float], list[int]] | None:
     """Atoms after the plan, end of each batch, tweezers in each; None if the plan is illegal."""
-    checker = NaiveChecker(occupancy, dop, motion)
+    checker = NaiveChecker(occupancy, dop, motion, grid)
     ends: list[float] = []
     n_tweezers: list[int] = []
     linked = plan.linked.tolist()
@@ -113,7 +199,10 @@ def naive(
             table = np.hstack([batch.from_sites, batch.to_sites]).tolist()
             moves = [((a, b), (c, d)) for a, b, c, d in table]
             leads = i + 1 < plan.n_batches and linked[i + 1]
-            n_tweezers.append(checker.play(moves, linked[i], leads, i == 0))
+            if batch.tones is not None:
+                n_tweezers.append(checker.play_paths(batch))
+            else:
+                n_tweezers.append(checker.play(moves, linked[i], leads, i == 0))
             ends.append(checker.time_s)
     except Illegal:
         return None
