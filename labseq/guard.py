@@ -1,7 +1,11 @@
-"""Runs every call into a plugin in a thread of its own, with a time limit.
+"""Runs every call into a plugin with a time limit, in a thread that can be abandoned.
 
 A plugin that hangs costs one thread, one that fails is named in the error, and one that calls ``sys.exit``
 ends nothing. While a call is out, the main thread looks for Ctrl-C and for stop requests.
+
+A device has a thread of its own. The steps of a shot share one, and the planner, the detector and
+devices that allow it are called in that one too: waking another thread takes 0.1 ms of the time between a
+frame and the moves.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
@@ -33,8 +38,8 @@ POLL_S: Final = 0.05
 """How often a waiting thread looks for a stop request; on Windows, Ctrl-C does not wake a waiting thread."""
 GRACE_S: Final = 1.0
 """How long a call may take to return after a stop request."""
-STEP_GRACE_S: Final = 2.0
-"""The same for a step, whose own call into a device has its grace first."""
+SHOT_GRACE_S: Final = 2.0
+"""The same for the steps of a shot, whose own call into a device has its grace first."""
 DRIVER_MARGIN_S: Final = 2.0
 """A call counts as hung this long after the timeout that the driver itself was given."""
 
@@ -147,8 +152,25 @@ def readable(error: LabseqError) -> LabseqError:
     return made
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Limit:
+    """The time limit of what a thread does within a call, enforced by the thread that waits for the call.
+
+    Attributes:
+        owner: Device or plugin that is called, or "step".
+        what: What has to end in time, for the message.
+        timeout_s: The limit.
+        deadline_s: When it is reached, on the monotonic clock.
+    """
+
+    owner: str
+    what: str
+    timeout_s: float
+    deadline_s: float
+
+
 class GuardedCall:
-    """A call that a worker thread carries out.
+    """A call that a thread carries out.
 
     Attributes:
         done: Set when it has returned.
@@ -156,18 +178,25 @@ class GuardedCall:
         error: What it raised, or None.
         own_error: The same if it is one of labseq's own errors, else None.
         text: Kind and text of the error, or "".
+        has_steps: Whether it is the steps of a shot.
+        is_abandoned: Whether nobody waits for it any longer; it must call nothing any more.
     """
 
-    def __init__(self, work: partial[Any]) -> None:
+    def __init__(self, work: partial[Any], *, has_steps: bool = False) -> None:
         self._work = work
+        self._limits: list[Limit] = []
+        self._lock = threading.Lock()
         self.done = threading.Event()
         self.result: Any = None
         self.error: BaseException | None = None
         self.own_error: LabseqError | None = None
         self.text = ""
+        self.has_steps = has_steps
+        self.is_abandoned = False
 
     def run(self) -> None:
-        """Carry it out; called by the worker thread."""
+        """Carry it out, in this thread."""
+        outer, _here.call = current_call(), self
         try:
             self.result = self._work()
         except BaseException as error:  # noqa: BLE001 - handed to the thread that waits
@@ -175,7 +204,33 @@ class GuardedCall:
             self.text = format_error(error)  # in this thread, because it may take long
             if issubclass(type(error), LabseqError):  # isinstance() asks the object itself
                 self.error = self.own_error = readable(cast("LabseqError", error))
+        _here.call = outer
         self.done.set()
+
+    def enter(self, limit: Limit) -> None:
+        """Begin something that has a limit, within this call."""
+        self._limits.append(limit)
+
+    def leave(self) -> None:
+        """It has ended."""
+        with self._lock:
+            self._limits.pop()
+
+    def abandon_if_late(self) -> Limit | None:
+        """Abandon the call if a limit is reached, the innermost first; returns that limit."""
+        now_s = time.monotonic()
+        with self._lock:
+            late = next((one for one in reversed(self._limits) if now_s >= one.deadline_s), None)
+            self.is_abandoned = late is not None
+        return late
+
+
+_here = threading.local()
+
+
+def current_call() -> GuardedCall | None:
+    """The call that this thread carries out."""
+    return getattr(_here, "call", None)
 
 
 class _Worker:
@@ -203,30 +258,34 @@ class _Worker:
 
 
 class Guard:
-    """Runs the calls into each device or plugin in one thread: vendor libraries want all calls from the same.
+    """Runs the calls into devices and plugins.
 
-    A call that does not return in time is abandoned. Its thread cannot be ended and lives on until the
+    Those into a device are made in one thread: vendor libraries want all calls from the same. A
+    call that does not return in time is abandoned. Its thread cannot be ended and lives on until the
     process ends; further calls of the same owner get a new thread.
 
     Args:
         stop: The request to stop; without one, calls are never stopped.
+
+    Attributes:
+        direct: Owners whose calls a shot makes in the thread of its steps. If one of these hangs, the shot is
+            abandoned.
     """
 
     def __init__(self, stop: StopFlag | None = None) -> None:
         self._stop = stop or StopFlag()
         self._workers: dict[str, _Worker] = {}
-        self._step_hangs = False
+        self.direct: frozenset[str] = frozenset()
 
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """Call a function of a device or plugin; see ``labseq.plugin.Shot.call``.
 
-        After a stop request, or after a step that hangs, nothing is called any more, not even while the
-        request is held: an abandoned step that wakes up must not switch anything on after the safe state.
+        After a stop request, or in a shot that was abandoned, nothing is called any more, not even while the
+        request is held: a step that wakes up late must not switch anything on after the safe state.
         """
-        if self._stop.is_set or self._step_hangs:
-            raise StopRequested(self._stop.signal_number)
+        self.check()
         return self._named(owner, timeout_s, GRACE_S, partial(function, *args, **kwargs))
 
     def call_despite_stop(
@@ -235,33 +294,71 @@ class Guard:
         """The same, even if the run is asked to stop; for opening, safe states and closing."""
         return self._named(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
 
-    def run_step(self, run: partial[None], timeout_s: float = math.inf) -> None:
-        """Run a step; one that hangs is abandoned after ``timeout_s``, or soon after a stop request."""
+    def check(self) -> None:
+        """Raise ``StopRequested`` if the run was asked to stop, or if the calling shot was abandoned."""
+        if self._stop.is_set or self.is_abandoned:
+            raise StopRequested(self._stop.signal_number)
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether the calling thread belongs to a shot that was abandoned."""
+        call = current_call()
+        return call is not None and call.is_abandoned
+
+    def run_shot(self, work: partial[None]) -> None:
+        """Run the steps of a shot; it is abandoned if one of them hangs, or soon after a stop request.
+
+        Raises:
+            LabseqError: As the shot raised it.
+            DeviceHungError: A step, or a device that it called directly, did not return in time.
+            PlanError: The planner did not return in time.
+        """
         self._stop.check()
+        self._named("step", math.inf, SHOT_GRACE_S, work, has_steps=True)
+
+    @contextmanager
+    def step(self, what: str, timeout_s: float) -> Generator[None]:
+        """A step, within :meth:`run_shot`; ``what`` names it.
+
+        Raises:
+            StopRequested: The shot was abandoned meanwhile.
+        """
+        call = current_call()
+        assert call is not None
+        call.enter(Limit("step", what, timeout_s, time.monotonic() + timeout_s))
         try:
-            self._named("step", timeout_s, STEP_GRACE_S, run)
-        except DeviceHungError:
-            self._step_hangs = True
-            raise
+            yield
+        finally:
+            call.leave()
+            if call.is_abandoned:
+                raise StopRequested(self._stop.signal_number)
 
     def run(
-        self, owner: str, timeout_s: float, work: partial[Any], grace_s: float = math.inf
+        self,
+        owner: str,
+        timeout_s: float,
+        work: partial[Any],
+        grace_s: float = math.inf,
+        *,
+        has_steps: bool = False,
     ) -> GuardedCall | None:
-        """Run a call and wait for its end.
+        """Run a call in the owner's thread and wait for its end.
 
         Args:
             owner: Whose thread it runs in.
             timeout_s: How long it may take.
             work: The call.
             grace_s: How long it may take to return after a stop request.
+            has_steps: Whether it is the steps of a shot.
 
         Returns:
             The call with its result or error; None if it has not returned in time and is abandoned.
 
         Raises:
             StopRequested: The run was asked to stop, and the call did not return in its grace time.
+            LabseqError: A limit within the call was reached.
         """
-        call = GuardedCall(work)
+        call = GuardedCall(work, has_steps=has_steps)
         try:
             worker = self._worker(owner)
         except (
@@ -271,14 +368,22 @@ class Guard:
             call.run()
             return call
         worker.submit(call)
-        deadline = time.monotonic() + timeout_s
-        while not call.done.wait(min(POLL_S, max(0.0, deadline - time.monotonic()))):
-            if grace_s < math.inf and self._stop.is_set:
-                call.done.wait(grace_s)
-                if not call.done.is_set():
-                    self._stop.check()
-            if time.monotonic() >= deadline and not call.done.is_set():
-                return None
+        deadline_s = time.monotonic() + timeout_s
+        try:
+            while not call.done.wait(min(POLL_S, max(0.0, deadline_s - time.monotonic()))):
+                if grace_s < math.inf and self._stop.is_set:
+                    call.done.wait(grace_s)
+                    if not call.done.is_set():
+                        self._stop.check()
+                late = call.abandon_if_late()
+                if late is not None:
+                    raise _hung(late)
+                if time.monotonic() >= deadline_s and not call.done.is_set():
+                    call.is_abandoned = True
+                    return None
+        except BaseException:
+            call.is_abandoned = True
+            raise
         return call
 
     def end(self) -> None:
@@ -296,19 +401,41 @@ class Guard:
             worker = self._workers[owner] = _Worker(owner)
         return worker
 
-    def _named(self, owner: str, timeout_s: float, grace_s: float, work: partial[T]) -> T:
+    def _named(
+        self, owner: str, timeout_s: float, grace_s: float, work: partial[T], *, has_steps: bool = False
+    ) -> T:
         """Run a call; name owner and function in whatever is not one of labseq's own errors."""
-        call = self.run(owner, timeout_s, work, grace_s)
-        if call is not None and call.error is None:
-            return call.result
         name = getattr(work.func, "__name__", "")
         name = f"{name}() " if name.isidentifier() else ""  # a lambda has none
+        limit = Limit(owner, name, timeout_s, time.monotonic() + timeout_s)
+        shot = current_call()
+        if owner in self.direct and grace_s < math.inf and shot is not None and shot.has_steps:
+            call = self._directly(shot, limit, work)
+        else:
+            call = self.run(owner, timeout_s, work, grace_s, has_steps=has_steps)
         if call is None:
-            text = f"{name}did not answer within {timeout_s:.3g} s and is abandoned"
-            if owner == "planner":
-                raise PlanError(f"{text}; if it is only slow, raise 'timeouts: {{plan: ...}}' in the profile")
-            raise DeviceHungError(owner, text, timeout_s)
-        if call.own_error is not None:
-            raise call.own_error
+            raise _hung(limit)
+        if call.error is None:
+            return call.result
+        if call.own_error is not None or has_steps:
+            raise call.own_error or call.error
         text = f"{name}raised {call.text}"
         raise (PlanError(text) if owner == "planner" else DeviceError(owner, text)) from call.error
+
+    def _directly(self, shot: GuardedCall, limit: Limit, work: partial[Any]) -> GuardedCall:
+        """Run a call in the thread of the steps."""
+        call = GuardedCall(work)
+        shot.enter(limit)
+        call.run()
+        shot.leave()
+        if shot.is_abandoned:
+            raise StopRequested(self._stop.signal_number)
+        return call
+
+
+def _hung(limit: Limit) -> LabseqError:
+    """The error for what did not end in time."""
+    text = f"{limit.what}did not answer within {limit.timeout_s:.3g} s and is abandoned"
+    if limit.owner == "planner":
+        return PlanError(f"{text}; if it is only slow, raise 'timeouts: {{plan: ...}}' in the profile")
+    return DeviceHungError(limit.owner, text, limit.timeout_s)

@@ -1,9 +1,17 @@
 import threading
+from contextlib import suppress
 from functools import partial
 
 import pytest
 
-from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, PlanError, StopRequested
+from labseq.errors import (
+    DeviceError,
+    DeviceHungError,
+    DeviceTimeoutError,
+    LimitError,
+    PlanError,
+    StopRequested,
+)
 from labseq.guard import Guard, StopFlag
 
 
@@ -97,7 +105,7 @@ def test_no_call_is_made_while_a_stop_request_is_held(guard, stop):
 
 
 def test_a_step_that_hangs_is_left_at_a_stop_request(guard, stop, monkeypatch):
-    monkeypatch.setattr("labseq.guard.STEP_GRACE_S", 0.01)
+    monkeypatch.setattr("labseq.guard.SHOT_GRACE_S", 0.01)
     release = threading.Event()
 
     def hang():
@@ -105,7 +113,7 @@ def test_a_step_that_hangs_is_left_at_a_stop_request(guard, stop, monkeypatch):
         release.wait()
 
     with pytest.raises(StopRequested, match="SIGTERM"):
-        guard.run_step(partial(hang))
+        guard.run_shot(partial(hang))
     release.set()
 
 
@@ -133,3 +141,59 @@ def test_a_call_that_comes_back_in_time_after_a_stop_request_keeps_its_result(gu
         return 7
 
     assert guard.call("camera", 10.0, answer) == 7
+
+
+def test_a_shot_calls_planner_and_detector_in_its_own_thread(guard):
+    guard.direct = frozenset({"planner"})
+    threads = {}
+
+    def shot():
+        for owner in ("step", "planner", "camera"):
+            name = threading.current_thread().name
+            threads[owner] = name if owner == "step" else guard.call(owner, 10.0, named)
+
+    def named():
+        return threading.current_thread().name
+
+    guard.run_shot(partial(shot))
+    assert threads == {"step": "labseq step", "planner": "labseq step", "camera": "labseq camera"}
+    assert guard.call("planner", 10.0, named) == "labseq planner"  # not within a shot
+
+
+@pytest.mark.parametrize(
+    ("owner", "error"),
+    [("planner", PlanError), ("mobile_tweezers", DeviceHungError), ("step", DeviceHungError)],
+)
+def test_a_shot_is_abandoned_if_what_it_calls_directly_hangs_and_calls_nothing_after(guard, owner, error):
+    guard.direct = frozenset({"planner", "mobile_tweezers"})
+    release, ended, called = threading.Event(), threading.Event(), threading.Event()
+
+    def shot():
+        try:
+            if owner == "step":
+                with guard.step("step 0 (load) ", 0.02):
+                    release.wait()
+            else:
+                guard.call(owner, 0.02, release.wait)
+        finally:
+            with suppress(StopRequested):
+                guard.call("camera", 10.0, called.set)
+            ended.set()
+
+    with pytest.raises(error, match=r"^.*did not answer within 0\.02 s and is abandoned"):
+        guard.run_shot(partial(shot))
+    guard.run_shot(partial(lambda: None))  # the next shot has a thread of its own
+    guard.call_despite_stop("mobile_tweezers", 10.0, lambda: None)  # as the safe state
+    release.set()
+    assert ended.wait(10.0)
+    assert not called.is_set()
+
+
+def test_an_error_of_a_direct_call_is_named(guard):
+    guard.direct = frozenset({"detector"})
+
+    def detect():
+        raise ZeroDivisionError("0")
+
+    with pytest.raises(DeviceError, match=r"detector: detect\(\) raised ZeroDivisionError"):
+        guard.run_shot(partial(guard.call, "detector", 10.0, detect))

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,15 @@ class Emergency:
 
 
 class Hardware(ABC):
-    """Base class of all hardware roles."""
+    """Base class of all hardware roles.
+
+    Attributes:
+        any_thread: Whether the vendor's library allows calls from different threads. By default each device
+            has a thread of its own for all calls; waking it takes 0.1 ms. ``safe_state`` of a device
+            that says True may be called while another call hangs.
+    """
+
+    any_thread: ClassVar[bool] = False
 
     @abstractmethod
     def open(self) -> None:

@@ -146,6 +146,12 @@ class Lab:
             yield "lines", self.lines
         yield "mobile_tweezers", self.mobile_tweezers
 
+    @property
+    def direct_calls(self) -> frozenset[str]:
+        """Devices and plugins that a shot calls in the thread of its steps."""
+        any_thread = (name for name, part in self.hardware() if getattr(part, "any_thread", False) is True)
+        return frozenset({"detector", "planner", *any_thread})
+
     def safe_order(self) -> Iterator[tuple[str, Hardware]]:
         """Name and device, in the order of the safe state."""
         return in_safe_order(dict(self.hardware()))

@@ -25,7 +25,7 @@ from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of, open_device
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
-from labseq.sequencer.shot import RunningShot, Stages
+from labseq.sequencer.shot import Events, RunningShot, Stages
 from labseq.watchdog import Watchdog
 
 
@@ -165,11 +165,6 @@ def plan_timeline(
     return guard.call("step", lab.timeouts.call_s, entries)
 
 
-def _run_step(step: Step, number: int, name: str, shot: RunningShot) -> None:
-    with _named(number, name, step):
-        step.run(shot)
-
-
 @contextmanager
 def _named(number: int, name: str, step: Step) -> Generator[None]:
     """Add the name of the step, and the line of its code, to errors that are not labseq's own."""
@@ -232,10 +227,11 @@ class Sequencer:
         self.lab = lab
         self._watchdog = watchdog or Watchdog()
         self.guard = Guard(stop)
+        self.guard.direct = lab.direct_calls
+        self._events = Events(observer, self.guard)
         self._steps = steps
         self._stop = stop
         self._sink = sink
-        self._observer = observer
         self._seed = seed
         self._policy = policy
         self._parameters = dict(parameters or {})
@@ -278,6 +274,7 @@ class Sequencer:
             close_devices(self.lab, self.guard, reopened)
             self._watchdog.forget(reopened)
         self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
+        self.guard.direct = lab.direct_calls
         if reopened:
             self._open(lab, reopened)
             self._states.to(State.IDLE)
@@ -364,12 +361,12 @@ class Sequencer:
             self._emit("warning", {"text": text})
         record = ShotRecord(index, attempt, self._seed, now_utc(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
-        shot = RunningShot(self.lab, self.guard, record, self._emit, self._timelines)
+        shot = RunningShot(self.lab, self.guard, record, self._events, self._timelines)
         failure: LabseqError | None = None
         then: Then | None = None
         try:
             try:
-                self._perform(shot)
+                self.guard.run_shot(partial(self._perform, shot))
             except LabseqError as error:
                 then = self._policy.after(error, shot.step if shot.in_step else None, attempt)
                 if then == "stop":
@@ -403,6 +400,7 @@ class Sequencer:
         stages.done("write", 0.0 if self.lab.clock.virtual else host_s, host_s, math.nan, 0)
 
     def _perform(self, shot: RunningShot) -> None:
+        """Take a shot, in the thread of its steps."""
         record = shot.record
         for stream in self.lab.random_streams:
             stream.begin_shot(record.shot_index, record.attempt)
@@ -416,7 +414,8 @@ class Sequencer:
         images = unique_names([name for name, _ in self._steps])
         for number, (name, step) in enumerate(self._steps):
             self._stop.check()
-            with shot.of_step(number, name, self._policy.of_step(number), images[number]):
+            policy = self._policy.of_step(number)
+            with shot.of_step(number, name, policy, images[number], needs_image=step.needs_image):
                 self._run_step(shot, number, name, step)
         shot.series.end()
         shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
@@ -430,7 +429,8 @@ class Sequencer:
             shot.stages.begin_attempt()
             try:
                 longest_s = policy.timeout_s + self.lab.timeouts.call_s
-                self.guard.run_step(partial(_run_step, step, number, name, shot), longest_s)
+                with self.guard.step(f"step {number} ({name}) ", longest_s), _named(number, name, step):
+                    step.run(shot)
                 shot.stages.check_timeout()
             except LabseqError as error:
                 if not (left and may_be_retried(error)):
@@ -478,4 +478,5 @@ class Sequencer:
         self._emit("state", {"state": state.value})
 
     def _emit(self, name: str, values: Mapping[str, Any]) -> None:
-        self._observer.event(name, values)
+        self._events.release()
+        self._events(name, values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 import time
@@ -32,13 +33,55 @@ from labseq.model import (
     TimelineEntry,
 )
 from labseq.model.records import OVERSHOOT_S, STEP
-from labseq.roles import Device, ReportsSignals, StepContext, offers
+from labseq.roles import Device, ReportsSignals, RunObserver, StepContext, offers
 from labseq.sequencer.images import CameraSeries, take_frame
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
 from labseq.sequencer.policies import StepPolicy
 from labseq.units import format_quantity
+
+
+class Events:
+    """Reports the events of shots.
+
+    From a frame to the start of the moves that follow from it they are kept, and Python collects no garbage:
+    a slow disk or screen, or a search for garbage, would take longer than all the rest.
+
+    Args:
+        observer: Receives every event.
+        guard: Knows which shot was abandoned; its events are dropped.
+    """
+
+    def __init__(self, observer: RunObserver, guard: Guard) -> None:
+        self._observer = observer
+        self._guard = guard
+        self._kept: list[tuple[str, Mapping[str, Any]]] = []
+        self._is_held = False
+        self._collects = gc.isenabled()
+
+    def __call__(self, name: str, values: Mapping[str, Any]) -> None:
+        """Report an event, or keep it."""
+        if self._is_held and not self._guard.is_abandoned:
+            self._kept.append((name, values))
+        elif not self._guard.is_abandoned:
+            self._observer.event(name, values)
+
+    def hold(self) -> None:
+        """Keep the events from now on."""
+        if not self._is_held and not self._guard.is_abandoned:
+            self._is_held, self._collects = True, gc.isenabled()
+            gc.disable()
+
+    def release(self) -> None:
+        """Report the events that were kept, and those that follow at once."""
+        if not self._is_held or self._guard.is_abandoned:
+            return
+        if self._collects:
+            gc.enable()
+        kept, self._kept, self._is_held = self._kept, [], False
+        for name, values in kept:
+            self._observer.event(name, values)
 
 
 class Stages:
@@ -55,7 +98,7 @@ class Stages:
         policy: Its policy.
     """
 
-    def __init__(self, lab: Lab, record: ShotRecord, emit: Callable[[str, Mapping[str, Any]], None]) -> None:
+    def __init__(self, lab: Lab, record: ShotRecord, emit: Emit) -> None:
         self.start_s = lab.clock.now()
         self.step = 0
         self.policy = StepPolicy()
@@ -151,7 +194,7 @@ class RunningShot:
         lab: The devices.
         guard: Runs every call into them.
         record: Filled while the shot runs, so that nothing is lost if it fails.
-        emit: Receives every event: name and values.
+        events: Receives every event.
         timelines: The timeline of each step.
     """
 
@@ -160,7 +203,7 @@ class RunningShot:
         lab: Lab,
         guard: Guard,
         record: ShotRecord,
-        emit: Emit,
+        events: Events,
         timelines: Sequence[Sequence[TimelineEntry]] = (),
     ) -> None:
         self.lab = lab
@@ -185,13 +228,13 @@ class RunningShot:
         self.in_step = False
         self._image_name = "image"
         self._kept: tuple[float, float] | None = None
-        self.stages = Stages(lab, record, emit)
+        self.stages = Stages(lab, record, events)
         self.start_s = self.stages.start_s
-        self.leaders = LeaderAnswers(lab, guard, record, emit)
+        self.leaders = LeaderAnswers(lab, guard, record, events)
         self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
         self._fired_s = self._started_s = 0.0
         self._guard = guard
-        self._emit = emit
+        self._events = events
 
     @property
     def step(self) -> int:
@@ -210,6 +253,8 @@ class RunningShot:
         name: str,
         policy: StepPolicy,
         images: str = "",
+        *,
+        needs_image: bool = False,
     ) -> Generator[None]:
         """Context manager around a step: the stages, images and failures within belong to it.
 
@@ -220,10 +265,13 @@ class RunningShot:
             name: Its name.
             policy: Its policy.
             images: Beginning of the names of its images; by default its name.
+            needs_image: Whether it follows from the image before it.
 
         Raises:
             OverBudgetError: It took longer than its budget, and its policy does not allow that.
         """
+        if not needs_image:
+            self._events.release()
         self.in_step, self._image_name, self._kept = True, images or name, None
         self.stages.begin_step(number, name, policy)
         self.series.begin_step(number)
@@ -323,6 +371,7 @@ class RunningShot:
         if start is not None and (lines is None or is_triggered):
             start()
         if lines is None:
+            self._events.release()
             yield
             return
         program = line_program(specs, kind, duration_s)
@@ -335,6 +384,7 @@ class RunningShot:
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
         if start is not None and not is_triggered:
             start()
+        self._events.release()
         yield
         if is_triggered:
             self._check_end(program.begin_s + duration_s)
@@ -385,11 +435,13 @@ class RunningShot:
             DeviceError: Camera or detector returned an object of the wrong type, or a light is on that
                 would damage the camera.
         """
+        self._events.release()
         check_blinding(self.lab, self._guard)
         if self.series.is_ready(exposure_s):
             self._await_exposure()
         timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         frame = self._expose(exposure_s, cycle)
+        self._events.hold()
         if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
         with self.stage("detect", cycle=cycle):
@@ -402,7 +454,7 @@ class RunningShot:
         if cycle >= 0 and self.record.seen_defect_free_cycle < 0 and self.target.is_met_by(occupancy):
             self.record.seen_defect_free_cycle = cycle
         filling = math.nan if self.target.is_none else self.target.filling_fraction(occupancy)
-        self._emit("image", {"image": image, "filling_fraction": filling})
+        self._events("image", {"image": image, "filling_fraction": filling})
         return occupancy
 
     def _name_of_image(self, cycle: int) -> str:
@@ -474,7 +526,7 @@ class RunningShot:
                 self.log("too_few_atoms", n_missing_atoms=n_missing)
         self.record.success, self.record.filling_fraction = False, float("nan")  # judged before the moves
         self.record.cycles.append(cycle)
-        self._emit("cycle", {"cycle": cycle})
+        self._events("cycle", {"cycle": cycle})
 
     def note(self, name: str, value: float | Sequence[Any]) -> None:
         """Record a value among the shot's readings."""
@@ -482,7 +534,7 @@ class RunningShot:
 
     def log(self, event: str, **values: Any) -> None:
         """Add a line to the run's event log."""
-        self._emit(event, {"shot": self.index, **values})
+        self._events(event, {"shot": self.index, **values})
 
     def record_truth(self) -> None:
         """Record the simulation's true occupancy, losses and events of the atoms."""

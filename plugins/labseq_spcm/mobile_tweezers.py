@@ -116,6 +116,8 @@ class SpcmMobileTweezers(MobileTweezers):
         ConfigError: The mode is ``dds``, and the profile allows more tones than it has.
     """
 
+    any_thread = True
+
     def __init__(self, settings: SpcmSettings, context: Context) -> None:
         self._name = context.name or "mobile_tweezers"
         if trigger_line(context.lines, "mobile_tweezers") is not None:

@@ -84,6 +84,8 @@ class VirtualCamera(CameraDriver):
         LimitError: Its sensor has no EM register.
     """
 
+    any_thread = True
+
     def __init__(self, settings: CameraSettings, context: Context) -> None:
         super().__init__(context, settings.orientation)
         self._settings = settings

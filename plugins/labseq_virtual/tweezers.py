@@ -43,6 +43,8 @@ class VirtualDriver(Hardware):
         ConfigError: There is no simulation.
     """
 
+    any_thread = True
+
     def __init__(self, context: Context, role: str) -> None:
         self._name = context.name or role
         self._clock = context.clock

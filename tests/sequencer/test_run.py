@@ -1,5 +1,6 @@
 """Whole runs on fakes: order of calls, what is recorded, retries, changes between shots."""
 
+import gc
 import re
 import threading
 from types import SimpleNamespace
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from labseq.builtin.rearrange import RearrangeStep
 from labseq.builtin.steps import DeviceStep, WaitStep
 from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
 from labseq.messages import MAX_ERROR
@@ -506,3 +508,23 @@ def test_a_shutdown_that_was_interrupted_can_be_repeated():
     assert not rig.sequencer.shut_down()
     assert rig.made_safe() == SAFE_ORDER
     assert rig.sequencer.state is State.CLOSED
+
+
+def test_nothing_is_reported_between_a_frame_and_the_start_of_the_moves(monkeypatch):
+    settings = given(cycles=1, exposure=0.02, stop_when="never", window_mode="early", window_of=lambda _: 1.0)
+    steps = LOAD, IMAGE, ("rearrange", RearrangeStep(settings))
+    rig, seen = Rig(steps, occupancies=[[[1, 0]], [[0, 1]]], fill=[[0, 1]]), []
+    event = rig.observer.event
+
+    def keep(name, values):
+        seen.append((name, len(rig.lab.calls)))
+        event(name, values)
+
+    monkeypatch.setattr(rig.observer, "event", keep)
+    rig.run()
+    names = rig.lab.calls.names()
+    frame, play = (1 + names.index(name) for name in ("camera.read", "mobile_tweezers.play"))
+    assert {name for name, n_calls in seen if frame <= n_calls < play} <= {"stage"}  # the exposure's
+    later = [name for name, n_calls in seen if n_calls >= play]
+    assert later.index("image") < later.index("cycle")
+    assert gc.isenabled()

@@ -13,7 +13,7 @@ from labseq.errors import StopRequested
 from labseq.guard import Guard
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.roles import Step, StepContext
-from labseq.sequencer.shot import RunningShot
+from labseq.sequencer.shot import Events, RunningShot
 from labseq.testing.contracts.promises import (
     ContractViolation,
     calls_of_sleep,
@@ -23,7 +23,7 @@ from labseq.testing.contracts.promises import (
     quietly,
     refusal,
 )
-from labseq.testing.fakes import FakeLab, fake_lab
+from labseq.testing.fakes import FakeLab, RecordingObserver, fake_lab
 
 Factory: TypeAlias = Callable[[], Step]
 
@@ -145,7 +145,7 @@ class StepContract:
             device.open()
         lab.static_tweezers.start()
         guard = Guard(lab.stop)
-        shot = RunningShot(lab, guard, ShotRecord(0, 0, 0, ""), lambda _name, _values: None)
+        shot = RunningShot(lab, guard, ShotRecord(0, 0, 0, ""), Events(RecordingObserver(), guard))
         shot.take_image(0.045)
         try:
             yield shot, lab
