@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from labseq.errors import InvalidPlanError, LimitError
 from labseq.model import MotionSpec, Plan, PlanReport, SiteGrid, TargetPattern, as_occupancy
 from labseq.motion.axes import AXES
-from labseq.motion.tones import default_grid, site_time_s
+from labseq.motion.tones import default_grid, path_geometry, site_time_s
 from labseq.units import format_quantity
 
 RULES: Final[Mapping[str, str]] = MappingProxyType(
@@ -192,17 +190,6 @@ def check_plan(
     for array in (atoms, end_s, n_tweezers):
         array.flags.writeable = False
     return PlanReport(atoms, end_s, n_tweezers, n_defects, n_surplus)
-
-
-@lru_cache(maxsize=16)
-def path_geometry(grid: SiteGrid, motion: MotionSpec) -> NDArray[np.float64]:
-    """What the kernels need to know of a grid and the clearance, see :func:`check_kernels.check`."""
-    a1, a2 = grid.axes / grid.spacing_m
-    clearance, cosine = motion.clearance_m / grid.spacing_m, float(a1 @ a2)
-    across = clearance / math.sqrt(1.0 - cosine**2)  # lines are nearer to one another than their sites
-    geometry = np.array([clearance, cosine, across, motion.empty_tweezers_may_land], np.float64)
-    geometry.flags.writeable = False
-    return geometry
 
 
 def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, planner: str) -> None:

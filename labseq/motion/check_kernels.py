@@ -19,13 +19,16 @@ from labseq.kernel import const, helper_kernel, kernel
 from labseq.motion.path_kernels import (
     KNOTS,
     PATH_SHAPE,
+    PATHS,
     POSITIONS,
     Floats,
+    Paths,
     Shape,
     check_axis,
     check_ends,
     check_motion,
     leg_way,
+    paths_of,
 )
 
 Bools = NDArray[np.bool_]
@@ -252,26 +255,6 @@ def count_wrong(atoms: Bools, fill: Bools, clear: Bools) -> tuple[int, int]:
             n_defects += fill[row, col] and not atoms[row, col]
             n_surplus += clear[row, col] and atoms[row, col]
     return n_defects, n_surplus
-
-
-PATHS: Final = f"Tuple(({const('int32', 2)}, {POSITIONS}, {KNOTS}))"
-Paths = tuple[NDArray[np.int32], Floats, NDArray[np.int32]]
-
-
-@helper_kernel(f"Tuple(({POSITIONS}, {KNOTS}, UniTuple(int64, 3)))({PATHS}, int64, int64, int64)")
-def paths_of(paths: Paths, number: int, start: int, off_start: int) -> tuple[Floats, Stamps, Shape]:
-    """The positions of a batch from ``start`` on, its knots from ``off_start`` on, and its shape.
-
-    For a line batch they are empty, and the shape is (0, 0, 0).
-    """
-    shapes, positions, off = paths
-    n_knots = n_rows = n_cols = 0
-    if number < len(shapes):
-        n_knots, n_rows, n_cols = shapes[number, 0], shapes[number, 1], shapes[number, 2]
-    n_tones = n_rows + n_cols
-    return positions[start : start + n_knots * n_tones], off[off_start : off_start + n_tones], (
-        n_knots, n_rows, n_cols,
-    )  # fmt: skip
 
 
 @helper_kernel(f"{FAULT}(UniTuple(int64, 3), int64, int64, int64)")

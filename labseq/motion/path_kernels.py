@@ -48,6 +48,27 @@ MOVES: Final = const("int16", 2)
 STAMPS: Final = "int32[:, ::1]"
 
 
+PATHS: Final = f"Tuple(({const('int32', 2)}, {POSITIONS}, {KNOTS}))"
+Paths = tuple[Ints, Floats, Ints]
+"""``path_shapes``, ``path_positions`` and ``path_off`` of :class:`labseq.model.Plan`."""
+
+
+@helper_kernel(f"Tuple(({POSITIONS}, {KNOTS}, UniTuple(int64, 3)))({PATHS}, int64, int64, int64)")
+def paths_of(paths: Paths, number: int, start: int, off_start: int) -> tuple[Floats, Ints, Shape]:
+    """The positions of a batch from ``start`` on, its knots from ``off_start`` on, and its shape.
+
+    For a line batch they are empty, and the shape is (0, 0, 0).
+    """
+    shapes, positions, off = paths
+    n_knots = n_rows = n_cols = 0
+    if number < len(shapes):
+        n_knots, n_rows, n_cols = shapes[number, 0], shapes[number, 1], shapes[number, 2]
+    n_tones = n_rows + n_cols
+    return positions[start : start + n_knots * n_tones], off[off_start : off_start + n_tones], (
+        n_knots, n_rows, n_cols,
+    )  # fmt: skip
+
+
 @helper_kernel(f"float64({POSITIONS}, {SHAPE}, int64, int64, int64)")
 def position(positions: Floats, shape: Shape, axis: int, knot: int, tone: int) -> float:
     """Position of a tone of an axis (0: rows, 1: columns) at a knot."""

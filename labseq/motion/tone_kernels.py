@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.kernel import const, helper_kernel, kernel
+from labseq.motion.path_kernels import KNOTS, PATHS, POSITIONS, Paths, Shape, leg_way, paths_of, position
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -221,14 +222,145 @@ def level(keyed_s: float, ramp_s: float, is_ramped: bool) -> float:
     return float(np.sqrt(keyed_s / ramp_s)) if is_ramped else 1.0
 
 
+Batch = tuple[Floats, NDArray[np.int32], Shape, int, int]
+"""A batch with paths: positions, knots and shape as in :mod:`labseq.motion.path_kernels`; axis; index."""
+BATCH: Final = f"Tuple(({POSITIONS}, {KNOTS}, UniTuple(int64, 3), int64, int64))"
+
+
+@helper_kernel(f"UniTuple(float64, 2)({SITES_OF_AXIS}, float64)")
+def tone_at(sites: Sites, place: float) -> tuple[float, float]:
+    """Frequency and amplitude of a tone at a place between sites: frequency and power change evenly."""
+    site_hz, step_hz, site_amplitude = sites
+    below = int(np.floor(place))
+    part = place - below
+    first_hz, first = frequency(site_hz, step_hz, below), amplitude(site_amplitude, below)
+    if part == 0.0:
+        return first_hz, first
+    last_hz, last = frequency(site_hz, step_hz, below + 1), amplitude(site_amplitude, below + 1)
+    power = first * first + part * (last * last - first * first)
+    return first_hz + part * (last_hz - first_hz), float(np.sqrt(power))
+
+
+@helper_kernel(
+    f"int64(float64[:, ::1], int64, {SITES_OF_AXIS}, {BATCH}, int64, int64, float64, float64, float64,"
+    " float64, float64[::1])"
+)
+def add_path_tones(
+    values: Floats,
+    n: int,
+    sites: Sites,
+    of: Batch,
+    knot: int,
+    to_knot: int,
+    start: float,
+    end: float,
+    rest: float,
+    duration_s: float,
+    phase: Floats,
+) -> int:
+    """Add the tones of a segment from one knot to another or at one; return how many there are then.
+
+    Args:
+        values: As in :func:`add_tones`.
+        n: How many there are.
+        sites: The sites of the axis.
+        of: The batch.
+        knot: Where the segment starts.
+        to_knot: Where it ends.
+        start: Amplitude at the start of tones that go off at ``to_knot``, relative to that of their place.
+        end: The same at the end.
+        rest: The same for tones that go off later.
+        duration_s: Duration of the segment.
+        phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
+    """
+    positions, off, shape, axis, _ = of
+    for k in range(shape[1 + axis]):
+        goes_off = off[axis * shape[1] + k]
+        if goes_off < to_knot:
+            continue
+        start_hz, start_amplitude = tone_at(sites, position(positions, shape, axis, knot, k))
+        end_hz, end_amplitude = tone_at(sites, position(positions, shape, axis, to_knot, k))
+        values[START_HZ, n] = start_hz
+        values[END_HZ, n] = end_hz
+        values[START_AMPLITUDE, n] = start_amplitude * (start if goes_off == to_knot else rest)
+        values[END_AMPLITUDE, n] = end_amplitude * (end if goes_off == to_knot else rest)
+        values[PHASE, n] = phase[k]
+        phase[k] = (phase[k] + 0.5 * (start_hz + end_hz) * duration_s) % 1.0
+        n += 1
+    return n
+
+
+@helper_kernel(
+    f"UniTuple(int64, 2)(int64, int64, {BATCH}, {SITES_OF_AXIS}, int64, float64, {SITES}, {SEGMENTS},"
+    " float64[:, ::1], float64[::1])"
+)
+def add_path_batch(
+    m: int,
+    n: int,
+    of: Batch,
+    sites: Sites,
+    course: int,
+    cosine: float,
+    times_s: Floats,
+    segments: Segments,
+    values: Floats,
+    phase: Floats,
+) -> tuple[int, int]:
+    """Add the segments of a batch with paths of tones; return the numbers of segments and of tones.
+
+    Row tones are ramped, at the first and at the last knot while the column tones are switched; at a knot
+    in between the tones that go off are ramped, on both axes.
+    """
+    positions, off, shape, axis, batch = of
+    pause_s, pick_up_s, site_s, drop_off_s, keyed_up_s, keyed_down_s = times_s
+    last, ramped = shape[0] - 1, axis == 0
+    if pause_s > 0.0:
+        m = add_segment(segments, m, IDLE, LINEAR, batch, pause_s, n)
+    if pick_up_s > 0.0:  # no tone goes off at knot 0, so that all are among the rest
+        part = level(keyed_up_s, pick_up_s, ramped)
+        for start, end, took_s in ((0.0, part, keyed_up_s), (part, 1.0, pick_up_s - keyed_up_s)):
+            first = n
+            n = add_path_tones(values, n, sites, of, 0, 0, 1.0, 1.0, 1.0, took_s, phase)
+            values[START_AMPLITUDE, first:n] *= start
+            values[END_AMPLITUDE, first:n] *= end
+            m = add_segment(segments, m, PICK_UP, LINEAR, batch, took_s, n)
+    for leg in range(last):
+        took_s, at = leg_way(positions, off, shape, cosine, leg) * site_s, leg + 1
+        if took_s > 0.0:
+            n = add_path_tones(values, n, sites, of, leg, at, 1.0, 1.0, 1.0, took_s, phase)
+            m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)
+        if drop_off_s == 0.0 or not (off == at).any():
+            continue
+        if at < last:
+            n = add_path_tones(values, n, sites, of, at, at, 1.0, 0.0, 1.0, drop_off_s, phase)
+            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, drop_off_s, n)
+            continue
+        part, ramp_s = level(keyed_down_s, drop_off_s, ramped), drop_off_s - keyed_down_s
+        n = add_path_tones(values, n, sites, of, at, at, 1.0, part, 1.0, ramp_s, phase)
+        m = add_segment(segments, m, DROP_OFF, LINEAR, batch, ramp_s, n)
+        n = add_path_tones(values, n, sites, of, at, at, part, 0.0, 1.0, keyed_down_s, phase)
+        m = add_segment(segments, m, DROP_OFF, LINEAR, batch, keyed_down_s, n)
+    return m, n
+
+
+@helper_kernel(f"void({BATCH}, int64, {TONES})")
+def start_sites(of: Batch, n_sites: int, tones: Ints) -> None:
+    """The sites nearest to where the tones of a batch with paths start, for their first phases."""
+    for k in range(of[2][1 + of[3]]):
+        place = np.rint(position(of[0], of[2], of[3], 0, k))
+        tones[0, k] = int(min(max(place, 0.0), n_sites - 1.0))
+
+
 @kernel(
-    f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, int64, int64, int64,"
-    f" {SITES_OF_AXIS}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS}, float64[:, ::1])"
+    f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, {PATHS}, float64, int64, int64,"
+    f" int64, {SITES_OF_AXIS}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS}, float64[:, ::1])"
 )
 def build_axis(
     moves: Moves,
     batch_offsets: Offsets,
     linked: NDArray[np.bool_],
+    paths: Paths,
+    cosine: float,
     n_batches: int,
     axis: int,
     n_other_sites: int,
@@ -249,12 +381,14 @@ def build_axis(
     transport is one segment. The axis that moves is ramped at pick-up and drop-off; the
     other one is switched on in the first microseconds of the pick-up, and off in the last of
     the drop-off, which are segments of their own. A batch in which no atom moves counts as
-    moving along its row.
+    moving along its row. For batches with paths of tones see :func:`add_path_batch`.
 
     Args:
         moves: int16 (n, 4), sources on the grid.
         batch_offsets: int32 (>= n_batches + 1,).
         linked: bool (>= n_batches,).
+        paths: Those of the plan.
+        cosine: Of the angle between rows and columns.
         n_batches: Number of batches to build.
         axis: 0 for the row tones, 1 for the column tones.
         n_other_sites: Sites of the other axis.
@@ -274,13 +408,23 @@ def build_axis(
     """
     pause_s, pick_up_s, site_s, drop_off_s = times_s[0], times_s[1], times_s[2], times_s[3]
     keyed_up_s, keyed_down_s = times_s[4], times_s[5]
-    n_sites = len(preassigned)
-    tones = np.empty((2, n_sites), np.int64)
+    n_sites = most = len(preassigned)
+    for number in range(len(paths[0])):
+        most = max(most, paths[0][number, 1 + axis])
+    tones = np.empty((2, most), np.int64)
     others = np.empty((2, n_other_sites), np.int64)
-    phase = np.zeros(n_sites, np.float64)
+    phase = np.zeros(most, np.float64)
     segments[3][0] = 0
-    m = n = 0
+    m = n = at_position = at_knot = 0
     for batch in range(n_batches):
+        positions, off, shape = paths_of(paths, batch, at_position, at_knot)
+        if len(positions) > 0:
+            at_position, at_knot = at_position + len(positions), at_knot + len(off)
+            of = positions, off, shape, axis, batch
+            start_sites(of, n_sites, tones)
+            first_phases(tones, shape[1 + axis], preassigned, low_crest, sites[2], phase)
+            m, n = add_path_batch(m, n, of, sites, course, cosine, times_s, segments, values, phase)
+            continue
         start, stop = batch_offsets[batch], batch_offsets[batch + 1]
         n_tones = collect_tones(moves, start, stop, axis, n_sites, tones)
         n_others = collect_tones(moves, start, stop, 1 - axis, n_other_sites, others)

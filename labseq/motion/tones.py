@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Final, NoReturn, get_args
 
@@ -76,6 +77,17 @@ def default_grid(n_rows: int, n_cols: int) -> SiteGrid:
     return SiteGrid(n_rows, n_cols)
 
 
+@lru_cache(maxsize=16)
+def path_geometry(grid: SiteGrid, motion: MotionSpec) -> NDArray[np.float64]:
+    """Distances and angle that :func:`labseq.motion.check_kernels.check` and the tones need, float64 (4,)."""
+    a1, a2 = grid.axes / grid.spacing_m
+    clearance, cosine = motion.clearance_m / grid.spacing_m, float(a1 @ a2)
+    across = clearance / math.sqrt(1.0 - cosine**2)  # lines are nearer to one another than their sites
+    geometry = np.array([clearance, cosine, across, motion.empty_tweezers_may_land], np.float64)
+    geometry.flags.writeable = False
+    return geometry
+
+
 def tone_program(
     plan: Plan,
     grid: SiteGrid | None = None,
@@ -92,6 +104,10 @@ def tone_program(
     constant speed. At pick-up and drop-off the tones of the axis that moves are ramped,
     linearly in trap depth; those of the other axis are switched on and off over 2 us at its two ends.
     Between linked batches there is no drop-off, pause and pick-up.
+
+    In a batch with paths of tones each leg is a segment, whose longest way has the mean speed of the
+    setting; between sites frequency and amplitude squared are interpolated. Row tones are ramped, and at
+    a knot before the last the tones that go off there, while the others wait.
 
     Each site's tone has a preassigned amplitude; by default all are equal, such that
     the most tones an axis may have reach full scale together. During a transport at constant
@@ -135,7 +151,10 @@ def tone_program(
     n_cuts = 2 * sizes  # a tone may arrive on either axis
     if is_uneven:
         n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)
-    n_segments = 5 * n_batches + int(n_cuts.sum())
+    shapes = plan.path_shapes[:n_batches].astype(np.int64)
+    n_path_segments = 2 * shapes[:, 0] + 4
+    n_segments = 5 * n_batches + int(n_cuts.sum() + n_path_segments.sum())
+    cosine = float(path_geometry(grid, motion)[1])
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
     duration_s = np.empty(n_segments, np.float64)
@@ -144,11 +163,14 @@ def tone_program(
     for axis in AXIS_INDICES:
         driven = drives[axis]
         offsets = np.empty(n_segments + 1, np.int32)
-        values = np.empty((N_FIELDS, int(((n_cuts + 4) * sizes).sum())), np.float64)
+        n_values = ((n_cuts + 4) * sizes).sum() + (n_path_segments * shapes[:, 1 + axis]).sum()
+        values = np.empty((N_FIELDS, int(n_values)), np.float64)
         n, n_tones = build_axis(
             plan.moves,
             plan.batch_offsets,
             plan.linked,
+            (plan.path_shapes, plan.path_positions, plan.path_off),
+            cosine,
             n_batches,
             axis,
             grid.shape[1 - axis],

@@ -116,6 +116,8 @@ class NaiveChecker:
         end = {
             (i, j): min(paths.row_off[i], paths.column_off[j]) for i in range(n_rows) for j in range(n_cols)
         }
+        all_on = [np.arange(n_rows), np.arange(n_cols)]
+        self.fly([paths.row[[0, 0]], paths.column[[0, 0]]], all_on, standing, {})
         self.time_s += motion.overhead_per_batch_s + motion.pick_up_s
         for leg in range(n_knots - 1):
             tones = [(off > leg).nonzero()[0] for off in (paths.row_off, paths.column_off)]
