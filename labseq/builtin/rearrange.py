@@ -11,6 +11,7 @@ from itertools import combinations
 from numbers import Real
 from typing import Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from labseq.model.records import OVERSHOOT_S
@@ -143,13 +144,16 @@ class RearrangeStep(Step):
     def _play(self, shot: Shot, plan: Plan, report: PlanReport, cycle: int, start_s: float) -> int:
         """Play the batches that end within the window; returns their number.
 
-        If preparing them took too long for the window, fewer are prepared.
+        If preparing them took too long for the window, fewer are prepared. Mobile tweezers that can do so
+        start with the first batches, and the rest is made while these play.
         """
         end_s = start_s + self.settings.window_of(cycle) - shot.margin_s("rearrange")
-        duration_s, n_batches = 0.0, self._n_fitting(shot, plan, report, start_s, end_s)
+        duration_s, n_first, n_batches = 0.0, 0, self._n_fitting(shot, plan, report, start_s, end_s)
         while n_batches:
-            program = partial(tone_program, plan, grid=shot.grid, motion=shot.motion, n_batches=n_batches)
-            duration_s, took_s = prepare(shot, program, start_s, cycle)
+            n_first = _n_beginning(shot, plan, report, n_batches)
+            build = partial(tone_program, plan.first(n_first), grid=shot.grid, motion=shot.motion)
+            duration_s, took_s = prepare(shot, build, start_s, cycle, is_whole=n_first == n_batches)
+            duration_s += float(report.batch_end_s[n_batches - 1] - report.batch_end_s[n_first - 1])
             if duration_s > 0:
                 self._measured.append((duration_s, took_s))
             if shot.clock.now() + duration_s <= end_s + OVERSHOOT_S:
@@ -160,7 +164,7 @@ class RearrangeStep(Step):
             values = {"n_batches": plan.n_batches, "n_batches_played": n_batches}
             shot.log("window_too_short", cycle=cycle, **values, before_moves_s=shot.clock.now() - start_s)
         if n_batches:
-            play_prepared(shot, duration_s, cycle)
+            play_prepared(shot, duration_s, cycle, _rest(shot, plan, n_first, n_batches))
         return n_batches
 
     def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
@@ -171,6 +175,24 @@ class RearrangeStep(Step):
         if shot.clock.virtual or not self._measured:
             window_s = min(window_s, end_s - start_s)
         return fitting_batches(report, plan, window_s)
+
+
+def _n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> int:
+    """How many batches to start with: all, if the mobile tweezers take whole programs only."""
+    mobile = shot.mobile_tweezers
+    least_s = mobile.beginning_s if offers(mobile, "beginning_s") else math.inf
+    played_s = report.batch_end_s[:n_batches] - shot.motion.overhead_per_cycle_s
+    n_first = int(np.searchsorted(played_s, least_s)) + 1
+    while n_first < n_batches and plan.linked[n_first]:
+        n_first += 1
+    return min(n_first, n_batches)
+
+
+def _rest(shot: Shot, plan: Plan, start: int, stop: int) -> Callable[[], ToneProgram] | None:
+    """Makes the tone program of the batches that follow the first ones; None if there are none."""
+    if start == stop:
+        return None
+    return partial(tone_program, plan.part(start, stop), grid=shot.grid, motion=shot.motion)
 
 
 def preparing_time(measured: Collection[tuple[float, float]]) -> tuple[float, float]:
@@ -234,7 +256,9 @@ def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: in
     play_prepared(shot, prepare(shot, build, start_s, cycle)[0], cycle)
 
 
-def prepare(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int) -> tuple[float, float]:
+def prepare(
+    shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int, *, is_whole: bool = True
+) -> tuple[float, float]:
     """Build a tone program and upload it.
 
     On a virtual clock it ends the modelled overhead of a cycle after ``start_s``, or later.
@@ -244,6 +268,7 @@ def prepare(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle:
         build: Makes the program.
         start_s: Start of the cycle on the session's clock; its overhead counts from there.
         cycle: Index of the rearrangement cycle; -1 outside of one.
+        is_whole: Whether it is a whole program, or the beginning of one.
 
     Returns:
         Its playing time, and how long it took to make and upload, in seconds.
@@ -258,7 +283,8 @@ def prepare(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle:
         began_s = shot.clock.now()
         with shot.stage("tones", cycle=cycle):
             program = build()
-        duration_s = _playing_time_s(shot.call("mobile_tweezers", limit_s, mobile.prepare, program))
+        upload = mobile.prepare if is_whole else mobile.prepare_beginning
+        duration_s = _playing_time_s(shot.call("mobile_tweezers", limit_s, upload, program))
         took_s = shot.clock.now() - began_s
         if offers(mobile, "timings"):
             for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
@@ -268,10 +294,19 @@ def prepare(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle:
     return duration_s, took_s
 
 
-def play_prepared(shot: Shot, duration_s: float, cycle: int = -1) -> None:
+def play_prepared(
+    shot: Shot, duration_s: float, cycle: int = -1, rest: Callable[[], ToneProgram] | None = None
+) -> None:
     """Play the prepared program and wait for its end.
 
+    Args:
+        shot: The running shot.
+        duration_s: Playing time, with that of the rest.
+        cycle: Index of the rearrangement cycle; -1 outside of one.
+        rest: Makes the rest of a program of which the beginning was prepared.
+
     Raises:
+        LimitError: The rest breaks a limit.
         DeviceError: The mobile tweezers fail, or a watched value is past its limit.
     """
     mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
@@ -279,6 +314,9 @@ def play_prepared(shot: Shot, duration_s: float, cycle: int = -1) -> None:
     budget_s = duration_s + shot.margin_s("rearrange")
     start = partial(shot.call, "mobile_tweezers", limit_s, mobile.play)
     with shot.stage("play", budget_s, cycle), shot.lines_on("rearrange", duration_s, start):
+        if rest is not None:
+            with shot.stage("rest", cycle=cycle):
+                shot.call("mobile_tweezers", limit_s, mobile.append, rest())
         shot.call("mobile_tweezers", duration_s + 2 * limit_s, mobile.wait, duration_s + limit_s)
 
 

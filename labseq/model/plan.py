@@ -254,11 +254,16 @@ class Plan:
 
     def first(self, n_batches: int) -> Plan:
         """The plan cut after its first ``n_batches`` batches."""
-        offsets = self.batch_offsets[: n_batches + 1]
-        shapes = self.path_shapes[:n_batches]
-        stop, off_stop = _path_ends(shapes)
-        paths = shapes, self.path_positions[:stop], self.path_off[:off_stop]
-        return Plan(self.moves[: offsets[-1]], offsets, self.linked[:n_batches], *paths)
+        return self.part(0, n_batches)
+
+    def part(self, start: int, stop: int) -> Plan:
+        """Batches ``start`` to ``stop - 1``; a chain of linked batches must not be cut."""
+        offsets, shapes = self.batch_offsets[start : stop + 1], self.path_shapes[start:stop]
+        (at, off_at), (end, off_end) = (_path_ends(self.path_shapes[:n]) for n in (start, stop))
+        paths = shapes, self.path_positions[at:end], self.path_off[off_at:off_end]
+        return Plan(
+            self.moves[offsets[0] : offsets[-1]], offsets - offsets[0], self.linked[start:stop], *paths
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

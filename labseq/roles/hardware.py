@@ -6,6 +6,7 @@ nothing, and the core calls them only where a driver has its own version (see :f
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -254,6 +255,27 @@ class MobileTweezers(Hardware):
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
         """
+
+    @property
+    def beginning_s(self) -> float:
+        """Playing time after which a program can be cut and its rest follow by :meth:`append`; inf: never.
+
+        It is long enough to make the rest meanwhile. Tones are off where a program is cut.
+        """
+        return math.inf
+
+    def prepare_beginning(self, program: ToneProgram) -> float:
+        """As :meth:`prepare`, for the beginning of a program; :meth:`append` follows right after ``play``."""
+        raise NotImplementedError("these mobile tweezers take whole programs only")
+
+    def append(self, program: ToneProgram) -> None:
+        """Have the rest of a program follow what plays, at once, or after a pause if it comes too late.
+
+        Raises:
+            LimitError: It exceeds a limit of the device.
+            TransientError: It came so late that it cannot be played.
+        """
+        raise NotImplementedError("these mobile tweezers take whole programs only")
 
     def timings(self) -> Mapping[str, float]:
         """Durations of the parts of the last ``prepare()``, such as "render": name -> seconds of real time.

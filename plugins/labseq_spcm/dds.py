@@ -42,6 +42,8 @@ COMMANDS_PER_S: Final = 10e6
 """Rate at which commands reach the card by DMA (likewise)."""
 PORTION: Final = 1000
 """Commands sent in one call, when the queue has room for them; no block has as many."""
+BEGINNING_S: Final = 1e-3
+"""A program is cut after that time: making the rest takes less, even if the computer is busy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,15 @@ class Commands:
 
     entries: NDArray[np.void]
     ends: NDArray[np.int64]
+
+    def without_end(self) -> Commands:
+        """Without the last block, which switches the timer off: more blocks follow."""
+        return Commands(self.entries[: self.ends[-2]], self.ends[:-1])
+
+    def followed_by(self, rest: Commands) -> Commands:
+        """These commands, then those of the rest of the program."""
+        entries = np.concatenate([self.entries, rest.entries])
+        return Commands(entries, np.concatenate([self.ends, len(self.entries) + rest.ends]))
 
 
 NO_COMMANDS: Final = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
@@ -189,6 +200,7 @@ class Dds:
     """
 
     max_wait_s = POLL_S
+    beginning_s = BEGINNING_S
     render_s = 0.0
 
     def __init__(self, card: AwgCard, cores: Cores, keep_warm: KeepWarm | None) -> None:
@@ -197,6 +209,7 @@ class Dds:
         self._keep_warm = keep_warm
         self._is_at_rest = False
         self._commands = NO_COMMANDS
+        self._continues = False
         self._n_sent = 0
         self._n_events = 0
         spcm = card.spcm
@@ -215,17 +228,26 @@ class Dds:
         card.set(spcm.SPC_DDS_DATA_TRANSFER_MODE, spcm.SPCM_DDS_DTM_DMA, "DDS transfer mode")
         card.set(spcm.SPC_DDS_AMP_RAMP_STEPSIZE, AMPLITUDE_STEPSIZE, "DDS amplitude ramp step size")
 
-    def prepare(self, program: ToneProgram) -> float:
-        """Compile a program, and queue as much as there is room for; returns its playing time in seconds."""
+    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:
+        """Compile a program, and queue its first commands; returns its playing time in seconds."""
         start_s = time.perf_counter()
-        self._commands = compile_commands(self._card.name, program, self._cores, self._keep_warm)
+        commands = compile_commands(self._card.name, program, self._cores, self._keep_warm)
+        self._commands = commands.without_end() if continues else commands
+        self._continues = continues
         self.render_s = time.perf_counter() - start_s
         self._n_sent = 0
         if not (self._is_at_rest and self._card.running):
             self.rest()
         self._is_at_rest = False
-        self._card.wait_until(self._feed, "the DDS takes no commands: its queue stays full")
+        self._card.wait_until(self._feed_once, "the DDS takes no commands: its queue stays full")
         self._card.clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
+        return program.total_duration_s
+
+    def append(self, program: ToneProgram) -> float:
+        """Compile the rest of a program, and queue as much of it as there is room for."""
+        rest = compile_commands(self._card.name, program, self._cores, self._keep_warm)
+        self._commands, self._continues = self._commands.followed_by(rest), False
+        self._feed()
         return program.total_duration_s
 
     def rest(self) -> None:
@@ -269,9 +291,10 @@ class Dds:
         card.command(command & ~spcm.M2CMD_CARD_START, "trigger")
 
     def start(self, command: int) -> None:
-        """Start the program."""
+        """Start the program, and queue as much of it as there is room for."""
         self._n_events = self._card.read(self._card.spcm.SPC_DDS_TRG_COUNT)
         self._start_triggered(command)
+        self._feed()
 
     def triggered(self) -> bool:
         """Whether the program has begun."""
@@ -288,7 +311,7 @@ class Dds:
         card, spcm = self._card, self._card.spcm
         self._feed()
         n_events = card.read(spcm.SPC_DDS_TRG_COUNT) - self._n_events
-        if n_events >= len(self._commands.ends) - (self._keep_warm is None):
+        if not self._continues and n_events >= len(self._commands.ends) - (self._keep_warm is None):
             self._is_at_rest = self._keep_warm is not None
             command = spcm.M2CMD_CARD_DISABLETRIGGER if self._is_at_rest else spcm.M2CMD_CARD_STOP
             card.command(command, "end of the program")
@@ -299,21 +322,23 @@ class Dds:
             raise TransientError(f"{text}; use fewer tones at once, or the mode replay", card.name)
         return False
 
-    def _feed(self) -> bool:
-        """Send whole blocks while the queue has room; returns whether any were sent.
+    def _feed(self) -> None:
+        """Send whole blocks while the queue has room."""
+        while self._feed_once():
+            pass
+
+    def _feed_once(self) -> bool:
+        """Send some whole blocks if the queue has room; returns whether any were sent.
 
         ``spcm``'s own DDSCommandList never waits for room.
         """
         card, spcm = self._card, self._card.spcm
         entries, ends = self._commands.entries, self._commands.ends
+        portion = min(PORTION, len(entries) - self._n_sent)
+        if not portion or portion > self._queue_length - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT):
+            return False
+        last = int(np.searchsorted(ends, self._n_sent + portion, "right")) - 1
         send = np.array([(spcm.SPC_DDS_CMD, TYPE_INT64, spcm.SPCM_DDS_CMD_WRITE_TO_CARD)], ENTRY)
-        fed = False
-        while self._n_sent < len(entries):
-            portion = min(PORTION, len(entries) - self._n_sent)
-            if portion > self._queue_length - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT):
-                break
-            last = int(np.searchsorted(ends, self._n_sent + portion, "right")) - 1
-            card.write_list(np.append(entries[self._n_sent : ends[last]], send), "DDS commands")
-            self._n_sent = int(ends[last])
-            fed = True
-        return fed
+        card.write_list(np.append(entries[self._n_sent : ends[last]], send), "DDS commands")
+        self._n_sent = int(ends[last])
+        return True

@@ -56,13 +56,15 @@ class PlayMode(Protocol):
     Attributes:
         max_wait_s: How long the card needs no attention while it plays; 0: none at all.
         render_s: Time for rendering in the last ``prepare``, on this computer's clock.
+        beginning_s: Playing time after which a program can be cut; inf: only whole programs are played.
     """
 
     max_wait_s: float
     render_s: float
+    beginning_s: float
 
-    def prepare(self, program: ToneProgram) -> float:
-        """Transfer a program to the card; returns the playing time in seconds.
+    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:
+        """Transfer a program, or the beginning of one, to the card; returns the playing time in seconds.
 
         Raises:
             LimitError: The mode cannot play it.
@@ -72,6 +74,14 @@ class PlayMode(Protocol):
 
     def start(self, command: int) -> None:
         """Start the card with this command."""
+        ...
+
+    def append(self, program: ToneProgram) -> float:
+        """Have the rest of a program follow its beginning; returns its playing time in seconds.
+
+        Raises:
+            LimitError: The mode cannot play it.
+        """
         ...
 
     def triggered(self) -> bool:
@@ -254,6 +264,18 @@ class SpcmMobileTweezers(MobileTweezers):
             LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
             DeviceError: Not open, still playing, or the card refuses.
         """
+        return self._prepare(program, continues=False)
+
+    @property
+    def beginning_s(self) -> float:
+        """A fraction of a program's length for the modes ``stream`` and ``dds``."""
+        return math.inf if self._mode is None else self._mode.beginning_s
+
+    def prepare_beginning(self, program: ToneProgram) -> float:
+        """The same, for the beginning of a program."""
+        return self._prepare(program, continues=True)
+
+    def _prepare(self, program: ToneProgram, *, continues: bool) -> float:
         mode = self._opened()[1]
         self._check_idle("prepare()")
         self._duration_s = None
@@ -262,12 +284,27 @@ class SpcmMobileTweezers(MobileTweezers):
         took_s = time.perf_counter() - start_s
         self.settle()
         start_s = time.perf_counter()
-        playing_s = mode.prepare(program)
+        playing_s = mode.prepare(program, continues=continues)
         took_s += time.perf_counter() - start_s
         self._timings = {"render": mode.render_s, "upload": took_s - mode.render_s}
         duration_s = max(playing_s, program.total_duration_s) + float(self._facts["trigger_delay_s"])
         self._duration_s = duration_s
         return duration_s
+
+    def append(self, program: ToneProgram) -> None:
+        """Have the rest of a program follow its beginning, which plays.
+
+        Raises:
+            LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
+            DeviceError: Not open, nothing plays, or the card refuses.
+        """
+        mode = self._opened()[1]
+        if self._due_s is None:
+            raise DeviceError(
+                self._name, "append() while nothing plays; call prepare_beginning() and play() first"
+            )
+        limits.check_program(self._name, program, self._rf)
+        self._due_s += max(mode.append(program), program.total_duration_s)
 
     def timings(self) -> Mapping[str, float]:
         """Times of the last ``prepare`` on this computer's clock, in seconds: rendering, and the rest."""

@@ -79,6 +79,7 @@ class SampleMode:
     """
 
     render_s = 0.0
+    beginning_s = math.inf
 
     def __init__(
         self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None
@@ -112,6 +113,10 @@ class SampleMode:
         """Start the card."""
         self._card.command(command, "start")
 
+    def append(self, program: ToneProgram) -> float:  # noqa: ARG002
+        """Not possible: the card knows before the start how many samples it will play."""
+        raise DeviceError(self._card.name, "this mode plays whole programs only")
+
     def triggered(self) -> bool:
         """Whether the program has begun."""
         return self._card.triggered
@@ -131,7 +136,7 @@ class Replay(SampleMode):
         spcm = card.spcm
         self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
 
-    def prepare(self, program: ToneProgram) -> float:
+    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
         """Render and upload a program; returns its playing time in seconds."""
         start_s = time.perf_counter()
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
@@ -190,7 +195,7 @@ class Fifo(SampleMode):
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
         card.write_setup()  # the buffer of a transfer is named afterwards
 
-    def prepare(self, program: ToneProgram) -> float:
+    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
         """Fill ring and card with the beginning of a program; returns its playing time in seconds."""
         card, spcm = self._card, self._card.spcm
         start_s = time.perf_counter()

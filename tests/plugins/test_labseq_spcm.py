@@ -395,10 +395,11 @@ class TestTones:
     def test_of_a_program_larger_than_the_queue_are_sent_while_it_plays(self, driver: Any) -> None:
         with driver("dds") as lab:
             program = lab.program(50)
-            lab.tweezers.prepare(program)
-            n_sent = sum(603000 <= entry.register < DDS_CMD for entry in lab.card.log)
-            assert 3000 < n_sent <= 4096
-            lab.tweezers.play()
+            n_sent = []
+            for call in (partial(lab.tweezers.prepare, program), lab.tweezers.play):
+                call()
+                n_sent.append(sum(603000 <= entry.register < DDS_CMD for entry in lab.card.log))
+            assert 500 < n_sent[0] <= 1000 < 3000 < n_sent[1] <= 4096 + 1000
             lab.tweezers.wait(1.0)
             assert not lab.card.running
             last = lab.card.played(0)[-1]
@@ -407,6 +408,39 @@ class TestTones:
             sent = [i for i, command in enumerate(commands) if command == (DDS_CMD, WRITE_TO_CARD)]
             assert len(sent) > 5
             assert all(commands[i - 1] == (DDS_CMD, EXEC_AT_TRG) for i in sent), "only whole blocks are sent"
+
+    @pytest.mark.parametrize("keep_warm", [None, {"row_frequency": 82.2e6, "column_frequency": 117.9e6}])
+    def test_of_the_rest_of_a_program_follow_those_of_its_beginning(
+        self, driver: Any, keep_warm: Any
+    ) -> None:
+        with driver("dds", keep_warm=keep_warm) as lab:
+            parts, begun = (lab.program(4), lab.program(20)), list[float]()
+            for _ in range(2):
+                lab.clock.sleep(1e-3)
+                lab.tweezers.prepare_beginning(parts[0])
+                begun.append(lab.clock.now() + float(lab.tweezers.describe()["trigger_delay_s"]))
+                lab.tweezers.play()
+                lab.tweezers.append(parts[1])
+                lab.tweezers.wait(1.0)
+            for start_s in begun:
+                joint_s = start_s + parts[0].total_duration_s + 166.4e-9  # the cores are silenced in between
+                for part, at_s in zip(parts, (start_s, joint_s), strict=True):
+                    for u in np.linspace(0.013, 0.987, 50):
+                        now = part.tones_at(u * part.total_duration_s).column
+                        wanted = np.sort(now.frequency_hz[now.amplitude > 0.0])
+                        tones = _tones_at(lab.card.played(1), at_s + u * part.total_duration_s)
+                        loud = np.sort([tone.frequency_hz for tone in tones if tone.amplitude > 0.0])
+                        assert loud == pytest.approx(wanted, abs=2e4)
+
+    def test_of_the_rest_that_come_too_late_are_an_error(self, driver: Any) -> None:
+        with driver("dds") as lab:
+            lab.tweezers.prepare_beginning(lab.program(2))
+            lab.tweezers.play()
+            lab.clock.sleep(10e-3)
+            lab.tweezers.append(lab.program(20))
+            with pytest.raises(TransientError, match="no commands in time"):
+                lab.tweezers.wait(1.0)
+            assert lab.card.outputs_on == (False, False)
 
     def test_that_come_too_late_are_an_error(self, driver: Any) -> None:
         with driver("dds") as lab:

@@ -37,7 +37,7 @@ from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
 
-Stream._check_bus = lambda self: None  # samples go through a pipe, which may be slow
+Stream._check_bus = lambda self: None  # samples go through a pipe, which may be slow, hence look_ahead
 tones = np.linspace(12e6, 18e6, 5)
 grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
@@ -48,7 +48,7 @@ def tweezers(state, mode, speed_m_s, n_batches, trigger="software", keep_warm=No
     motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=speed_m_s, eject_slots=0, rf=rf)
     card = f"simulated@{sys.argv[1]}/{state}"
     settings = dict(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=0.1, keep_warm=keep_warm)
-    settings = SpcmSettings.model_validate(settings)
+    settings = SpcmSettings.model_validate(settings | {"look_ahead": 0.01})
     device = SpcmMobileTweezers(settings, Context("mobile_tweezers", grid, motion=motion))
     device.open()
     if n_batches:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import replace
@@ -141,6 +142,45 @@ def test_a_computer_that_is_held_up_after_the_last_samples_were_handed_over(driv
         lab.card.hold_up(duration_s)
         lab.tweezers.wait(1.0)
         start_s(lab, program)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 3e-3, 20e-3])
+def test_the_rest_of_a_program_follows_its_beginning(driver: Any, late_s: float) -> None:
+    with driver("stream") as lab:
+        parts = [lab.program(4), lab.program(30)]
+        lab.tweezers.settle()
+        lab.clock.sleep(1e-3)
+        lab.tweezers.prepare_beginning(parts[0])
+        lab.card.forget(lab.clock.now())
+        lab.tweezers.play()
+        lab.clock.sleep(late_s / 20)
+        if late_s > 10e-3:
+            lab.card.hold_up(10e-3)  # the whole beginning is in the ring, and the card runs dry after it
+        lab.clock.sleep(late_s)
+        lab.tweezers.append(parts[1])
+        lab.tweezers.wait(1.0)
+        lab.clock.sleep(1e-3)
+        for channel in (0, 1):
+            played = np.trim_zeros(lab.samples(channel))
+            begins, follows = (np.trim_zeros(render(part, lab.rate_hz).samples[channel]) for part in parts)
+            assert np.array_equal(played[: len(begins)], begins)
+            assert np.array_equal(played[-len(follows) :], follows)
+            pause = played[len(begins) : -len(follows)]
+            assert not pause.any()
+            block_s = (1 << 16) / 4 / lab.rate_hz
+            assert (len(pause) / lab.rate_hz < 2 * block_s) == (late_s == 0.0)
+        assert lab.tweezers.describe()["silent_underruns"] == (late_s > 10e-3)
+
+
+@pytest.mark.parametrize("mode", ["stream", "replay"])
+def test_nothing_is_appended_where_nothing_plays_or_a_program_must_be_whole(driver: Any, mode: str) -> None:
+    with driver(mode) as lab:
+        lab.tweezers.prepare(lab.program(2))
+        assert (lab.tweezers.beginning_s == math.inf) == (mode == "replay")
+        if mode == "replay":
+            lab.tweezers.play()
+        with pytest.raises(DeviceError, match=r"plays whole programs only|append\(\) while nothing plays"):
+            lab.tweezers.append(lab.program(2))
 
 
 def test_a_bus_that_cannot_stream_is_reported_when_the_card_is_opened(driver: Any) -> None:

@@ -182,10 +182,15 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         return tone_program(plan, grid=context.grid, motion=context.motion)
 
     def work(self, device: MobileTweezers) -> None:
-        """Prepare, play, wait."""
+        """Prepare, play, wait; the same in two parts if the tweezers can."""
         duration_s = device.prepare(self.program())
         device.play()
         device.wait(duration_s + self.timeout_s)
+        if offers(device, "append") and math.isfinite(device.beginning_s):
+            device.prepare_beginning(self.program())
+            device.play()
+            device.append(self.program())
+            device.wait(2 * duration_s + self.timeout_s)
 
     def uses(self) -> Mapping[str, Action[MobileTweezers]]:
         """Prepare, play, wait."""
