@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from labseq_grid.planner import GridPlanner, GridSettings
 from labseq_psca.planner import PscaPlanner, PscaSettings
 from labseq_scans.planners import Mta1Planner, Mta1Settings, TetrisPlanner, TetrisSettings
 from labseq_single.planner import CompressionPlanner, HcaPlanner, LsapPlanner, LsapSquaredPlanner
@@ -31,6 +32,10 @@ def psca(**settings: Any) -> MakePlanner:
     return lambda context, dop: PscaPlanner(PscaSettings(degree_of_parallelism=dop, **settings), context)
 
 
+def grid(context: Context, dop: int) -> GridPlanner:
+    return GridPlanner(GridSettings(degree_of_parallelism=dop), context)
+
+
 def mta1(context: Context, dop: int) -> Mta1Planner:
     return Mta1Planner(Mta1Settings(degree_of_parallelism=dop), context)
 
@@ -45,7 +50,7 @@ def single(planner: type[Any]) -> MakePlanner:
 
 SINGLE = {cls.name: single(cls) for cls in (LsapPlanner, LsapSquaredPlanner, CompressionPlanner, HcaPlanner)}
 """Planners with one mobile tweezer: name -> how to make them."""
-PLANNERS: dict[str, MakePlanner] = {"psca": psca(), "mta1": mta1, "tetris": tetris, **SINGLE}
+PLANNERS: dict[str, MakePlanner] = {"psca": psca(), "grid": grid, "mta1": mta1, "tetris": tetris, **SINGLE}
 VARIANTS = {"psca, as in the paper": psca(variant="paper"), "psca, repair": psca(repair_below=1)}
 
 

@@ -1,0 +1,190 @@
+"""Kernels that turn rows and columns of a batch into paths of tones.
+
+The tweezers leave their sites for the *lanes* half-way between rows and half-way between columns, go along
+these, and reach their goals from there: in a lane they keep half a line's distance from every site.
+Everything is written for tones of the rows first; with rows and columns swapped it is the same.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import helper_kernel
+from labseq_grid.kernels_columns import NUMBERS, Ints
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LANE: Final = 0.5
+"""Distance of a lane from the lines of sites on both sides."""
+KNOTS: Final = 24
+"""More than the number of knots of any batch: 5, and 2 for each further row that is put down on its own."""
+KNOTS_OF: Final = "float64[:, ::1]"
+
+
+@helper_kernel(f"void({NUMBERS}, int64, int64, int64, int64, float64[::1])")
+def find_lanes(lines: Ints, n: int, first: int, last: int, side: int, lanes: Floats) -> None:
+    """Choose a lane beside each of some lines, on the given side if that is possible.
+
+    At the edge of the AOD's band all go to the other side. If both edges are taken, the
+    lines up to a gap go down and those from there on up; there is a gap, since a batch never takes all lines.
+
+    Args:
+        lines: int64 (n,), ascending.
+        n: Number of lines.
+        first: First line that the band reaches.
+        last: Last one.
+        side: 1 or -1, the side where they go if they can.
+        lanes: Result, float64 (n,).
+    """
+    turn = n  # lines before this one go up, the others down
+    if side < 0:
+        turn = 0
+    if lines[n - 1] == last:
+        turn = 0
+    if turn == 0 and lines[0] == first:
+        turn = n
+        if lines[n - 1] == last:
+            turn = 1
+            while lines[turn] == lines[turn - 1] + 1:
+                turn += 1
+    for i in range(n):
+        lanes[i] = lines[i] + (LANE if i < turn else -LANE)
+
+
+@helper_kernel("int64(int64[::1], int64[::1], int64)")
+def main_side(before: Ints, after: Ints, n: int) -> int:
+    """The side to which most of the way goes; 1 if there is none."""
+    total = 0
+    for i in range(n):
+        total += after[i] - before[i]
+    return -1 if total < 0 else 1
+
+
+@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1])")
+def add_knot(rows: Floats, columns: Floats, n_knots: int, row: Floats, column: Floats) -> int:
+    """Add a knot, unless all tones are there already; return the number of knots."""
+    moves = n_knots == 0
+    for i in range(len(row)):
+        moves = moves or rows[n_knots - 1, i] != row[i]
+    for i in range(len(column)):
+        moves = moves or columns[n_knots - 1, i] != column[i]
+    if not moves:
+        return n_knots
+    rows[n_knots, : len(row)] = row
+    columns[n_knots, : len(column)] = column
+    return n_knots + 1
+
+
+@helper_kernel("void(bool_[:, ::1], int64[::1], int64, int64, bool_[::1], bool_[::1])")
+def next_to_put_down(free: Bools, goes_off: Ints, n: int, m: int, together: Bools, used: Bools) -> None:
+    """Choose the rows that are put down together: those that leave no empty tweezer on an atom.
+
+    Args:
+        free: bool (2 n, m): which crossings carry atoms, then which may be put down.
+        goes_off: int64 (n,), the knot at which each row is put down, 0 if it is still on.
+        n: Number of rows.
+        m: Number of columns.
+        together: Result, bool (n,), the rows.
+        used: Result, bool (m,), the columns that carry atoms in these rows.
+    """
+    together[:] = False
+    used[:] = False
+    for i in range(n):
+        if goes_off[i] > 0:
+            continue
+        fits = True
+        for j in range(m):
+            if used[j] or free[i, j]:
+                for k in range(i + 1):
+                    if k == i or together[k]:
+                        fits = fits and free[n + k, j]
+        if not fits:
+            continue
+        together[i] = True
+        for j in range(m):
+            used[j] = used[j] or free[i, j]
+
+
+@helper_kernel(
+    f"int64({NUMBERS}, {NUMBERS}, {NUMBERS}, {NUMBERS}, bool_[:, ::1], int64, int64, int64, int64, "
+    f"{KNOTS_OF}, {KNOTS_OF}, {NUMBERS})"
+)
+def find_paths(
+    row: Ints,
+    to_row: Ints,
+    column: Ints,
+    to_column: Ints,
+    free: Bools,
+    n_rows: int,
+    n_cols: int,
+    slots: int,
+    stages: int,
+    rows: Floats,
+    columns: Floats,
+    goes_off: Ints,
+) -> int:
+    """Find the paths of the tones of a batch.
+
+    Args:
+        row: int64 (n,), where the row tones start.
+        to_row: int64 (n,), where they end.
+        column: int64 (m,), where the column tones start.
+        to_column: int64 (m,), where they end.
+        free: bool (2 n, m): which crossings carry atoms, then which may be put down.
+        n_rows: Rows of the grid.
+        n_cols: Columns of the grid.
+        slots: Lines beyond the grid that the tones reach.
+        stages: Whether rows are put down in stages, so that only free crossings are put down.
+        rows: Result, float64 (KNOTS, n), positions of the row tones at each knot.
+        columns: Result, float64 (KNOTS, m), of the column tones.
+        goes_off: Result, int64 (n,), the knot at which each row tone is ramped down.
+
+    Returns:
+        Number of knots.
+    """
+    n, m = len(row), len(column)
+    low, high = -slots, n_rows - 1 + slots
+    left, right = -slots, n_cols - 1 + slots
+    here, across = np.empty(n), np.empty(m)
+    there, beside = np.empty(n), np.empty(m)
+    side = main_side(row, to_row, n)
+    still = True
+    for i in range(n):
+        still = still and row[i] == to_row[i]
+    find_lanes(row, n, low, high, side, here)
+    find_lanes(to_row, n, low, high, side if still else -side, there)
+    side = main_side(column, to_column, m)
+    still = True
+    for j in range(m):
+        still = still and column[j] == to_column[j]
+    find_lanes(column, m, left, right, side, across)
+    find_lanes(to_column, m, left, right, side if still else -side, beside)
+    n_knots = add_knot(rows, columns, 0, row.astype(np.float64), column.astype(np.float64))
+    n_knots = add_knot(rows, columns, n_knots, here, across)
+    n_knots = add_knot(rows, columns, n_knots, here, beside)
+    n_knots = add_knot(rows, columns, n_knots, there, beside)
+    goes_off[:] = 0
+    together, used = np.ones(n, np.bool_), np.ones(m, np.bool_)
+    first = True
+    while True:
+        if stages:
+            next_to_put_down(free, goes_off, n, m, together, used)
+        at = np.where(used, to_column.astype(np.float64), beside)
+        if not first:
+            n_knots = add_knot(rows, columns, n_knots, there, at)
+        first = False
+        for i in range(n):
+            if together[i]:
+                there[i] = to_row[i]
+        n_knots = add_knot(rows, columns, n_knots, there, at)
+        n_on = 0
+        for i in range(n):
+            if together[i]:
+                goes_off[i] = n_knots - 1
+            n_on += goes_off[i] == 0
+        if n_on == 0:
+            return n_knots
