@@ -30,7 +30,7 @@ class TestContractWhereEmptyTweezersLand(PlannerContract):
         return lambda context: grid(context, 9)
 
 
-@pytest.mark.parametrize(("dop", "most"), [(7, 12.6), (20, 7.5), (15, 8.0)])
+@pytest.mark.parametrize(("dop", "most"), [(7, 12.6), (15, 8.0), (20, 7.7)])
 @pytest.mark.parametrize("may_land", [False, True])
 def test_mean_number_of_batches_of_the_papers_array(dop: int, most: float, may_land: bool) -> None:
     n_batches: list[int] = []
