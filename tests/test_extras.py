@@ -23,6 +23,7 @@ from labseq.model import ScanSpace
 from labseq.pictures.figures import check_place
 from labseq.recording.export import check_export
 from labseq.recording.hdf5 import load_filter
+from labseq.web.serve import check_packages
 
 ROOT = Path(__file__).parents[1]
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
@@ -51,6 +52,8 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("pylon", "pypylon", "pypylon.pylon"): lambda: load_pypylon("camera"),
     ("testing", "hypothesis", "hypothesis"): lambda: labseq.testing.CameraContract,
     ("testing", "pytest", "pytest"): lambda: labseq.testing.CameraContract,
+    ("web", "starlette", "starlette"): check_packages,
+    ("web", "uvicorn", "uvicorn"): check_packages,
 }
 
 

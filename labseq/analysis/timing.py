@@ -80,18 +80,26 @@ class StageTotals:
         Raises:
             RecordingError: The file cannot be read.
         """
-        timing = shot.timing
+        self.add_timing(shot.timing)
+
+    def add_timing(self, timing: Sequence[StageTiming]) -> None:
+        """Add the stages of a shot that has been read."""
         for one in timing:
             self._found.setdefault(one.stage, []).append(one)
         self._shot_s.append(math.fsum(one.duration_s for one in timing if one.stage.startswith(STEP)))
 
+    def stages(self) -> list[StageStatistics]:
+        """The statistics of all stages added so far, without that of writing."""
+        n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
+        names = sorted(self._found, key=_place)
+        return [_sum_up(name, self._found[name], n_read, total_s) for name in names]
+
     def sum_up(self, run: Run) -> RunTiming:
         """The statistics of all stages added so far."""
         n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
-        names = sorted(self._found, key=_place)
-        stages = [_sum_up(name, self._found[name], n_read, total_s) for name in names]
+        stages = self.stages()
         written = _writing(run, total_s / n_read if n_read else math.nan)
-        before = sum(not name.startswith(STEP) for name in names)
+        before = sum(not one.stage.startswith(STEP) for one in stages)
         return RunTiming(n_read, quantiles(self._shot_s), (*stages[:before], *written, *stages[before:]))
 
 

@@ -47,6 +47,7 @@ from labseq.scaffold.commands import (
     new,
     schema,
 )
+from labseq.web.commands import WEB_EXAMPLES, web as show_web
 
 RUN_EXAMPLES: Final = """\b
 Examples:
@@ -148,6 +149,9 @@ def run(
     output: Output = None,
     as_json: Json = False,
     realtime: Realtime = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Also show the run in a browser, as `labseq web` does.")
+    ] = False,
     _plugins: Plugins = None,
 ) -> None:
     """Run a sequence and record every shot."""
@@ -157,7 +161,7 @@ def run(
     options = Options(
         profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime
     )
-    run_sequence(sequence, options, as_json=as_json)
+    run_sequence(sequence, options, as_json=as_json, web=web)
 
 
 @app.command(epilog=RESUME_EXAMPLES, short_help="Resume a run that ended early.")
@@ -254,6 +258,9 @@ def runs(
     list_runs(data, name, limit, as_json=as_json)
 
 
+app.command(epilog=WEB_EXAMPLES, name="web", short_help="Show runs, queue and calibrations in a browser.")(
+    show_web
+)
 app.command(epilog=PLAN_EXAMPLES, short_help="Plan the moves for one occupancy; print or draw them.")(plan)
 app.command(epilog=WAVEFORM_EXAMPLES, short_help="Show what the AWG would play for a plan.")(waveform)
 

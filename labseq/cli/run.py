@@ -31,8 +31,12 @@ if TYPE_CHECKING:
     from labseq.cli.live import LiveView
 
 
-def run_sequence(sequence: Path, options: Options, *, as_json: bool) -> None:
-    """Run a sequence and print the result, also if it was stopped or failed."""
+def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool = False) -> None:
+    """Run a sequence, with ``web`` also in a browser; print the result even if it was stopped or failed."""
+    if web:
+        from labseq.web.serve import start_beside
+
+        say(start_beside(options.output or data_root()), stream=sys.stderr)
 
     def start(observer: RunObserver | None) -> Session:
         return Session.open(sequence, **asdict(options), observer=observer)

@@ -95,3 +95,13 @@ def move(
     from labseq.queue.queue import Queue
 
     Queue(data_root()).move(entry, before)
+
+
+@queue.command(short_help="Start no further entry until the queue is continued.")
+def pause(
+    off: Annotated[bool, typer.Option("--off", help="Continue with the next entry.")] = False,
+) -> None:
+    """Let `labseq queue run` wait before its next entry; a run in progress is taken to its end."""
+    from labseq.queue.terminal import pause_queue
+
+    pause_queue(not off)

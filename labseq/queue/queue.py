@@ -34,6 +34,8 @@ from labseq.session.session import Session
 from labseq.text_files import MAX_BYTES, decode, read_bytes
 
 FOLDER: Final = "queue"
+PAUSE_FILE: Final = "PAUSE"
+"""Exists while the queue is paused."""
 FORMAT: Final = 1
 """Version of an entry's file."""
 EntryStatus = Literal["waiting", "running", "stopped", "failed"]
@@ -201,6 +203,25 @@ class Queue:
         with suppress(OSError):
             (self.folder / STOP_FILE).unlink(missing_ok=True)
 
+    @property
+    def is_paused(self) -> bool:
+        """Whether the process that runs the queue waits before its next entry."""
+        return (self.folder / PAUSE_FILE).exists()
+
+    def pause(self, is_paused: bool) -> None:
+        """Let the process that runs the queue wait before its next entry, or continue.
+
+        Raises:
+            RecordingError: The queue cannot be written to.
+        """
+        path = self.folder / PAUSE_FILE
+        with explained(path):
+            if is_paused:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                path.touch()
+            else:
+                path.unlink(missing_ok=True)
+
     def holder(self) -> Holder | None:
         """The process that runs the queue, or None."""
         if not self.folder.is_dir():
@@ -318,7 +339,7 @@ class QueueRun:
     _tried: set[int] = field(default_factory=set[int])
 
     def run(self, *, watch: bool = False) -> None:
-        """Take entries until none waits, or the queue is asked to stop.
+        """Take entries until none waits, or the queue is asked to stop; while it is paused, wait.
 
         Args:
             watch: Whether to wait for new ones when none waits.
@@ -336,10 +357,11 @@ class QueueRun:
         self.queue.clear_stop()
         try:
             while not self.queue.is_asked_to_stop:
-                entry = self._next()
+                is_paused = self.queue.is_paused
+                entry = None if is_paused else self._next()
                 if entry is not None:
                     self._work(entry)
-                elif watch:
+                elif watch or is_paused:
                     time.sleep(POLL_S)
                 else:
                     break

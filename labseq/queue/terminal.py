@@ -38,7 +38,16 @@ def list_entries(*, as_json: bool) -> None:
     holder = queue.holder()
     notes = [note for entry in entries for note in _notes(entry)]
     table = columns([_HEADER, *map(_row, entries)], right=(0,)) if entries else ["the queue is empty"]
-    say(*table, *([""] if notes else []), *notes, *([] if holder is None else ["", f"run by: {holder}"]))
+    state = [] if holder is None else [f"run by: {holder}"]
+    state += ["paused: 'labseq queue pause --off' continues it"] if queue.is_paused else []
+    say(*table, *([""] if notes else []), *notes, *([""] if state else []), *state)
+
+
+def pause_queue(is_paused: bool) -> None:
+    """Pause the queue, or continue it, and print that."""
+    Queue(data_root()).pause(is_paused)
+    paused = "the queue is paused: 'labseq queue pause --off' continues it"
+    say(paused if is_paused else "the queue continues")
 
 
 class RunSession(Protocol):

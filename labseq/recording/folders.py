@@ -25,6 +25,8 @@ RESULTS_FOLDER: Final = "analysis"
 """Results of analyses: a file of lines for each."""
 STOP_FILE: Final = "STOP"
 """Exists while a request to end the run after the current shot is pending."""
+NOTES_FILE: Final = "notes.json"
+"""Comment and tags, from `labseq web`; exists only if there are any."""
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
 

@@ -435,7 +435,7 @@ def command(names: Sequence[str], found: Any) -> list[Block]:
         found: The command, as typer sees it.
     """
     arguments = [one for one in found.params if one.param_type_name == "argument"]
-    options = [one for one in found.params if one.param_type_name == "option"]
+    options = [one for one in found.params if one.param_type_name == "option" and not one.hidden]
     usage = ["labseq", *names, *map(_argument_name, arguments)]
     usage += (["COMMAND", "..."] if hasattr(found, "commands") else []) + (["[OPTIONS]"] if options else [])
     blocks: list[Block] = [Code("text", " ".join(usage)), found.help]

@@ -1,0 +1,412 @@
+"""The API under /api/v1: what a browser or another program can ask for."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
+
+import labseq
+from labseq.analysis.statistics import statistics_of
+from labseq.analysis.timing import StageTotals
+from labseq.errors import LabseqError, RecordingError
+from labseq.files import read_file
+from labseq.plain import to_plain
+from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
+from labseq.recording.run_file import read_state
+from labseq.web.acting import Actions
+from labseq.web.history import finite
+from labseq.web.live import MAX_VIEWERS, Live, encode
+from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
+from labseq.web.scans import scan_values
+from labseq.web.shots import frame_png, readings_of, shot_values
+from labseq.web.state import N_BINS, Limits, figures_of, head_of, losses_of, stage_rows
+from labseq.web.store import calibration_picture, calibrations, queue_values
+
+BASE: Final = "/api/v1"
+MAX_LISTED: Final = 500
+MAX_FILE: Final = 1 << 20
+"""Maximum number of characters of a file's text."""
+MAX_STATISTICS: Final = 500
+"""Maximum number of shots that the statistics of a run are worked out from."""
+MAX_TIMED: Final = 50
+"""Maximum number of shots whose files are opened for the times of stages."""
+_RUN: Final = "/runs/{day}/{name}"
+_TEXTS: Final = {"sequence": SEQUENCE_FILE, "profile": PROFILE_FILE}
+_KINDS: Final[Mapping[str, str]] = {"n": "integer", "shot": "integer", "image": "integer"}
+_DESCRIPTIONS: Final = {
+    "day": "date of the run's folder, 2026-11-20",
+    "name": "name of the run's folder, 0001_compact-225",
+    "shot": "index of the shot, from 0",
+    "image": "index of the image in the shot, from 0",
+    "attempt": "an attempt that does not count; without it the shot that counts",
+    "q": "words that date, name, profile, outcome, comment or tags must contain",
+    "status": "running, complete, stopped, failed or damaged",
+    "first": "number of rows to leave out",
+    "n": "maximum number of rows",
+    "width": "maximum height and width of the picture, in pixels",
+    "kind": "which file or calibration",
+    "store": "which folder of calibrations, from the list",
+    "file": "name of the calibration's file",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """An address of the API; its description is the docstring of its function.
+
+    Attributes:
+        path: Below /api/v1.
+        answer: Makes the answer from the request; called in a thread unless it is a coroutine.
+        query: Names of its query parameters.
+        content: Media type of the answer.
+        method: "GET" or "POST".
+        body: Names of the values in the body of a POST, and what they are.
+    """
+
+    path: str
+    answer: Callable[..., Any]
+    query: tuple[str, ...] = ()
+    content: str = "application/json"
+    method: str = "GET"
+    body: Mapping[str, str] | None = None
+
+    @property
+    def description(self) -> str:
+        """What it answers."""
+        return inspect.cleandoc(self.answer.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+
+
+class Api:
+    """The endpoints.
+
+    Args:
+        catalogue: The runs.
+        limits: When alarms are raised.
+        actions: What visitors may do; None if the server only shows.
+    """
+
+    def __init__(self, catalogue: Catalogue, limits: Limits, actions: Actions | None) -> None:
+        self._runs = catalogue
+        self._live = Live(catalogue, limits)
+        self._actions = actions
+        self._started_s = time.monotonic()
+        self._n_requests = 0
+
+    def endpoints(self) -> list[Endpoint]:
+        """All endpoints of this server."""
+        reading = [
+            Endpoint("/server", self.server),
+            Endpoint("/now", self.now),
+            Endpoint("/events", self.events, ("day", "name"), "text/event-stream"),
+            Endpoint("/runs", self.runs, ("q", "status", "first", "n")),
+            Endpoint(_RUN, self.run),
+            Endpoint(f"{_RUN}/state", self.state),
+            Endpoint(f"{_RUN}/statistics", self.statistics),
+            Endpoint(f"{_RUN}/scan", self.scan),
+            Endpoint(f"{_RUN}/shots", self.shots, ("first", "n")),
+            Endpoint(f"{_RUN}/shots/{{shot}}", self.shot, ("attempt",)),
+            Endpoint(
+                f"{_RUN}/shots/{{shot}}/frames/{{image}}.png", self.frame, ("attempt", "width"), "image/png"
+            ),
+            Endpoint(f"{_RUN}/files/{{kind}}", self.file, content="text/plain"),
+            Endpoint("/queue", self.queue),
+            Endpoint("/calibrations", self.calibrations),
+            Endpoint("/calibrations/{store}/{file}.png", self.calibration_picture, content="image/png"),
+        ]
+        return reading + (self._actions.endpoints() if self._actions is not None else [])
+
+    def server(self, _: Request) -> Any:
+        """What this server is: version, data folder, whether visitors may act."""
+        return {
+            "labseq": labseq.__version__,
+            "data": text_of(self._runs.root),
+            "may_act": self._actions is not None,
+            "up_s": round(time.monotonic() - self._started_s, 1),
+            "viewers": self._live.n_viewers,
+        }
+
+    def now(self, _: Request) -> Any:
+        """The state of the run in progress, else of the newest run: all that the page "Now" shows."""
+        return self._live.state()
+
+    async def events(self, request: Request) -> Response:
+        """The same state as server-sent events, each time it changes: of the newest run, or of one run.
+
+        The answer to `Last-Event-ID` is the present state, or nothing if it is still the same.
+        """
+        if self._live.n_viewers >= MAX_VIEWERS:
+            return JSONResponse({"error": f"{MAX_VIEWERS} pages are open already"}, 503)
+        channel = self._live.channel(
+            request.query_params.get("day", ""), request.query_params.get("name", "")
+        )
+        states = channel.states(request.headers.get("last-event-id", ""))
+        headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
+        return StreamingResponse(states, media_type="text/event-stream", headers=headers)
+
+    def runs(self, request: Request) -> Any:
+        """The runs, the newest first."""
+        asked = request.query_params
+        first, most = _number(asked, "first", 0), min(MAX_LISTED, _number(asked, "n", 50))
+        return self._runs.search(asked.get("q", "")[:200], asked.get("status", "")[:20], first, most)
+
+    def run(self, request: Request) -> Any:
+        """A run: its head, figures, trend, losses, what was changed, and its files."""
+        run = self._opened(request)
+        record, (status, error) = run.record, read_state(run.folder)
+        run.history.update()
+        columns = run.history.columns()
+        changes: dict[str, Any] = record.get("overrides") or {}
+        return {
+            "run": head_of(run, record, status, error),
+            "figures": figures_of(columns),
+            "trend": columns.trend(N_BINS),
+            "losses": losses_of(columns),
+            "changes": readings_of({address: one["written"] for address, one in changes.items()}),
+            "calibrations": readings_of(record.get("calibrations") or {}),
+            "devices": {
+                text_of(name, 80): readings_of(one) if isinstance(one, dict) else text_of(one, 200)
+                for name, one in (record.get("devices") or {}).items()
+            },
+            "plugins": [readings_of(one) for one in record.get("plugins") or () if isinstance(one, dict)],
+            "provenance": readings_of(record.get("provenance") or {}),
+            "n_damaged_lines": run.history.n_damaged,
+            "has_scan": bool(record.get("scan")),
+            "files": [kind for kind, name in _TEXTS.items() if (run.folder / name).is_file()],
+        }
+
+    def state(self, request: Request) -> Any:
+        """The state of a run, as in `/now`."""
+        self._opened(request)
+        return self._live.state(request.path_params["day"], request.path_params["name"])
+
+    def statistics(self, request: Request) -> Any:
+        """Statistics of each cycle, defects and stages, from at most 500 shots evenly chosen."""
+        run = self._opened(request)
+        run.history.update()
+        counted = run.history.columns().counted.tolist()
+        shots = run.with_rows(_evenly(counted, MAX_STATISTICS))
+        totals = StageTotals()
+        for shot in _evenly(shots, MAX_TIMED):
+            with suppress(RecordingError):
+                totals.add_timing(shot.timing)
+        return {
+            "n_read": len(shots),
+            "n_shots": len(counted),
+            "statistics": statistics_of(shots, run.target).as_dict(),
+            "stages": stage_rows(totals, simulated=bool(run.record["simulated"])),
+        }
+
+    def scan(self, request: Request) -> Any:
+        """The points of a run's scan and the figures at each; null without a scan."""
+        run = self._opened(request)
+        run.history.update()
+        run.read_events()
+        return scan_values(run) if run.record.get("scan") else None
+
+    def shots(self, request: Request) -> Any:
+        """The shots of a run, the newest first, with attempts that do not count."""
+        run = self._opened(request)
+        run.history.update()
+        first = _number(request.query_params, "first", 0)
+        most = min(MAX_LISTED, _number(request.query_params, "n", 50))
+        columns = run.history.columns()
+        lines = range(len(columns.shot))[::-1][first : first + most]
+        names = ("success", "filling", "seen", "n_cycles", "n_batches", "n_atom_moves", "duration_s")
+        rows = [
+            {
+                "shot": int(columns.shot[line]),
+                "attempt": int(columns.attempt[line]),
+                "counts": bool(columns.counts[line]),
+                **{name: finite(float(columns.numbers[name][line])) for name in names},
+            }
+            for line in lines
+        ]
+        return {"n_lines": len(columns.shot), "shots": rows}
+
+    def shot(self, request: Request) -> Any:
+        """A shot: images with occupancies, cycle by cycle moves, stages and readings."""
+        run = self._opened(request)
+        line = self._line(run, request)
+        record = run.record
+        values = shot_values(run.shot(line), str(record.get("record_frames")))
+        status, error = read_state(run.folder)
+        return {"run": head_of(run, record, status, error), "shot": values}
+
+    def frame(self, request: Request) -> Response:
+        """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""
+        run = self._opened(request)
+        shot = run.shot(self._line(run, request))
+        width = max(16, _number(request.query_params, "width", 512))
+        png, factor = frame_png(shot, _number(request.path_params, "image", 0), width)
+        headers = {"cache-control": "private, max-age=600", "x-reduced": str(factor)}
+        return Response(png, media_type="image/png", headers=headers)
+
+    def file(self, request: Request) -> Response:
+        """The sequence or the profile as it was when the run began: `kind` is one of them."""
+        run = self._opened(request)
+        name = _TEXTS.get(request.path_params["kind"])
+        if name is None:
+            raise NoSuchRun("a run has the files 'sequence' and 'profile'")
+        text = read_file(run.folder / name).decode("utf-8", "replace")
+        return PlainTextResponse(text_of(text, MAX_FILE))
+
+    def queue(self, _: Request) -> Any:
+        """The queue: its entries in the order in which they are taken, and the process that takes them."""
+        return queue_values(self._runs.root)
+
+    def calibrations(self, _: Request) -> Any:
+        """All calibrations by folder and kind with their quality, and those in use."""
+        return calibrations(self._runs)
+
+    def calibration_picture(self, request: Request) -> Response:
+        """The picture of a calibration."""
+        store, file = request.path_params["store"], request.path_params["file"]
+        png = calibration_picture(self._runs, store, file)
+        if png is None:
+            raise NoSuchRun("there is no such picture")
+        return Response(png, media_type="image/png", headers={"cache-control": "private, max-age=600"})
+
+    def _opened(self, request: Request) -> OpenRun:
+        return self._runs.open(request.path_params["day"], request.path_params["name"])
+
+    @staticmethod
+    def _line(run: OpenRun, request: Request) -> int:
+        run.history.update()
+        shot = _number(request.path_params, "shot", 0)
+        attempt = _number(request.query_params, "attempt", -1)
+        line = run.history.line_of(shot, None if attempt < 0 else attempt)
+        if line is None:
+            raise NoSuchRun(f"the run has no shot {shot} yet")
+        return line
+
+    def openapi(self) -> dict[str, Any]:
+        """The API as an OpenAPI document."""
+        paths: dict[str, dict[str, Any]] = {}
+        for one in self.endpoints():
+            paths.setdefault(BASE + one.path, {})[one.method.lower()] = _operation(one)
+        about = {"title": "labseq", "version": labseq.__version__, "description": _ABOUT}
+        return {"openapi": "3.1.0", "info": about, "paths": paths}
+
+    def metrics(self) -> str:
+        """The state of the newest run in the format of Prometheus."""
+        state = self._live.state()
+        lines = [
+            "# HELP labseq_up Whether the data folder can be read.",
+            "# TYPE labseq_up gauge",
+            f"labseq_up {int(not state['error'])}",
+        ]
+        run, alarms = state["run"], state["alarms"]
+        values: dict[str, tuple[str, float | None]] = {
+            "labseq_runs_in_progress": ("Runs in progress.", float(len(state.get("running") or ()))),
+            "labseq_alarms": ("Alarms of the newest run.", float(len(alarms))),
+            "labseq_viewers": ("Pages that are open.", float(self._live.n_viewers)),
+        }
+        if run is not None:
+            figures = state["figures"]
+            values |= {
+                "labseq_run_in_progress": (
+                    "Whether this run is in progress.",
+                    float(run["status"] == "running"),
+                ),
+                "labseq_run_shots": ("Shots of the run so far.", float(run["n_done"])),
+                "labseq_run_shots_planned": ("Shots that the run will have.", float(run["n_shots"])),
+                "labseq_run_failed_attempts": ("Attempts that do not count.", float(run["n_attempts"])),
+                "labseq_run_filling": ("Mean filling of the target.", figures["filling"]),
+                "labseq_run_defect_free": ("Fraction of defect-free shots.", figures["defect_free"]),
+            }
+        label = "" if run is None else f'{{run="{_label(run["id"])}",name="{_label(run["name"])}"}}'
+        for name, (about, value) in values.items():
+            shown = "NaN" if value is None or not math.isfinite(value) else f"{value:.12g}"
+            lines += [f"# HELP {name} {about}", f"# TYPE {name} gauge"]
+            lines.append(f"{name}{label if name.startswith('labseq_run_') else ''} {shown}")
+        return "\n".join(lines) + "\n"
+
+
+_ABOUT: Final = (
+    "Runs, shots, scans, queue and calibrations of a labseq data folder. Times are in seconds, fractions "
+    "from 0 to 1, intervals of 68 %. Shots, images, cycles and sites are counted from 0. Unknown numbers are "
+    'null. An error has the form {"error": "..."}. With a token, send "Authorization: Bearer TOKEN".'
+)
+
+
+def _operation(one: Endpoint) -> dict[str, Any]:
+    in_path = [part.partition("}")[0] for part in one.path.split("{")[1:]]
+    parameters = [_parameter(name, "path") for name in in_path] + [_parameter(n, "query") for n in one.query]
+    found: dict[str, Any] = {
+        "operationId": getattr(one.answer, "__name__", "answer"),
+        "summary": one.description,
+        "parameters": parameters,
+        "responses": {
+            "200": {"description": "as described", "content": {one.content: {}}},
+            "404": {"description": "there is no such thing"},
+            "409": {"description": "it cannot be read, or not be done; 'error' says why"},
+        },
+    }
+    if one.body is not None:
+        keys = {name: {"description": about} for name, about in one.body.items()}
+        schema = {"type": "object", "properties": keys}
+        found["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
+    return found
+
+
+def _parameter(name: str, place: str) -> dict[str, Any]:
+    is_number = name in ("shot", "image", "attempt", "first", "n", "width")
+    return {
+        "name": name,
+        "in": place,
+        "required": place == "path",
+        "description": _DESCRIPTIONS.get(name, name),
+        "schema": {"type": "integer" if is_number else "string"},
+    }
+
+
+def _label(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+
+
+def _number(values: Mapping[str, Any], name: str, default: int) -> int:
+    """A whole number that the address contains.
+
+    Raises:
+        NoSuchRun: It is none.
+    """
+    text = str(values.get(name, default))
+    if not (text.removeprefix("-").isdecimal() and len(text) < 12):
+        raise NoSuchRun(f"'{name}' is no whole number")
+    return max(int(text), -1)
+
+
+def _evenly(items: Any, n_most: int) -> list[Any]:
+    step = max(1, math.ceil(len(items) / n_most))
+    return list(items[::step])
+
+
+async def answered(one: Endpoint, request: Request) -> Response:
+    """Answer a request; what cannot be shown is a reason in the answer, never a crash."""
+    try:
+        if inspect.iscoroutinefunction(one.answer):
+            found = await one.answer(request)
+        else:
+            found = await run_in_threadpool(partial(one.answer, request))
+    except NoSuchRun as error:
+        return JSONResponse({"error": text_of(error)}, 404)
+    except (LabseqError, OSError) as error:
+        return JSONResponse({"error": text_of(error)}, 409)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:  # a file with other values
+        return JSONResponse(
+            {"error": text_of(f"a file of this run has values that cannot be read: {error!r}")}, 409
+        )
+    if isinstance(found, Response):
+        return found
+    content = encode(to_plain(found))
+    return Response(content, media_type="application/json", headers={"cache-control": "no-store"})

@@ -1,0 +1,82 @@
+"""The application: the pages, the files that they consist of, the API and the metrics."""
+
+from __future__ import annotations
+
+import mimetypes
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from labseq.web.access import Access, App, Guard
+from labseq.web.acting import Actions
+from labseq.web.api import BASE, Api, Endpoint, answered
+from labseq.web.runs import Catalogue
+from labseq.web.state import Limits
+
+STATIC: Final = Path(__file__).parent / "static"
+PAGES: Final = (
+    *("/", "/now", "/scan", "/runs", "/compare", "/queue", "/calibrations", "/api"),
+    *("/runs/{day}/{name}", "/runs/{day}/{name}/shots/{shot}"),
+)
+_KINDS: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
+
+
+def make_app(root: Path, access: Access | None = None, limits: Limits | None = None) -> App:
+    """The whole application, with its guard.
+
+    Args:
+        root: The data folder.
+        access: Who may use it; by default everybody who can reach it, only to look.
+        limits: When alarms are raised.
+    """
+    allowed = access or Access()
+    catalogue = Catalogue(root)
+    api = Api(catalogue, limits or Limits(), Actions(catalogue) if allowed.may_act else None)
+    files = {path.name: _file(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}
+    page = files["index.html"]
+
+    async def show_page(_: Request) -> Response:
+        return _copy(page)
+
+    async def show_file(request: Request) -> Response:
+        found = files.get(request.path_params["file"])
+        return _copy(found) if found is not None else PlainTextResponse("there is no such file\n", 404)
+
+    async def show_api(_: Request) -> Response:
+        return JSONResponse(api.openapi())
+
+    async def show_metrics(_: Request) -> Response:
+        text = await run_in_threadpool(api.metrics)
+        return Response(text, media_type="text/plain; version=0.0.4")
+
+    routes = [
+        *(Route(path, show_page) for path in PAGES),
+        Route("/static/{file}", show_file),
+        Route(f"{BASE}/openapi.json", show_api),
+        Route("/metrics", show_metrics),
+        *(_route(one) for one in api.endpoints()),
+    ]
+    return Guard(Starlette(routes=routes, exception_handlers={404: _missing}), allowed)
+
+
+def _route(one: Endpoint) -> Route:
+    return Route(BASE + one.path, partial(answered, one), methods=[one.method])
+
+
+def _file(path: Path) -> tuple[bytes, str]:
+    return path.read_bytes(), _KINDS.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "text/plain"
+
+
+def _copy(file: tuple[bytes, str]) -> Response:
+    content, kind = file
+    return Response(content, media_type=kind, headers={"cache-control": "no-cache"})
+
+
+async def _missing(_: Request, error: Any) -> Response:
+    return JSONResponse({"error": "there is no such page"}, getattr(error, "status_code", 404))

@@ -1,0 +1,139 @@
+"""Passes the state of runs on to browsers; one that is slow misses states, and holds nothing up."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from typing import Any, Final
+
+from labseq.errors import LabseqError
+from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
+from labseq.web.state import Limits, RunState, alarm
+
+POLL_S: Final = 0.1
+"""Interval at which the files of a run are looked at while somebody watches it."""
+IDLE_S: Final = 1.0
+"""The same for a run that is over."""
+HEARTBEAT_S: Final = 15.0
+"""A connection is used at least so often, so that one that is dead is noticed."""
+MAX_VIEWERS: Final = 100
+
+
+class Channel:
+    """One run, or the newest one, for all browsers that watch it.
+
+    There is one slot: the latest state, encoded once. A browser that is slow finds the latest when it is
+    ready for the next one.
+
+    Args:
+        read: Returns the state of the run; may take time, and is called in a thread.
+    """
+
+    def __init__(self, read: Callable[[], dict[str, Any]]) -> None:
+        self._read = read
+        self._changed = asyncio.Condition()
+        self._text = ""
+        self._task: asyncio.Task[None] | None = None
+        self.n_viewers = 0
+        self.version = 0
+
+    async def states(self, after: str) -> AsyncIterator[str]:
+        """The states as server-sent events, from now on until the browser leaves.
+
+        Args:
+            after: Id of the last event that the browser has; the present state is left out if it is that.
+        """
+        self.n_viewers += 1
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._follow())
+        seen, is_first = 0, True
+        try:
+            while True:
+                async with self._changed:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(
+                            self._changed.wait_for(lambda seen=seen: self.version > seen), HEARTBEAT_S
+                        )
+                    text, is_new = self._text, self.version > seen
+                    seen = self.version
+                if not is_new:
+                    yield ": still here\n\n"
+                elif not (is_first and after == _id_of(text)):
+                    yield f"id: {_id_of(text)}\nevent: state\ndata: {text}\n\n"
+                is_first = False
+        finally:
+            self.n_viewers -= 1
+
+    async def _follow(self) -> None:
+        """Read the run as long as somebody watches."""
+        while self.n_viewers:
+            state = await asyncio.to_thread(self._read)
+            text = encode(state)
+            if text != self._text:
+                async with self._changed:
+                    self._text = text
+                    self.version += 1
+                    self._changed.notify_all()
+            is_running = (state.get("run") or {}).get("status") == "running"
+            await asyncio.sleep(POLL_S if is_running or state.get("error") else IDLE_S)
+
+
+class Live:
+    """The runs that are watched.
+
+    Args:
+        catalogue: The runs.
+        limits: When alarms are raised.
+    """
+
+    def __init__(self, catalogue: Catalogue, limits: Limits) -> None:
+        self._catalogue = catalogue
+        self._limits = limits
+        self._channels: dict[str, Channel] = {}
+        self._states: dict[str, RunState] = {}
+
+    @property
+    def n_viewers(self) -> int:
+        """Number of connections that are open."""
+        return sum(channel.n_viewers for channel in self._channels.values())
+
+    def channel(self, day: str, name: str) -> Channel:
+        """The channel of a run; of the newest if both are empty."""
+        self._channels = {key: one for key, one in self._channels.items() if one.n_viewers}
+        key = f"{day}/{name}"
+        if key not in self._channels:
+            self._channels[key] = Channel(lambda: self.state(day, name))
+        return self._channels[key]
+
+    def state(self, day: str = "", name: str = "") -> dict[str, Any]:
+        """The state of a run, of the newest by default; with "error" if it cannot be read."""
+        try:
+            run = self._catalogue.open(day, name) if name else self._catalogue.newest()
+            if run is None:
+                return {"run": None, "running": [], "alarms": [], "error": ""}
+            return self._state_of(run).update() | {"running": self._catalogue.running(), "error": ""}
+        except (LabseqError, OSError, NoSuchRun) as error:
+            text = text_of(error)
+            found = alarm("error", "This cannot be shown", text)
+            return {"run": None, "running": [], "alarms": [found], "error": text}
+
+    def _state_of(self, run: OpenRun) -> RunState:
+        state = self._states.get(run.id)
+        if state is None or state.run is not run:
+            state = self._states[run.id] = RunState(run, self._limits)
+            while len(self._states) > 8:
+                del self._states[next(iter(self._states))]
+        return state
+
+
+def encode(values: dict[str, Any]) -> str:
+    """A state as JSON of one line."""
+    return json.dumps(values, allow_nan=False, separators=(",", ":"), default=str)
+
+
+def _id_of(text: str) -> str:
+    import zlib
+
+    return f"{zlib.crc32(text.encode('utf-8', 'replace')):08x}"

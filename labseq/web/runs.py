@@ -1,0 +1,349 @@
+"""The runs of a data folder: the list, and what the pages need of each run."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+from typing import Any, Final, cast
+
+from labseq.console.runs import runs_in
+from labseq.errors import RecordingError
+from labseq.files import NewLines, read_file, write_file
+from labseq.messages import visible
+from labseq.model import TargetPattern
+from labseq.plain import dumps, now_utc, parse_object
+from labseq.recording import Run, Shot
+from labseq.recording.folders import EVENTS_FILE, NOTES_FILE, RUN_FILE, STATE_FILE
+from labseq.recording.run_file import RunTime, read_run, read_state, target_of
+from labseq.web.history import RunHistory, finite, interval_of
+
+MAX_TEXT: Final = 2000
+"""Maximum number of characters of a text from a file that is passed on."""
+MAX_NOTE: Final = 10_000
+"""Maximum number of characters of a comment."""
+MAX_TAGS: Final = 20
+_LISTED_S: Final = 0.5
+"""For so long the list of folders is not read again, in seconds."""
+_MAX_OPEN: Final = 12
+"""Maximum number of runs that are kept open: 20,000 shots take 3 MB."""
+_DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
+_MAX_EVENTS: Final = 40
+_NOTED: Final = frozenset(
+    {"warning", "safe_state", "closed", "shot_repeated", "window_too_short", "window_exceeded"}
+    | {"scan_ended", "leader_awaited", "left_on", "run_finished", "run_starting"}
+)
+"""Events that the page lists."""
+
+
+def text_of(value: object, most: int = MAX_TEXT) -> str:
+    """A text from a file: of limited length, control characters as escapes, lines kept."""
+    text = str(value)
+    text = text if len(text) <= most else f"{text[:most]} ..."
+    return "\n".join(visible(line.replace("\t", "    ")) for line in text.split("\n"))
+
+
+class NoSuchRun(LookupError):  # noqa: N818 - a page that is not there is no failure
+    """The data folder has no run of this name."""
+
+
+class OpenRun:
+    """A run whose files are followed while it is written.
+
+    Args:
+        folder: The run's folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.id = f"{folder.parent.name}/{folder.name}"
+        self.history = RunHistory(folder)
+        self.lock = Lock()
+        self._record: dict[str, Any] = {}
+        self._record_stamp: object = None
+        self._event_lines = NewLines(folder / EVENTS_FILE)
+        self._time = RunTime()
+        self.events: list[dict[str, Any]] = []
+        self.scan_events: list[dict[str, Any]] = []
+        self.first_shot_s = self.last_event_s = math.nan
+        self.shots_before = 0
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The content of run.json.
+
+        Raises:
+            RecordingError: It is damaged.
+        """
+        stamp = _stamp(self.folder / RUN_FILE)
+        if stamp != self._record_stamp or not self._record:
+            self._record = read_run(self.folder)
+            self._record_stamp = stamp
+            self.__dict__.pop("target", None)
+        return self._record
+
+    @cached_property
+    def target(self) -> TargetPattern:
+        """The target of the run.
+
+        Raises:
+            RecordingError: It is damaged.
+        """
+        return target_of(self.folder / RUN_FILE, self.record)
+
+    def read_events(self) -> bool:
+        """Read what was added to the event log; whether there was anything.
+
+        Raises:
+            RecordingError: It cannot be read.
+        """
+        lines = self._event_lines.read()
+        for line in lines:
+            with suppress(KeyError, TypeError, ValueError, AttributeError):  # a damaged line
+                self._add_event(str(line["event"]), line["values"], line)
+        return bool(lines)
+
+    def _add_event(self, name: str, values: Mapping[str, Any], line: Mapping[str, Any]) -> None:
+        self._time.advance(line.get("t_s"))
+        self.last_event_s = self._time.total_s
+        if name == "run_starting":
+            self.shots_before, self.first_shot_s = int(values.get("n_before") or 0), math.nan
+        elif name == "shot_started" and math.isnan(self.first_shot_s):
+            self.first_shot_s = self._time.total_s
+        elif name == "scan_point":
+            self.scan_events.append(dict(values))
+        if name in _NOTED and not (name in ("safe_state", "closed") and values.get("ok") is True):
+            self.events.append({"t_utc": text_of(line.get("t_utc", ""), 40), "event": name, "values": values})
+            del self.events[:-_MAX_EVENTS]
+
+    def with_rows(self, lines: Iterable[int]) -> list[Shot]:
+        """The shots of some lines of the index; those that cannot be read are left out."""
+        found = list[Shot]()
+        for line in lines:
+            with suppress(RecordingError):
+                found.append(self.shot(line))
+        return found
+
+    def shot(self, line: int) -> Shot:
+        """The shot of a line of the index.
+
+        Raises:
+            RecordingError: The line cannot be read.
+        """
+        row = self.history.row(line)
+        return Shot(self.folder / row["file"], row)
+
+    def outline(self) -> Run:
+        """The run with no more of its shots than how they were judged, however many there are."""
+        columns = self.history.columns()
+        numbers = zip(
+            columns.shot[columns.counted].tolist(),
+            columns.of_shots("filling").tolist(),
+            columns.of_shots("success").tolist(),
+            strict=True,
+        )
+        rows = (
+            {"shot": shot, "filling_fraction": finite(filling), "success": success == 1.0}
+            for shot, filling, success in numbers
+        )
+        status, error = read_state(self.folder)
+        shots = tuple(Shot(self.folder, row) for row in rows)
+        return Run(self.folder, self.record, status, error, shots, ())
+
+
+class Catalogue:
+    """All runs of a data folder. Methods may be called from several threads.
+
+    Args:
+        root: The data folder, which may vanish and return.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._lock = Lock()
+        self._open: OrderedDict[str, OpenRun] = OrderedDict()
+        self._summaries: dict[Path, tuple[object, dict[str, Any]]] = {}
+        self._folders: list[Path] = []
+        self._listed_s = -math.inf
+
+    def folders(self) -> list[Path]:
+        """The folders of all runs, the newest last.
+
+        Raises:
+            RecordingError: The data folder cannot be read.
+        """
+        with self._lock:
+            if time.monotonic() - self._listed_s > _LISTED_S:
+                try:
+                    next(self.root.iterdir(), None)
+                    self._folders = runs_in(self.root)
+                except OSError as error:
+                    self._folders = []
+                    reason = f"the data folder cannot be read: {error.strerror}"
+                    raise RecordingError(self.root, f"{reason}; it is tried again") from error
+                self._listed_s = time.monotonic()
+            return self._folders
+
+    def newest(self) -> OpenRun | None:
+        """The newest run in progress, else the newest; None without one.
+
+        Raises:
+            RecordingError: The data folder cannot be read.
+        """
+        folders = [folder for folder in self.folders()[-20:] if (folder / RUN_FILE).exists()]
+        running = [folder for folder in folders if read_state(folder)[0] == "running"]
+        chosen = (running or folders)[-1:]
+        return self._opened(chosen[0]) if chosen else None
+
+    def running(self) -> list[str]:
+        """The runs in progress, among the newest 20.
+
+        Raises:
+            RecordingError: The data folder cannot be read.
+        """
+        return [run_id(one) for one in self.folders()[-20:] if read_state(one)[0] == "running"]
+
+    def open(self, day: str, name: str) -> OpenRun:
+        """Open a run by its day and the name of its folder.
+
+        Raises:
+            NoSuchRun: There is none.
+        """
+        folder = self.root / day / name
+        is_name = _DAY.fullmatch(day) and not {"/", "\\", "\0"} & set(name) and name.strip(".")
+        if not is_name or len(name) > 255 or not folder.is_dir():
+            raise NoSuchRun(f"there is no run {visible(day[:40])}/{visible(name[:100])}")
+        return self._opened(folder)
+
+    def _opened(self, folder: Path) -> OpenRun:
+        with self._lock:
+            run = self._open.pop(str(folder), None) or OpenRun(folder)
+            self._open[str(folder)] = run
+            while len(self._open) > _MAX_OPEN:
+                self._open.popitem(last=False)
+            return run
+
+    def summary(self, folder: Path) -> dict[str, Any]:
+        """A run in a line of the list; it is only read again if one of its files has changed."""
+        names = (RUN_FILE, STATE_FILE, "index.jsonl", NOTES_FILE)
+        stamp = [_stamp(folder / name) for name in names]
+        known = self._summaries.get(folder)
+        if known is not None and known[0] == stamp and known[1]["status"] != "running":
+            return known[1]
+        values = _summary(self._open.get(str(folder)) or OpenRun(folder))
+        self._summaries[folder] = (stamp, values)
+        return values
+
+    def search(self, text: str, status: str, first: int, most: int) -> dict[str, Any]:
+        """The newest runs whose line contains all the words.
+
+        Args:
+            text: Words that date, name, profile, outcome, comment or tags must contain.
+            status: Only runs of this status; "" for all.
+            first: Number of newer ones to leave out.
+            most: Maximum number of runs.
+
+        Raises:
+            RecordingError: The data folder cannot be read.
+        """
+        folders = self.folders()[::-1]
+        words = text.lower().split()
+        if not words and not status:
+            found = [self.summary(folder) for folder in folders[first : first + most]]
+            return {"n_runs": len(folders), "n_found": len(folders), "runs": found}
+        matching = [
+            summary
+            for folder in folders
+            if _matches(summary := self.summary(folder), words) and status in ("", summary["status"])
+        ]
+        return {
+            "n_runs": len(folders),
+            "n_found": len(matching),
+            "runs": matching[first : first + most],
+        }
+
+
+def run_id(folder: Path) -> str:
+    """The name by which commands and pages know a run."""
+    return f"{folder.parent.name}/{folder.name}"
+
+
+def _stamp(path: Path) -> object:
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_ino, about.st_mtime_ns, about.st_size
+
+
+def _matches(summary: Mapping[str, Any], words: Iterable[str]) -> bool:
+    keys = ("id", "name", "profile", "status", "outcome", "comment", "started_utc", "error")
+    text = " ".join(str(summary[key] or "") for key in keys).lower()
+    text += " ".join(summary["tags"]).lower() + (" simulated" if summary["simulated"] else "")
+    return all(word in text for word in words)
+
+
+def _summary(run: OpenRun) -> dict[str, Any]:
+    values: dict[str, Any] = {"id": text_of(run.id, 300), **read_notes(run.folder)}
+    keys = ("name", "profile", "started_utc", "simulated", "n_shots", "n_done", "filling", "defect_free")
+    values |= dict.fromkeys((*keys, "has_scan"))
+    try:
+        record, (status, error) = run.record, read_state(run.folder)
+        run.history.update()
+    except (RecordingError, OSError) as failure:
+        return values | {"status": "damaged", "outcome": "cannot be read", "error": text_of(failure)}
+    columns = run.history.columns()
+    rate = columns.defect_free
+    outcome = f"{rate.n} of {rate.n_trials} defect-free" if rate.n_trials else "no judged shots"
+    return values | {
+        "name": text_of(record["name"], 200),
+        "profile": profile_of(record),
+        "started_utc": text_of(record.get("t_start_utc", ""), 40),
+        "simulated": record["simulated"],
+        "n_shots": record["n_shots"],
+        "n_done": run.history.n_shots,
+        "status": status,
+        "error": text_of(error, 400),
+        "filling": finite(columns.filling.value),
+        "filling_interval": interval_of(columns.filling),
+        "defect_free": finite(rate.value),
+        "defect_free_interval": interval_of(rate),
+        "outcome": outcome,
+        "has_scan": bool(record.get("scan")),
+    }
+
+
+def profile_of(record: Mapping[str, Any]) -> str:
+    """Name of the profile of a run."""
+    resolved: Any = record.get("resolved")
+    profile: Any = resolved.get("profile") if isinstance(resolved, dict) else None
+    name: Any = cast("dict[str, Any]", profile).get("name") if isinstance(profile, dict) else None
+    return text_of(name or Path(str(record.get("profile_path") or "")).stem or "-", 200)
+
+
+def read_notes(folder: Path) -> dict[str, Any]:
+    """Comment and tags of a run; empty if there are none or they are damaged."""
+    values: Mapping[str, Any] = {}
+    with suppress(RecordingError):
+        if (folder / NOTES_FILE).exists():
+            values = parse_object(read_file(folder / NOTES_FILE, 1 << 20)) or {}
+    tags: Any = values.get("tags")
+    kept = cast("list[Any]", tags)[:MAX_TAGS] if isinstance(tags, list) else []
+    return {"comment": text_of(values.get("comment") or "", MAX_NOTE), "tags": [text_of(t, 60) for t in kept]}
+
+
+def write_notes(folder: Path, comment: str, tags: list[str]) -> None:
+    """Replace comment and tags of a run.
+
+    Raises:
+        RecordingError: The folder cannot be written to.
+    """
+    words = list(dict.fromkeys(word for tag in tags if (word := " ".join(tag.split())[:60])))[:MAX_TAGS]
+    values = {"comment": comment[:MAX_NOTE], "tags": words, "t_utc": now_utc()}
+    write_file(folder / NOTES_FILE, dumps(values, indent=1).encode() + b"\n")

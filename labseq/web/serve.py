@@ -1,0 +1,220 @@
+"""`labseq web`: starts the server."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.console.output import say
+from labseq.errors import ConfigError, Problem
+from labseq.files import data_root
+from labseq.messages import install_hint, visible
+from labseq.processes import Process
+from labseq.web.access import Access, find_token, is_loopback, own_names
+
+HOST: Final = "127.0.0.1"
+PORT: Final = 8642
+_PORTS: Final = 20
+"""Number of ports that `labseq run --web` tries."""
+_LOOK_S: Final = 2.0
+"""Interval at which a server looks whether its terminal is still there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """How the server is reached.
+
+    Attributes:
+        host: Address that it listens on.
+        port: Port that it listens on; 0 for any that is free.
+        names: Further names of the server, such as that of a proxy.
+        certificate: PEM file of the certificate, for TLS.
+        key: PEM file of its key.
+        control: Whether visitors may act.
+        calibration_age_s: Age of a calibration in use at which an alarm is raised.
+        ends_with: Process id; the server ends when this process does. None: at Ctrl-C.
+    """
+
+    host: str = HOST
+    port: int = PORT
+    names: tuple[str, ...] = ()
+    certificate: Path | None = None
+    key: Path | None = None
+    control: bool = False
+    calibration_age_s: float = 7 * 86_400.0
+    ends_with: int | None = None
+
+
+def serve(data: Path | None, how: Serving) -> None:
+    """Serve the pages of a data folder until Ctrl-C.
+
+    Raises:
+        ConfigError: The package is missing, the folder or a certificate does not exist, or the port is taken.
+    """
+    check_packages()
+    import uvicorn
+
+    from labseq.web.app import make_app
+    from labseq.web.state import Limits
+
+    root = (data or data_root()).expanduser().absolute()
+    if data is not None and not root.is_dir():
+        raise ConfigError(Problem("there is no such folder", visible(str(root)), expected="a data folder"))
+    for path in (how.certificate, how.key):
+        if path is not None and not path.is_file():
+            raise ConfigError(Problem("there is no such file", visible(str(path)), expected="a PEM file"))
+    is_open = is_loopback(how.host) and not how.names
+    token = "" if is_open and not how.control else find_token()
+    listener = _listener(how.host, how.port)
+    app = make_app(root, Access(token, own_names(how.names), how.control), Limits(how.calibration_age_s))
+    for line in _greeting(root, how, listener.getsockname()[1], token):
+        say(line)
+    config = uvicorn.Config(
+        app,  # pyright: ignore[reportArgumentType]
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        ws="none",
+        lifespan="off",
+        limit_concurrency=400,
+        timeout_keep_alive=20,
+        timeout_graceful_shutdown=1,
+        ssl_certfile=how.certificate,
+        ssl_keyfile=how.key,
+    )
+    server = uvicorn.Server(config)
+    if how.ends_with is not None:
+        threading.Thread(target=_end_with, args=(how.ends_with, server), daemon=True).start()
+    with suppress(KeyboardInterrupt):
+        server.run(sockets=[listener])
+
+
+def check_packages() -> None:
+    """Check that the extra is installed.
+
+    Raises:
+        ConfigError: A package is missing.
+    """
+    for name in ("starlette", "uvicorn"):
+        if find_spec(name) is None:
+            what = f"showing runs in a browser needs {name}, which is not installed"
+            raise ConfigError(Problem(what, hint=install_hint("web")))
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """A socket that listens.
+
+    Raises:
+        ConfigError: The address is wrong, or the port is taken.
+    """
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        if os.name != "nt":  # there it would let another process take the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(128)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        hint = "choose another one with --port; perhaps the server is already running"
+        raise ConfigError(Problem(f"{host}:{port} cannot be used: {reason}", hint=hint)) from error
+    return listener
+
+
+def _greeting(root: Path, how: Serving, port: int, token: str) -> list[str]:
+    scheme = "https" if how.certificate else "http"
+    any_address = how.host in ("0.0.0.0", "::")  # noqa: S104 - compared, not bound
+    host = how.names[0] if how.names else socket.gethostname() if any_address else how.host
+    host = f"[{host}]" if ":" in host else host
+    query = f"?token={token}" if token else ""
+    lines = [f"{scheme}://{host}:{port}/{query}", f"shows {root}; Ctrl-C ends it"]
+    if not is_loopback(how.host) and not how.certificate:
+        lines.append("warning: without TLS, everybody in this network can read what it sends, the token too")
+    return lines
+
+
+def _end_with(pid: int, server: Any) -> None:
+    """End the server when a process has ended."""
+    other = _process(pid)
+    while other is not None and other.is_running:
+        time.sleep(_LOOK_S)
+    server.should_exit = True
+
+
+def _process(pid: int) -> Process | None:
+    import psutil
+
+    try:
+        psutil.Process(pid)
+    except psutil.Error:
+        return None
+    return Process(pid, 0.0, Process.current().host)
+
+
+def start_beside(root: Path) -> str:
+    """Start a server for a run in a process of its own, unless there is one for this data folder.
+
+    Returns:
+        The lines to print: its address, and when it ends.
+
+    Raises:
+        ConfigError: There is no free port, or a package is missing.
+    """
+    check_packages()
+    root = root.expanduser().absolute()
+    for port in range(PORT, PORT + _PORTS):
+        address = f"http://{HOST}:{port}/"
+        with socket.socket() as probe:
+            is_taken = probe.connect_ex((HOST, port)) == 0
+        if is_taken and _serves(address, root):
+            return f"{address} shows this run"
+        if not is_taken:
+            pid = _spawn(root, port)
+            return f"{address} shows this run (process {pid}; it ends with this terminal)"
+    raise ConfigError(
+        Problem(f"the ports {PORT} to {PORT + _PORTS - 1} are taken", hint="start `labseq web`")
+    )
+
+
+def _serves(address: str, root: Path) -> bool:
+    """Whether a server of this data folder answers there."""
+    address = f"{address}api/v1/server"
+    with suppress(OSError, ValueError, KeyError), urllib.request.urlopen(address, timeout=0.5) as answer:  # noqa: S310 - loopback
+        return bool(json.loads(answer.read(10_000))["data"] == visible(str(root)))
+    return False
+
+
+def _spawn(root: Path, port: int) -> int:
+    root.mkdir(parents=True, exist_ok=True)
+    command = [
+        sys.executable,
+        "-m",
+        "labseq",
+        "web",
+        str(root),
+        f"--port={port}",
+        f"--ends-with={os.getppid()}",
+    ]
+    # Ctrl-C must end the run alone
+    own_group: dict[str, Any] = (
+        {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}  # type: ignore[attr-defined]
+        if os.name == "nt"
+        else {"process_group": 0}
+    )
+    nothing = subprocess.DEVNULL
+    process = subprocess.Popen(  # noqa: S603 - this Python
+        command, stdin=nothing, stdout=nothing, stderr=nothing, **own_group
+    )
+    process.returncode = 0  # it goes on after the run: no warning that it was not waited for
+    return process.pid

@@ -1,0 +1,336 @@
+"""What the page of a run shows while it runs: figures, trend, stages, losses, last shot and alarms."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, cast
+
+from labseq.analysis.timing import StageTotals
+from labseq.calibration.store import read_entry
+from labseq.console.events import event_text, point_of_shot
+from labseq.console.text import age_text, percent, plural, size_text
+from labseq.errors import LabseqError, RecordingError
+from labseq.model import StageTiming
+from labseq.model.records import OVERSHOOT_S, STEP
+from labseq.plain import now
+from labseq.recording import Shot
+from labseq.recording.folders import STOP_FILE
+from labseq.recording.run_file import read_state
+from labseq.web.history import Columns, finite, interval_of
+from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
+from labseq.web.scans import scan_values
+from labseq.web.shots import rows_of, shot_values
+
+N_BINS: Final = 40
+"""Maximum number of points of a trend."""
+_KEPT_SHOTS: Final = 50
+"""Number of latest shots whose stages are summed up."""
+_OPENED: Final = (20, 3)
+"""Maximum number of new shots that are opened at first, and later at once; older ones are not."""
+_SILENT_FACTOR: Final = 10
+_SILENT_S: Final = 120.0
+_LEAST_FREE: Final = 2e9
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """When the page raises an alarm.
+
+    Attributes:
+        calibration_s: Greatest age of a calibration in use, in seconds.
+        free_share: Least share of the disk that is free.
+    """
+
+    calibration_s: float = 7 * 86_400.0
+    free_share: float = 0.05
+
+
+class RunState:
+    """The state of a run, brought up to date by :meth:`update`.
+
+    Args:
+        run: The run.
+        limits: When an alarm is raised.
+    """
+
+    def __init__(self, run: OpenRun, limits: Limits) -> None:
+        self.run = run
+        self._limits = limits
+        self._stages: OrderedDict[tuple[int, int], tuple[StageTiming, ...]] = OrderedDict()
+        self._last: dict[str, Any] | None = None
+        self._n_opened = 0
+        self._scan: dict[str, Any] | None = None
+        self._scan_s = -math.inf
+
+    def update(self) -> dict[str, Any]:
+        """The state as the files are now, JSON-ready.
+
+        Raises:
+            RecordingError: run.json is damaged, or a file cannot be read.
+        """
+        with self.run.lock:
+            record, (status, error) = self.run.record, read_state(self.run.folder)
+            self.run.history.update()
+            self.run.read_events()
+            columns = self.run.history.columns()
+            shot_error = self._open_shots(record)
+            return {
+                "run": self._head(record, status, error),
+                "figures": figures_of(columns),
+                "trend": columns.trend(N_BINS),
+                "losses": losses_of(columns),
+                "stages": self._stage_rows(record),
+                "shot": self._last,
+                "scan": self._scan_now(record, status),
+                "alarms": self._alarms(record, status, error, columns, shot_error),
+                "log": [log_line(one) for one in self.run.events[-12:]],
+            }
+
+    def _head(self, record: Mapping[str, Any], status: str, error: str) -> dict[str, Any]:
+        head = head_of(self.run, record, status, error)
+        return head | {"time_left_s": self._time_left_s(head)}
+
+    def _time_left_s(self, head: Mapping[str, Any]) -> float | None:
+        n_new = head["n_done"] - self.run.shots_before
+        taken_s = self.run.last_event_s - self.run.first_shot_s
+        if head["status"] != "running" or n_new <= 0 or math.isnan(taken_s):
+            return None
+        return taken_s / n_new * max(0, head["n_shots"] - head["n_done"])
+
+    def _open_shots(self, record: Mapping[str, Any]) -> str:
+        """Read the newest shots; the error if the last one cannot be read."""
+        lines = len(self.run.history)
+        failure = ""
+        for line in range(max(self._n_opened, lines - _OPENED[self._n_opened > 0]), lines):
+            try:
+                shot = self.run.shot(line)
+                self._stages[shot.index, shot.attempt] = shot.timing
+                if line == lines - 1:
+                    self._last = self._shot(shot, record)
+            except RecordingError as error:
+                failure = text_of(error, 400)
+                self._last = {"error": failure}
+        self._n_opened = lines
+        while len(self._stages) > _KEPT_SHOTS:
+            self._stages.popitem(last=False)
+        return failure
+
+    def _shot(self, shot: Shot, record: Mapping[str, Any]) -> dict[str, Any]:
+        values = shot_values(shot, str(record.get("record_frames")))
+        del values["stages"]
+        return values | {"point": point_of_shot(record.get("scan") or {}, shot.index, shot.parameters)}
+
+    def _stage_rows(self, record: Mapping[str, Any]) -> list[dict[str, Any]]:
+        totals = StageTotals()
+        for timing in self._stages.values():
+            totals.add_timing(timing)
+        return stage_rows(totals, simulated=bool(record["simulated"]))
+
+    def _scan_now(self, record: Mapping[str, Any], status: str) -> dict[str, Any] | None:
+        """The scan, worked out at most every half second."""
+        if not record.get("scan"):
+            return None
+        if self._scan is None or time.monotonic() - self._scan_s > 0.5 or status != "running":
+            self._scan = scan_values(self.run)
+            self._scan_s = time.monotonic()
+        return self._scan
+
+    def _alarms(
+        self, record: Mapping[str, Any], status: str, error: str, columns: Columns, shot_error: str
+    ) -> list[dict[str, str]]:
+        found = [
+            *_run_alarms(self.run, status, error, columns),
+            *self._budget_alarms(),
+            *calibration_alarms(self.run.folder, record, self._limits.calibration_s),
+            *disk_alarms(self.run.folder, self._limits.free_share),
+        ]
+        if shot_error:
+            found.append(alarm("warning", "The last shot cannot be read", shot_error))
+        return found
+
+    def _budget_alarms(self) -> list[dict[str, str]]:
+        over: dict[str, int] = {}
+        for timing in self._stages.values():
+            for one in timing:
+                over[one.stage] = over.get(one.stage, 0) + one.over_budget
+        n_shots = plural(len(self._stages), "shot")
+        return [
+            alarm(
+                "warning", f"'{text_of(stage, 60)}' exceeded its budget", f"{n} times in the last {n_shots}"
+            )
+            for stage, n in over.items()
+            if n
+        ]
+
+
+def head_of(run: OpenRun, record: Mapping[str, Any], status: str, error: str) -> dict[str, Any]:
+    """What the head of a run's page says."""
+    grid: Any = {}
+    with suppress(KeyError, TypeError):
+        grid = record["resolved"]["profile"]["grid"]
+    target = run.target
+    return {
+        "id": text_of(run.id, 300),
+        "name": text_of(record["name"], 200),
+        "profile": profile_of(record),
+        "status": status,
+        "error": text_of(error),
+        "is_stopping": status == "running" and (run.folder / STOP_FILE).exists(),
+        "simulated": bool(record["simulated"]),
+        "seed": str(record["seed"]),
+        "started_utc": text_of(record.get("t_start_utc") or "", 40),
+        "n_shots": record["n_shots"],
+        "n_done": run.history.n_shots,
+        "n_attempts": len(run.history) - run.history.n_shots,
+        "taken_s": finite(run.last_event_s),
+        "lattice": {
+            "rows": target.shape[0],
+            "cols": target.shape[1],
+            "kind": "square" if record.get("lattice") == "square" else "triangular",
+            "shear": -1 if isinstance(grid, dict) and cast("Any", grid).get("shear") == -1 else 1,
+        },
+        "target": {
+            "name": text_of(target.name, 100),
+            "n_atoms": target.n_atoms,
+            "fill": rows_of(target.fill),
+        },
+        **read_notes(run.folder),
+    }
+
+
+def figures_of(columns: Columns) -> dict[str, Any]:
+    """The main figures of a run with their 68 % intervals."""
+    filling, rate = columns.filling, columns.defect_free
+    cycles = columns.of_shots("n_cycles")
+    return {
+        "filling": finite(filling.value),
+        "filling_interval": interval_of(filling),
+        "defect_free": finite(rate.value),
+        "defect_free_interval": interval_of(rate),
+        "n_defect_free": rate.n,
+        "n_judged": rate.n_trials,
+        "n_seen": int((columns.of_shots("seen") >= 0).sum()),
+        "cycles": finite(float(cycles.mean())) if len(cycles) else None,
+        "shot_s": finite(float(columns.of_shots("duration_s").mean())) if len(cycles) else None,
+    }
+
+
+def losses_of(columns: Columns) -> list[dict[str, Any]]:
+    """Atoms lost per shot by cause, the greatest first; empty on real hardware."""
+    found = [
+        {"cause": text_of(cause.replace("_", " "), 60), "mean": value.value, "error": finite(value.error)}
+        for cause, value in columns.losses.items()
+        if value.value > 0
+    ]
+    return sorted(found, key=lambda one: -cast("float", one["mean"]))
+
+
+def stage_rows(totals: StageTotals, *, simulated: bool) -> list[dict[str, Any]]:
+    """Stages of the latest shots: host times in a simulated run, as measured on real hardware."""
+    rows = list[dict[str, Any]]()
+    for one in totals.stages():
+        median_s, p99_s = one.host_s if simulated else one.session_s
+        whole = one.stage.startswith(STEP)
+        rows.append(
+            {
+                "stage": text_of(one.stage.removeprefix(STEP) if whole else one.stage, 80),
+                "is_step": whole,
+                "n": one.n,
+                "median_s": finite(median_s),
+                "p99_s": finite(p99_s),
+                "modelled_s": finite(one.session_s[0]) if simulated else None,
+                "budget_s": finite(one.budget_s),
+                "n_over": one.n_over,
+                "margin_s": OVERSHOOT_S,
+            }
+        )
+    return rows
+
+
+def alarm(level: str, title: str, text: str = "") -> dict[str, str]:
+    """An alarm: "error" if the run is in danger or over, "warning" otherwise."""
+    return {"level": level, "title": title, "text": text}
+
+
+def _run_alarms(run: OpenRun, status: str, error: str, columns: Columns) -> list[dict[str, str]]:
+    found = list[dict[str, str]]()
+    if status == "failed":
+        title = "The run died" if "process" in error else "The run failed"
+        found.append(alarm("error", title, text_of(error)))
+    n_failed = len(columns.shot) - len(columns.counted)
+    if n_failed:
+        last = int((~columns.counts).nonzero()[0][-1])
+        text = ""
+        with suppress(RecordingError):
+            row = run.history.row(last)
+            text = f"the last: shot {row['shot']}, {row['status']}: {text_of(row['error'], 300)}"
+        found.append(alarm("warning", f"{plural(n_failed, 'attempt')} at a shot failed", text))
+    if run.history.n_damaged:
+        text = "they are left out here; `labseq doctor` repairs what can be repaired"
+        found.append(
+            alarm("warning", f"{plural(run.history.n_damaged, 'line')} of the index cannot be read", text)
+        )
+    if status == "running" and (silent_s := _silent_s(run, columns)):
+        found.append(alarm("warning", f"No shot for {age_text(silent_s)}", "the process of the run is there"))
+    return found
+
+
+def _silent_s(run: OpenRun, columns: Columns) -> float:
+    """Time without a new shot, if it is much longer than one takes; else 0."""
+    try:
+        silent_s = time.time() - (run.folder / "index.jsonl").stat().st_mtime
+    except OSError:
+        return 0.0
+    t_s = columns.of_shots("t_s")[-20:]
+    usual_s = float(abs(t_s[1:] - t_s[:-1]).mean()) if len(t_s) > 1 else 0.0
+    return silent_s if silent_s > max(_SILENT_S, _SILENT_FACTOR * usual_s) else 0.0
+
+
+def calibration_alarms(folder: Path, record: Mapping[str, Any], limit_s: float) -> list[dict[str, str]]:
+    """An alarm for each calibration of a run that is older than allowed."""
+    found = list[dict[str, str]]()
+    for kind in list(record.get("calibrations") or {})[:20]:
+        with suppress(LabseqError, ValueError, OverflowError, OSError):
+            taken = datetime.fromisoformat(read_entry(folder / f"calibration_{kind}.json").taken_utc)
+            age_s = (now() - taken).total_seconds()
+            if age_s > limit_s:
+                title = f"The calibration '{text_of(kind, 40)}' is {age_text(age_s, ' old')}"
+                found.append(alarm("warning", title, f"limit: {age_text(limit_s)}"))
+    return found
+
+
+def disk_alarms(folder: Path, free_share: float) -> list[dict[str, str]]:
+    """An alarm if the disk is nearly full."""
+    try:
+        disk = shutil.disk_usage(folder)
+    except OSError:
+        return []
+    if disk.free >= max(_LEAST_FREE, free_share * disk.total):
+        return []
+    free = f"{size_text(disk.free)} of {size_text(disk.total)} free ({percent(disk.free / disk.total)})"
+    return [alarm("warning" if disk.free else "error", "The disk is nearly full", free)]
+
+
+def log_line(event: Mapping[str, Any]) -> dict[str, str]:
+    """An event of the log as a line of text."""
+    name, values = event["event"], event["values"]
+    text = ""
+    with suppress(KeyError, TypeError, ValueError, AttributeError):  # an event of another version of labseq
+        if name == "shot_repeated":
+            shot = values["shot"]
+            text = f"shot {shot['shot_index']}: attempt {shot['attempt']} failed: {shot['error']}"
+        elif name == "run_finished":
+            text = f"run {values['status']}" + (f": {values['error']}" if values.get("error") else "")
+        elif name == "run_starting":
+            text = "run resumed" if values.get("n_before") else "run started"
+        else:
+            text = event_text(name, values, None)
+    return {"t_utc": event["t_utc"], "event": text_of(name, 60), "text": text_of(text or name, 400)}

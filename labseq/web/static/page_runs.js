@@ -1,0 +1,137 @@
+// The list of runs, one run, and two runs side by side.
+import { go, server } from "./app.js";
+import { bars, curve, DEFECT_FREE, FILLING, trendPoints } from "./charts.js";
+import { count, el, facts, failure, getJson, localTime, panel, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
+import { headOf, stageTable, tilesOf } from "./page_now.js";
+import { scanOfRun } from "./page_scan.js";
+
+const PAGE = 50;
+
+export async function showRuns(main, _, asked) {
+  const text = el("input", { type: "search", value: asked.get("q") ?? "", placeholder: "date, name, profile, outcome, comment, tag", "aria-label": "Search the runs" });
+  const status = el("select", { "aria-label": "Status" }, ["", "running", "complete", "stopped", "failed", "damaged"].map((one) => el("option", { value: one, selected: one === (asked.get("status") ?? "") }, one || "any status")));
+  const found = el("div"), note = el("span.note", { role: "status" });
+  const chosen = new Set();
+  const compare = el("button", { type: "button", disabled: true, onclick: () => { const [a, b] = chosen; go(`/compare?a=${encodeURIComponent(a)}&b=${encodeURIComponent(b)}`); } }, "Compare two");
+  let first = Number(asked.get("first") ?? 0), timer = null;
+
+  async function load() {
+    const query = new URLSearchParams({ q: text.value, status: status.value, first, n: PAGE });
+    try {
+      const answer = await getJson(`/runs?${query}`);
+      history.replaceState(null, "", `/runs?${new URLSearchParams([...query].filter(([key, value]) => value && key !== "n" && value !== "0"))}`.replace(/\?$/, ""));
+      note.textContent = `${answer.n_found} of ${count(answer.n_runs, "run")}`;
+      replace(found, answer.runs.length ? listOf(answer.runs) : el("p.hint", {}, answer.n_runs ? "No run has these words." : "There are no runs in this data folder yet."), pages(answer.n_found));
+    } catch (error) { replace(found, failure(error)); }
+  }
+  function listOf(runs) {
+    const heads = ["", "run", "started", "profile", { text: "shots", right: true }, "status", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
+    return table(heads, runs.map((run) => [
+      el("input", { type: "checkbox", checked: chosen.has(run.id), "aria-label": `Choose ${run.id} to compare`, onchange: (event) => { event.target.checked ? chosen.add(run.id) : chosen.delete(run.id); compare.disabled = chosen.size !== 2; } }),
+      runLink(run.id), localTime(run.started_utc), run.profile, run.n_shots === null ? "–" : `${run.n_done} of ${run.n_shots}`,
+      [statusPill(run.status), run.simulated ? el("span.tag", {}, "simulated") : null, run.has_scan ? el("span.tag", {}, "scan") : null].filter(Boolean),
+      percent(run.defect_free), percentWithError(run.filling, run.filling_interval),
+      [run.tags.map((tag) => el("span.tag", {}, tag)), " ", (run.comment || (run.status === "damaged" ? run.error : "")).slice(0, 120)],
+    ].map((cell) => (Array.isArray(cell) ? el("span", {}, cell) : cell))), { label: "Runs" });
+  }
+  function pages(n) {
+    if (n <= PAGE) return null;
+    const move = (by) => () => { first = Math.max(0, first + by); load(); scrollTo(0, 0); };
+    return el("div.pages", {}, el("button", { type: "button", disabled: first === 0, onclick: move(-PAGE) }, "Newer"), el("span.note", {}, `${first + 1} to ${Math.min(n, first + PAGE)}`), el("button", { type: "button", disabled: first + PAGE >= n, onclick: move(PAGE) }, "Older"));
+  }
+  const later = () => { clearTimeout(timer); timer = setTimeout(() => { first = 0; load(); }, 200); };
+  text.addEventListener("input", later);
+  status.addEventListener("change", later);
+  replace(main, el("div.title-line", {}, el("h1", {}, "Runs"), note), el("div.tools", { role: "search" }, text, status, compare), found);
+  await load();
+  const again = setInterval(() => { if (!document.hidden && first === 0) load(); }, 5000);
+  return () => { clearInterval(again); clearTimeout(timer); };
+}
+
+export async function showRun(main, [day, name]) {
+  const id = `${day}/${name}`, values = await getJson(`/runs/${runPath(id)}`);
+  const { run } = values;
+  document.title = `${run.name} · labseq`;
+  const filling = el("div.chart"), rate = el("div.chart"), more = el("div.grid"), shots = el("div"), scan = el("div.grid");
+  replace(main, el("div.run-head", {}, headOf(run, {}), el("div.links", {}, run.status === "running" ? el("a", { href: `/now?run=${encodeURIComponent(id)}` }, "watch it") : null,
+    values.has_scan ? el("a", { href: `/scan?run=${encodeURIComponent(id)}` }, "its scan") : null, values.files.map((kind) => el("a", { href: `/api/v1/runs/${runPath(id)}/files/${kind}` }, kind)), el("a", { href: `/api/v1/runs/${runPath(id)}` }, "as JSON"))),
+    run.error ? el("div.alarm.is-error", {}, el("strong", {}, run.status), el("span", {}, run.error)) : null,
+    values.n_damaged_lines ? el("div.alarm.is-warning", {}, el("strong", {}, `${count(values.n_damaged_lines, "line")} of the index cannot be read`)) : null,
+    el("div.tiles", {}, tilesOf(run, values.figures)),
+    el("div.grid", {}, panel("Filling", { class: "half" }, filling), panel("Defect-free", { class: "half" }, rate)), scan, more,
+    el("div.grid", {}, panel("Shots", { class: "wide" }, shots), panel("Changed by the command line", { class: "half" }, orNone(values.changes)), notesPanel(run),
+      panel("Calibrations", { class: "half" }, orNone(values.calibrations)), panel("Devices", { class: "half" }, Object.entries(values.devices).map(([device, about]) => el("details", {}, el("summary", {}, device, about.model ? `: ${about.model}` : ""), typeof about === "object" ? facts(about) : about))),
+      panel("Where it came from", { class: "wide" }, facts({ ...values.provenance, plugins: values.plugins.map((one) => `${one.name} ${one.version}`).join(", ") }))));
+  if (values.trend.length) {
+    curve(filling, trendPoints(values.trend, "filling"), FILLING);
+    curve(rate, trendPoints(values.trend, "defect_free"), DEFECT_FREE);
+  }
+  fillLater(id, values, more, scan);
+  await shotTable(shots, id);
+}
+
+async function fillLater(id, values, more, scan) {
+  try {
+    if (values.has_scan) await scanOfRun(scan, id);
+    const { statistics, stages, n_read, n_shots } = await getJson(`/runs/${runPath(id)}/statistics`);
+    const part = n_read < n_shots ? `from ${n_read} of ${n_shots} shots` : `from all ${count(n_shots, "shot")}`;
+    const each = (one, factor = 1) => withError(one.mean === null ? null : factor * one.mean, factor * (one.error ?? 0));
+    replace(more,
+      statistics.cycles.length ? panel(`Cycles, ${part}`, { class: "half" }, table(["cycle", ...["shots", "defect-free", "seen", "filling", "moves", "batches", "left out"].map((text) => ({ text, right: true }))],
+        statistics.cycles.map((one) => [String(one.cycle), String(one.n_shots), percent(one.defect_free.rate), percent(one.seen.rate), one.filling.mean === null ? "–" : `${each(one.filling, 100)} %`, each(one.n_atom_moves), each(one.n_batches), each(one.n_left_out)]), { label: "Cycles" })) : null,
+      panel(`Defects at the end, ${part}`, { class: "half" }, statistics.defects.length ? bars(statistics.defects.slice(0, 13).map((n, defects) => ({ name: String(defects), value: n, text: count(n, "shot") })), "Shots by number of defects") : el("p.hint", {}, "no judged shot")),
+      values.losses.length ? panel("Losses by cause", { class: "half" }, bars(values.losses.map((one) => ({ name: one.cause, value: one.mean, text: withError(one.mean, one.error ?? 0) })), "Atoms lost in a shot")) : null,
+      panel("Stages", { class: "half" }, stageTable(stages, values.run.simulated)));
+  } catch (error) { replace(more, failure(error)); }
+}
+
+function orNone(values) { return Object.keys(values).length ? facts(values) : el("p.hint", {}, "none"); }
+
+async function shotTable(box, id, first = 0) {
+  const { shots, n_lines } = await getJson(`/runs/${runPath(id)}/shots?first=${first}&n=${PAGE}`);
+  if (!n_lines) { replace(box, el("p.hint", {}, "no shot yet")); return; }
+  const heads = [{ text: "shot", right: true }, "outcome", ...["filling", "seen after cycle", "cycles", "batches", "moves", "time"].map((text) => ({ text, right: true }))];
+  const rows = shots.map((one) => [el("a", { href: `/runs/${runPath(id)}/shots/${one.shot}${one.counts ? "" : `?attempt=${one.attempt}`}` }, String(one.shot)),
+    !one.counts ? `attempt ${one.attempt}, does not count` : one.success === 1 ? "defect-free" : one.filling === null ? "not judged" : "defects", percent(one.filling, 2), one.seen >= 0 ? String(one.seen) : "–", one.n_cycles, one.n_batches, one.n_atom_moves, time(one.duration_s)].map((cell) => (typeof cell === "number" ? String(cell) : cell)));
+  replace(box, table(heads, rows, { label: "Shots" }), n_lines > PAGE ? el("div.pages", {},
+    el("button", { type: "button", disabled: first === 0, onclick: () => shotTable(box, id, Math.max(0, first - PAGE)) }, "Later"),
+    el("span.note", {}, `${first + 1} to ${Math.min(n_lines, first + PAGE)} of ${n_lines}, the newest first`),
+    el("button", { type: "button", disabled: first + PAGE >= n_lines, onclick: () => shotTable(box, id, first + PAGE) }, "Earlier")) : null);
+}
+
+function notesPanel(run) {
+  if (!server.may_act) return panel("Comment", { class: "half" }, run.comment || run.tags.length ? [el("p.comment", {}, run.comment), run.tags.map((tag) => el("span.tag", {}, tag))] : el("p.hint", {}, "none"));
+  const comment = el("textarea", { rows: 3, value: run.comment, "aria-label": "Comment" }), tags = el("input", { value: run.tags.join(", "), "aria-label": "Tags, separated by commas", placeholder: "tags, separated by commas" });
+  const note = el("span.note", { role: "status" });
+  const keep = async () => {
+    try { await post(`/runs/${runPath(run.id)}/notes`, { comment: comment.value, tags: tags.value.split(",") }); note.textContent = "kept"; } catch (error) { note.textContent = error.message; }
+  };
+  return panel("Comment", { class: "half" }, el("div.form", {}, comment, tags, el("div", {}, el("button", { type: "button", onclick: keep }, "Keep"), " ", note)));
+}
+
+export async function showCompare(main, _, asked) {
+  const ids = [asked.get("a") ?? "", asked.get("b") ?? ""];
+  const runs = await Promise.all(ids.map((id) => getJson(`/runs/${runPath(id)}`)));
+  const texts = await Promise.all(ids.map(async (id) => { const answer = await fetch(`/api/v1/runs/${runPath(id)}/files/sequence`); return answer.ok ? answer.text() : ""; }));
+  const rows = [["profile", (r) => r.run.profile], ["status", (r) => r.run.status], ["shots", (r) => `${r.run.n_done} of ${r.run.n_shots}`], ["defect-free", (r) => `${percent(r.figures.defect_free)} (${r.figures.n_defect_free} of ${r.figures.n_judged})`],
+    ["filling", (r) => percentWithError(r.figures.filling, r.figures.filling_interval)], ["cycles", (r) => r.figures.cycles?.toFixed(2) ?? "–"], ["time of a shot", (r) => time(r.figures.shot_s)], ["seed", (r) => r.run.seed],
+    ["changed", (r) => Object.entries(r.changes).map(([k, v]) => `${k} = ${v}`).join(", ") || "nothing"], ["calibrations", (r) => Object.entries(r.calibrations).map(([k, v]) => `${k} ${v}`).join(", ") || "none"], ["comment", (r) => r.run.comment || "–"]];
+  const charts = runs.map(() => [el("div.chart"), el("div.chart")]);
+  replace(main, el("h1", {}, "Two runs"), table(["", ...runs.map((r) => el("span", {}, runLink(r.run.id)))], rows.map(([name, of]) => ({ mark: of(runs[0]) === of(runs[1]) ? "" : "is-other", cells: [name, of(runs[0]), of(runs[1])] })), { label: "Figures of both runs" }),
+    el("div.grid", {}, runs.map((r, i) => panel(`Filling: ${r.run.id}`, { class: "half" }, charts[i][0])), runs.map((r, i) => panel(`Defect-free: ${r.run.id}`, { class: "half" }, charts[i][1])),
+      panel("Lines of the sequences that differ", { class: "wide" }, differences(texts))));
+  const ends = runs.flatMap((r) => r.trend.flatMap((bin) => [bin.filling, ...bin.filling_interval])).filter((v) => v !== null);
+  runs.forEach((r, i) => {
+    if (!r.trend.length) return;
+    curve(charts[i][0], trendPoints(r.trend, "filling"), { ...FILLING, ...(ends.length ? { lowest: Math.min(...ends) } : {}) });
+    curve(charts[i][1], trendPoints(r.trend, "defect_free"), DEFECT_FREE);
+  });
+}
+
+function differences([a, b]) {
+  const [left, right] = [a.split("\n"), b.split("\n")];
+  const only = (these, those) => these.filter((line) => line.trim() && !those.includes(line));
+  const first = only(left, right), second = only(right, left);
+  if (!first.length && !second.length) return el("p.hint", {}, "The sequences are the same.");
+  return el("div.two", {}, el("pre", { tabindex: "0" }, first.join("\n")), el("pre", { tabindex: "0" }, second.join("\n")));
+}

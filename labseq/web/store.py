@@ -1,0 +1,153 @@
+"""The queue and the calibrations for the pages."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, cast
+
+from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of
+from labseq.errors import ConfigError, LabseqError, RecordingError
+from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
+from labseq.queue.queue import Entry, Queue
+from labseq.session.profile import DRY_RUN_FOLDER, FOLDER
+from labseq.web.history import finite
+from labseq.web.runs import Catalogue, run_id, text_of
+
+_MAX_ENTRIES: Final = 500
+_MAX_CALIBRATIONS: Final = 1000
+_MAX_PICTURE: Final = 8 << 20
+_RUNS: Final = 30
+"""Number of latest runs whose profiles are looked up."""
+
+
+def queue_values(root: Path) -> dict[str, Any]:
+    """The queue of a data folder, JSON-ready; "error" if an entry is damaged."""
+    queue = Queue(root)
+    holder = queue.lock().holder() if queue.folder.is_dir() else None
+    is_run = holder is not None and holder.is_running
+    values: dict[str, Any] = {
+        "run_by": text_of(holder, 200) if is_run else None,
+        "is_paused": queue.is_paused,
+        "is_ending": is_run and queue.is_asked_to_stop,
+        "error": "",
+        "entries": [],
+    }
+    try:
+        values["entries"] = [_entry(entry) for entry in queue.entries()[:_MAX_ENTRIES]]
+    except RecordingError as error:
+        values["error"] = text_of(error)
+    return values
+
+
+def _entry(entry: Entry) -> dict[str, Any]:
+    return {
+        "id": entry.id,
+        "state": entry.state,
+        "sequence": text_of(entry.sequence.stem, 200),
+        "path": text_of(entry.sequence, 400),
+        "changed": entry.has_changed,
+        "added_utc": text_of(entry.added_utc, 40),
+        "options": {text_of(k, 200): text_of(v, 200) for k, v in entry.options.changes().items()},
+        "run": None if entry.run_dir is None else text_of(run_id(entry.run_dir), 300),
+        "error": text_of(entry.error),
+    }
+
+
+def calibrations(catalogue: Catalogue) -> dict[str, Any]:
+    """The calibrations of the profiles in ./hardware_profiles and of the latest runs."""
+    return {"stores": [_store_values(key, *one) for key, one in _stores(catalogue).items()]}
+
+
+def calibration_picture(catalogue: Catalogue, store: str, file: str) -> bytes | None:
+    """The PNG of a calibration; None if there is none.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    known = _stores(catalogue).get(store)
+    if known is None or Path(file).name != file:
+        return None
+    path = known[1] / f"{file}.png"
+    png = read_file(path, _MAX_PICTURE) if path.is_file() else b""
+    return png if png.startswith(b"\x89PNG") else None
+
+
+def _stores(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:
+    """Key -> profile and folder, of the folders of calibrations that exist."""
+    folders: dict[Path, str] = {}
+    for place in (Path(PROFILES).absolute() / FOLDER, packaged_profiles_dir() / FOLDER):
+        with suppress(OSError):
+            folders |= {folder: folder.name for folder in sorted(place.iterdir()) if folder.is_dir()}
+    with suppress(RecordingError, OSError):
+        for folder in catalogue.folders()[-_RUNS:]:
+            with suppress(LabseqError, OSError, KeyError, TypeError, ValueError):
+                found = _folder_of(catalogue.open(folder.parent.name, folder.name).record)
+                folders.setdefault(found, found.name)
+    with_dry_runs = {
+        folder: name
+        for one, profile in folders.items()
+        for folder, name in ((one, profile), (one / DRY_RUN_FOLDER, f"{profile}, dry runs"))
+    }
+    return {_key(folder): (name, folder) for folder, name in with_dry_runs.items() if folder.is_dir()}
+
+
+def _folder_of(record: Mapping[str, Any]) -> Path:
+    """The folder of calibrations of a run's profile."""
+    profile = Path(str(record["profile_path"]))
+    chosen: Any = record["resolved"]["profile"]["calibrations"]["folder"]
+    return Path(chosen) if isinstance(chosen, str) else profile_dir(profile) / FOLDER / profile.stem
+
+
+def _key(folder: Path) -> str:
+    return hashlib.sha256(str(folder).encode("utf-8", "replace")).hexdigest()[:12]
+
+
+def _store_values(key: str, profile: str, folder: Path) -> dict[str, Any]:
+    store, error = Store(folder), ""
+    used: dict[str, str] = {}
+    found: list[Stored | Damaged] = []
+    try:
+        found = store.entries()[-_MAX_CALIBRATIONS:]
+        used = {kind: one.file for kind, one in store.active().items()}
+    except (ConfigError, OSError) as failure:
+        error = text_of(failure)
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for one in found:
+        kind = one.kind if isinstance(one, Damaged) else one.entry.kind
+        kinds.setdefault(kind, []).append(_calibration(one, used.get(kind) == one.path.name))
+    return {
+        "key": key,
+        "profile": text_of(profile, 200),
+        "folder": text_of(folder, 400),
+        "error": error,
+        "kinds": [
+            {
+                "kind": kind,
+                "figure": DECIDING[cast("Any", kind)].label if kind in DECIDING else "",
+                "entries": rows,
+            }
+            for kind, rows in kinds.items()
+        ],
+    }
+
+
+def _calibration(one: Stored | Damaged, in_use: bool) -> dict[str, Any]:
+    head = {"file": one.path.stem, "in_use": in_use}
+    if isinstance(one, Damaged):
+        return {"id": text_of(one.id, 40), **head, "error": text_of(one.error), "taken_utc": None}
+    entry = one.entry
+    figure = figure_of(entry) if entry.kind in DECIDING else math.nan
+    return {
+        "id": entry.id,
+        **head,
+        "error": "",
+        "taken_utc": text_of(entry.taken_utc, 40),
+        "figure": finite(figure),
+        "quality": {text_of(name, 60): finite(value) for name, value in entry.quality.items()},
+        "run": text_of(entry.origin.get("run") or entry.origin.get("command") or "", 200),
+        "has_picture": one.picture is not None,
+    }
