@@ -254,7 +254,7 @@ def is_same(one: Plan, other: Plan) -> bool:
     """Whether two plans are the same, move by move."""
     return all(
         np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("moves", "batch_offsets", "linked")
+        for name in ("moves", "batch_offsets", "linked", "path_shapes", "path_positions", "path_off")
     )
 
 

@@ -16,7 +16,7 @@ from labseq.cli.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
 from labseq.console.text import columns, count_of, encodes, plural
 from labseq.kernel import interpret
-from labseq.model import Batch
+from labseq.model import Batch, TonePaths
 from labseq.pictures.plans import occupancies, on_grid
 from labseq.session.occupancies import read_source
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
@@ -154,6 +154,8 @@ def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[
         >>> moves_text(Batch([(2, 0), (2, 4)], [(2, 3), (2, 5)]), (5, 5))
         ['row 2: columns 0->3, 4->ejected']
     """
+    if batch.tones is not None:
+        return _paths_text(batch, batch.tones, shape, arrow)
     along_column = bool(np.any(batch.from_sites[:, 0] != batch.to_sites[:, 0]))
     line_index, place = (1, 0) if along_column else (0, 1)
     line_name, place_name = ("column", "row") if along_column else ("row", "column")
@@ -166,6 +168,21 @@ def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[
         f"{line_name} {line}: {place_name}{'s' if len(ways) > 1 else ''} {', '.join(ways)}"
         for line, ways in sorted(found.items())
     ]
+
+
+def _paths_text(batch: Batch, paths: TonePaths, shape: tuple[int, int], arrow: str) -> list[str]:
+    """Where the tones of each axis go and in how many legs, and which atoms move."""
+    lines: list[str] = []
+    for name, path, off in (("rows", paths.row, paths.row_off), ("columns", paths.column, paths.column_off)):
+        ends = path[off, np.arange(len(off))]
+        ways = (f"{start:g}{arrow}{end:g}" for start, end in zip(path[0], ends, strict=True))
+        lines.append(f"{name} {', '.join(ways)}")
+    stays = on_grid(batch.to_sites, shape).tolist()
+    ways = (
+        f"{(*start,)}{arrow}{(*goal,) if lands else 'ejected'}"
+        for start, goal, lands in zip(batch.from_sites.tolist(), batch.to_sites.tolist(), stays, strict=True)
+    )
+    return [f"{'; '.join(lines)}, in {plural(paths.shape[0] - 1, 'leg')}", f"atoms {', '.join(ways)}"]
 
 
 PLAIN_WIDTH: Final = 132

@@ -15,7 +15,7 @@ from labseq.config.profile import Sites
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
 from labseq.messages import shown
-from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern
+from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern, TonePaths
 from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
 
@@ -53,6 +53,33 @@ class TargetFile(Settings):
     clear: Rows = Field(description="sites that must be empty")
 
 
+Position: TypeAlias = Annotated[float, Field(ge=-1000, le=2000)]
+"""Row or column of a tone, in sites."""
+Path: TypeAlias = tuple[tuple[Position, ...], ...]
+Knots: TypeAlias = tuple[Annotated[int, Field(ge=1, le=100_000)], ...]
+
+
+class PathsFile(Settings):
+    """Where the tones of a batch go."""
+
+    row: Path = Field(description="position of each row tone, in sites, at the first knot, at the next, ...")
+    column: Path = Field(description="the same for the column tones")
+    row_off: Knots = Field(description="knot at which each row tone goes off, from 0")
+    column_off: Knots = Field(description="the same for the column tones")
+
+    @model_validator(mode="after")
+    def _are_paths(self) -> Self:
+        try:
+            self.model()
+        except ValueError as error:
+            raise setting_error(str(error), "paths of tones as 'labseq plan --json' writes them") from None
+        return self
+
+    def model(self) -> TonePaths:
+        """The paths."""
+        return TonePaths(*map(np.array, (self.row, self.column, self.row_off, self.column_off)))
+
+
 class BatchFile(Settings):
     """A batch of a plan."""
 
@@ -61,12 +88,17 @@ class BatchFile(Settings):
     )
     to_sites: tuple[tuple[Index, Index], ...] = Field(alias="to", description="[row, column] of each goal")
     linked: bool = Field(default=False, description="whether the tweezers stay on from the batch before")
+    tones: PathsFile | None = Field(
+        default=None, description="paths of the tones, where rows and columns move at once"
+    )
 
     @model_validator(mode="after")
     def _has_a_goal_for_each_atom(self) -> Self:
         if len(self.from_sites) != len(self.to_sites):
             what = f"'from' has {len(self.from_sites)} sites, 'to' has {len(self.to_sites)}"
             raise setting_error(what, "as many of both")
+        if self.linked and self.tones is not None:
+            raise setting_error("a batch with 'tones' is linked", "only line batches are")
         return self
 
     def model(self) -> Batch:
@@ -74,7 +106,7 @@ class BatchFile(Settings):
         from_sites, to_sites = (
             np.array(sites, np.int16).reshape(-1, 2) for sites in (self.from_sites, self.to_sites)
         )
-        return Batch(from_sites, to_sites, self.linked)
+        return Batch(from_sites, to_sites, self.linked, self.tones and self.tones.model())
 
 
 class _Header(Settings):

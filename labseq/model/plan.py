@@ -192,7 +192,7 @@ class Plan:
         if (shapes < 0).any() or (len(positions), len(off)) != (stop, off_stop):
             came = f"{len(positions)} and {len(off)} came"
             raise ValueError(f"path_shapes asks for {stop} positions and {off_stop} knots; {came}")
-        object.__setattr__(self, "path_shapes", shapes)
+        object.__setattr__(self, "path_shapes", shapes if shapes.any() else NO_SHAPES)
         object.__setattr__(self, "path_positions", positions)
         object.__setattr__(self, "path_off", off)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from itertools import groupby, pairwise, product
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -133,6 +133,8 @@ Lines = tuple[Axis, tuple[int, ...]]
 def batch_lines(plan: Plan) -> list[Lines]:
     """The rows or the columns along which the atoms of each batch of a checked plan move.
 
+    Of a batch with paths of tones, the rows that its atoms come from.
+
     Example:
         >>> batch_lines(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]))
         [('row', (2,))]
@@ -141,7 +143,9 @@ def batch_lines(plan: Plan) -> list[Lines]:
 
 
 def _lines_of(batch: Batch) -> Lines:
-    axis: Axis = "column" if (batch.to_sites != batch.from_sites)[:, 0].any() else "row"
+    axis: Axis = (
+        "column" if batch.tones is None and (batch.to_sites != batch.from_sites)[:, 0].any() else "row"
+    )
     return axis, tuple(np.unique(batch.from_sites[:, 1 if axis == "column" else 0]).tolist())
 
 
@@ -233,15 +237,35 @@ def paint_moves(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int1
     from matplotlib.collections import LineCollection, PolyCollection
 
     start, end = place_sites(moves[:, :2], grid), place_sites(moves[:, 2:], grid)
-    shafts, heads = hops(start, end, heights(lanes(moves)))
+    goes = (moves[:, :2] != moves[:, 2:]).any(axis=1)
+    shafts, heads = hops(start[goes], end[goes], heights(lanes(moves[goes])))
     points = sheet.site_in * POINTS_PER_INCH
     thick = min(1.5, 0.11 * points)
     rings: dict[str, Any] = {"s": (0.62 * points) ** 2, "facecolors": "none", "linewidths": thick}
     axes.scatter(start[:, 0], start[:, 1], edgecolors=colours, zorder=2, **rings)
     lost = ~on_grid(moves[:, 2:], grid.shape)
     axes.plot(end[lost, 0], end[lost, 1], **EJECTED_LOOK.keywords(sheet.site_in), zorder=2)
-    axes.add_collection(LineCollection(list(shafts), colors=colours, linewidths=thick, zorder=3))
-    axes.add_collection(PolyCollection(list(heads), facecolors=colours, linewidths=0, zorder=4))
+    arrows = np.asarray(colours)[goes]
+    axes.add_collection(LineCollection(list(shafts), colors=arrows, linewidths=thick, zorder=3))
+    axes.add_collection(PolyCollection(list(heads), facecolors=arrows, linewidths=0, zorder=4))
+
+
+def paint_paths(axes: Axes, sheet: Sheet, grid: SiteGrid, batch: Batch, colour: Any) -> None:
+    """Paint the ways of all tweezers of a batch with paths of tones, dotted those without an atom."""
+    paths, points = batch.tones, sheet.site_in * POINTS_PER_INCH
+    assert paths is not None
+    thick = min(1.5, 0.11 * points)
+    carrying = set(map(tuple, paths.tones_of(batch.from_sites).tolist()))
+    for crossing in product(range(paths.shape[1]), range(paths.shape[2])):
+        way = place_sites(paths.path_of(*crossing), grid)
+        if crossing not in carrying:
+            axes.plot(way[:, 0], way[:, 1], ":", color=colour, linewidth=thick / 2, zorder=2)
+            continue
+        axes.plot(*way[0], "o", ms=0.62 * points, mfc="none", mec=colour, mew=thick, zorder=2)
+        axes.plot(way[:, 0], way[:, 1], color=colour, linewidth=thick, zorder=3)
+        axes.plot(*way[-1], "o", ms=0.3 * points, color=colour, mew=0, zorder=4)
+    lost = place_sites(batch.to_sites[~on_grid(batch.to_sites, grid.shape)], grid)
+    axes.plot(lost[:, 0], lost[:, 1], **EJECTED_LOOK.keywords(sheet.site_in), zorder=4)
 
 
 def paint_lines(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int16]) -> None:
@@ -519,9 +543,14 @@ def _paint_panel(axes: Axes, sheet: Sheet, drawing: PlanDrawing, panel: Panel, *
         of_batch = [colour_of(panel.first, plan.n_batches)]
     else:
         of_batch = [colour_of(i, panel.n_batches) for i in range(panel.n_batches)]
-    colours = np.repeat(of_batch, np.diff(offsets), axis=0)
-    paint_lines(axes, sheet, drawing.grid, moves)
-    paint_moves(axes, sheet, drawing.grid, moves, colours)
+    straight = np.ones(len(moves), np.bool_)
+    for index, colour in zip(range(panel.first, panel.last + 1), of_batch, strict=True):
+        if (batch := plan.batch(index)).tones is not None:
+            straight[plan.batch_offsets[index] - offsets[0] :][: len(batch)] = False
+            paint_paths(axes, sheet, drawing.grid, batch, colour)
+    colours = np.repeat(of_batch, np.diff(offsets), axis=0)[straight]
+    paint_lines(axes, sheet, drawing.grid, moves[straight])
+    paint_moves(axes, sheet, drawing.grid, moves[straight], colours)
 
 
 def colour_of(index: int, n_batches: int) -> Any:

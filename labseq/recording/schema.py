@@ -10,7 +10,8 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       images_view               NXdata: what viewers open by default
       detection                 occupancy (n, row, col), confidence, signal, t_s and the table of images;
                                 threshold (row, col), sites_px (row, col, yx)
-      rearrangement             tables of moves, batches and cycles; predicted (cycle, row, col)
+      rearrangement             tables of moves, batches and cycles, and of paths where tones have some;
+                                predicted (cycle, row, col)
       steps                     table of the steps: planned and achieved durations
       timing                    table of the stages
       atom_events               tables of the events of the atoms in a simulation
@@ -35,7 +36,7 @@ from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.plain import plain_text
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "4.0"
+FORMAT_VERSION: Final = "4.1"
 """major.minor; a newer minor version only adds things, another major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
@@ -315,6 +316,25 @@ def _moves_in_batch(cycle: CycleRecord) -> NDArray[np.int32]:
     return np.diff(cycle.plan.batch_offsets)
 
 
+def _shapes(cycle: CycleRecord) -> NDArray[np.int32]:
+    """Numbers of knots, row tones and column tones of each batch."""
+    shapes = cycle.plan.path_shapes
+    return shapes if len(shapes) else np.zeros((cycle.plan.n_batches, 3), np.int32)
+
+
+def _path_places(cycle: CycleRecord) -> NDArray[np.int_]:
+    """Batch, axis, knot, tone and last knot of each position of a plan's paths, (n_positions, 5)."""
+    found: list[NDArray[Any]] = [np.empty((0, 5), np.int_)]
+    off = cycle.plan.path_off
+    for batch, (n_knots, *n_tones) in enumerate(_shapes(cycle).tolist()):
+        for axis, n in enumerate(n_tones):
+            knot, tone = (index.ravel() for index in np.indices((n_knots, n)))
+            ends, off = np.tile(off[:n], n_knots), off[n:]
+            of = np.full_like(knot, batch), np.full_like(knot, axis)
+            found.append(np.stack([*of, knot, tone, ends], axis=1))
+    return np.concatenate(found)
+
+
 def _batch_of_move(cycle: CycleRecord) -> NDArray[np.int_]:
     return np.repeat(_batch_numbers(cycle), _moves_in_batch(cycle))
 
@@ -344,6 +364,14 @@ BATCHES: Final = Table(
             "report.batch_end_s",
         ),
         Field("linked", "?", _LINKED, "plan.linked"),
+        Field(
+            "n_knots",
+            "i4",
+            "knots of the tones' paths; 0 for a line batch",
+            lambda cycle: _shapes(cycle)[:, 0],
+        ),
+        Field("n_row_tones", "i4", "row tones with a path", lambda cycle: _shapes(cycle)[:, 1]),
+        Field("n_column_tones", "i4", "column tones with a path", lambda cycle: _shapes(cycle)[:, 2]),
         Field("played", "?", _PLAYED, lambda cycle: _batch_numbers(cycle) < cycle.n_batches_played),
     ),
 )
@@ -376,6 +404,25 @@ MOVES: Final = Table(
     ),
 )
 """The moves of each :class:`CycleRecord`."""
+
+PATHS: Final = Table(
+    "rearrangement/paths",
+    "position",
+    "the paths of the tones, where rows and columns move at once; left out if no plan has any",
+    (
+        _STEP,
+        _CYCLE,
+        Field(
+            "batch", "i4", "index of the batch in its cycle, from 0", lambda cycle: _path_places(cycle)[:, 0]
+        ),
+        Field("axis", "i1", "0 for a row tone, 1 for a column tone", lambda cycle: _path_places(cycle)[:, 1]),
+        Field("knot", "i4", "index of the knot, from 0", lambda cycle: _path_places(cycle)[:, 2]),
+        Field("tone", "i4", "index of the tone on its axis, from 0", lambda cycle: _path_places(cycle)[:, 3]),
+        Field("position", "f8", "row or column of the tone at the knot, in sites", "plan.path_positions"),
+        Field("off_knot", "i4", "knot at which the tone goes off", lambda cycle: _path_places(cycle)[:, 4]),
+    ),
+)
+"""The paths of the tones of each :class:`CycleRecord`, by batch, axis, knot and tone."""
 
 TIMING: Final = Table(
     "timing",
@@ -416,17 +463,18 @@ STEPS: Final = Table(
 )
 """Of :class:`StepTiming`."""
 
-TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, CYCLES, STEPS, TIMING)
+TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, PATHS, CYCLES, STEPS, TIMING)
 
 
 def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> list[CycleRecord]:
     """The cycles from their tables.
 
     Args:
-        tables: "cycles", "batches" and "moves" -> rows.
+        tables: "cycles", "batches" and "moves" -> rows, and "paths", which files without paths lack.
         predicted: (n_cycles, n_rows, n_cols), occupancy after each plan.
     """
     batches, moves = tables["batches"], tables["moves"]
+    paths = tables.get("paths", np.empty(0, [("position", "f8"), ("knot", "i4"), ("off_knot", "i4")]))
     sites = np.stack([moves[name] for name in ("from_row", "from_col", "to_row", "to_col")], axis=1)
     found: list[CycleRecord] = []
     for row, known, occupancy in zip(
@@ -444,8 +492,21 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
             n_defects=int(row["n_defects_predicted"]),
             n_surplus=int(row["n_surplus_predicted"]),
         )
-        found.append(CycleRecord(plan=Plan(own_sites, offsets, own["linked"]), report=report, **known))
+        shapes = _shapes_of(own)
+        n_positions = int((shapes[:, 0] * shapes[:, 1:].sum(axis=1)).sum())
+        own_paths, paths = paths[:n_positions], paths[n_positions:]
+        off = own_paths["off_knot"][own_paths["knot"] == 0]
+        plan = Plan(own_sites, offsets, own["linked"], shapes, own_paths["position"], off)
+        found.append(CycleRecord(plan=plan, report=report, **known))
     return found
+
+
+def _shapes_of(batches: NDArray[Any]) -> NDArray[np.int32]:
+    """Shapes of the paths of batches that were read; files before version 4.1 have none."""
+    names = ("n_knots", "n_row_tones", "n_column_tones")
+    if names[0] not in (batches.dtype.names or ()):
+        return np.zeros((len(batches), 3), np.int32)
+    return np.stack([batches[name] for name in names], axis=1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,6 +182,9 @@ def _write_cycles(group: Any, shot: ShotRecord, grid_shape: tuple[int, int]) -> 
     batches = schema.BATCHES.rows_of_arrays(cycles, attrgetter("plan.n_batches"))
     write_table(group, schema.MOVES, moves)
     write_table(group, schema.BATCHES, batches)
+    if any(cycle.plan.has_paths for cycle in cycles):
+        paths = schema.PATHS.rows_of_arrays(cycles, lambda cycle: len(cycle.plan.path_positions))
+        write_table(group, schema.PATHS, paths)
     write_table(group, schema.CYCLES, schema.CYCLES.rows(cycles))
     predicted = np.array([cycle.report.predicted for cycle in cycles], np.uint8)
     write_array(group, "rearrangement/predicted", predicted.reshape(len(cycles), *grid_shape))
@@ -309,7 +312,8 @@ def _record(entry: Any) -> ShotRecord:
         images=_images(entry["detection"]),
         **_detector(entry["detection"]),
         cycles=schema.cycles_of(
-            {name: cycles[name][()] for name in ("cycles", "batches", "moves")}, cycles["predicted"][()]
+            {name: cycles[name][()] for name in ("cycles", "batches", "moves", "paths") if name in cycles},
+            cycles["predicted"][()],
         ),
         timing=[StageTiming(**known) for known in timing],
         steps=[StepTiming(**known) for known in steps],

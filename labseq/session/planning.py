@@ -21,7 +21,7 @@ from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
 from labseq.guard import Guard
 from labseq.messages import clean, format_error, visible
-from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
+from labseq.model import Batch, MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import check_plan
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
@@ -300,10 +300,7 @@ class PlannedMoves:
             "n_batches": self.plan.n_batches,
             "n_atom_moves": self.plan.n_atom_moves,
             "duration_s": report.duration_s,
-            "batches": [
-                {"from": b.from_sites.tolist(), "to": b.to_sites.tolist(), "linked": b.linked}
-                for b in self.plan.batches
-            ],
+            "batches": [_batch(batch) for batch in self.plan.batches],
             "predicted": _bits(report.predicted),
             "refused": refused and {"batch": refused.batch, "move": refused.move, "why": str(refused)},
         }
@@ -408,6 +405,19 @@ def call_planner(
 def changed_settings(settings: Settings | None) -> dict[str, Any]:
     """The settings that differ from the defaults, SI, JSON-ready."""
     return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
+
+
+def _batch(batch: Batch) -> dict[str, Any]:
+    """A batch as :mod:`labseq.config.plan_file` reads it."""
+    values: dict[str, Any] = {
+        "from": batch.from_sites.tolist(),
+        "to": batch.to_sites.tolist(),
+        "linked": batch.linked,
+    }
+    if batch.tones is None:
+        return values
+    names = ("row", "column", "row_off", "column_off")
+    return values | {"tones": {name: getattr(batch.tones, name).tolist() for name in names}}
 
 
 def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:

@@ -65,7 +65,11 @@ def make_run(**changes: Any) -> RunRecord:
 def _plan(n_moves_per_batch: tuple[int, ...], rng: np.random.Generator) -> Plan:
     offsets = np.cumsum([0, *n_moves_per_batch])
     moves = rng.integers(-1, 6, (int(offsets[-1]), 4)).astype(np.int16)
-    return Plan(moves, offsets, rng.random(len(n_moves_per_batch)) < 0.5)
+    linked = rng.random(len(n_moves_per_batch)) < 0.5
+    if len(linked) < 3:
+        return Plan(moves, offsets, linked)
+    shapes = np.array([(0, 0, 0), (3, 2, 1), (0, 0, 0)], np.int32)  # rows and columns move at once
+    return Plan(moves, offsets, linked, shapes, rng.random(9), np.array([1, 2, 2], np.int32))
 
 
 def _cycle(number: int, n_moves_per_batch: tuple[int, ...], rng: np.random.Generator) -> CycleRecord:

@@ -70,7 +70,17 @@ def images(draw: st.DrawFn, shape: tuple[int, int]) -> ImageRecord:
 def cycles(draw: st.DrawFn, shape: tuple[int, int]) -> CycleRecord:
     sizes = draw(st.lists(st.integers(0, 3), max_size=4))
     n = len(sizes)
-    plan = Plan(draw(arrays(np.int16, (sum(sizes), 4))), np.cumsum([0, *sizes]), draw(arrays(np.bool_, (n,))))
+    shape_of_paths = st.just((0, 0, 0)) | st.tuples(st.integers(1, 3), st.integers(1, 2), st.integers(1, 2))
+    shapes = np.array(draw(st.lists(shape_of_paths, min_size=n, max_size=n)), np.int32).reshape(n, 3)
+    n_tones = shapes[:, 1] + shapes[:, 2]
+    plan = Plan(
+        draw(arrays(np.int16, (sum(sizes), 4))),
+        np.cumsum([0, *sizes], dtype=np.int32),
+        draw(arrays(np.bool_, (n,))),
+        shapes,
+        draw(arrays(np.float64, (int(shapes[:, 0] @ n_tones),))),
+        draw(arrays(np.int32, (int(n_tones.sum()),))),
+    )
     report = PlanReport(
         draw(arrays(np.bool_, shape)),
         draw(arrays(np.float64, (n,))),

@@ -269,7 +269,7 @@ def _sites(atoms: Occupancy) -> str:
 
 def equal(plan: Plan, other: Plan) -> bool:
     """Whether two plans are the same, batch for batch."""
-    fields = ("moves", "batch_offsets", "linked")
+    fields = ("moves", "batch_offsets", "linked", "path_shapes", "path_positions", "path_off")
     return all(np.array_equal(getattr(plan, name), getattr(other, name)) for name in fields)
 
 
