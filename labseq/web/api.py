@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -178,7 +178,7 @@ class Api:
                 for name, one in (record.get("devices") or {}).items()
             },
             "plugins": [readings_of(one) for one in record.get("plugins") or () if isinstance(one, dict)],
-            "provenance": readings_of(record.get("provenance") or {}),
+            "provenance": readings_of(_unfolded(record.get("provenance") or {})),
             "n_damaged_lines": run.history.n_damaged,
             "has_scan": bool(record.get("scan")),
             "files": [kind for kind, name in _TEXTS.items() if (run.folder / name).is_file()],
@@ -368,6 +368,17 @@ def _parameter(name: str, place: str) -> dict[str, Any]:
         "description": _DESCRIPTIONS.get(name, name),
         "schema": {"type": "integer" if is_number else "string"},
     }
+
+
+def _unfolded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values with those of the mappings in it: "git.commit"."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            found |= {f"{name}.{key}": one for key, one in cast("dict[str, Any]", value).items()}
+        else:
+            found[name] = value
+    return found
 
 
 def _label(text: str) -> str:

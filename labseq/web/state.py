@@ -241,7 +241,7 @@ def stage_rows(totals: StageTotals, *, simulated: bool) -> list[dict[str, Any]]:
         whole = one.stage.startswith(STEP)
         rows.append(
             {
-                "stage": text_of(one.stage.removeprefix(STEP) if whole else one.stage, 80),
+                "stage": text_of(one.stage.removeprefix(STEP) if whole else one.stage, 80).replace("_", " "),
                 "is_step": whole,
                 "n": one.n,
                 "median_s": finite(median_s),

@@ -55,6 +55,7 @@ function describe(box, points, options) {
 function chartOptions(box, options) {
   const ink = colour(options.ink ?? "blue"), soft = colour("ink-2"), grid = colour("grid");
   const font = `${Math.round(0.75 * parseFloat(getComputedStyle(document.documentElement).fontSize))}px ${getComputedStyle(document.body).fontFamily}`;
+  const rem = parseFloat(getComputedStyle(document.documentElement).fontSize);
   const axis = { stroke: soft, font, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1, size: 4 } };
   return {
     width: Math.max(60, Math.floor(box.clientWidth)), height: box.chartHeight(),
@@ -62,8 +63,8 @@ function chartOptions(box, options) {
     cursor: { y: false, points: { size: 8 }, drag: { setScale: true, x: true, y: false } },
     scales: { x: { time: Boolean(options.isTime), range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low - 0.02 * (high - low), high + 0.02 * (high - low)]) },
       y: { range: () => rangeOf(box.points, options) } },
-    axes: [{ ...axis, size: 28, space: 60, values: options.formatX ? (_, all) => all.map(options.formatX) : undefined },
-      { ...axis, size: 56, space: 34, values: (_, all) => all.map(options.format) }],
+    axes: [{ ...axis, size: 2 * rem, space: 4.5 * rem, values: options.formatX ? (_, all) => all.map(options.formatX) : undefined },
+      { ...axis, size: 4.2 * rem, space: 2.4 * rem, values: (_, all) => all.map(options.format) }],
     series: [{}, { stroke: ink, width: options.line === false ? 0 : 1.6, spanGaps: true,
       points: { show: true, size: box.points.length > 60 ? 3 : 6, fill: ink, stroke: ink } }, { show: false }, { show: false }],
     hooks: { draw: [(u) => drawBars(u, ink)], setCursor: [(u) => showValue(u, box, options)] },
@@ -71,6 +72,7 @@ function chartOptions(box, options) {
 }
 
 function rangeOf(points, options) {
+  if (options.fixed) return options.fixed;
   const ends = points.flatMap((p) => [p.y, p.low, p.high]).filter((v) => v !== null && v !== undefined && Number.isFinite(v));
   if (!ends.length) return options.range ?? [0, 1];
   let low = Math.min(...ends), high = Math.max(...ends);

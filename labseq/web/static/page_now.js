@@ -31,8 +31,8 @@ function makeView(main) {
   const grid = el("div.grid", {},
     panel("Last shot", { class: "wide arrays", aside: choice }, el("div.figures", {}, frame.node, before.node, after.node)),
     panel("Filling", { class: "trend" }, filling), panel("Defect-free", { class: "trend" }, rate),
-    panel("Stages against their budgets", { class: "stages" }, stages), lossPanel,
-    panel("Readings and interlocks", { class: "readings" }, readings), panel("Events", { class: "log" }, log));
+    panel("Stages against their budgets", { class: "stages" }, stages),
+    el("div.stack", {}, lossPanel, panel("Readings and interlocks", {}, readings), panel("Events", {}, log)));
   let latest = null, picked = null, bitmap = null, reduced = 1, isBuilt = false;
   const load = oneSlot((image, factor) => { bitmap = image; reduced = factor; arrays(); });
 

@@ -61,7 +61,7 @@ export async function showRun(main, [day, name]) {
     el("div.grid", {}, panel("Filling", { class: "half" }, filling), panel("Defect-free", { class: "half" }, rate)), scan, more,
     el("div.grid", {}, panel("Shots", { class: "wide" }, shots), panel("Changed by the command line", { class: "half" }, orNone(values.changes)), notesPanel(run),
       panel("Calibrations", { class: "half" }, orNone(values.calibrations)), panel("Devices", { class: "half" }, Object.entries(values.devices).map(([device, about]) => el("details", {}, el("summary", {}, device, about.model ? `: ${about.model}` : ""), typeof about === "object" ? facts(about) : about))),
-      panel("Where it came from", { class: "wide" }, facts({ ...values.provenance, plugins: values.plugins.map((one) => `${one.name} ${one.version}`).join(", ") }))));
+      panel("Where it came from", { class: "wide" }, el("details", {}, el("summary", {}, `labseq ${values.provenance.labseq ?? "?"} on ${values.provenance.host ?? "?"}`), facts({ ...values.provenance, plugins: values.plugins.map((one) => `${one.name} ${one.version}`).join(", ") })))));
   if (values.trend.length) {
     curve(filling, trendPoints(values.trend, "filling"), FILLING);
     curve(rate, trendPoints(values.trend, "defect_free"), DEFECT_FREE);
@@ -121,10 +121,11 @@ export async function showCompare(main, _, asked) {
     el("div.grid", {}, runs.map((r, i) => panel(`Filling: ${r.run.id}`, { class: "half" }, charts[i][0])), runs.map((r, i) => panel(`Defect-free: ${r.run.id}`, { class: "half" }, charts[i][1])),
       panel("Lines of the sequences that differ", { class: "wide" }, differences(texts))));
   const ends = runs.flatMap((r) => r.trend.flatMap((bin) => [bin.filling, ...bin.filling_interval])).filter((v) => v !== null);
+  const range = ends.length ? [Math.min(...ends) - 0.001, Math.max(...ends) + 0.001] : [0, 1];
   runs.forEach((r, i) => {
     if (!r.trend.length) return;
-    curve(charts[i][0], trendPoints(r.trend, "filling"), { ...FILLING, ...(ends.length ? { lowest: Math.min(...ends) } : {}) });
-    curve(charts[i][1], trendPoints(r.trend, "defect_free"), DEFECT_FREE);
+    curve(charts[i][0], trendPoints(r.trend, "filling"), { ...FILLING, fixed: range });
+    curve(charts[i][1], trendPoints(r.trend, "defect_free"), { ...DEFECT_FREE, fixed: [-0.02, 1.02] });
   });
 }
 

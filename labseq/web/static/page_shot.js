@@ -14,7 +14,7 @@ export async function showShot(main, [day, name, number], asked) {
   replace(main, el("div.title-line", {}, el("h1", {}, `Shot ${shot.shot}`), el("span.tag", {}, outcome), attempt !== null ? el("span.tag", {}, `attempt ${shot.attempt}`) : null, step(-1), step(1)),
     el("div.sub-line", {}, runLink(id), el("span", {}, `${count(shot.images.length, "image")}, ${count(shot.cycles.length, "cycle")}`), el("a", { href: `/api/v1${base}${suffix ? `?${suffix}` : ""}` }, "as JSON")),
     el("div.grid", {}, shot.cycles.length ? cyclesPanel(run, shot, draws) : null, framesPanel(run, shot, base, suffix, draws),
-      panel("Stages", { class: "half" }, stages(shot)), panel("Readings", { class: "half" }, orNone(shot.readings)), panel("Settings of this shot", { class: "half" }, orNone(shot.parameters)), panel("Calibrations", { class: "half" }, orNone(shot.calibrations))));
+      panel("Stages", { class: "half tall" }, stages(shot)), panel("Readings", { class: "half" }, orNone(shot.readings)), panel("Settings of this shot", { class: "half" }, orNone(shot.parameters)), panel("Calibrations", { class: "half" }, orNone(shot.calibrations))));
   const draw = () => draws.forEach((one) => one());
   draw();
   document.addEventListener("themechange", draw);
