@@ -114,7 +114,7 @@ def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
     return np.array([named[place] for place in range(len(named))])
 
 
-MIXING: Final = 0.5
+MIXING: Final = 0.45
 """Distance of two tones, in sites, below which their tweezers merge (ours)."""
 AT_REST: Final = 1e-6
 """Motion in a segment, in sites, below which a tweezer counts as at rest (rounding)."""

@@ -11,7 +11,7 @@ Rules, in the order in which they act on a segment:
    switched off.
 2. A crossing that switches on takes the atom of the nearest site, if it is close and deep enough
    (``handover.py``).
-3. Tones of one axis that come closer than half a site, or pass one another, mix the atoms on both: they are
+3. Tones of one axis that come closer than 0.45 sites, or pass one another, mix the atoms on both: they are
    lost.
 4. A crossing that moves over an atom on a site, or ends on one, knocks it out, if it is deeper than a static
    tweezer. The first to arrive loses its own atom too.

@@ -27,10 +27,12 @@ from labseq_virtual.flight_kernels import (
 )
 from labseq_virtual.rf_analysis import PulseReceiver, RfPulse
 from labseq_virtual.settings import MobileLightSettings, SimulationSettings
+from labseq_virtual.transport import Transport
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from labseq.model import SiteGrid, ToneProgram, TonesNow
+from labseq.model import Batch, Plan, SiteGrid, TargetPattern, TonePaths, ToneProgram, TonesNow
+from labseq.motion import check_plan, tone_program
 
 from .rf import (
     FULL_SCALE_V,
@@ -305,6 +307,28 @@ def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> N
         for site in np.ndindex(*grid.shape):
             near[site] |= site[0] - math.floor(row) in (0, 1) and site[1] - math.floor(col) in (0, 1)
     np.testing.assert_array_equal(RfTransport(grid, spec(), SURE)._near(rows, cols), near)
+
+
+def test_rows_are_put_down_one_after_the_other() -> None:
+    """While the second row is put down, the column that it does not use waits half a site beside it."""
+    row = np.array([[0.0, 2], [0.5, 2.5], [1, 2.5], [1, 2.5], [1, 3]])
+    column = np.array([[2.0, 3]] * 3 + [[2.5, 3]] * 2)
+    tones = TonePaths(row, column, np.array([2, 4]))
+    plan = Plan.from_batches([Batch(np.array([(0, 2), (2, 3)]), np.array([(1, 2), (3, 3)]), tones=tones)])
+    atoms = [(0, 2), (2, 3), (3, 2), (1, 1), (4, 3)]
+    occupied = np.zeros(GRID.shape, np.bool_)
+    occupied[tuple(np.array(atoms).T)] = True
+    report = check_plan(plan, occupied, TargetPattern.none(GRID.shape), 4)
+    expected = {(1, 2), (3, 3), (3, 2), (1, 1), (4, 3)}
+    assert {(int(r), int(c)) for r, c in np.argwhere(report.predicted)} == expected
+    program = tone_program(plan, GRID, spec())
+    there, flights, jumps = fly(program, atoms)
+    assert there == expected
+    assert set(flights["fate"].tolist()) == {b"kept"}
+    assert len(jumps) == 0
+    transport = Transport(GRID, spec(), SURE)
+    transport.carry(occupied, program, program.n_segments, np.ones(GRID.shape), np.random.default_rng(1), 1.0)
+    assert np.array_equal(occupied, report.predicted)
 
 
 MOVE = ([(5, 2), (5, 5)], [(5, 5), (5, 9)])
