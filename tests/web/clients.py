@@ -90,9 +90,9 @@ def path_of(run_dir: Path) -> str:
     return f"/api/v1/runs/{run_dir.parent.name}/{run_dir.name}"
 
 
-def write_run(root: Path, n_shots: int, name: str = "compact", **record: Any) -> RunWriter:
-    """Write a run that is not finished, with so many shots."""
-    writer = RunWriter.create(root, make_run(name=name, n_shots=max(1, n_shots), **record))
-    for index in range(n_shots):
+def write_run(root: Path, n_taken: int, name: str = "compact", **record: Any) -> RunWriter:
+    """Write a run that is not finished, with so many shots so far."""
+    writer = RunWriter.create(root, make_run(name=name, **{"n_shots": max(1, n_taken), **record}))
+    for index in range(n_taken):
         writer.write_shot(make_shot(index))
     return writer

@@ -70,6 +70,7 @@ async function show() {
   const mine = {};
   show.latest = mine;
   replace(main, el("p.hint", {}, "Loading ..."));
+  main.setAttribute("aria-busy", "true");
   try {
     const close = await page(main, parts, new URLSearchParams(location.search));
     if (show.latest === mine) leave = close ?? null;
@@ -77,6 +78,7 @@ async function show() {
   } catch (error) {
     if (show.latest === mine) replace(main, failure(error));
   }
+  if (show.latest === mine) main.setAttribute("aria-busy", "false");
 }
 
 // Links within the pages do not load everything again.

@@ -104,9 +104,9 @@ export function statusPill(status) {
 }
 
 export function table(heads, rows, props = {}) {
-  const cells = (row, tag) => row.map((cell, i) => el(tag, {
+  const cells = (row, tag) => row.map((cell, i) => el(cell === "" ? "td" : tag, {
     class: heads[i]?.right ? "num" : "", scope: tag === "th" ? "col" : null }, cell ?? "–"));
-  return el("div.scroller", { tabindex: "0", role: "region", "aria-label": props.label ?? "table" },
+  return el("div.scroller", { tabindex: "0", role: "region", "aria-label": `${props.label ?? "values"}, a table` },
     el("table", {}, el("thead", {}, el("tr", {}, cells(heads.map((h) => h.text ?? h), "th"))),
       el("tbody", {}, rows.map((row) => el("tr", { class: row.mark ?? "" }, cells(row.cells ?? row, "td"))))));
 }

@@ -1,0 +1,345 @@
+"""The pages in a real browser: live, in both themes and three sizes, and when things go wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import playwright.sync_api as playwright
+import pytest
+
+from labseq.calibration.store import Store
+from labseq.model import CalibrationEntry, SiteGrid, grid_facts
+from labseq.queue.queue import Queue
+from labseq.recording import open_run
+from labseq.web.shots import encode_png
+from tests.recording.records import make_shot
+
+from .clients import TOKEN, write_run
+from .test_acting import entry
+
+expect: Any = playwright.expect
+
+ROOT = Path(__file__).parents[2]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+MARKUP = '<img src=x onerror="document.title=1"><b>bold</b>'
+SIZES = ((390, 844), (1440, 900), (2560, 1440))
+WAIT_MS = 15_000
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(
+        CHROMIUM is None and not os.environ.get("LABSEQ_REQUIRE_ALL"), reason="needs chromium"
+    ),
+]
+
+
+@dataclass
+class Server:
+    """`labseq web` in a process of its own."""
+
+    data: Path
+    options: tuple[str, ...] = ()
+    variables: dict[str, str] = field(default_factory=dict[str, str])
+    port: int = 0
+    address: str = ""
+    process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        command = [
+            sys.executable,
+            "-m",
+            "labseq",
+            "web",
+            str(self.data),
+            f"--port={self.port}",
+            *self.options,
+        ]
+        own = {
+            "LABSEQ_STATE": str(self.data.parent / "state"),
+            "LABSEQ_LOCKS": str(self.data.parent / "locks"),
+        }
+        self.process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=self.data.parent,
+            env={**os.environ, **own, **self.variables},
+        )
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().strip()
+        self.port = urlsplit(self.address).port or 0
+
+    def stop(self) -> None:
+        assert self.process is not None
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Generator[Server]:
+    found = Server(tmp_path / "data")
+    found.data.mkdir()
+    found.start()
+    yield found
+    found.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Generator[Any]:
+    with playwright.sync_playwright() as started:
+        found = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        yield found
+        found.close()
+
+
+@dataclass
+class Watched:
+    """A page, and whatever it should not do: requests elsewhere, errors, dialogs."""
+
+    page: Any
+    faults: list[str] = field(default_factory=list[str])
+
+    def __post_init__(self) -> None:
+        def request(route: Any) -> None:
+            host = urlsplit(route.request.url).hostname
+            if host == "127.0.0.1" or route.request.url.startswith(("blob:", "data:")):
+                route.continue_()
+            else:
+                self.faults.append(route.request.url)
+                route.abort()
+
+        self.page.route("**/*", request)
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page.on("dialog", lambda dialog: (self.faults.append(dialog.message), dialog.dismiss()))
+        self.page.on("console", lambda line: line.type == "error" and self.faults.append(line.text))
+
+
+@pytest.fixture
+def watched(browser: Any) -> Generator[Watched]:
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(WAIT_MS)
+    expect.set_options(timeout=WAIT_MS)
+    yield Watched(context.new_page())
+    context.close()
+
+
+def test_a_run_is_watched_from_its_first_shot_to_its_last(server: Server, watched: Watched) -> None:
+    page = watched.page
+    page.goto(server.address)
+    expect(page.get_by_text("There is no run yet")).to_be_visible()
+    writer = write_run(server.data, 0, n_shots=4)
+    for index in range(4):
+        writer.write_shot(make_shot(index))
+        expect(page.locator(".progress-text")).to_have_text(re.compile(rf"{index + 1} of 4 shots"))
+    expect(page.locator("h1 + .pill")).to_have_text(re.compile("running"))
+    writer.finish("complete")
+    expect(page.locator("h1 + .pill")).to_have_text(re.compile("complete"))
+    shown = page.locator(".tile", has_text="Filling").locator(".tile-value").inner_text()
+    assert float(re.split(r"[ (]", shown)[0]) == pytest.approx(
+        100 * open_run(writer.run_dir).filling_fraction, abs=0.6
+    )
+    for canvas in page.locator("figure:visible canvas").all():
+        assert canvas.evaluate(
+            "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(v => v)"
+        )
+    assert watched.faults == []
+
+
+RUN = """
+import sys, time
+from pathlib import Path
+from tests.web.clients import write_run
+writer = write_run(Path(sys.argv[1]), 2, n_shots=9)
+print("ready", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_run_that_is_killed_is_said_to_have_died(server: Server, watched: Watched) -> None:
+    page = watched.page
+    page.goto(server.address)
+    run = subprocess.Popen(
+        [sys.executable, "-c", RUN, str(server.data)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    expect(page.locator("h1 + .pill")).to_have_text(re.compile("running"))
+    run.send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))
+    run.communicate()
+    expect(page.get_by_text("The run died")).to_be_visible()
+    expect(page.locator(".progress-text")).to_have_text(re.compile("2 of 9 shots"))
+
+
+def test_the_page_goes_on_after_the_server_was_restarted(server: Server, watched: Watched) -> None:
+    page = watched.page
+    writer = write_run(server.data, 1, n_shots=9)
+    page.goto(server.address)
+    expect(page.locator(".progress-text")).to_have_text(re.compile("1 of 9"))
+    server.stop()
+    expect(page.get_by_text("no connection")).to_be_visible()
+    writer.write_shot(make_shot(1))
+    server.start()
+    expect(page.locator(".progress-text")).to_have_text(re.compile("2 of 9"))
+    expect(page.get_by_text("live", exact=True)).to_be_visible()
+
+
+def test_browsers_that_do_not_read_hold_nothing_up(server: Server, watched: Watched) -> None:
+    writer = write_run(server.data, 1, n_shots=9)
+    page, stalled = watched.page, list[socket.socket]()
+    for _ in range(20):
+        client = socket.socket()
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", server.port))
+        client.sendall(b"GET /api/v1/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        stalled.append(client)
+    page.goto(server.address)
+    for index in range(1, 9):
+        writer.write_shot(make_shot(index))
+        expect(page.locator(".progress-text")).to_have_text(re.compile(f"{index + 1} of 9"), timeout=5000)
+    for client in stalled:
+        client.close()
+
+
+def test_token_is_asked_for(tmp_path: Path, watched: Watched, browser: Any) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    server = Server(data, ("--control",), {"LABSEQ_WEB_TOKEN": TOKEN})
+    server.start()
+    try:
+        page, base = watched.page, f"http://127.0.0.1:{server.port}"
+        assert page.goto(f"{base}/runs").status == 401
+        assert page.goto(f"{base}/runs?token={TOKEN[::-1]}").status == 401
+        page.goto(f"{base}/runs?token={TOKEN}".replace(" ", "%20"))
+        expect(page.get_by_role("heading", name="Runs")).to_be_visible()
+        assert page.url == f"{base}/runs"
+        other = browser.new_context().new_page()
+        assert other.goto(base).status == 401
+    finally:
+        server.stop()
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Generator[Server]:
+    """A data folder with something for every page: a real scan, hostile texts, a queue, calibrations."""
+    home = tmp_path_factory.mktemp("lab")
+    data = home / "data"
+    store = Store(home / "hardware_profiles" / "calibrations" / "virtual")
+    picture = encode_png(np.zeros((40, 60), np.uint8))
+    for day in (3, 11, 19):
+        quality = {"error_m": 1e-8 * day}
+        taken = f"2026-11-{day:02}T08:00:00+00:00"
+        store.add(
+            CalibrationEntry(
+                "overlay", {"offset_m": np.array([1e-8, 0.0])}, quality, grid_facts(SiteGrid()), {}, taken
+            ),
+            picture,
+        )
+    queue = Queue(data)
+    queue.folder.mkdir(parents=True)
+    queue.write(entry(1))
+    writer = write_run(data, 2, MARKUP)
+    (writer.run_dir / "notes.json").write_text(json.dumps({"comment": MARKUP, "tags": [MARKUP]}))
+    writer.event("warning", text=MARKUP)
+    writer.finish("failed", MARKUP * 20)
+    command = [sys.executable, "-m", "labseq", "run", str(ROOT / "sequences" / "scan_dop.yaml"), "--profile"]
+    command += [str(ROOT / "hardware_profiles" / "virtual.yaml"), "--set=repeats=2", "--seed=1", "--json"]
+    subprocess.run(
+        [*command, f"--output={data}"],
+        check=True,
+        capture_output=True,
+        env={**os.environ, "LABSEQ_LOCKS": str(home / "locks"), "LABSEQ_STATE": str(home / "state")},
+    )
+    found = Server(data, ("--control",), {"LABSEQ_WEB_TOKEN": "t" * 20})
+    found.start()
+    yield found
+    found.stop()
+
+
+def pages_of(data: Path) -> list[str]:
+    runs = sorted((run.parent for run in data.glob("*/*/run.json")), key=lambda run: "scan-dop" in run.name)
+    first, second = (f"{run.parent.name}/{run.name}" for run in runs)
+    return [
+        *(f"/now?run={first}", f"/now?run={second}", "/now?wall=1", f"/scan?run={second}", "/runs"),
+        *(f"/runs/{first}", f"/runs/{second}/shots/1", f"/compare?a={first}&b={second}"),
+        *("/queue", "/calibrations", "/api"),
+    ]
+
+
+def settled(page: Any) -> None:
+    expect(page.locator("main[aria-busy='false'] h1").first).to_be_visible()
+
+
+def test_every_page_in_both_themes_and_three_sizes(full: Server, watched: Watched) -> None:
+    """No overflow, no request elsewhere, no markup from a file, and nothing that axe finds serious."""
+    page, axe = watched.page, (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
+    page.goto(f"{full.address}")
+    for path in pages_of(full.data):
+        page.goto(f"http://127.0.0.1:{full.port}{path}")
+        settled(page)
+        page.evaluate(axe)
+        for theme in ("light", "dark"):
+            page.emulate_media(color_scheme=theme)
+            for width, height in SIZES:
+                page.set_viewport_size({"width": width, "height": height})
+                is_wide = page.evaluate("document.documentElement.scrollWidth > innerWidth")
+                assert not is_wide, (path, theme, width)
+            assert serious(page, theme) == [], (path, theme)
+        assert page.locator("main img[src='x'], main b").count() == 0, path
+    assert watched.faults == []
+
+
+AXE = """async rules => (await axe.run(document, {resultTypes: ['violations'], runOnly: rules})).violations
+    .filter(found => ['serious', 'critical'].includes(found.impact))
+    .map(found => [found.id, ...found.nodes.slice(0, 3).map(one => one.html + one.failureSummary)].join())"""
+
+
+def serious(page: Any, theme: str) -> list[str]:
+    """What axe-core finds; nothing but the contrast depends on the theme."""
+    rules = ["wcag2a", "wcag2aa", "wcag21aa", "best-practice"] if theme == "light" else ["color-contrast"]
+    return page.evaluate(AXE, rules)
+
+
+def test_a_link_leads_to_the_same_shot_with_its_images_and_moves(full: Server, watched: Watched) -> None:
+    page = watched.page
+    page.goto(full.address)
+    run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
+    shot = open_run(run).shots[1]
+    page.goto(f"http://127.0.0.1:{full.port}/runs/{run.parent.name}/{run.name}")
+    page.get_by_role("link", name="1", exact=True).click()
+    expect(page.get_by_role("heading", name="Shot 1")).to_be_visible()
+    assert page.url.endswith(f"{run.name}/shots/1")
+    assert page.locator("section[aria-label='Images'] figure").count() == len(shot.images)
+    captions = page.locator("section[aria-label='Cycle by cycle'] figcaption").all_inner_texts()
+    assert [int(re.search(r"(\d+) moves?,", text)[1]) for text in captions] == [  # type: ignore[index]
+        cycle.n_atom_moves_played for cycle in shot.cycles
+    ]
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("heading", name="Shot 2")).to_be_visible()
+    page.go_back()
+    expect(page.get_by_role("heading", name="Shot 1")).to_be_visible()
+
+
+def test_a_comment_is_kept_and_found(full: Server, watched: Watched) -> None:
+    page = watched.page
+    page.goto(full.address)
+    run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
+    page.goto(f"http://127.0.0.1:{full.port}/runs/{run.parent.name}/{run.name}")
+    page.get_by_label("Comment", exact=True).last.fill("a new lens")
+    page.get_by_role("button", name="Keep").click()
+    expect(page.get_by_text("kept")).to_be_visible()
+    page.goto(f"http://127.0.0.1:{full.port}/runs")
+    page.get_by_role("searchbox").fill("new LENS")
+    expect(page.locator("main .note").first).to_have_text(re.compile("1 of 2 runs"))
+    expect(page.get_by_role("link", name=f"{run.parent.name}/{run.name}")).to_be_visible()
