@@ -45,6 +45,7 @@ _HOMES = {
         "ShotRecord",
         "SiteGrid",
         "TargetPattern",
+        "TonePaths",
         "ToneProgram",
         "VisitedPoint",
         "as_occupancy",

@@ -36,6 +36,7 @@ from labseq.model import (
     ShotRecord as ShotRecord,
     SiteGrid as SiteGrid,
     TargetPattern as TargetPattern,
+    TonePaths as TonePaths,
     ToneProgram as ToneProgram,
     VisitedPoint as VisitedPoint,
     as_occupancy as as_occupancy,
