@@ -54,7 +54,7 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def planners(n_loadings: int) -> list[str]:
     """All planners side by side, one after the other so that times are true."""
-    comparison = read_comparison(planners=PLANNERS, dop=15, loadings=n_loadings)
+    comparison = read_comparison(planners=PLANNERS, dop="15", loadings=n_loadings)
     report = compare(comparison, 1)
     header = (
         "planner",
@@ -91,7 +91,7 @@ def sizes(n_loadings: int) -> list[str]:
     rows: list[list[str]] = []
     for grid, side in SIZES:
         target = f"compact:{side}x{side}"
-        comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop=15, loadings=n_loadings)
+        comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop="15", loadings=n_loadings)
         (row,) = compare(comparison, 1).rows
         times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
         rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])

@@ -28,6 +28,7 @@ Examples:
   labseq bench planners --planners psca,lsap --dop 15 --loadings 10000
   labseq bench planners --planners psca,psca:variant=paper --grid 30x30 --target kagome:20x20 --loading "60 %"
   labseq bench planners --planners psca --dop 15 --json - | jq .rows[0].n_batches
+  labseq bench planners --planners psca,grid --dop 7,15,20
   labseq bench planners --planners psca,mta1 --set profile.mobile_tweezers.speed="130 um/ms"
 """
 
@@ -83,10 +84,10 @@ def planners(
     ] = "compact:15x15",
     loading: Annotated[str, typer.Option(metavar="P", help="Probability that a site is loaded.")] = "75 %",
     dop: Annotated[
-        int | None,
+        str | None,
         typer.Option(
-            metavar="N",
-            help="Degree of parallelism of all planners that have one. Default: each planner's own.",
+            metavar="N,...",
+            help="Degrees of parallelism of all planners that have one. Default: each planner's own.",
         ),
     ] = None,
     loadings: Annotated[

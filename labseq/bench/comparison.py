@@ -20,6 +20,7 @@ BARE_MOTION: Final[Words] = (("overhead_per_batch", "0"), ("overhead_per_cycle",
 
 _ENTRY_SEPARATOR: Final = re.compile(r",(?=\s*[^\W\d][\w.-]*\s*(?:,|\Z|:\s*[^\W\d]\w*\s*=))")
 _SETTING_SEPARATOR: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
+_MOTION_PREFIX: Final = "profile.mobile_tweezers."
 _NAME: Final = re.compile(r"[^\W\d][\w.-]*")
 _GRID: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
 
@@ -142,6 +143,24 @@ def parse_loading(text: str) -> float:
     return probability
 
 
+def parse_parallelism(text: str | None) -> tuple[int | None, ...]:
+    """Read degrees of parallelism; (None,) for that of each planner.
+
+    Example:
+        >>> parse_parallelism("7,15"), parse_parallelism(None)
+        ((7, 15), (None,))
+    """
+    if text is None:
+        return (None,)
+    try:
+        return tuple(dict.fromkeys(int(part) for part in text.split(",")))
+    except ValueError as error:
+        expected = "whole numbers with commas between them, for example 7,15,20"
+        raise ConfigError(
+            Problem("this is no degree of parallelism", clean(f"--dop {text}"), expected=expected)
+        ) from error
+
+
 def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
     """Separate the settings of planners from those of the motion in the values of ``--set``.
 
@@ -159,9 +178,11 @@ def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
     motion: list[tuple[str, str]] = []
     for text in texts:
         address, equals, value = text.partition("=")
-        where, _, key = address.strip().rpartition(".")
-        settings = {"": planner, "planner": planner, "profile.mobile_tweezers": motion}.get(where)
-        if not equals or not key or settings is None:
+        key = address.strip().removeprefix(_MOTION_PREFIX)
+        settings = motion
+        if key == address.strip():
+            key, settings = key.removeprefix("planner."), planner
+        if not equals or not key or (settings is planner and "." in key):
             example = "planner.KEY=VALUE or profile.mobile_tweezers.KEY=VALUE"
             raise ConfigError(
                 Problem("there is nothing to set here", clean(f"--set {text}"), expected=example)
@@ -175,13 +196,15 @@ def read_comparison(
     grid: str = "20x20",
     target: str = "compact:15x15",
     loading: str = "75 %",
-    dop: int | None = None,
+    dop: str | None = None,
     loadings: int = 1000,
     seed: int = 1,
     overrides: Sequence[str] = (),
 ) -> Comparison:
     """Read the options of ``labseq bench planners``; raises ``ConfigError`` if one has an error."""
     settings, motion = parse_overrides(overrides)
-    condition = Condition(parse_grid(grid), target, parse_loading(loading), dop, (*BARE_MOTION, *motion))
-    entries = parse_planners(planners)
-    return Comparison(entries, (condition,), loadings, seed, settings, f"--planners {planners}")
+    where = parse_grid(grid), target, parse_loading(loading)
+    conditions = tuple(Condition(*where, n, (*BARE_MOTION, *motion)) for n in parse_parallelism(dop))
+    return Comparison(
+        parse_planners(planners), conditions, loadings, seed, settings, f"--planners {planners}"
+    )

@@ -85,6 +85,7 @@ PRINTED: Final[Sequence[tuple[str, str, Callable[[Any], str]]]] = (
     ("atoms moved", "n_atoms_moved", str),
     ("distance/mm", "distance_m", _milli),
     ("motion/ms", "motion_s", _milli),
+    ("moving/ms", "moving_s", _milli),
     ("scans", "n_scans", str),
     ("scans/ms", "scan_s", _milli),
     ("planning", "planning_s", lambda times: _time(times["median"])),
@@ -92,6 +93,8 @@ PRINTED: Final[Sequence[tuple[str, str, Callable[[Any], str]]]] = (
     ("filled", "filling_fraction", _percent),
     ("met", "target_met", _percent),
     ("/bound", "ratio_to_bound", str),
+    ("atoms lost", "n_lost", str),
+    ("defect-free", "p_defect_free", _percent),
 )
 """Heading, value and format of the printed columns."""
 
@@ -219,21 +222,23 @@ def summarise(results: NDArray[Any], loadings: NDArray[Any], n_atoms: int) -> di
     Returns:
         ``n_short`` loadings have fewer atoms than the target, ``n_failed`` no valid plan. Linked batches
         count as one; an atom that is picked up again counts again. ``n_scans`` and ``scan_s`` are NaN for
-        a planner whose paper counts batches. ``bound`` is the number of lines that cover the vacancies,
-        see :func:`labseq.bench.work.lines_to_cover`, and ``ratio_to_bound`` the mean number of batches over
-        the mean bound, both over the loadings whose target was filled.
+        a planner whose paper counts batches. ``n_lost`` and ``p_defect_free`` are predicted. ``bound`` is
+        the number of lines that cover the vacancies, see :func:`labseq.bench.work.lines_to_cover`, and
+        ``ratio_to_bound`` the mean number of batches over the mean bound, both over the loadings whose
+        target was filled.
     """
     right = ~results["failed"]
     good = results[right]
     filled = good["n_defects"] == 0
     planning_s = good["planning_s"] if len(good) else np.array([math.nan])
-    means = ("n_batches", "n_atoms_moved", "distance_m", "motion_s", "n_scans", "scan_s")
+    means = ("n_batches", "n_atoms_moved", "distance_m", "motion_s", "moving_s", "n_scans", "scan_s")
     return {
         "n_loadings": len(results),
         "n_short": int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
         "n_failed": int(np.count_nonzero(~right)),
         **{name: mean(good[name]) for name in means},
         "filling_fraction": mean(1.0 - good["n_defects"] / max(1, n_atoms)),
+        **{name: mean(good[name]) for name in ("n_lost", "p_defect_free")},
         "target_met": mean(filled & (good["n_surplus"] == 0)),
         "bound": mean(loadings["n_lines"]),
         "ratio_to_bound": ratio_of_means(good["n_batches"][filled], loadings["n_lines"][right][filled]),
@@ -245,11 +250,15 @@ def summarise(results: NDArray[Any], loadings: NDArray[Any], n_atoms: int) -> di
 
 
 def table(report: Report) -> list[str]:
-    """The printed table of a comparison with one condition: a line per planner."""
+    """The printed table of a comparison: a line per condition and planner."""
     if not report.rows:
         return ["no plan was made"]
-    scans = any(row.scans for row in report.rows)
-    printed = [column for column in PRINTED if scans or column[1] not in ("n_scans", "scan_s")]
+    hidden: set[str] = set()
+    if not any(row.scans for row in report.rows):
+        hidden |= {"n_scans", "scan_s"}
+    if all(row["moving_s"] == row["motion_s"] for row in report.rows):
+        hidden.add("moving_s")
+    printed = [column for column in PRINTED if column[1] not in hidden]
     lines = [[text(row[name]) for _, name, text in printed] for row in report.rows]
     return columns([[heading for heading, *_ in printed], *lines], range(1, len(printed)))
 
@@ -302,18 +311,19 @@ def _again(comparison: Comparison, row: Row, loading: int) -> str:
 
 
 def save_histogram(path: Path, report: Report) -> None:
-    """Draw how many batches the planners need, for a comparison with one condition, as a PNG.
+    """Draw how many batches the planners need, with conditions that differ in parallelism alone, as a PNG.
 
     Raises:
         ConfigError: The file cannot be written.
     """
 
     def draw() -> Figure:
-        (condition,) = report.comparison.conditions
+        condition, *more = report.comparison.conditions
         figure = make_figure(5.4, 4.2, layout="constrained")
         axes = figure.add_subplot()
         for i, row in enumerate(report.rows):
-            label = f"{row['label']}: {row['n_batches']}"
+            parallel = f", {row['degree_of_parallelism']} tweezers" if more else ""
+            label = f"{row['label']}{parallel}: {row['n_batches']}"
             draw_histogram(axes, row.counts, f"C{i % 10}", label)
         axes.set_xlabel("batches")
         axes.set_ylabel("share of the loadings")
@@ -321,7 +331,7 @@ def save_histogram(path: Path, report: Report) -> None:
             axes.legend(frameon=False, fontsize=8)
         rows, cols = condition.shape
         given = f"{100 * condition.loading:g} % loading"
-        if condition.degree_of_parallelism is not None:
+        if condition.degree_of_parallelism is not None and not more:
             given += f", degree of parallelism {condition.degree_of_parallelism}"
         title = f"{condition.target} out of {rows} x {cols}, {given}\n{report.extent_text}"
         figure.suptitle(title, fontsize=9)

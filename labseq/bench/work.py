@@ -20,7 +20,7 @@ from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCo
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
-from labseq.motion import check_plan
+from labseq.motion import check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
@@ -95,7 +95,9 @@ def _motion(condition: Condition) -> MotionSpec:
         Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
         for key, value in condition.motion
     ]
-    document = Document.parse("{}", _MOTION_ADDRESS).override_all(overrides, may_add=("motion",))
+    parts = [override.address.split(".") for override in overrides]
+    parents = {".".join(path[:n]) for path in parts for n in range(1, len(path))}
+    document = Document.parse("{}", _MOTION_ADDRESS).override_all(overrides, may_add=parents)
     motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
     n = condition.degree_of_parallelism
     limit, what = min(
@@ -153,6 +155,9 @@ RESULT: Final = np.dtype(
         ("n_atoms_moved", np.int32),
         ("distance_m", np.float64),
         ("motion_s", np.float64),
+        ("moving_s", np.float64),
+        ("n_lost", np.float64),
+        ("p_defect_free", np.float64),
         ("n_scans", np.float64),
         ("scan_s", np.float64),
         ("planning_s", np.float64),
@@ -161,13 +166,17 @@ RESULT: Final = np.dtype(
         ("failed", np.bool_),
     ]
 )
-"""Results of one plan; linked batches, which share one pick-up, count as one. NaN without scans."""
+"""Results of one plan; linked batches, which share one pick-up, count as one. NaN without scans.
+
+``moving_s`` is ``motion_s`` without the overheads of batches and cycle; ``n_lost`` and ``p_defect_free``
+are those of :class:`labseq.motion.Survival`.
+"""
 
 LOADING: Final = np.dtype([("n_atoms", np.int32), ("n_lines", np.int32)])
 """Results of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
 
 _NO_SCANS: Final = (math.nan, math.nan)
-_FAILED: Final = (0, 0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
+_FAILED: Final = (0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
 
 
 class Scanned(Protocol):
@@ -333,7 +342,11 @@ def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> 
     scans = _NO_SCANS
     if scanned is not None:
         scans = float(scanned.n_scans), scanned.duration_s(condition.grid, condition.motion)
-    starts = ~plan.linked
+    survival = predict_survival(plan, report, occupancy, condition.target, condition.grid, condition.motion)
+    motion, starts = condition.motion, ~plan.linked
+    overhead_s = plan.n_batches and (
+        motion.overhead_per_cycle_s + np.count_nonzero(starts) * motion.overhead_per_batch_s
+    )
     n_atoms_moved = int(np.diff(plan.batch_offsets)[starts].sum())
     n_sites = int(np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).sum())
     return (
@@ -341,6 +354,9 @@ def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> 
         n_atoms_moved,
         n_sites * condition.grid.spacing_m,
         report.duration_s,
+        report.duration_s - overhead_s,
+        survival.n_lost,
+        survival.p_defect_free,
         *scans,
         planning_s,
         report.n_defects,

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from labseq.cli.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
-from labseq.console.text import columns, count_of, encodes, plural
+from labseq.console.text import columns, count_of, encodes, percent, plural
 from labseq.kernel import interpret
 from labseq.model import Batch, TonePaths
 from labseq.pictures.plans import occupancies, on_grid
@@ -279,12 +279,18 @@ def totals(moves: PlannedMoves) -> list[tuple[str, str]]:
     if moves.refused is not None:
         valid = f"{plan.n_batches}, of which {moves.refused.batch} come before the refused one"
         return [("batches", valid), ("atom moves", str(plan.n_atom_moves))]
+    lost: list[tuple[str, str]] = []
+    if plan.n_batches:
+        survival = moves.survival
+        text = f"{survival.n_lost:.2g} atoms expected until the next image"
+        lost.append(("lost", f"{text}; defect-free then: {percent(survival.p_defect_free, 1)}"))
     rows = [
         ("batches", str(plan.n_batches)),
         ("atom moves", str(plan.n_atom_moves)),
         ("duration", format_quantity(report.duration_s, "time")),
         ("tweezers", f"at most {moves.max_tweezers} on at once"),
         ("ejected", plural(moves.n_ejected, "atom")),
+        *lost,
         ("filled", f"{count_of(moves.n_filled, n_atoms)} target sites"),
     ]
     if report.n_surplus:

@@ -15,7 +15,7 @@ from labseq.config.document import Document, FallbackValues, StoredText, check_k
 from labseq.config.find import find_profile
 from labseq.errors import ProblemCollector
 from labseq.messages import clean
-from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
+from labseq.model import CALIBRATION_KINDS, LossSpec, MotionSpec, RfSpec, SiteGrid
 from labseq.model.lines import LineSpec
 from labseq.model.motion import PhaseChoice, SpeedProfile
 from labseq.settings import (
@@ -388,6 +388,43 @@ class RfSettings(Settings):
         )
 
 
+_LOSSES: Final = LossSpec()
+
+
+class LossSettings(Settings):
+    """How probably atoms are lost, to compare plans by what survives; nothing is lost because of it."""
+
+    move: Annotated[Fraction, Field(lt=1)] = Field(
+        default=_LOSSES.move, description="loss of an atom that is picked up, moved and dropped off"
+    )
+    tone: Annotated[Fraction, Field(lt=1)] = Field(
+        default=_LOSSES.tone, description="added to it for each tone on beyond one per axis"
+    )
+    distance_per_m: Annotated[float, Field(ge=0)] = Field(
+        default=_LOSSES.distance_per_m, description="added to it per metre of the way"
+    )
+    landing: Annotated[Fraction, Field(lt=1)] = Field(
+        default=_LOSSES.landing,
+        description="loss of an atom that stands where a tweezer without an atom is ramped down",
+    )
+    spread: Annotated[float, Field(ge=0, le=5)] = Field(
+        default=_LOSSES.spread,
+        description="spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor "
+        "with mean 1",
+    )
+    image: Annotated[Fraction, Field(lt=1)] = Field(
+        default=_LOSSES.image, description="loss of an atom by one image, beyond that of the moves"
+    )
+    lifetime: PositiveDuration = Field(
+        default=_LOSSES.lifetime_s, description="lifetime of an atom in a static tweezer"
+    )
+
+    def spec(self) -> LossSpec:
+        """Convert the settings to the core's type."""
+        values = self.model_dump()
+        return LossSpec(lifetime_s=values.pop("lifetime"), **values)
+
+
 _MOTION: Final = MotionSpec()
 
 Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
@@ -441,6 +478,9 @@ class MotionSettings(Settings):
     rf: Annotated[RfSettings, empty_is({})] = Field(
         default=RfSettings(), description="the RF drive of the AODs, and its limits"
     )
+    losses: Annotated[LossSettings, empty_is({})] = Field(
+        default=LossSettings(), description="losses of atoms that plans are compared by"
+    )
 
     def spec(self) -> MotionSpec:
         """Convert the settings to the core's type."""
@@ -458,6 +498,7 @@ class MotionSettings(Settings):
             clearance_m=self.clearance,
             empty_tweezers_may_land=self.empty_tweezers_may_land,
             rf=self.rf.spec(),
+            losses=self.losses.spec(),
         )
 
 

@@ -11,7 +11,7 @@ from labseq.model.calibration import (
 from labseq.model.camera import CameraFacts, Flip, Frame, Orientation, SensorMode
 from labseq.model.grid import SiteGrid, TargetPattern
 from labseq.model.lines import LineProgram, LinesFacts, LineSpec
-from labseq.model.motion import MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
+from labseq.model.motion import LossSpec, MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport, TonePaths
 from labseq.model.records import (
     COMPUTER,
@@ -56,6 +56,7 @@ __all__ = [
     "LineProgram",
     "LineSpec",
     "LinesFacts",
+    "LossSpec",
     "MotionSpec",
     "Occupancy",
     "Orientation",

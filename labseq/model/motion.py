@@ -79,6 +79,39 @@ class RfSpec:
 
 
 @dataclass(frozen=True, slots=True)
+class LossSpec:
+    """How probably atoms are lost, to predict what a plan does to an array.
+
+    Attributes:
+        move: Loss of an atom that is picked up, moved and dropped off: about the paper's filling after one
+            cycle (derived).
+        tone: Added to it for each tone on beyond one per axis.
+        distance_per_m: Added to it per metre of the way.
+        landing: Loss of an atom that stands where a tweezer without an atom is ramped down.
+        spread: Spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor with
+            mean 1, common to all atoms.
+        image: Loss of an atom by one image (the paper's, 0.45 %), beyond that of the moves.
+        lifetime_s: Lifetime of an atom in a static tweezer (paper).
+    """
+
+    move: float = 0.0188
+    tone: float = 0.0
+    distance_per_m: float = 0.0
+    landing: float = 0.0
+    spread: float = 0.5
+    image: float = 0.0045
+    lifetime_s: float = 33.0
+
+    def __post_init__(self) -> None:
+        if any(not 0 <= loss < 1 for loss in (self.move, self.tone, self.landing, self.image)):
+            raise ValueError("a loss is a probability from 0 to below 1")
+        if not (0 <= self.distance_per_m < math.inf and 0 <= self.spread < math.inf):
+            raise ValueError("the loss per metre and the spread of losses cannot be negative")
+        if not self.lifetime_s > 0:
+            raise ValueError(f"the lifetime is {self.lifetime_s} s; expected more than 0")
+
+
+@dataclass(frozen=True, slots=True)
 class MotionSpec:
     """Ramps, speed, overheads and limits of the mobile tweezers.
 
@@ -107,6 +140,7 @@ class MotionSpec:
             paper's lattice it is 1.944 um; a mobile tweezer of the paper has 1.1 uK left at 1.9 um (ours).
         empty_tweezers_may_land: Whether a tweezer without an atom may end on a site that holds one.
         rf: What drives the AODs.
+        losses: How probably atoms are lost.
     """
 
     pick_up_s: float = 60e-6
@@ -122,6 +156,7 @@ class MotionSpec:
     clearance_m: float = 1.9e-6
     empty_tweezers_may_land: bool = False
     rf: RfSpec = field(default_factory=RfSpec)
+    losses: LossSpec = field(default_factory=LossSpec)
 
     def __post_init__(self) -> None:
         if not self.speed_m_s > 0:

@@ -29,6 +29,7 @@ from labseq.motion.overlay import (
     overlay_offset,
 )
 from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_chunks
+from labseq.motion.survival import Survival, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "OverlayFit",
     "RenderPath",
     "Renderer",
+    "Survival",
     "SurvivalShape",
     "TableCalibration",
     "all_on_program",
@@ -57,6 +59,7 @@ __all__ = [
     "hold_program",
     "hold_time_s",
     "overlay_offset",
+    "predict_survival",
     "render",
     "render_chunks",
     "standing_on_sites",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,7 @@ from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError
 from labseq.guard import Guard
 from labseq.messages import clean, format_error, visible
 from labseq.model import Batch, MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
-from labseq.motion import check_plan
+from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
 from labseq.roles import Context, Planner
@@ -281,6 +281,12 @@ class PlannedMoves:
         """Maximum number of mobile tweezers on at once."""
         return int(self.report.n_tweezers.max(initial=0))
 
+    @property
+    def survival(self) -> Survival:
+        """Prediction of what the plan costs, by the losses of the profile."""
+        plan = self.plan if self.refused is None else self.plan.first(self.refused.batch)
+        return predict_survival(plan, self.report, self.occupancy, self.target, self.grid, self.motion)
+
     def as_dict(self) -> dict[str, Any]:
         """Everything, JSON-ready; occupancies as rows of 0 and 1, ejected atoms at sites off the grid."""
         grid, report, refused = self.grid, self.report, self.refused
@@ -300,6 +306,7 @@ class PlannedMoves:
             "n_batches": self.plan.n_batches,
             "n_atom_moves": self.plan.n_atom_moves,
             "duration_s": report.duration_s,
+            "survival": asdict(self.survival),
             "batches": [_batch(batch) for batch in self.plan.batches],
             "predicted": _bits(report.predicted),
             "refused": refused and {"batch": refused.batch, "move": refused.move, "why": str(refused)},

@@ -104,6 +104,18 @@ def test_a_row_sums_up_what_the_planner_did(report: Report) -> None:
     assert (row["degree_of_parallelism"], row["settings"]["degree_of_parallelism"]) == (4, 4)
 
 
+def test_losses_are_predicted_by_those_of_the_profile(report: Report) -> None:
+    """Without spread, vacuum and image, each atom moved is lost with the loss of a move."""
+    losses = {"move": "1 %", "spread": "0", "image": "0", "lifetime": "700 h"}
+    overrides = [f"profile.mobile_tweezers.losses.{key}={value}" for key, value in losses.items()]
+    asked = read_comparison("psca", "8x8", "compact:4x4", "75 %", "2,4", 20, 1, overrides)
+    two, four = compare(asked, 1).rows
+    assert (two["degree_of_parallelism"], four["degree_of_parallelism"]) == (2, 4)
+    for row in (two, four):
+        assert row["n_lost"].value == pytest.approx(0.01 * row["n_atoms_moved"].value, rel=0.03)
+        assert row["p_defect_free"].value == pytest.approx(1 - row["n_lost"].value, rel=0.02)
+
+
 def test_csv_and_json_hold_the_same(report: Report) -> None:
     values = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     lines = list(csv.DictReader(io.StringIO(report.as_csv())))
@@ -119,6 +131,7 @@ def test_overheads_count_only_where_they_are_set(report: Report) -> None:
     loaded = compare(replace(SMALL, conditions=(replace(SMALL.conditions[0], motion=motion),)), 1).rows[0]
     more_s = loaded["motion_s"].value - report.rows[0]["motion_s"].value
     assert more_s == pytest.approx(1e-3 * loaded["n_batches"].value)
+    assert loaded["moving_s"].value == pytest.approx(report.rows[0]["motion_s"].value)
 
 
 def test_too_few_atoms_show_in_the_filling() -> None:
@@ -151,11 +164,15 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
     [
         ({"planners": "psac"}, "unknown planner 'psac'; expected .*; did you mean 'psca'?"),
         ({"target": "compact:30x30"}, "--target compact:30x30: the size of the target is 30 rows"),
-        ({"dop": 21}, "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
+        ({"dop": "21"}, "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
         (
-            {"dop": 6, "overrides": [f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")]},
+            {
+                "dop": "6",
+                "overrides": [f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")],
+            },
             "--dop 6: .*; expected 1 to 5, the most tones of an axis",
         ),
+        ({"dop": "7,x"}, "--dop 7,x: this is no degree of parallelism; expected whole numbers"),
         ({"planners": "psca:dop=3"}, "psca:dop=3: 'dop' is not a setting of planner 'psca'"),
         ({"overrides": ["planner.dop=3"]}, "--set planner.dop=3: 'dop' is not a setting"),
         ({"overrides": ["profile.mobile_tweezers.speed=3 ms"]}, "'3 ms' is a time, not a speed"),

@@ -17,6 +17,7 @@ from labseq.config.profile import (
     CalibrationSettings,
     ChannelSettings,
     GridSettings,
+    LossSettings,
     MotionSettings,
     ProfileSpec,
     RfSettings,
@@ -24,7 +25,7 @@ from labseq.config.profile import (
     load_profile,
 )
 from labseq.errors import ConfigError
-from labseq.model import CALIBRATION_KINDS, MotionSpec, RfSpec, SiteGrid
+from labseq.model import CALIBRATION_KINDS, LossSpec, MotionSpec, RfSpec, SiteGrid
 from labseq.settings import Settings
 from tests.config.wrong_files import wrong_files
 
@@ -103,6 +104,7 @@ def test_what_may_be_left_out() -> None:
 def test_defaults_are_those_of_the_core() -> None:
     assert MotionSettings().spec() == MotionSpec()
     assert RfSettings().spec() == RfSpec()
+    assert LossSettings().spec() == LossSpec()
     grid, paper = GridSettings(rows=20, cols=20, spacing=4.49e-6).model(), SiteGrid()
     np.testing.assert_array_equal(grid.positions_m, paper.positions_m)
     np.testing.assert_array_equal(grid.row_frequency_hz, paper.row_frequency_hz)
@@ -113,12 +115,14 @@ CHANGES: dict[str, Any] = {
     "clearance": "1.5 um",
     "empty_tweezers_may_land": True,
     "rf": {"phases": "low_crest"},
+    "losses": {"move": 0.5},
     "row_band": ["90 MHz", "110 MHz"],
     "column_band": ["90 MHz", "110 MHz"],
     "row_amplitudes": ["5 %", 0.1],
     "column_amplitudes": ["5 %", 0.1],
     "phases": "low_crest",
     "snap_within": "5 nm",
+    **dict.fromkeys(("move", "tone", "landing", "image", "spread"), 0.25),
 }
 
 
@@ -127,6 +131,7 @@ CHANGES: dict[str, Any] = {
     [
         *((MotionSettings, key) for key in MOTION_KEYS),
         *((RfSettings, key) for key in RfSettings.model_fields),
+        *((LossSettings, key) for key in LossSettings.model_fields),
     ],
 )
 def test_every_key_changes_its_own_field_of_the_core(model: Any, key: str) -> None:

@@ -1,57 +1,93 @@
+"""Losses predicted from a plan, against atoms drawn one by one."""
+
 from __future__ import annotations
+
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
-from labseq.model import SiteGrid
-from labseq.motion.overlay import (
-    SurvivalShape,
-    covariance,
-    deviance_residuals,
-    dispersion,
-    distance_m,
-    unit_axes,
+from labseq.model import Batch, LossSpec, MotionSpec, Plan, SiteGrid, TargetPattern, TonePaths
+from labseq.motion import check_plan
+from labseq.motion.survival import Survival, predict_survival
+
+NO_LOSS = LossSpec(move=0.0, spread=0.0, image=0.0, lifetime_s=math.inf)
+GRID = SiteGrid(3, 4)
+ATOMS = np.array([[1, 0, 1, 0], [0, 0, 0, 0], [1, 0, 1, 1]], np.bool_)
+FILL = np.array([[0, 1, 0, 1], [0, 0, 0, 0], [1, 0, 1, 1]], np.bool_)
+TARGET = TargetPattern(FILL, np.zeros_like(FILL))
+LINE = Plan.from_batches([([(0, 0)], [(0, 1)]), ([(0, 2)], [(0, 3)])])
+"""One atom after the other moves by one site."""
+LANDING = Plan.from_batches(
+    [
+        Batch(
+            np.array([(0, 0), (0, 2)], np.int16),
+            np.array([(0, 1), (0, 3)], np.int16),
+            tones=TonePaths(
+                row=np.array([[0, 1], [0.5, 1.5], [0.5, 1.5], [0, 2]]),
+                column=np.array([[0, 2], [0.5, 2.5], [0.5, 2.5], [1, 3]]),
+            ),
+        )
+    ]
 )
-
-SHAPE = SurvivalShape(0.95e-6, 0.12e-6, floor=0.02, ceiling=0.97)
-
-
-def test_a_shape_comes_back_from_its_calibration() -> None:
-    assert SurvivalShape.from_values(SHAPE.values()) == SHAPE
-    assert SurvivalShape.from_values({"offset_m": [0.0, 0.0]}) is None
+"""Both at once, in a second row of tones whose last tweezer, without an atom, ends on the atom at (2, 3)."""
 
 
-@pytest.mark.parametrize(("lattice", "far"), [("triangular", 3**0.5), ("square", 2**0.5)])
-def test_distances_are_those_in_the_plane(lattice: str, far: float) -> None:
-    grid = SiteGrid(3, 3, lattice=lattice)  # pyright: ignore[reportArgumentType]
-    offsets = np.array([[1.0, 0.0], [0.0, 2.0], [1.0, 1.0]])
-    assert distance_m(offsets, unit_axes(grid)) == pytest.approx([1.0, 2.0, far])
+def predict(plan: Plan, wait_s: float = 0.0, **losses: float) -> Survival:
+    motion = MotionSpec(losses=replace(NO_LOSS, **losses), empty_tweezers_may_land=True)
+    report = check_plan(plan, ATOMS, TARGET, 4, GRID, motion)
+    return predict_survival(plan, report, ATOMS, TARGET, GRID, motion, wait_s)
 
 
-@given(st.integers(1, 500), st.floats(0.001, 0.999), st.floats(0, 1))
-def test_residuals_are_the_roots_of_the_deviance(n: int, p: float, share: float) -> None:
-    k = round(share * n)
-    (residual,) = deviance_residuals(np.array([k]), np.array([n]), np.array([p]))
+@pytest.mark.parametrize(
+    ("losses", "plan", "survives", "lost"),
+    [
+        ({"move": 0.1}, LINE, 0.9**2, 0.2),
+        ({"move": 0.1}, LANDING, 0.9**2, 0.2),
+        ({"move": 0.1, "tone": 0.05}, LINE, 0.9**2, 0.2),
+        ({"tone": 0.05}, LANDING, 0.9**2, 0.2),
+        ({"distance_per_m": 1e4}, LINE, (1 - 0.0449) ** 2, 2 * 0.0449),
+        ({"landing": 0.3}, LANDING, 0.7, 0.3),
+        ({"image": 0.1}, LINE, 0.9**5, 0.5),
+        ({"lifetime_s": 50.0, "wait_s": 50 * math.log(2)}, LINE, 0.5**5, 2.5),
+    ],
+)
+def test_each_loss_alone(losses: dict[str, float], plan: Plan, survives: float, lost: float) -> None:
+    predicted = predict(plan, **losses)
+    assert predicted.p_defect_free == pytest.approx(survives, rel=2e-3)
+    assert predicted.n_lost == pytest.approx(lost, rel=2e-3)
+    assert predicted.n_landings == (1 if plan is LANDING else 0)
 
-    def log_likelihood(q: float) -> float:
-        return (k * np.log(q) if k else 0.0) + ((n - k) * np.log(1 - q) if n - k else 0.0)
 
-    deviance = 2 * (log_likelihood(k / n) - log_likelihood(p))
-    assert residual**2 == pytest.approx(deviance, rel=1e-6, abs=1e-9)
-    assert residual * (k / n - p) >= 0
-
-
-def test_the_covariance_of_a_share_is_binomial() -> None:
-    n = np.array([100.0, 300.0])
-    spread = covariance(np.array([0.2]), n, lambda theta: np.full(2, theta[0]), np.array([1e3]))
-    assert spread[0, 0] == pytest.approx(0.2 * 0.8 / 400)
-
-
-def test_counts_that_scatter_more_than_binomial_ones_are_noticed() -> None:
+def test_losses_that_vary_from_shot_to_shot() -> None:
+    """Against the mean over drawn factors: a spread helps, because losses come together."""
     rng = np.random.default_rng(1)
-    n, p = np.full(2000, 200.0), np.full(2000, 0.5)
-    binomial = rng.binomial(200, p).astype(np.float64)
-    common = rng.binomial(200, np.clip(p + rng.normal(0, 0.05, 2000), 0, 1)).astype(np.float64)
-    assert dispersion(binomial, n, p, 0) == pytest.approx(1.0, abs=0.15)
-    assert dispersion(common, n, p, 0) == pytest.approx(1 + 200 * 0.05**2 / 0.25, rel=0.15)
+    factor = np.exp(0.8 * rng.standard_normal(400_000) - 0.32)
+    predicted = predict(LINE, move=0.3, spread=0.8)
+    assert predicted.p_defect_free == pytest.approx(float((0.7**factor).__pow__(2).mean()), rel=0.01)
+    assert predicted.p_defect_free > 0.7**2
+    assert predicted.n_lost == predicted.n_lost_moved == pytest.approx(2 * (1 - 0.7**factor).mean(), rel=0.01)
+
+
+def test_an_atom_that_moves_twice_is_at_risk_twice_unless_the_tweezers_stay_on() -> None:
+    there, on = ([(0, 2)], [(1, 2)]), ([(1, 2)], [(1, 3)])
+    fill = np.zeros((3, 4), np.bool_)
+    fill[1, 3] = True
+    target, motion = TargetPattern(fill, ~fill & False), MotionSpec(losses=replace(NO_LOSS, move=0.2))
+    chances: list[float] = []
+    for linked in (False, True):
+        plan = Plan.from_batches([there, Batch(np.array(on[0]), np.array(on[1]), linked=linked)])
+        report = check_plan(plan, ATOMS, target, 1, GRID, motion)
+        chances.append(predict_survival(plan, report, ATOMS, target, GRID, motion).p_defect_free)
+    assert chances == pytest.approx([0.64, 0.8], rel=1e-3)
+
+
+def test_a_plan_that_leaves_defects_has_no_chance() -> None:
+    assert predict(LINE.first(1)).p_defect_free == 0.0
+
+
+@pytest.mark.parametrize("wrong", [{"move": 1.0}, {"spread": -1.0}, {"lifetime_s": 0.0}])
+def test_losses_that_mean_nothing_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"probability|negative|more than 0"):
+        LossSpec(**wrong)

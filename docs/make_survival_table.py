@@ -1,0 +1,153 @@
+"""Compare the predicted survival of plans with the virtual simulation, and write the table of its page.
+
+    python docs/make_survival_table.py --shots 1000
+
+In each of ten settings, shots are loaded, planned on the true occupancy, played, and followed by one
+exposure. Counted are the atoms that the moves, the exposure and the vacuum take until its end,
+and the shots whose target is then whole; predicted are both for the same plans.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from labseq_grid.planner import GridPlanner, GridSettings
+from labseq_psca.planner import PscaPlanner, PscaSettings
+from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
+
+from labseq.geometry import pattern
+from labseq.model import LossSpec, MotionSpec
+from labseq.model.estimate import Estimate, mean
+from labseq.motion import check_plan, predict_survival, tone_program
+from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid
+
+PAGE: Final = Path(__file__).parent / "explanation" / "survival.md"
+EXPOSURE_S: Final = 45e-3
+GRID: Final = SiteGrid()
+TARGET: Final = pattern(np.ones((15, 15), np.bool_), GRID, name="compact 15 x 15")
+PLANNERS: Final[dict[str, Any]] = {"psca": (PscaPlanner, PscaSettings), "grid": (GridPlanner, GridSettings)}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What one line of the table is about."""
+
+    planner: str
+    parallel: int
+    losses: dict[str, float] = field(default_factory=dict)
+    loading: float = 0.75
+    speed_m_s: float = 0.130
+
+    @property
+    def name(self) -> str:
+        """The line's first column."""
+        changed = [f"{key} {value:g}" for key, value in self.losses.items()]
+        changed += [f"loading {self.loading:g}"] * (self.loading != 0.75)
+        changed += [f"speed {1e3 * self.speed_m_s:g} um/ms"] * (self.speed_m_s != 0.130)
+        return ", ".join([f"`{self.planner}`, {self.parallel} tweezers", *changed])
+
+
+SETTINGS: Final = (
+    Setting("psca", 7),
+    Setting("psca", 15),
+    Setting("grid", 7),
+    Setting("grid", 15),
+    Setting("grid", 20),
+    Setting("grid", 15, {"move": 0.005}),
+    Setting("grid", 15, {"spread": 0.0}),
+    Setting("grid", 15, {"tone": 0.002}),
+    Setting("grid", 15, {"lifetime_s": 15.0}, speed_m_s=0.050),
+    Setting("psca", 15, {"move": 0.005}, loading=0.9),
+)
+
+
+def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimate]]:
+    """Simulated and predicted, for atoms lost and shots without a defect."""
+    losses = replace(LossSpec(image=0.00314), **setting.losses)
+    motion = MotionSpec(losses=losses, speed_m_s=setting.speed_m_s)
+    settings = SimulationSettings.model_validate(
+        {
+            "transport_loss": losses.move,
+            "transport_loss_per_tone": losses.tone,
+            "transport_loss_spread": losses.spread,
+            "lifetime": losses.lifetime_s,
+            "loading": setting.loading,
+            "image": {"frame": (2, 2), "background": 0.0},
+        }
+    )
+    random = RandomStream(1)
+    simulation = VirtualSimulation(settings, Context("simulation", GRID, motion, random=random))
+    simulation.open()
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    planner_class, settings_class = PLANNERS[setting.planner]
+    planner = planner_class(
+        settings_class(degree_of_parallelism=setting.parallel), Context(grid=GRID, motion=motion)
+    )
+    found: list[tuple[float, ...]] = []
+    for shot in range(n_shots):
+        now_s = 100.0 * shot
+        random.begin_shot(shot, 0)
+        simulation.begin_shot()
+        simulation.load(now_s, 1.0)
+        before = simulation.truth()
+        if before.sum() < TARGET.n_atoms:
+            continue
+        plan = planner.plan(before, TARGET)
+        report = check_plan(plan, before, TARGET, setting.parallel, GRID, motion)
+        start_s = now_s + 1.0 + motion.overhead_per_cycle_s
+        simulation.play("mobile_tweezers", tone_program(plan, grid=GRID, motion=motion), start_s)
+        simulation.expose(now_s + 1.0 + report.duration_s, EXPOSURE_S)
+        after = simulation.truth()
+        predicted = predict_survival(plan, report, before, TARGET, GRID, motion, EXPOSURE_S)
+        found.append(
+            (
+                float(before.sum() - after.sum()),
+                predicted.n_lost,
+                float(after[TARGET.fill].all()),
+                predicted.p_defect_free,
+            )
+        )
+    lost, lost_predicted, whole, whole_predicted = np.array(found, np.float64).T
+    return {"lost": (mean(lost), mean(lost_predicted)), "whole": (mean(whole), mean(whole_predicted))}
+
+
+def table(n_shots: int) -> list[str]:
+    """The table, and how far the predictions are off in all."""
+    header = ("setting", "atoms lost", "predicted", "defect-free", "predicted")
+    lines, deviations = [], list[float]()
+    for setting in SETTINGS:
+        cells = [setting.name]
+        for simulated, predicted in measure(setting, n_shots).values():
+            cells += [str(simulated), f"{predicted.value:.3g}"]
+            deviations.append((simulated.value - predicted.value) / simulated.error)
+        sys.stderr.write(" | ".join(cells) + "\n")
+        lines.append("| " + " | ".join(cells) + " |")
+    spread = float(np.sqrt(np.mean(np.square(deviations))))
+    head = ["| " + " | ".join(row) + " |" for row in (header, ["---"] * len(header))]
+    largest = max(map(abs, deviations))
+    n = len(deviations)
+    note = f"The {n} values deviate by {spread:.2f} standard errors (r.m.s.), by {largest:.1f} at most."
+    return [*head, *lines, "", note]
+
+
+def main() -> None:
+    """Measure, and replace the table of the page."""
+    parser = argparse.ArgumentParser(description="Compare predicted and simulated survival.")
+    parser.add_argument("--shots", type=int, default=1000)
+    n_shots = parser.parse_args().shots
+    command = f"python docs/make_survival_table.py --shots {n_shots}"
+    body = ["", "<!-- not run: takes minutes -->", "```console", command, "```", "", *table(n_shots), ""]
+    text = PAGE.read_text(encoding="utf-8")
+    part = re.compile(r"(?<=<!-- measured: survival -->\n).*?(?=<!-- end -->)", re.DOTALL)
+    PAGE.write_text(part.sub(lambda _: "\n".join(body) + "\n", text), encoding="utf-8", newline="\n")
+
+
+if __name__ == "__main__":
+    main()

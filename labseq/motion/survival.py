@@ -1,0 +1,163 @@
+"""What a plan is expected to cost: atoms lost, and the chance of an array without defects."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from labseq.model import Batch, LossSpec, MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
+
+Floats = NDArray[np.float64]
+
+NODES: Final = 24
+"""Points of the Gauss-Hermite rule over the spread of the losses; 48 change no probability by 1e-6."""
+
+
+@dataclass(frozen=True, slots=True)
+class Survival:
+    """Prediction for a plan.
+
+    Attributes:
+        p_defect_free: Probability that every target site holds an atom on the next image.
+        n_lost: Expected number of atoms lost until then, over the whole grid.
+        n_lost_moved: Those of them lost by moves.
+        n_lost_landing: Those lost because an empty tweezer was ramped down on them.
+        n_landings: Empty tweezers that are ramped down on an atom.
+    """
+
+    p_defect_free: float
+    n_lost: float
+    n_lost_moved: float
+    n_lost_landing: float
+    n_landings: int
+
+
+def predict_survival(
+    plan: Plan,
+    report: PlanReport,
+    occupancy: ArrayLike,
+    target: TargetPattern,
+    grid: SiteGrid,
+    motion: MotionSpec,
+    wait_s: float = 0.0,
+) -> Survival:
+    """Predict what a checked plan costs, by the losses of the profile.
+
+    Each loss p counts as the hazard -ln(1 - p), and an atom with the sum of hazards h survives with
+    exp(-f h). The factor f is common to all atoms of a shot: log-normal with mean 1 and the spread of the
+    losses; the probability is the mean over it. Vacuum and image act on all atoms, without f.
+
+    Args:
+        plan: The plan.
+        report: What the check says of it.
+        occupancy: bool (n_rows, n_cols), before the plan.
+        target: The target.
+        grid: The grid of sites.
+        motion: How the tweezers move, with the losses.
+        wait_s: Time in vacuum beside the plan's duration.
+
+    Returns:
+        The prediction; ``p_defect_free`` is 0 for a plan that leaves defects.
+
+    Example:
+        >>> target = TargetPattern(fill=[[False, True]], clear=[[False, False]])
+        >>> plan = Plan.from_batches([([(0, 0)], [(0, 1)])])
+        >>> from labseq.motion import check_plan
+        >>> motion, grid = MotionSpec(losses=LossSpec(move=0.1, spread=0, image=0)), SiteGrid(1, 2)
+        >>> report = check_plan(plan, [[True, False]], target, 1, grid, motion)
+        >>> round(predict_survival(plan, report, [[True, False]], target, grid, motion).p_defect_free, 3)
+        0.9
+    """
+    losses = motion.losses
+    moved, landed, n_landings = _hazards(plan, np.asarray(occupancy, np.bool_), grid, losses)
+    duration_s = report.duration_s + wait_s
+    standing = duration_s / losses.lifetime_s - math.log1p(-losses.image)
+    factors, weights = _factors(losses.spread)
+    kept = np.exp(-np.multiply.outer(factors, moved + landed))
+    atoms = report.predicted
+    n_lost_here = weights @ (1.0 - math.exp(-standing) * kept[:, atoms]).sum(axis=1)
+    by_moves = weights @ (1.0 - np.exp(-np.multiply.outer(factors, moved[atoms]))).sum(axis=1)
+    by_landing = weights @ (1.0 - np.exp(-np.multiply.outer(factors, landed[atoms]))).sum(axis=1)
+    wanted = target.fill
+    chance = weights @ np.exp(-factors * (moved + landed)[wanted].sum())
+    chance *= math.exp(-standing * np.count_nonzero(wanted))
+    return Survival(
+        p_defect_free=float(chance) if report.n_defects == 0 else 0.0,
+        n_lost=float(n_lost_here),
+        n_lost_moved=float(by_moves),
+        n_lost_landing=float(by_landing),
+        n_landings=n_landings,
+    )
+
+
+@lru_cache(maxsize=8)
+def _factors(spread: float) -> tuple[Floats, Floats]:
+    """Values of the factor on the losses, and their weights."""
+    if spread == 0:
+        return np.ones(1), np.ones(1)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+    return np.exp(spread * nodes - spread**2 / 2), weights / weights.sum()
+
+
+def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) -> tuple[Floats, Floats, int]:
+    """Hazards of the atom that ends on each site, by moves and by landings, and the number of landings."""
+    moved, landed = np.zeros(grid.shape), np.zeros(grid.shape)
+    atoms, n_landings = occupied.copy(), 0
+    for batch in plan.batches:
+        row, col = batch.from_sites.T
+        before = np.stack([moved[row, col], landed[row, col]])
+        before[0] += _batch_hazard(batch, grid, losses)
+        atoms[row, col] = False
+        moved[row, col] = landed[row, col] = 0.0
+        for at in _landings(batch, atoms):
+            landed[at] -= math.log1p(-losses.landing)
+            n_landings += 1
+        to_row, to_col = batch.to_sites.T
+        stays = (to_row >= 0) & (to_row < grid.n_rows) & (to_col >= 0) & (to_col < grid.n_cols)
+        goal = to_row[stays], to_col[stays]
+        atoms[goal] = True
+        moved[goal], landed[goal] = before[:, stays]
+    return moved, landed, n_landings
+
+
+def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
+    """Hazard of each atom that a batch moves; ramps count where they are, at the start of linked batches."""
+    a1, a2 = grid.axes
+    if batch.tones is None:
+        n_tones = [
+            max(len(np.unique(sites[:, axis])) for sites in (batch.from_sites, batch.to_sites))
+            for axis in (0, 1)
+        ]
+        steps = (batch.to_sites - batch.from_sites)[None].astype(np.float64)
+    else:
+        n_tones = list(batch.tones.shape[1:])
+        tones = batch.tones.tones_of(batch.from_sites)
+        rows, columns = np.diff(batch.tones.row, axis=0), np.diff(batch.tones.column, axis=0)
+        steps = np.stack([rows[:, tones[:, 0]], columns[:, tones[:, 1]]], axis=2)
+    way_m = np.linalg.norm(steps[..., :1] * a2 + steps[..., 1:] * a1, axis=2).sum(axis=0)
+    ramps = 0.0 if batch.linked else losses.move + losses.tone * (sum(n_tones) - 2)
+    loss: Floats = np.minimum(ramps + losses.distance_per_m * way_m, 1.0 - 1e-9)
+    return -np.log1p(-loss)
+
+
+def _landings(batch: Batch, atoms: Occupancy) -> list[tuple[int, int]]:
+    """Sites of atoms that stand where an empty tweezer of a batch is ramped down."""
+    if batch.tones is None:
+        return []
+    paths, found = batch.tones, list[tuple[int, int]]()
+    carried = {(int(i), int(j)) for i, j in paths.tones_of(batch.from_sites)}
+    for i, row_off in enumerate(paths.row_off.tolist()):
+        for j, column_off in enumerate(paths.column_off.tolist()):
+            end = min(row_off, column_off)
+            row, col = paths.row[end, i], paths.column[end, j]
+            inside = 0 <= row < atoms.shape[0] and 0 <= col < atoms.shape[1]
+            if (i, j) in carried or not inside or row % 1 or col % 1:
+                continue
+            if atoms[int(row), int(col)]:
+                found.append((int(row), int(col)))
+    return found
