@@ -99,6 +99,7 @@ from labseq.motion import (
 )
 from labseq.motion.tones import site_time_s
 from labseq.processes import Process
+from labseq.realtime import raise_priority
 from labseq.recording import Run, open_run
 from labseq.registry import Registry
 from labseq.roles import (
@@ -305,6 +306,7 @@ __all__ = [
     "port_identities",
     "ports_here",
     "ports_text",
+    "raise_priority",
     "render",
     "scaled",
     "serial_emergency",

@@ -18,7 +18,7 @@ from labseq.recording import Run, Shot
 
 ORDER: Final = (
     *("load", "arm", "expose", "read_out", "detect", "plan", "check"),
-    *("tones", "render", "upload", "prepare", "play", "move", "write"),
+    *("tones", "render", "upload", "prepare", "start", "light", "rest", "play", "move", "write"),
 )
 """The stages of a shot in order; unknown ones come last."""
 WRITE: Final = "write"

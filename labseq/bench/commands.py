@@ -196,14 +196,22 @@ def latency(
         typer.Option("--set", metavar="ADDRESS=VALUE", help="As for labseq run; may be given several times."),
     ] = None,
     json: JsonFile = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw a histogram of the times, as .png, .svg or .pdf."),
+    ] = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Measure the time from the end of an exposure to the first light of the mobile tweezers.
+    """Measure the time from a frame in memory to the first light of the mobile tweezers.
 
-    Shots are taken in a dry run up to the first image, and continued to the start of the moves.
+    Shots are taken in a dry run up to the first image; then the atoms are rearranged once, as in a run.
     """
-    from labseq.bench.latency import LatencyRequest, measure_latency, report_text
+    from labseq.bench.latency import LatencyRequest, draw_report, measure_latency, report_text
     from labseq.console.output import json_writer, report_compiling, say
+    from labseq.pictures.figures import check_place
+
+    if picture is not None:
+        check_place(picture)
 
     write = json_writer(json)
     request = LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed)
@@ -211,6 +219,9 @@ def latency(
         report = measure_latency(request, announce=report_compiling, progress=progress)
     say(*report_text(report))
     say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
+    if picture is not None:
+        draw_report(report, picture)
+        say(f"written: {picture}")
     write(report.as_dict())
 
 

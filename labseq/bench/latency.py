@@ -1,4 +1,4 @@
-"""Measures the time from the end of the exposure to the first light of the mobile tweezers."""
+"""Measures the time from a frame in memory to the first light of the mobile tweezers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
@@ -13,29 +14,30 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.console.text import columns, percent, plural
-from labseq.errors import ConfigError, LimitError, Problem
+from labseq.builtin.rearrange import checked_plan, n_beginning, play_prepared, prepare, rest_of
+from labseq.console.text import columns, plural
+from labseq.errors import ConfigError, Problem
 from labseq.guard import stop_on_signals
-from labseq.model import Frame, Occupancy, Plan, ShotRecord, StageTiming, TargetPattern, TimelineEntry
-from labseq.motion import Renderer, RenderPath, check_plan, comb_sample_rate, tone_program
-from labseq.roles import Detection, Detector, Planner, Shot, Step, StepContext, offers
+from labseq.model import ShotRecord, TimelineEntry
+from labseq.motion import tone_program
+from labseq.realtime import raise_priority, restore_priority
+from labseq.roles import Shot, Step, StepContext, offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
 from labseq.session.session import Session
 from labseq.units import format_quantity
 
-HOST_STAGES: Final = ("detect", "plan", "check", "tone program", "renderer", "first chunk")
-"""The stages between a frame in memory and the first chunk of samples."""
+HOST_STAGES: Final = ("detect", "plan", "check", "tones", "prepare")
+"""The stages between a frame in memory and the first samples at the device.
 
-HAND_OVER: Final = "hand-over"
-"""Stage of switching to the threads of detector and planner, and back; each switch wakes a core."""
+``tones`` is a part of ``prepare`` in the record of a shot, and counts separately here."""
 
 BETWEEN: Final = "in between"
 """Stage of the remaining time, for the shot's record and between steps."""
 
-GOAL_S: Final = 2e-3
-"""Goal for the total time from a frame in memory to the first chunk of samples, in seconds."""
+GOAL_S: Final = 1e-3
+"""Goal for the total time from a frame in memory to the light, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,16 +72,15 @@ class LatencyReport:
         degree_of_parallelism: Maximum number of tweezers on at once.
         n_batches: Median number of batches of a plan.
         playing_s: Median playing time of its tone program.
-        sample_rate_hz: Sample rate of the first chunk.
-        stages: From the frame to the first chunk, in order; they add up to the total.
-        total: From a frame in memory to the first chunk.
-        planned: From a frame in memory to the tone program.
+        stages: From the frame to the first samples at the device, in order.
+        total: From a frame in memory to the first samples; a whole program, if the device needs that.
+        start: Duration of ``play()``.
+        light: From a frame in memory to the light.
+        light_s: The same of each loading, in seconds, with modelled times.
         device: Model of the mobile tweezers, from their description.
         mode: Their mode, if they have one.
         readout_s: The camera's read-out time.
-        prepare: Duration of ``prepare()`` of the mobile tweezers, which must end before they can start.
-        start: Duration of ``play()``.
-        trigger_s: Time from the trigger to the output, from the description of the device.
+        delay_s: Time from ``play()`` to the output.
         load: Mean number of busy processes in the last minute; None if unknown.
     """
 
@@ -90,39 +91,32 @@ class LatencyReport:
     degree_of_parallelism: int
     n_batches: float
     playing_s: float
-    sample_rate_hz: float
     stages: tuple[Stage, ...]
     total: Stage
-    planned: Stage
+    start: Stage
+    light: Stage
+    light_s: tuple[float, ...]
     device: str
     mode: str
     readout_s: float
-    prepare: Stage
-    start: Stage
-    trigger_s: float
+    delay_s: float
     n_cores: int
     load: float | None
     warnings: tuple[str, ...]
 
     @property
-    def to_light_s(self) -> float:
-        """Time from the end of the exposure to the start of the program at the output: a sum of medians."""
-        device_s = sum(stage.median_s + stage.modelled_s for stage in (self.prepare, self.start))
-        return self.readout_s + self.planned.median_s + device_s + self.trigger_s
+    def light_quantiles_s(self) -> tuple[float, float, float]:
+        """Median, 99th percentile and maximum of the time to the light, with modelled times."""
+        median, p99 = np.quantile(self.light_s, (0.5, 0.99))
+        return float(median), float(p99), max(self.light_s)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything, JSON-ready, in SI."""
-        return asdict(self) | {"goal_s": GOAL_S, "to_light_s": self.to_light_s}
+        return asdict(self) | {"goal_s": GOAL_S, "light_quantiles_s": self.light_quantiles_s}
 
-
-CHUNK: Final = 1 << 17
-"""Samples per channel that a streaming driver hands over at a time: 0.2 ms at 625 MS/s."""
 
 N_WARM: Final = 5
 """Number of initial loadings that are not counted, because caches are cold."""
-
-FALLBACK_RATE_HZ: Final = 625e6
-"""Sample rate if the profile has none and the tones form no comb."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,12 +170,11 @@ def measure_latency(
         observer=watch,
     )
     lab = session.build_lab()
-    timed = _Timed(lab.detector, lab.planner)
-    measured = _Measured(_sample_rate_hz(session, lab), watch, timed)
+    lab = replace(lab, motion=replace(lab.motion, overhead_per_cycle_s=0.0))  # which models what is measured
+    measured = _Measured()
     steps: list[tuple[str, Any]] = [*_up_to_the_image(session), ("latency", measured)]
     with stop_on_signals(session.stop_flag):
         session.warm(lab)
-        lab = replace(lab, detector=timed, planner=timed)
         sequencer = Sequencer(
             lab, steps, session.stop_flag, watch, watch, seed=request.seed, policy=RunPolicy(attempts=1)
         )
@@ -203,15 +196,11 @@ class _Watch:
         self._announce = announce
         self._progress = progress
         self._n_loadings = n_loadings
-        self.frame_s = 0.0
         self.shots: list[dict[str, tuple[float, float]]] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Record when a frame is in memory."""
-        timing = values.get("timing")
-        if isinstance(timing, StageTiming) and timing.stage == "expose":
-            self.frame_s = time.perf_counter()
-        elif name == "compiling":
+        """Pass on that kernels are compiled."""
+        if name == "compiling":
             self._announce(float(values["about_s"]))
 
     def write_shot(self, shot: ShotRecord) -> None:
@@ -221,87 +210,39 @@ class _Watch:
             self._progress(shot.shot_index + 1 - N_WARM, self._n_loadings)
 
 
-class _Timed:
-    """Measures the time of detector and planner, without that for switching threads."""
-
-    def __init__(self, detector: Detector, planner: Planner) -> None:
-        self._detector = detector
-        self._planner = planner
-        self.detect_s = self.plan_s = 0.0
-
-    def detect(self, frame: Frame) -> Detection:
-        start_s = time.perf_counter()
-        answer = self._detector.detect(frame)
-        self.detect_s = time.perf_counter() - start_s
-        return answer
-
-    def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        start_s = time.perf_counter()
-        answer = self._planner.plan(occupancy, target)
-        self.plan_s = time.perf_counter() - start_s
-        return answer
-
-
 class _Measured(Step):
-    """A step that does the work of a rearrangement, and times the first chunk of a stream separately."""
+    """A step that rearranges once, without a window and without an image after it."""
 
     needs_image = True
     takes_image = False
 
-    def __init__(self, sample_rate_hz: float, watch: _Watch, timed: _Timed) -> None:
-        self.sample_rate_hz = sample_rate_hz
+    def __init__(self) -> None:
         self.plans: list[tuple[int, float]] = []
-        self.own_s: list[tuple[float, float]] = []
-        self.total_s: list[float] = []
-        self._watch = watch
-        self._timed = timed
-        self._samples = np.empty((2, CHUNK), np.int16)
-        self._frames = np.empty((CHUNK, 2), np.int16)
+        self.settle_s: list[float] = []
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002
         """Empty: its duration is not planned."""
         return []
 
     def run(self, shot: Shot) -> None:
-        """Plan, prepare and start playing; then wait for the end, as a run does."""
-        occupancy = shot.occupancy
-        assert occupancy is not None
-        mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
+        """Plan, prepare and play, as a rearrangement does."""
+        start_s = time.perf_counter()
+        mobile = shot.mobile_tweezers
+        raise_priority()  # as a run in real time does before the frame
         if offers(mobile, "settle"):
-            start_s = time.perf_counter()
             mobile.settle()  # a simulated device does here what was due while the virtual clock advanced
-            self._watch.frame_s += time.perf_counter() - start_s
-        with shot.stage("plan"):
-            seen = occupancy.copy()
-            plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, seen, shot.target)
+        self.settle_s.append(time.perf_counter() - start_s)
+        plan, report = checked_plan(shot, 0)
         if plan.n_batches == 0:
             what = "there is nothing to move: a random loading needs no moves, or has no atoms to move"
             raise ConfigError(Problem(what, "shot", hint="choose another target or loading"))
-        with shot.stage("check"):
-            dop = shot.degree_of_parallelism
-            check_plan(plan, occupancy, shot.target, dop, shot.grid, shot.motion, shot.planner_name)
-        with shot.stage("tone program"):
-            program = tone_program(plan, shot.grid, shot.motion)
-        with shot.stage("renderer"):
-            renderer = Renderer(program, self.sample_rate_hz)
-        with shot.stage("first chunk"):
-            self._render_first(renderer)
-        self.total_s.append(time.perf_counter() - self._watch.frame_s)
-        self.own_s.append((self._timed.detect_s, self._timed.plan_s))
-        self.plans.append((plan.n_batches, program.total_duration_s))
-        with shot.stage("prepare"):
-            playing_s = shot.call("mobile_tweezers", limit_s, mobile.prepare, program)
-        with shot.stage("start"):
-            shot.call("mobile_tweezers", limit_s, mobile.play)
-        shot.call("mobile_tweezers", playing_s + 2 * limit_s, mobile.wait, playing_s + limit_s)
-
-    def _render_first(self, renderer: Renderer) -> None:
-        """Render a chunk that begins with the first tones, for both channels in parallel."""
-        loud = (renderer.path != RenderPath.SILENT).any(axis=0)
-        start = int(renderer.first_sample[loud.argmax()])
-        for channel, samples in enumerate(self._samples):
-            renderer.write(channel, start, samples)
-            self._frames[:, channel] = samples
+        n_first = n_beginning(shot, plan, report, plan.n_batches)
+        build = partial(tone_program, plan.first(n_first), shot.grid, shot.motion)
+        is_whole = n_first == plan.n_batches
+        prepare(shot, build, shot.clock.now(), 0, is_whole=is_whole)
+        self.plans.append((plan.n_batches, report.duration_s))
+        play_prepared(shot, report.duration_s, 0, rest_of(shot, plan, n_first, plan.n_batches))
+        restore_priority()
 
 
 def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
@@ -317,18 +258,6 @@ def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
     return steps
 
 
-def _sample_rate_hz(session: Session, lab: Lab) -> float:
-    """The sample rate that the profile sets, if its device has one, else one that suits its tones."""
-    settings = session.assembly.hardware.chosen["mobile_tweezers"].settings
-    given = getattr(settings, "sample_rate", None)
-    if isinstance(given, float):
-        return given
-    try:
-        return comb_sample_rate(lab.grid)
-    except LimitError:
-        return FALLBACK_RATE_HZ
-
-
 def _report(
     request: LatencyRequest,
     session: Session,
@@ -338,14 +267,14 @@ def _report(
     device: dict[str, Any],
 ) -> LatencyReport:
     shots = watch.shots[N_WARM:]
-    names = (*HOST_STAGES, "prepare", "start")
-    times = {name: np.array([shot[name] for shot in shots]).T for name in names}
-    total_s, own_s = np.array(measured.total_s[N_WARM:]), np.array(measured.own_s[N_WARM:]).T
-    here_s = {name: times[name][0] for name in HOST_STAGES}
-    between_s = total_s - sum(here_s.values())
-    handed_s = here_s["detect"] + here_s["plan"] - own_s.sum(axis=0)
-    here_s |= {"detect": own_s[0], "plan": own_s[1], HAND_OVER: handed_s, BETWEEN: between_s}
-    rendered_s = here_s["renderer"] + here_s["first chunk"]  # prepare() does this again
+    times = {n: np.array([shot[n] for shot in shots]).T for n in (*HOST_STAGES, "start", "light")}
+    settle_s = np.array(measured.settle_s[N_WARM:])
+    times["prepare"][0] -= times["tones"][0]
+    times["light"][0] -= settle_s
+    (light_s, modelled_s), start_s = times["light"], times["start"][0]
+    total_s = light_s - start_s
+    between_s = total_s - sum(times[name][0] for name in HOST_STAGES)
+    stages = [Stage.of(name, *times[name]) for name in HOST_STAGES]
     n_batches, playing_s = np.median(np.array(measured.plans[N_WARM:]), axis=0)
     return LatencyReport(
         n_loadings=request.n_loadings,
@@ -355,16 +284,15 @@ def _report(
         degree_of_parallelism=lab.degree_of_parallelism,
         n_batches=float(n_batches),
         playing_s=float(playing_s),
-        sample_rate_hz=measured.sample_rate_hz,
-        stages=tuple(Stage.of(name, taken_s) for name, taken_s in here_s.items()),
-        total=Stage.of("frame to first chunk", total_s),
+        stages=(*stages, Stage.of(BETWEEN, between_s)),
+        total=Stage.of("frame to first samples", total_s, times["prepare"][1]),
+        start=Stage.of("start", *times["start"]),
+        light=Stage.of("frame to light", light_s, modelled_s),
+        light_s=tuple((light_s + modelled_s).tolist()),
         device=str(device.get("model", "")),
         mode=str(device.get("mode", "")),
         readout_s=lab.step_context.camera.readout_s,
-        prepare=Stage.of("prepare", *times["prepare"]),
-        start=Stage.of("start", *times["start"]),
-        trigger_s=float(device.get("trigger_delay_s", 0.0)),
-        planned=Stage.of("frame to tone program", total_s - rendered_s),
+        delay_s=lab.mobile_tweezers.start_delay_s,
         n_cores=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         warnings=session.assembly.hardware.warnings,
@@ -372,50 +300,56 @@ def _report(
 
 
 def report_text(report: LatencyReport) -> list[str]:
-    """The two tables and the notes that are printed."""
-    return [*_chunk_table(report), "", *_light_table(report), "", *_notes(report)]
+    """The report as a table and notes."""
+    stages = (*report.stages, report.total, report.start, report.light)
+    rows = [(s.name, _time(s.median_s), _time(s.p99_s), _time(s.modelled_s)) for s in stages]
+    return [*columns([("stage", "median", "99 %", "modelled"), *rows], right=(1, 2, 3)), "", *_notes(report)]
+
+
+def draw_report(report: LatencyReport, path: Path) -> None:
+    """Draw a histogram of the times from a frame to the light.
+
+    Raises:
+        ConfigError: matplotlib is not installed, or the file cannot be written.
+    """
+    from labseq.pictures.figures import make_figure, save_figure
+
+    def draw() -> Any:
+        figure = make_figure(6.4, 3.2)
+        axes = figure.add_subplot(xlabel="frame in memory to light (ms)", ylabel="programs")
+        light_ms = 1e3 * np.array(report.light_s)
+        bins = np.geomspace(0.95 * light_ms.min(), 1.05 * light_ms.max(), 80)
+        axes.hist(light_ms, bins, color="#3b6ea5")
+        axes.set(xscale="log", yscale="log")
+        for value_s, name in zip(report.light_quantiles_s[:2], ("median", "99 %"), strict=True):
+            axes.axvline(1e3 * value_s, color="#c44e52", linewidth=1)
+            text = f" {name} {format_quantity(value_s, 'time')}"
+            axes.text(1e3 * value_s, 0.97, text, transform=axes.get_xaxis_transform(), va="top", fontsize=8)
+        mode = f", mode {report.mode}" if report.mode else ""
+        load = "" if report.load is None else f", load {report.load:.2g}"
+        axes.set_title(f"{report.device}{mode}: {plural(report.n_loadings, 'program')}{load}", fontsize=9)
+        return figure
+
+    save_figure(path, draw)
 
 
 def _time(duration_s: float) -> str:
     return format_quantity(duration_s, "time") if duration_s else "-"
 
 
-def _chunk_table(report: LatencyReport) -> list[str]:
-    """From a frame in memory to the first chunk of samples."""
-    rows = [("stage", "median", "99 %", "share")]
-    for stage in (*report.stages, report.total):
-        share = percent(stage.median_s / report.total.median_s, 0)
-        rows.append((stage.name, _time(stage.median_s), _time(stage.p99_s), share))
-    return columns(rows, right=(1, 2, 3))
-
-
-def _light_table(report: LatencyReport) -> list[str]:
-    """From the end of the exposure to the output; the times of the hardware are modelled."""
-    parts = (
-        Stage("camera read-out", 0.0, 0.0, report.readout_s),
-        report.planned,
-        report.prepare,
-        report.start,
-        Stage("trigger", 0.0, 0.0, report.trigger_s),
-    )
-    rows = [("to the light", "this computer", "99 %", "modelled")]
-    rows += [(s.name, _time(s.median_s), _time(s.p99_s), _time(s.modelled_s)) for s in parts]
-    here_s = sum(stage.median_s for stage in parts)
-    rows.append(("end of exposure to light", _time(here_s), "-", _time(report.to_light_s - here_s)))
-    return columns(rows, right=(1, 2, 3))
-
-
 def _notes(report: LatencyReport) -> list[str]:
-    """Notes below the tables: the measured stages, and the computer."""
+    """Notes below the table: what was measured, and the computer."""
     device = f"{report.device}, mode {report.mode}" if report.mode else report.device
     load = "" if report.load is None else f", load {report.load:.2g}"
-    playing, rate = format_quantity(report.playing_s, "time"), report.sample_rate_hz
+    playing, delay = format_quantity(report.playing_s, "time"), format_quantity(report.delay_s, "time")
     planner = f"{report.planner}, degree of parallelism {report.degree_of_parallelism}"
-    median, goal = (format_quantity(s, "time") for s in (report.total.median_s, GOAL_S))
+    median, p99, worst = (format_quantity(s, "time") for s in report.light_quantiles_s)
+    ended = format_quantity(report.light_quantiles_s[0] + report.readout_s, "time")
     return [
-        f"frame to first chunk: {median}; the goal is {goal}",
+        f"frame to light, with what is modelled: median {median}, 99 % {p99}, at most {worst}",
+        f"end of the exposure to light: {ended}; goal from the frame: {format_quantity(GOAL_S, 'time')}",
         f"{plural(report.n_loadings, 'loading')}, seed {report.seed}; {plural(report.n_cores, 'core')}{load}",
         f"{planner}: {report.n_batches:g} batches, played in {playing}",
-        f"profile {report.profile}: {device}; first chunk at {format_quantity(rate, 'frequency')}",
-        "prepare includes the driver's own rendering and the work of a simulated device",
+        f"profile {report.profile}: {device}; {delay} from play() to the output",
+        "prepare and start include the work of a simulated device",
     ]

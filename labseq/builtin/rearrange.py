@@ -150,7 +150,7 @@ class RearrangeStep(Step):
         end_s = start_s + self.settings.window_of(cycle) - shot.margin_s("rearrange")
         duration_s, n_first, n_batches = 0.0, 0, self._n_fitting(shot, plan, report, start_s, end_s)
         while n_batches:
-            n_first = _n_beginning(shot, plan, report, n_batches)
+            n_first = n_beginning(shot, plan, report, n_batches)
             build = partial(tone_program, plan.first(n_first), grid=shot.grid, motion=shot.motion)
             duration_s, took_s = prepare(shot, build, start_s, cycle, is_whole=n_first == n_batches)
             duration_s += float(report.batch_end_s[n_batches - 1] - report.batch_end_s[n_first - 1])
@@ -164,7 +164,7 @@ class RearrangeStep(Step):
             values = {"n_batches": plan.n_batches, "n_batches_played": n_batches}
             shot.log("window_too_short", cycle=cycle, **values, before_moves_s=shot.clock.now() - start_s)
         if n_batches:
-            play_prepared(shot, duration_s, cycle, _rest(shot, plan, n_first, n_batches))
+            play_prepared(shot, duration_s, cycle, rest_of(shot, plan, n_first, n_batches))
         return n_batches
 
     def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
@@ -177,7 +177,7 @@ class RearrangeStep(Step):
         return fitting_batches(report, plan, window_s)
 
 
-def _n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> int:
+def n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> int:
     """How many batches to start with: all, if the mobile tweezers take whole programs only."""
     mobile = shot.mobile_tweezers
     least_s = mobile.beginning_s if offers(mobile, "beginning_s") else math.inf
@@ -188,7 +188,7 @@ def _n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> 
     return min(n_first, n_batches)
 
 
-def _rest(shot: Shot, plan: Plan, start: int, stop: int) -> Callable[[], ToneProgram] | None:
+def rest_of(shot: Shot, plan: Plan, start: int, stop: int) -> Callable[[], ToneProgram] | None:
     """Makes the tone program of the batches that follow the first ones; None if there are none."""
     if start == stop:
         return None
@@ -312,7 +312,11 @@ def play_prepared(
     mobile, limit_s = shot.mobile_tweezers, shot.call_timeout_s
     shot.check_interlocks()
     budget_s = duration_s + shot.margin_s("rearrange")
-    start = partial(shot.call, "mobile_tweezers", limit_s, mobile.play)
+
+    def start() -> None:
+        with shot.stage("start", cycle=cycle):
+            shot.call("mobile_tweezers", limit_s, mobile.play)
+
     with shot.stage("play", budget_s, cycle), shot.lines_on("rearrange", duration_s, start):
         if rest is not None:
             with shot.stage("rest", cycle=cycle):

@@ -257,6 +257,11 @@ class MobileTweezers(Hardware):
         """
 
     @property
+    def start_delay_s(self) -> float:
+        """Time from ``play``, or from the trigger, to the first tones at the outputs; known once open."""
+        return 0.0
+
+    @property
     def beginning_s(self) -> float:
         """Playing time after which a program can be cut and its rest follow by :meth:`append`; inf: never.
 

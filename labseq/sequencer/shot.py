@@ -33,6 +33,7 @@ from labseq.model import (
     TimelineEntry,
 )
 from labseq.model.records import OVERSHOOT_S, STEP
+from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Device, ReportsSignals, RunObserver, StepContext, offers
 from labseq.sequencer.images import CameraSeries, take_frame
 from labseq.sequencer.lab import Lab, check_blinding
@@ -57,7 +58,7 @@ class Events:
         self._observer = observer
         self._guard = guard
         self._kept: list[tuple[str, Mapping[str, Any]]] = []
-        self._is_held = False
+        self._is_held = self._is_raised = False
         self._collects = gc.isenabled()
 
     def __call__(self, name: str, values: Mapping[str, Any]) -> None:
@@ -67,6 +68,10 @@ class Events:
         elif not self._guard.is_abandoned:
             self._observer.event(name, values)
 
+    def expect_frame(self) -> None:
+        """Give this thread priority until the events are released: it waits for a frame."""
+        self._is_raised = raise_priority()
+
     def hold(self) -> None:
         """Keep the events from now on."""
         if not self._is_held and not self._guard.is_abandoned:
@@ -75,6 +80,9 @@ class Events:
 
     def release(self) -> None:
         """Report the events that were kept, and those that follow at once."""
+        if self._is_raised:
+            self._is_raised = False
+            restore_priority()
         if not self._is_held or self._guard.is_abandoned:
             return
         if self._collects:
@@ -233,6 +241,7 @@ class RunningShot:
         self.leaders = LeaderAnswers(lab, guard, record, events)
         self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
         self._fired_s = self._started_s = 0.0
+        self._frame_s: tuple[float, float] | None = None
         self._guard = guard
         self._events = events
 
@@ -371,7 +380,7 @@ class RunningShot:
         if start is not None and (lines is None or is_triggered):
             start()
         if lines is None:
-            self._events.release()
+            self._begin_moves(start)
             yield
             return
         program = line_program(specs, kind, duration_s)
@@ -384,12 +393,23 @@ class RunningShot:
         self.clock.sleep(max(0.0, program.begin_s - (self.clock.now() - fired_s)))
         if start is not None and not is_triggered:
             start()
-        self._events.release()
+        self._begin_moves(start)
         yield
         if is_triggered:
             self._check_end(program.begin_s + duration_s)
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
         self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
+
+    def _begin_moves(self, start: Callable[[], object] | None) -> None:
+        """Record how long after the frame the light of the mobile tweezers came, and report what was kept."""
+        if start is not None and self._frame_s is not None:
+            mobile, (frame_s, host_s) = self.mobile_tweezers, self._frame_s
+            delay_s = mobile.start_delay_s if offers(mobile, "start_delay_s") else 0.0
+            cycle = self.record.images[-1].cycle + 1 if self.record.images else -1
+            taken_s = self.clock.now() - frame_s + delay_s, time.perf_counter() - host_s
+            self._frame_s = None
+            self.stage_done("light", *taken_s, cycle=cycle)
+        self._events.release()
 
     def _check_end(self, least_s: float) -> None:
         """Refuse a program that ended before it can be over: it was started by a trigger too many."""
@@ -441,6 +461,7 @@ class RunningShot:
             self._await_exposure()
         timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         frame = self._expose(exposure_s, cycle)
+        self._frame_s = self.clock.now(), time.perf_counter()
         self._events.hold()
         if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
@@ -475,6 +496,8 @@ class RunningShot:
                 if not self.series.by_line:
                     self.call("camera", limit_s, camera.trigger)
                 end_s, host_start_s = self.elapsed_s + exposure_s, time.perf_counter()
+                if not self.clock.virtual:
+                    self._events.expect_frame()
                 frame = self.call("camera", limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
                 host_s = time.perf_counter() - host_start_s
                 late_s = max(0.0, self.elapsed_s - end_s)

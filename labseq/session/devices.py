@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+from labseq import realtime
 from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.guard import Guard, StopFlag, stop_on_signals
@@ -118,6 +119,8 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         devices = check_each_device(
             in_order, timeouts_of(hardware.profile), stop, simulation, warnings.append
         )
+    if not is_virtual and (text := realtime.refused()):
+        warnings.append(text)
     warnings += [f"{one.name}: {note}" for one in devices for note in one.described.get("notes", ())]
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
     plugins = {name: chosen.entry.name for name, chosen in hardware.chosen.items()}

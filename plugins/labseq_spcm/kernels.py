@@ -55,6 +55,7 @@ TOO_SHORT: Final = -1
 TOO_MANY: Final = -2
 
 TONES: Final = const("float64", 2)
+REALS: Final = const("float64", 1)
 OFFSETS: Final = const("int32", 1)
 CORES: Final = const("int64", 1)
 
@@ -68,6 +69,26 @@ def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
     """
     for i in range(len(out)):
         out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
+
+
+@kernel(f"boolean({REALS}, {REALS}, {REALS}, {REALS}, {REALS}, {OFFSETS}, float64, float64, float64)")
+def is_within(
+    start_hz: Reals, end_hz: Reals, start: Reals, end: Reals, phase_rad: Reals, offsets: Shorts,
+    low_hz: float, high_hz: float, most: float,
+) -> bool:  # fmt: skip
+    """Whether the tones of an axis are in a band, and the sums of their amplitudes at most ``most``."""
+    for segment in range(len(offsets) - 1):
+        sum_start = sum_end = 0.0
+        for i in range(offsets[segment], offsets[segment + 1]):
+            if not (low_hz <= start_hz[i] <= high_hz and low_hz <= end_hz[i] <= high_hz):
+                return False
+            if not (start[i] >= 0.0 and end[i] >= 0.0 and abs(phase_rad[i]) < np.inf):
+                return False
+            sum_start += start[i]
+            sum_end += end[i]
+        if not (sum_start <= most and sum_end <= most):
+            return False
+    return True
 
 
 @helper_kernel("float64(int64, float64)")

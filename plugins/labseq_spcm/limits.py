@@ -119,7 +119,12 @@ def check_program(name: str, program: ToneProgram, rf: RfSpec) -> None:
 
 
 def _check_axis(what: str, axis: AxisTones, batch: NDArray[np.int32], band_hz: tuple[float, float]) -> None:
+    from labseq_spcm.kernels import is_within
+
     low, high = band_hz
+    tones = axis.start_hz, axis.end_hz, axis.start_amplitude, axis.end_amplitude, axis.phase_rad
+    if is_within(*tones, axis.offsets, low, high, 1.0 + ROUNDING):
+        return
     band = f"the AOD's band, {low / 1e6:g} to {high / 1e6:g} MHz"
     amplitudes = 0.0, 1.0 + ROUNDING, "0 to 1 of full scale"
     for quantity, values, (least, most, limit) in (

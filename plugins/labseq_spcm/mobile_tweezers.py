@@ -267,6 +267,11 @@ class SpcmMobileTweezers(MobileTweezers):
         return self._prepare(program, continues=False)
 
     @property
+    def start_delay_s(self) -> float:
+        """Delay of the outputs; in the mode ``stream`` with the silence ahead of them."""
+        return float(self._facts.get("trigger_delay_s", 0.0))
+
+    @property
     def beginning_s(self) -> float:
         """A fraction of a program's length for the modes ``stream`` and ``dds``."""
         return math.inf if self._mode is None else self._mode.beginning_s
@@ -287,7 +292,7 @@ class SpcmMobileTweezers(MobileTweezers):
         playing_s = mode.prepare(program, continues=continues)
         took_s += time.perf_counter() - start_s
         self._timings = {"render": mode.render_s, "upload": took_s - mode.render_s}
-        duration_s = max(playing_s, program.total_duration_s) + float(self._facts["trigger_delay_s"])
+        duration_s = max(playing_s, program.total_duration_s) + self.start_delay_s
         self._duration_s = duration_s
         return duration_s
 

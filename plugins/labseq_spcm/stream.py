@@ -9,7 +9,14 @@ from typing import Final
 
 import numpy as np
 
-from labseq.plugin import DeviceError, LabseqError, ToneProgram, TransientError, format_quantity
+from labseq.plugin import (
+    DeviceError,
+    LabseqError,
+    ToneProgram,
+    TransientError,
+    format_quantity,
+    raise_priority,
+)
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples
 from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES
@@ -181,6 +188,7 @@ class Stream:
 
     def _run(self, stop: threading.Event) -> None:
         """The thread."""
+        raise_priority()  # so that the card does not run dry because other programs are busy
         while (pause_s := self._step()) is not None and not stop.wait(pause_s):
             pass
 

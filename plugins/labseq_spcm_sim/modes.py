@@ -244,7 +244,8 @@ class Fifo:
 
     def _keep(self, data: Samples) -> None:
         """Remember samples that will be played: no silence, and of equal blocks only the first."""
-        if not (data.view(np.uint64) if data.nbytes % 8 == 0 else data).any():
+        words = data.view(np.uint64) if data.nbytes % 8 == 0 else data.view(np.uint16)
+        if not words.max():  # several times faster than any()
             return
         data = data.reshape(-1, self._frame // 2)
         first, n_samples = self._handed // self._frame, len(data)

@@ -22,8 +22,8 @@ Write = Callable[..., Run]
 def test_stages_come_in_the_order_of_a_shot_and_whole_steps_last(compact: Run) -> None:
     names = [stage.stage for stage in timing_of(compact, compact.shots).stages]
     seen = ["arm", "expose", "read_out", "detect", "plan", "check"]
-    assert names[:11] == [*seen, "tones", "prepare", "play", "move", "write"]
-    assert names[11:] == ["step_0_load", "step_1_image", "step_2_rearrange", "step_3_image"]
+    assert names[:13] == [*seen, "tones", "prepare", "start", "light", "play", "move", "write"]
+    assert names[13:] == ["step_0_load", "step_1_image", "step_2_rearrange", "step_3_image"]
 
 
 def test_each_stage_is_told_against_its_budget(write: Write) -> None:

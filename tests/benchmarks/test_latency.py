@@ -16,12 +16,12 @@ from labseq_spcm.settings import SpcmSettings
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-from labseq.bench.latency import CHUNK
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import ToneProgram
 from labseq.motion import Renderer, check_plan, comb_sample_rate, render_chunks, tone_program
 from labseq.plugin import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
 
+CHUNK = 1 << 15  # samples per channel that a stream needs first
 GRID = SiteGrid()
 RATE_HZ = comb_sample_rate(GRID)
 DDS_LIMITS = MotionSpec(max_row_tones=16, max_column_tones=5)

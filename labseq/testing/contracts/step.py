@@ -145,11 +145,13 @@ class StepContract:
             device.open()
         lab.static_tweezers.start()
         guard = Guard(lab.stop)
-        shot = RunningShot(lab, guard, ShotRecord(0, 0, 0, ""), Events(RecordingObserver(), guard))
-        shot.take_image(0.045)
+        events = Events(RecordingObserver(), guard)
+        shot = RunningShot(lab, guard, ShotRecord(0, 0, 0, ""), events)
         try:
+            shot.take_image(0.045)
             yield shot, lab
         finally:
+            events.release()
             guard.end()
 
     def _timeline(self, step: Step) -> list[TimelineEntry]:
