@@ -112,7 +112,8 @@ def calibrate(
         str,
         typer.Argument(
             metavar="KIND",
-            help="What to calibrate: sites, thresholds, tweezers, amplitudes, frequencies or overlay.",
+            help="What to calibrate: sites, thresholds, tweezers, amplitudes, frequencies, overlay or "
+            "timing.",
             show_default=False,
         ),
     ],

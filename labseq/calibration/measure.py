@@ -17,6 +17,7 @@ from labseq.calibration.methods import (
     analyse_frequencies,
     analyse_overlay,
     analyse_sites,
+    analyse_timing,
     analyse_tweezers,
     read_site_file,
 )
@@ -50,6 +51,7 @@ METHODS: Final[Mapping[str, Method]] = {
         Method("amplitudes", analyse_tweezers, uses_detector=False),
         Method("frequencies", analyse_frequencies),
         Method("overlay", analyse_overlay),
+        Method("timing", analyse_timing, ignored=("timing",)),
     )
 }
 """Kind of calibration -> its sequence and analysis."""
@@ -184,7 +186,7 @@ def _measure(
     ignoring: str,
     observer: RunObserver | None,
 ) -> Run:
-    overrides = [*_meter(method, hardware.profile), *request.overrides, ignoring]
+    overrides = [*_meter(method, hardware.profile), *_target(method, hardware), *request.overrides, ignoring]
     if not method.uses_detector:  # its settings may be wrong before it is calibrated
         overrides = [one for one in overrides if not one.lstrip().startswith("profile.detector.")]
         overrides.append("profile.detector={use: blind}")
@@ -248,6 +250,15 @@ def _meter(method: Method, spec: ProfileSpec) -> list[str]:
     values = {key: getattr(meter, key) for key in sorted(meter.model_fields_set)}
     texts = {key: value if isinstance(value, str) else f"{value!r} s" for key, value in values.items()}
     return [f"shot.0.equalise.{key}={json.dumps(text)}" for key, text in texts.items()]
+
+
+def _target(method: Method, hardware: ResolvedProfile) -> list[str]:
+    """The overrides for a target as large as a reservoir allows, and without the time that is measured."""
+    if method.kind != "timing":
+        return []
+    sizes = zip(("rows", "cols"), hardware.grid.shape, strict=True)
+    block = [f"target.{axis}={max(1, 3 * n // 4)}" for axis, n in sizes]
+    return [*block, "profile.mobile_tweezers.overhead_per_cycle=0 s"]
 
 
 def _of_profile(overrides: Sequence[str]) -> list[Override]:

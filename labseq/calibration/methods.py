@@ -121,6 +121,36 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
     )
 
 
+def analyse_timing(data: CalibrationData) -> AnalysisResult:
+    """Find how long a cycle takes to the light, from the start of the rearrangement.
+
+    The stage ``light`` of a shot counts from the frame, and so includes the detection. The clock of a
+    simulated run stands still while the computer works; there the computer's time is added.
+
+    Raises:
+        ConfigError: No shot of the run moved atoms.
+    """
+    taken_s: list[float] = []
+    for shot in data.run.shots:
+        detect = None
+        for stage in shot.timing:
+            if stage.stage == "detect":
+                detect = stage
+            elif stage.stage == "light" and detect is not None:
+                host_s = stage.host_s - detect.host_s if data.run.simulated else 0.0
+                taken_s.append(stage.duration_s - detect.duration_s + host_s)
+    if not taken_s:
+        text = "no shot of it moved atoms; choose a target that random loadings do not meet"
+        raise ConfigError(Problem(text, str(data.run.path), expected="a run that rearranges"))
+    median_s, p99_s = (float(value) for value in np.quantile(taken_s, (0.5, 0.99)))
+    median, p99 = (format_quantity(value, "time") for value in (median_s, p99_s))
+    return AnalysisResult(
+        {"overhead_s": [median_s]},
+        {"p99_s": p99_s, "n_cycles": float(len(taken_s))},
+        (f"{len(taken_s)} cycles: {median} from the start of a cycle to the light, 99 % within {p99}",),
+    )
+
+
 def _readings(run: Run) -> dict[str, Any]:
     """The readings of ``equalise`` in the last shot that has them."""
     for shot in reversed(run.shots):

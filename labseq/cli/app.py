@@ -110,7 +110,7 @@ def common(
 app.add_typer(bench)
 app.add_typer(calibration)
 app.add_typer(queue)
-app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, thresholds, tones or overlay.")(calibrate)
+app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, tones, timing and more.")(calibrate)
 
 
 @app.command(short_help="Run an example sequence on simulated hardware.")

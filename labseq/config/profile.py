@@ -151,6 +151,9 @@ class CalibrationChoices(Settings):
     overlay: Text | None = Field(
         default=None, description="position of the mobile tweezers on the static ones: an id, or `off`"
     )
+    timing: Text | None = Field(
+        default=None, description="time from the start of a cycle to the light: an id, or `off`"
+    )
 
     def of(self, kind: str) -> str | None:
         """The choice for a kind of calibration: an id, "off", or None for the active one."""
@@ -448,7 +451,9 @@ class MotionSettings(Settings):
         "another setup",
     )
     overhead_per_cycle: Duration = Field(
-        default=_MOTION.overhead_per_cycle_s, description="time that passes before the first batch of a cycle"
+        default=_MOTION.overhead_per_cycle_s,
+        description="time that passes before the first batch of a cycle; left out: what is typical of the "
+        "driver and its mode, if it says so; a calibration of the kind `timing` takes precedence",
     )
     max_tweezers: Sites = Field(
         default=_MOTION.max_tweezers, description="largest number of mobile tweezers on at once"

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from labseq.model.arrays import read_only
 from labseq.model.grid import SiteGrid
 
-CalibrationKind = Literal["sites", "thresholds", "tweezers", "amplitudes", "frequencies", "overlay"]
+CalibrationKind = Literal["sites", "thresholds", "tweezers", "amplitudes", "frequencies", "overlay", "timing"]
 CALIBRATION_KINDS: Final[tuple[CalibrationKind, ...]] = get_args(CalibrationKind)
 
 ID_DIGITS: Final = 12
@@ -31,6 +31,7 @@ VALUE_SHAPES: Final[Mapping[str, Mapping[str, tuple[str | int, ...]]]] = Mapping
         "amplitudes": {"row_amplitudes": ("rows",), "column_amplitudes": ("cols",)},
         "frequencies": {"row_hz": ("rows",), "column_hz": ("cols",)},
         "overlay": {"offset_m": (2,)},
+        "timing": {"overhead_s": (1,)},
     }
 )
 """Kind -> the values that it must have, and their shapes; "rows" and "cols" are the grid's."""
@@ -53,6 +54,7 @@ class CalibrationEntry:
     - frequencies: ``row_hz`` (n_rows,), ``column_hz`` (n_cols,): the mobile tweezers' tones at the sites.
     - overlay: ``offset_m`` (2,): offset of the mobile tweezers from the sites, along a1 (along a
       row) and a2 (from row to row).
+    - timing: ``overhead_s`` (1,): time from the start of a rearrangement cycle to the light, above 0.
 
     Attributes:
         kind: One of :data:`CALIBRATION_KINDS`.
@@ -117,6 +119,8 @@ class CalibrationEntry:
             not np.all(self.values[name] > 0) for name in VALUE_SHAPES[self.kind]
         ):
             raise ValueError("an amplitude is not above 0")
+        if self.kind == "timing" and not self.values["overhead_s"][0] > 0:
+            raise ValueError("'overhead_s' is not above 0")
         if self.kind == "frequencies":
             for name in VALUE_SHAPES[self.kind]:
                 steps = np.diff(self.values[name])

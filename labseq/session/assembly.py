@@ -287,6 +287,7 @@ def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
     core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
     roles = {role: chosen.dump() for role, chosen in hardware.chosen.items() if role in ROLES}
     roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
+    roles["mobile_tweezers"]["overhead_per_cycle"] = hardware.motion.overhead_per_cycle_s
     if "amplitudes" in hardware.calibrations:
         rf = hardware.motion.rf
         amplitudes = {"row_amplitudes": [*rf.row_amplitudes], "column_amplitudes": [*rf.column_amplitudes]}

@@ -69,8 +69,15 @@ class ResolvedProfile:
 
     @property
     def motion(self) -> MotionSpec:
-        """How the mobile tweezers move, with calibrated amplitudes."""
-        return with_amplitudes(self.profile.motion, self.calibrations)
+        """How the mobile tweezers move, with calibrated amplitudes and the time that they take to start.
+
+        Without a calibration or a value in the profile, that time is what the driver's settings say it takes.
+        """
+        motion, mobile = self.profile.motion, self.profile.mobile_tweezers
+        typical_s = getattr(self.chosen["mobile_tweezers"].settings, "overhead_per_cycle_s", None)
+        if typical_s is not None and "overhead_per_cycle" not in mobile.model_fields_set:
+            motion = replace(motion, overhead_per_cycle_s=typical_s)
+        return with_calibrations(motion, self.calibrations)
 
     @property
     def key(self) -> str:
@@ -350,11 +357,13 @@ def calibrated_machine(document: Document, profile: ProfileSpec) -> tuple[SiteGr
     found = ProblemCollector()
     active = calibrated(document, profile, found)
     found.raise_any()
-    return active.grid, with_amplitudes(profile.motion, active.entries)
+    return active.grid, with_calibrations(profile.motion, active.entries)
 
 
-def with_amplitudes(motion: MotionSpec, entries: Mapping[str, CalibrationEntry]) -> MotionSpec:
-    """Apply the calibrated amplitudes of the mobile tweezers' tones, if there are any."""
+def with_calibrations(motion: MotionSpec, entries: Mapping[str, CalibrationEntry]) -> MotionSpec:
+    """Apply the calibrated amplitudes of the mobile tweezers' tones, and the time before the first batch."""
+    if (timing := entries.get("timing")) is not None:
+        motion = replace(motion, overhead_per_cycle_s=float(timing.values["overhead_s"][0]))
     if (entry := entries.get("amplitudes")) is None:
         return motion
     rows, columns = (tuple(entry.values[f"{axis}_amplitudes"].tolist()) for axis in ("row", "column"))

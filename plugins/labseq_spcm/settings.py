@@ -14,6 +14,7 @@ Channel: TypeAlias = Literal[0, 1]
 
 LOOK_AHEAD_S: Final = 250e-6
 FILL_S: Final = {"fifo": 8e-3, "stream": 20e-3}
+OVERHEAD_S: Final = {"replay": 20e-3, "fifo": 13e-3, "stream": 3e-3, "dds": 5e-3}
 NO_TRIGGER: Final = (
     "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
 )
@@ -155,6 +156,11 @@ class SpcmSettings(Settings):
     def _buffered_s(self, sample_rate_hz: float) -> float:
         n_bytes = self.card_buffer + limits.OUTPUT_FIFO_BYTES + 2 * self.notify_size
         return n_bytes / limits.FRAME_BYTES / sample_rate_hz
+
+    @property
+    def overhead_per_cycle_s(self) -> float:
+        """How long a cycle takes to the light, from its plan on: measured, see the timing budget."""
+        return OVERHEAD_S[self.mode]
 
     @property
     def fill_s(self) -> float:

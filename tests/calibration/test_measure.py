@@ -18,6 +18,7 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationKind, SiteGrid
 from labseq.session.assembly import assemble
 from labseq.session.options import Options
+from labseq.session.profile import resolve_profile
 from labseq.testing.fakes import fake_calibration
 
 PROFILE = """grid: {rows: 6, cols: 6, spacing: 4.49 um}
@@ -233,10 +234,28 @@ def test_a_choice_in_the_profile_is_reported(lab: Any, measured: Any) -> None:
     assert warning == "the profile says 'calibrations.use.sites: off', which takes precedence"
 
 
+def test_the_time_to_the_light_is_measured_and_used_instead_of_the_profiles(
+    tmp_path: Path, make_lab: Any
+) -> None:
+    lab = make_lab(tmp_path, PROFILE)
+    assert resolve_profile(str(lab.profile)).motion.overhead_per_cycle_s == 13e-3
+    outcome = lab.calibrate("timing", shots=5)
+    assert not outcome.refused
+    assert outcome.stored.entry.quality["n_cycles"] == 5
+    (overhead_s,) = outcome.stored.entry.values["overhead_s"]
+    assert 0.0 < overhead_s < 0.1  # of this computer: the devices of the profile model no time
+    assert resolve_profile(str(lab.profile)).motion.overhead_per_cycle_s == overhead_s
+    again = lab.calibrate("timing", source=outcome.run.path)
+    assert again.stored.entry.values["overhead_s"] == [overhead_s]
+    with pytest.raises(ConfigError, match="no shot of it moved atoms"):
+        lab.calibrate("timing", shots=1, overrides=["profile.simulation.loading=0 %"])
+
+
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def test_every_sequence_can_be_run_on_every_profile_with_virtual_devices(method: Any) -> None:
     needs_meter = method.kind in ("tweezers", "amplitudes")
     assembly = assemble(method.sequence, Options("practice" if needs_meter else "virtual"))
     assert assembly.sequence.name == f"calibrate-{method.kind}"
-    assert assembly.sequence.record_frames == ("none" if needs_meter else "all")
+    takes_frames = method.kind not in ("tweezers", "amplitudes", "timing")
+    assert assembly.sequence.record_frames == ("all" if takes_frames else "none")
     assert not assembly.warnings
