@@ -1,11 +1,10 @@
-"""What a tweezer without an atom does to an atom on whose site it ends: the table of its page.
+"""What mobile tweezers do to atoms that stand: the measured tables of the page on checked plans.
 
     python docs/make_landings.py [--atoms 10000]
 
-The command replaces the part of ``docs/explanation/checked-plans.md`` between ``<!-- measured: landings -->``
-and ``<!-- end -->``. Atoms move by Newton's law in the light of a static tweezer and of a mobile one that
-comes from half a site away and is ramped down, as in the simulation of played samples
-(``labseq_virtual.flight``), but without the AOD's transit time.
+The command replaces the parts of ``docs/explanation/checked-plans.md`` between ``<!-- measured: NAME -->``
+and ``<!-- end -->``. Atoms move by Newton's law in the light of a static tweezer and of a mobile one, as in
+the simulation of played samples (``labseq_virtual.flight``), but without the AOD's transit time.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import argparse
 import math
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -36,61 +36,32 @@ GROUP: Final = 100
 APART_M: Final = 30e-6
 """Distance of these tweezers, in metres."""
 STATIC: Final = SimulationSettings()
+MOBILE_K: Final = STATIC.mobile_light.depth
 MOTION: Final = MotionSpec()
 HALF_M: Final = SiteGrid().spacing_m / 2
 
 
-@dataclass(frozen=True, slots=True)
-class Landing:
-    """How a tweezer arrives.
+@dataclass(frozen=True, slots=True, eq=False)
+class TweezerPath:
+    """The path of a mobile tweezer in frames, relative to the site of an atom.
 
     Attributes:
-        name: For the table.
-        speed_m_s: Mean speed on the last half site.
-        course: Course of the speed.
-        ramp_s: Ramp of the depth after it has arrived.
-        ends_at: Where it stops: 0 at the site, 1 half a site before, -1 half a site behind it.
-        fades: Whether the depth goes down evenly on the way instead.
-        depth_k: Depth of the mobile tweezer, in kelvin.
+        along_m: float64 (n_frames,), from the site along the path.
+        fraction: float64 (n_frames,), fraction of the full depth.
+        beside_m: Distance of the path from the site.
+        depth_k: Full depth, in kelvin.
+        temperature_k: Temperature of the atom.
     """
 
-    name: str
-    speed_m_s: float
-    course: FrequencyCourse = FrequencyCourse.LINEAR
-    ramp_s: float = MOTION.drop_off_s
-    ends_at: int = 0
-    fades: bool = False
-    depth_k: float = STATIC.mobile_light.depth
-
-    def path(self) -> tuple[Floats, Floats]:
-        """Distance from the site, in metres, and fraction of the full depth, at each frame."""
-        way = 1 - self.ends_at
-        n = max(1, round(way * HALF_M / self.speed_m_s / FRAME_S))
-        done = [self.course.fraction(i / n) for i in range(n + 1)]
-        place = HALF_M * (1 - way * np.array(done))
-        depth = 1 - np.arange(n + 1) / n if self.fades else np.ones(n + 1)
-        ramp = depth[-1] * np.linspace(1, 0, round(self.ramp_s / FRAME_S) + 1)[1:]
-        return np.append(place, np.full(len(ramp), place[-1])), np.append(depth, ramp)
+    along_m: Floats
+    fraction: Floats
+    beside_m: float = 0.0
+    depth_k: float = MOBILE_K
+    temperature_k: float = STATIC.temperature
 
 
-CONSTANT, JERK = FrequencyCourse.LINEAR, FrequencyCourse.MINIMUM_JERK
-LANDINGS: Final = (
-    *(Landing(f"{v} µm/ms, then the ramp", v * 1e-3) for v in (260, 130, 65, 32.5, 13, 4)),
-    *(Landing(f"minimum jerk, {v} µm/ms on average, then the ramp", v * 1e-3, JERK) for v in (130, 32.5, 13)),
-    Landing("13 µm/ms, then a ramp of 300 µs", 13e-3, ramp_s=300e-6),
-    *(Landing(f"{v} µm/ms, ramped down on the way", v * 1e-3, fades=True) for v in (130, 32.5, 13)),
-    Landing("ramped down half a site before", 0.13, ends_at=1),
-    Landing("passes over the site at 130 µm/ms", 0.13, ends_at=-1),
-    *(
-        Landing(f"{mk} mK: {v} µm/ms, then the ramp", v * 1e-3, depth_k=mk * 1e-3)
-        for mk in (0.6, 0.3, 0.15)
-        for v in (130, 13)
-    ),
-)
-
-
-def land(landing: Landing, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Let a tweezer land on each of a group of atoms; their energies before and after, in kelvin.
+def follow(path: TweezerPath, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Let a tweezer pass or land on each of a group of atoms; their energies before and after, in kelvin.
 
     They are counted from the bottom of the static tweezer; inf for an atom that is lost.
     """
@@ -98,20 +69,20 @@ def land(landing: Landing, rng: np.random.Generator) -> tuple[Floats, Floats]:
     rayleigh = math.pi * waists**2 / [STATIC.static_wavelength, STATIC.mobile_light.wavelength]
     beams = np.array([waists[0], rayleigh[0], waists[1], rayleigh[1]])
     depth = np.full(GROUP, KELVIN * STATIC.static_depth)
-    state = draw_atoms(depth, KELVIN * STATIC.temperature, beams[0], beams[1], rng)
+    state = draw_atoms(depth, KELVIN * path.temperature_k, beams[0], beams[1], rng)
     sites: Floats = np.zeros((GROUP, 2))
     sites[:, 0] = APART_M * np.arange(GROUP)
     state[:, :2] += sites
     before = energies(state, sites, depth, beams[0], beams[1])
     down, right = np.array([0.0, 2 * HALF_M]), np.array([APART_M, 0.0])
     plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
-    place, fraction = landing.path()
-    columns = np.tile(np.arange(float(GROUP)), (len(place), 1))
+    n_frames = len(path.along_m)
+    columns = np.tile(np.arange(float(GROUP)) + path.beside_m / APART_M, (n_frames, 1))
     alive, record = np.ones(GROUP, np.bool_), np.full((GROUP, N_COLUMNS), np.nan)
     follow_atoms(
         state, alive, record,
-        place[:, None] / (2 * HALF_M), fraction[:, None].copy(), columns, np.ones_like(columns),
-        FRAME_S * np.arange(len(place), dtype=np.float64), depth[None], KELVIN * landing.depth_k,
+        path.along_m[:, None] / (2 * HALF_M), path.fraction[:, None].copy(), columns, np.ones_like(columns),
+        FRAME_S * np.arange(n_frames, dtype=np.float64), depth[None], KELVIN * path.depth_k,
         np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S),
     )  # fmt: skip
     after = energies(state, sites, depth, beams[0], beams[1])
@@ -119,30 +90,126 @@ def land(landing: Landing, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return (before + depth[0]) / KELVIN, (after + depth[0]) / KELVIN
 
 
-def row(landing: Landing, n_atoms: int) -> str:
-    """A row of the table."""
+def results(path: TweezerPath, n_atoms: int) -> list[str]:
+    """The fraction of the atoms that are lost, and the heating of the others in uK."""
     rng = np.random.default_rng(1)
-    before, after = np.hstack([land(landing, rng) for _ in range(math.ceil(n_atoms / GROUP))])
+    before, after = np.hstack([follow(path, rng) for _ in range(math.ceil(n_atoms / GROUP))])
     lost = np.isinf(after)
-    n, kept = len(after), after[~lost]
-    loss, error = lost.mean(), math.sqrt(max(lost.mean() * (1 - lost.mean()), 1 / n) / n)
-    heat_uk = "-" if len(kept) < n / 10 else f"{(kept.mean() - before.mean()) / 3 * 1e6:.1f}"
-    return f"| {landing.name} | {100 * loss:.2f}({100 * error:.2f}) % | {heat_uk} |"
+    n, kept, loss = len(after), after[~lost], float(lost.mean())
+    error = math.sqrt(max(loss * (1 - loss), 1 / n) / n)
+    heating = "-" if len(kept) < n / 10 else f"{(kept.mean() - before.mean()) / 3 * 1e6:.1f}"
+    return [f"{100 * loss:.2f}({100 * error:.2f}) %", heating]
+
+
+CONSTANT, JERK = FrequencyCourse.LINEAR, FrequencyCourse.MINIMUM_JERK
+
+
+def landing(
+    speed_m_s: float,
+    course: FrequencyCourse = CONSTANT,
+    ramp_s: float = MOTION.drop_off_s,
+    ends_at: int = 0,
+    fades: bool = False,
+    depth_k: float = MOBILE_K,
+) -> TweezerPath:
+    """A tweezer that comes from half a site away.
+
+    Args:
+        speed_m_s: Mean speed.
+        course: Course of the speed.
+        ramp_s: Ramp of the depth after it has arrived.
+        ends_at: Where it stops: 0 at the site, 1 half a site before it, -1 half a site behind it.
+        fades: Whether the depth goes down evenly on the way instead.
+        depth_k: Full depth.
+    """
+    way = 1 - ends_at
+    n = max(1, round(way * HALF_M / speed_m_s / FRAME_S))
+    done = [course.fraction(i / n) for i in range(n + 1)]
+    place = HALF_M * (1 - way * np.array(done))
+    depth = 1 - np.arange(n + 1) / n if fades else np.ones(n + 1)
+    ramp = depth[-1] * np.linspace(1, 0, round(ramp_s / FRAME_S) + 1)[1:]
+    return TweezerPath(
+        np.append(place, np.full(len(ramp), place[-1])), np.append(depth, ramp), depth_k=depth_k
+    )
+
+
+LANDINGS: Final[dict[str, TweezerPath]] = {
+    **{f"{v} µm/ms, then the ramp": landing(v * 1e-3) for v in (260, 130, 65, 32.5, 13, 4)},
+    **{
+        f"minimum jerk, {v} µm/ms on average, then the ramp": landing(v * 1e-3, JERK) for v in (130, 32.5, 13)
+    },
+    "13 µm/ms, then a ramp of 300 µs": landing(13e-3, ramp_s=300e-6),
+    **{f"{v} µm/ms, ramped down on the way": landing(v * 1e-3, fades=True) for v in (130, 32.5, 13)},
+    "ramped down half a site before": landing(0.13, ends_at=1),
+    "passes over the site at 130 µm/ms": landing(0.13, ends_at=-1),
+    **{
+        f"{mk} mK: {v} µm/ms, then the ramp": landing(v * 1e-3, depth_k=mk * 1e-3)
+        for mk in (0.6, 0.3, 0.15)
+        for v in (130, 13)
+    },
+}
+
+FAR_M: Final = 6e-6
+"""Where a passing tweezer comes from and goes to, in metres from the nearest point."""
+
+
+def passing(beside_m: float, wait_s: float, temperature_k: float, depth_k: float = MOBILE_K) -> TweezerPath:
+    """A tweezer that passes an atom at the speed of transports, and waits at the nearest point."""
+    n = round(FAR_M / MOTION.speed_m_s / FRAME_S)
+    comes = FAR_M * (1 - np.arange(n + 1) / n)
+    place = np.concatenate([comes, np.zeros(round(wait_s / FRAME_S)), -comes[:-1][::-1]])
+    return TweezerPath(place, np.ones(len(place)), beside_m, depth_k, temperature_k)
+
+
+def barrier_k(beside_m: float, depth_k: float = MOBILE_K) -> float:
+    """Height of the barrier between an atom's site and a mobile tweezer, in kelvin."""
+    x = np.linspace(0, beside_m, 2001)
+    static = STATIC.static_depth * np.exp(-2 * (x / STATIC.static_waist) ** 2)
+    well = -static - depth_k * np.exp(-2 * ((beside_m - x) / STATIC.mobile_light.waist) ** 2)
+    slope = np.diff(well)
+    bottom = int(np.argmax(slope > 0))  # a little towards the mobile tweezer
+    return float(well[bottom + int(np.argmax(slope[bottom:] < 0))] - well[bottom])
+
+
+def landings(n_atoms: int) -> list[list[str]]:
+    """The table of landings."""
+    return [
+        ["the last half site", "lost", "heating of the others, µK"],
+        *([name, *results(path, n_atoms)] for name, path in LANDINGS.items()),
+    ]
+
+
+def passes(n_atoms: int) -> list[list[str]]:
+    """The table of passes."""
+    table = [
+        ["distance, µm", "mobile, mK", "atom, µK", "barrier, µK", "lost in a pass", "with a stop of 60 µs"]
+    ]
+    cases = [(um, 2.1, uk) for um in (1.7, 1.944, 2.245, 2.5) for uk in (15, 10, 5)]
+    for um, mk, uk in [*cases, (1.944, 1.0, 15), (1.944, 0.6, 15)]:
+        barrier = f"{1e6 * barrier_k(um * 1e-6, mk * 1e-3):.0f}"
+        made = [passing(um * 1e-6, wait_s, uk * 1e-6, mk * 1e-3) for wait_s in (0.0, 60e-6)]
+        table.append([str(um), str(mk), str(uk), barrier, *(results(path, n_atoms)[0] for path in made)])
+    return table
+
+
+TABLES: Final[dict[str, Callable[[int], list[list[str]]]]] = {"passes": passes, "landings": landings}
 
 
 def main() -> None:
-    """Write the table into the page."""
+    """Write the tables into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--atoms", type=int, default=10_000, help="atoms for each row of the table")
+    parser.add_argument("--atoms", type=int, default=10_000, help="atoms for each number")
+    parser.add_argument("--tables", nargs="*", default=[*TABLES], choices=[*TABLES], help="only these")
     arguments = parser.parse_args()
-    lines = ["| the last half site | lost | heating of the others, µK |", "| --- | --- | --- |"]
-    for landing in LANDINGS:
-        lines.append(row(landing, arguments.atoms))
-        sys.stdout.write(lines[-1] + "\n")
-        sys.stdout.flush()
-    text = PAGE.read_text(encoding="utf-8")
-    part = re.compile(r"(?<=<!-- measured: landings -->\n).*?(?=<!-- end -->)", re.DOTALL)
-    PAGE.write_text(part.sub(lambda _: "\n".join(["", *lines, "", ""]), text), encoding="utf-8")
+    for name in arguments.tables:
+        head, *rows = TABLES[name](arguments.atoms)
+        lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)]
+        sys.stdout.write("\n".join([*lines, ""]))
+        part = re.compile(rf"(?<=<!-- measured: {name} -->\n).*?(?=<!-- end -->)", re.DOTALL)
+        new = "\n".join(["", *lines, "", ""])
+        PAGE.write_text(
+            part.sub(lambda _, new=new: new, PAGE.read_text(encoding="utf-8"), count=1), encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

@@ -136,8 +136,9 @@ class MotionSpec:
         max_column_tones: Most tones on the column axis at once.
         eject_slots: Sites beyond the grid that the AOD band reaches, each side.
         clearance_m: Least distance of a tweezer from standing atoms, and of neighbouring lines of
-            tweezers from one another, in batches with paths of tones. Half-way between two rows of the
-            paper's lattice it is 1.944 um; a mobile tweezer of the paper has 1.1 uK left at 1.9 um (ours).
+            tweezers from one another, in batches with paths of tones (ours). Half-way between two rows
+            of the paper's lattice it is 1.944 um; how many atoms are lost there depends on their
+            temperature.
         empty_tweezers_may_land: Whether a tweezer without an atom may end on a site that holds one.
         rf: What drives the AODs.
         losses: How probably atoms are lost.

@@ -68,7 +68,7 @@ FAULTS: Final[Mapping[str, tuple[str, str]]] = {
     "PATH_POSITION": ("tones", "a position of {axis} tone {b} is not finite"),
     "PATH_OFF": (
         "tones",
-        "the {axis} tones go off at knot 1 or later, one of them at the last; see tone {b}",
+        "{axis} tones go off at knots from 1 to the last, one at the last; not so tone {b}",
     ),
     "PATH_OUTSIDE": ("grid", "{axis} tone {b} goes further than {slots} site(s) beyond the grid's edge"),
     "PATH_ORDER": (

@@ -113,7 +113,7 @@ def test_what_arrays_may_say_of_paths_is_tested() -> None:
     for words, shapes, positions, off, linked in (
         ("fewer than two knots", [[4, 1, 0]], good, [3], [False]),
         ("is not finite", [[2, 1, 1]], [np.nan] * 4, [1, 1], [False]),
-        ("go off at knot 1 or later", [[2, 1, 1]], good, [2, 1], [False]),
+        ("go off at knots from 1 to the last", [[2, 1, 1]], good, [2, 1], [False]),
         ("paths of tones; only line", [[2, 1, 1], [0, 0, 0]], good, [1, 1], [False, True]),
         ("or the batch before has", [[0, 0, 0], [2, 1, 1]], good, [1, 1], [False, True]),
     ):
