@@ -54,6 +54,8 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("testing", "pytest", "pytest"): lambda: labseq.testing.CameraContract,
     ("web", "starlette", "starlette"): check_packages,
     ("web", "uvicorn", "uvicorn"): check_packages,
+    ("web", "httptools", "httptools"): check_packages,
+    ("web", "uvloop", "uvloop"): check_packages,
 }
 
 

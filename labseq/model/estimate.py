@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -94,6 +95,7 @@ Estimated: TypeAlias = Estimate | Rate
 """A mean with its standard error, or a rate with its Jeffreys interval."""
 
 
+@lru_cache(maxsize=4096)
 def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, float]:
     """The equal-tailed interval of a probability, with Jeffreys' prior.
 

@@ -240,8 +240,13 @@ def read_frames(path: Path) -> dict[int, Frame]:
     return dict(sorted(iter_frames(path)))
 
 
-def iter_frames(path: Path) -> Generator[tuple[int, Frame]]:
-    """Read the frames one by one, with the index of the image of each; see :func:`read_frames`."""
+def iter_frames(path: Path, only: int | None = None) -> Generator[tuple[int, Frame]]:
+    """Read the frames one by one, with the index of the image of each; see :func:`read_frames`.
+
+    Args:
+        path: The file.
+        only: Index of the one image whose frame is read; None for all.
+    """
     with opened(path) as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
             stack = group["frames"]
@@ -249,6 +254,8 @@ def iter_frames(path: Path) -> Generator[tuple[int, Frame]]:
             values = schema.EXPOSURES.arguments(Frame, group["exposures"][()])
             camera = str(read_attribute(group, "name"))
             for i, (index, known) in enumerate(zip(group["image"][()], values, strict=True)):
+                if only not in (None, int(index)):
+                    continue
                 image = stack[i]
                 image.flags.writeable = False
                 yield int(index), Frame(image, camera=camera, **known)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Final
@@ -22,6 +23,7 @@ from labseq.queue.queue import Queue
 from labseq.recording.run_file import read_state
 from labseq.session.stopping import ask_to_stop
 from labseq.web.form import form_fields
+from labseq.web.live import in_thread
 from labseq.web.runs import MAX_NOTE, Catalogue, NoSuchRun, text_of, write_notes
 
 if TYPE_CHECKING:
@@ -119,13 +121,11 @@ class Actions:
 
     async def add(self, request: Request) -> Any:
         """Check a known sequence with changed values, and add it at the end of the queue."""
-        from starlette.concurrency import run_in_threadpool
-
         values = await body_of(request)
         path = _known().get(str(values.get("sequence")))
         if path is None:
             raise ConfigError(Problem("there is no such sequence", expected="one of /api/v1/sequences"))
-        return await run_in_threadpool(self._add, path, values)
+        return await in_thread(partial(self._add, path, values))
 
     def _add(self, path: Path, values: Mapping[str, Any]) -> dict[str, str]:
         changes: Any = values.get("changes") or {}

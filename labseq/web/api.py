@@ -5,13 +5,13 @@ from __future__ import annotations
 import inspect
 import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, cast
 
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 
@@ -25,7 +25,7 @@ from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
 from labseq.web.acting import Actions
 from labseq.web.history import finite
-from labseq.web.live import MAX_VIEWERS, Live, encode
+from labseq.web.live import MAX_VIEWERS, Live, encode, in_thread
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.scans import scan_values
 from labseq.web.shots import frame_png, readings_of, shot_values
@@ -40,6 +40,8 @@ MAX_STATISTICS: Final = 500
 """Maximum number of shots that the statistics of a run are worked out from."""
 MAX_TIMED: Final = 50
 """Maximum number of shots whose files are opened for the times of stages."""
+_FRAME_S, _MAX_FRAMES = 2.0, 8
+"""For so long a frame is kept, and so many."""
 _RUN: Final = "/runs/{day}/{name}"
 _TEXTS: Final = {"sequence": SEQUENCE_FILE, "profile": PROFILE_FILE}
 _KINDS: Final[Mapping[str, str]] = {"n": "integer", "shot": "integer", "image": "integer"}
@@ -100,7 +102,7 @@ class Api:
         self._live = Live(catalogue, limits)
         self._actions = actions
         self._started_s = time.monotonic()
-        self._n_requests = 0
+        self._frames: OrderedDict[str, tuple[float, tuple[bytes, int]]] = OrderedDict()
 
     def endpoints(self) -> list[Endpoint]:
         """All endpoints of this server."""
@@ -242,14 +244,23 @@ class Api:
         status, error = read_state(run.folder)
         return {"run": head_of(run, record, status, error), "shot": values}
 
-    def frame(self, request: Request) -> Response:
+    async def frame(self, request: Request) -> Response:
         """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""
+        key, now_s = str(request.url), time.monotonic()
+        kept = self._frames.get(key)
+        if kept is None or now_s - kept[0] > _FRAME_S:  # else many pages ask for the same one
+            kept = self._frames[key] = (now_s, await in_thread(partial(self._frame, request)))
+            while len(self._frames) > _MAX_FRAMES:
+                self._frames.popitem(last=False)
+        png, factor = kept[1]
+        headers = {"cache-control": "private, max-age=600", "x-reduced": str(factor)}
+        return Response(png, media_type="image/png", headers=headers)
+
+    def _frame(self, request: Request) -> tuple[bytes, int]:
         run = self._opened(request)
         shot = run.shot(self._line(run, request))
         width = max(16, _number(request.query_params, "width", 512))
-        png, factor = frame_png(shot, _number(request.path_params, "image", 0), width)
-        headers = {"cache-control": "private, max-age=600", "x-reduced": str(factor)}
-        return Response(png, media_type="image/png", headers=headers)
+        return frame_png(shot, _number(request.path_params, "image", 0), width)
 
     def file(self, request: Request) -> Response:
         """The sequence or the profile as it was when the run began: `kind` is one of them."""
@@ -408,7 +419,7 @@ async def answered(one: Endpoint, request: Request) -> Response:
         if inspect.iscoroutinefunction(one.answer):
             found = await one.answer(request)
         else:
-            found = await run_in_threadpool(partial(one.answer, request))
+            found = await in_thread(partial(one.answer, request))
     except NoSuchRun as error:
         return JSONResponse({"error": text_of(error)}, 404)
     except (LabseqError, OSError) as error:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import zlib
 from collections.abc import AsyncIterator, Callable
-from typing import Any, Final
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Final, TypeVar
 
 from labseq.errors import LabseqError
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.state import Limits, RunState, alarm
+
+T = TypeVar("T")
+_THREADS: Final = ThreadPoolExecutor(6, "labseq web")
 
 POLL_S: Final = 0.1
 """Interval at which the files of a run are looked at while somebody watches it."""
@@ -34,7 +39,7 @@ class Channel:
     def __init__(self, read: Callable[[], dict[str, Any]]) -> None:
         self._read = read
         self._changed = asyncio.Condition()
-        self._text = ""
+        self._text = self._shot = ""
         self._task: asyncio.Task[None] | None = None
         self.n_viewers = 0
         self.version = 0
@@ -42,13 +47,15 @@ class Channel:
     async def states(self, after: str) -> AsyncIterator[str]:
         """The states as server-sent events, from now on until the browser leaves.
 
+        The last shot, which is half of a state, is an event of its own, sent before the state if it is new.
+
         Args:
             after: Id of the last event that the browser has; the present state is left out if it is that.
         """
         self.n_viewers += 1
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._follow())
-        seen, is_first = 0, True
+        seen, shot_seen, is_first = 0, "", True
         try:
             while True:
                 async with self._changed:
@@ -56,12 +63,14 @@ class Channel:
                         await asyncio.wait_for(
                             self._changed.wait_for(lambda seen=seen: self.version > seen), HEARTBEAT_S
                         )
-                    text, is_new = self._text, self.version > seen
+                    text, shot, is_new = self._text, self._shot, self.version > seen
                     seen = self.version
                 if not is_new:
                     yield ": still here\n\n"
-                elif not (is_first and after == _id_of(text)):
-                    yield f"id: {_id_of(text)}\nevent: state\ndata: {text}\n\n"
+                elif not (is_first and after == _id_of(text + shot)):
+                    changed = f"event: shot\ndata: {shot}\n\n" if shot != shot_seen else ""
+                    yield f"{changed}id: {_id_of(text + shot)}\nevent: state\ndata: {text}\n\n"
+                    shot_seen = shot
                 is_first = False
         finally:
             self.n_viewers -= 1
@@ -69,11 +78,11 @@ class Channel:
     async def _follow(self) -> None:
         """Read the run as long as somebody watches."""
         while self.n_viewers:
-            state = await asyncio.to_thread(self._read)
-            text = encode(state)
-            if text != self._text:
+            state = await in_thread(self._read)
+            shot, text = encode(state.pop("shot", None)), encode(state)
+            if (text, shot) != (self._text, self._shot):
                 async with self._changed:
-                    self._text = text
+                    self._text, self._shot = text, shot
                     self.version += 1
                     self._changed.notify_all()
             is_running = (state.get("run") or {}).get("status") == "running"
@@ -128,12 +137,15 @@ class Live:
         return state
 
 
-def encode(values: dict[str, Any]) -> str:
-    """A state as JSON of one line."""
+async def in_thread(work: Callable[[], T]) -> T:
+    """Do what takes time in one of a few threads: each keeps memory of its own."""
+    return await asyncio.get_running_loop().run_in_executor(_THREADS, work)
+
+
+def encode(values: object) -> str:
+    """A value as JSON of one line."""
     return json.dumps(values, allow_nan=False, separators=(",", ":"), default=str)
 
 
 def _id_of(text: str) -> str:
-    import zlib
-
     return f"{zlib.crc32(text.encode('utf-8', 'replace')):08x}"

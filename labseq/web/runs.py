@@ -22,6 +22,7 @@ from labseq.plain import dumps, now_utc, parse_object
 from labseq.recording import Run, Shot
 from labseq.recording.folders import EVENTS_FILE, NOTES_FILE, RUN_FILE, STATE_FILE
 from labseq.recording.run_file import RunTime, read_run, read_state, target_of
+from labseq.recording.shot import caching_loader
 from labseq.web.history import RunHistory, finite, interval_of
 
 MAX_TEXT: Final = 2000
@@ -31,6 +32,7 @@ MAX_NOTE: Final = 10_000
 MAX_TAGS: Final = 20
 _LISTED_S: Final = 0.5
 """For so long the list of folders is not read again, in seconds."""
+_PAUSE_S: Final = 0.001
 _MAX_OPEN: Final = 12
 """Maximum number of runs that are kept open: 20,000 shots take 3 MB."""
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
@@ -65,6 +67,7 @@ class OpenRun:
         self.id = f"{folder.parent.name}/{folder.name}"
         self.history = RunHistory(folder)
         self.lock = Lock()
+        self._load = caching_loader()
         self._record: dict[str, Any] = {}
         self._record_stamp: object = None
         self._event_lines = NewLines(folder / EVENTS_FILE)
@@ -137,7 +140,7 @@ class OpenRun:
             RecordingError: The line cannot be read.
         """
         row = self.history.row(line)
-        return Shot(self.folder / row["file"], row)
+        return Shot(self.folder / row["file"], row, self._load)
 
     def outline(self) -> Run:
         """The run with no more of its shots than how they were judged, however many there are."""
@@ -239,6 +242,15 @@ class Catalogue:
         values = _summary(self._open.get(str(folder)) or OpenRun(folder))
         self._summaries[folder] = (stamp, values)
         return values
+
+    def warm(self) -> None:
+        """Read all runs for the list once, the newest first, at a pace that leaves room for answers."""
+        with suppress(RecordingError, OSError):
+            if (newest := self.newest()) is not None:
+                newest.history.update()
+            for folder in self.folders()[::-1]:
+                self.summary(folder)
+                time.sleep(_PAUSE_S)
 
     def search(self, text: str, status: str, first: int, most: int) -> dict[str, Any]:
         """The newest runs whose line contains all the words.

@@ -106,7 +106,7 @@ def check_packages() -> None:
     Raises:
         ConfigError: A package is missing.
     """
-    for name in ("starlette", "uvicorn"):
+    for name in ("starlette", "uvicorn", "httptools", *(() if os.name == "nt" else ("uvloop",))):
         if find_spec(name) is None:
             what = f"showing runs in a browser needs {name}, which is not installed"
             raise ConfigError(Problem(what, hint=install_hint("web")))

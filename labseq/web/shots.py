@@ -126,12 +126,11 @@ def frame_png(shot: Shot, image: int, width: int) -> tuple[bytes, int]:
     return _cached_png(shot.file, str(shot.row["sha256"]), image, min(width, MAX_SIDE))
 
 
-@lru_cache(maxsize=24)
+@lru_cache(maxsize=8)
 def _cached_png(path: Path, _sha256: str, image: int, width: int) -> tuple[bytes, int]:
-    for index, frame in iter_frames(path):
-        if index == image:
-            factor = max(1, math.ceil(max(frame.image.shape) / max(1, width)))
-            return encode_png(reduced(frame.image, factor)), factor
+    for _, frame in iter_frames(path, image):
+        factor = max(1, math.ceil(max(frame.image.shape) / max(1, width)))
+        return encode_png(reduced(frame.image, factor)), factor
     raise RecordingError(path, f"has no frame of image {image}; see 'record_frames' of the sequence")
 
 

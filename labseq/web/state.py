@@ -33,8 +33,10 @@ N_BINS: Final = 40
 """Maximum number of points of a trend."""
 _KEPT_SHOTS: Final = 50
 """Number of latest shots whose stages are summed up."""
-_OPENED: Final = (20, 3)
+_OPENED: Final = (20, 1)
 """Maximum number of new shots that are opened at first, and later at once; older ones are not."""
+_OPEN_S: Final = 0.5
+"""Minimum time between two openings: reading a shot's file takes 10 to 20 ms of the processor."""
 _SILENT_FACTOR: Final = 10
 _SILENT_S: Final = 120.0
 _LEAST_FREE: Final = 2e9
@@ -67,6 +69,9 @@ class RunState:
         self._stages: OrderedDict[tuple[int, int], tuple[StageTiming, ...]] = OrderedDict()
         self._last: dict[str, Any] | None = None
         self._n_opened = 0
+        self._opened_s = -math.inf
+        self._shot_error = ""
+        self._rows: list[dict[str, Any]] = []
         self._scan: dict[str, Any] | None = None
         self._scan_s = -math.inf
 
@@ -81,16 +86,16 @@ class RunState:
             self.run.history.update()
             self.run.read_events()
             columns = self.run.history.columns()
-            shot_error = self._open_shots(record)
+            self._open_shots(record)
             return {
                 "run": self._head(record, status, error),
                 "figures": figures_of(columns),
                 "trend": columns.trend(N_BINS),
                 "losses": losses_of(columns),
-                "stages": self._stage_rows(record),
+                "stages": self._rows,
                 "shot": self._last,
                 "scan": self._scan_now(record, status),
-                "alarms": self._alarms(record, status, error, columns, shot_error),
+                "alarms": self._alarms(record, status, error, columns),
                 "log": [log_line(one) for one in self.run.events[-12:]],
             }
 
@@ -105,10 +110,15 @@ class RunState:
             return None
         return taken_s / n_new * max(0, head["n_shots"] - head["n_done"])
 
-    def _open_shots(self, record: Mapping[str, Any]) -> str:
-        """Read the newest shots; the error if the last one cannot be read."""
+    def _open_shots(self, record: Mapping[str, Any]) -> None:
+        """Read the newest shots, unless some have just been read: a later update does it then."""
         lines = len(self.run.history)
-        failure = ""
+        if lines == self._n_opened or time.monotonic() - self._opened_s < _OPEN_S:
+            return
+        self._opened_s, self._shot_error = time.monotonic(), ""
+        if lines < self._n_opened:  # the index was replaced
+            self._stages.clear()
+            self._last, self._n_opened = None, 0
         for line in range(max(self._n_opened, lines - _OPENED[self._n_opened > 0]), lines):
             try:
                 shot = self.run.shot(line)
@@ -116,12 +126,12 @@ class RunState:
                 if line == lines - 1:
                     self._last = self._shot(shot, record)
             except RecordingError as error:
-                failure = text_of(error, 400)
-                self._last = {"error": failure}
+                self._shot_error = text_of(error, 400)
+                self._last = {"error": self._shot_error}
         self._n_opened = lines
         while len(self._stages) > _KEPT_SHOTS:
             self._stages.popitem(last=False)
-        return failure
+        self._rows = self._stage_rows(record)
 
     def _shot(self, shot: Shot, record: Mapping[str, Any]) -> dict[str, Any]:
         values = shot_values(shot, str(record.get("record_frames")))
@@ -144,7 +154,7 @@ class RunState:
         return self._scan
 
     def _alarms(
-        self, record: Mapping[str, Any], status: str, error: str, columns: Columns, shot_error: str
+        self, record: Mapping[str, Any], status: str, error: str, columns: Columns
     ) -> list[dict[str, str]]:
         found = [
             *_run_alarms(self.run, status, error, columns),
@@ -152,8 +162,8 @@ class RunState:
             *calibration_alarms(self.run.folder, record, self._limits.calibration_s),
             *disk_alarms(self.run.folder, self._limits.free_share),
         ]
-        if shot_error:
-            found.append(alarm("warning", "The last shot cannot be read", shot_error))
+        if self._shot_error:
+            found.append(alarm("warning", "The last shot cannot be read", self._shot_error))
         return found
 
     def _budget_alarms(self) -> list[dict[str, str]]:

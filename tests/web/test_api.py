@@ -118,7 +118,8 @@ def test_list_is_searched_by_name_status_and_comment(run_dir: Path, tmp_path: Pa
         assert [run["name"] for run in answers(client, f"/api/v1/runs?{query}")["runs"]] == expected
 
 
-def test_a_run_that_grows_and_one_that_is_replaced(tmp_path: Path) -> None:
+def test_a_run_that_grows_and_one_that_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq.web.state._OPEN_S", 0.0)
     writer = write_run(tmp_path, 2)
     client = client_of(tmp_path)
     path = path_of(writer.run_dir)
@@ -131,7 +132,8 @@ def test_a_run_that_grows_and_one_that_is_replaced(tmp_path: Path) -> None:
     writer.finish("failed", "no light")
     assert answers(client, f"{path}/state")["alarms"][0]["text"] == "no light"
     (writer.run_dir / "index.jsonl").write_text("")
-    assert answers(client, f"{path}/state")["run"]["n_done"] == 0
+    state = answers(client, f"{path}/state")
+    assert (state["run"]["n_done"], state["shot"], state["stages"]) == (0, None, [])
 
 
 def test_a_data_folder_that_vanishes_and_returns(run_dir: Path, tmp_path: Path, monkeypatch: Any) -> None:

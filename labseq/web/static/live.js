@@ -1,15 +1,16 @@
 // The state of a run as server-sent events. A page in the background closes its connection.
 
 export function follow(query, onState, onLink) {
-  let source = null, timer = null, closed = false, wait = 500;
+  let source = null, timer = null, closed = false, wait = 500, shot = null;
 
   function open() {
     if (closed || source || document.hidden) return;
     source = new EventSource(`/api/v1/events${query}`);
+    source.addEventListener("shot", (event) => { shot = JSON.parse(event.data); });
     source.addEventListener("state", (event) => {
       wait = 500;
       onLink(true);
-      onState(JSON.parse(event.data));
+      onState({ shot, ...JSON.parse(event.data) });
     });
     source.addEventListener("open", () => onLink(true));
     source.addEventListener("error", () => {
@@ -46,7 +47,7 @@ export function oneSlot(show) {
       if (answer.ok) show(await createImageBitmap(await answer.blob()), Number(answer.headers.get("x-reduced") ?? 1));
       else show(null, 1);
     } catch { /* the server is away; the next state asks again */ shown = ""; }
-    await new Promise((done) => setTimeout(done, 250));
+    await new Promise((done) => setTimeout(done, 500));
     isLoading = false;
     if (next) { const later = next; next = null; run(later); }
   }
