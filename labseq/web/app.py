@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import mimetypes
 import threading
 from functools import partial
@@ -38,9 +39,7 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
     """
     allowed = access or Access()
     catalogue = Catalogue(root)
-    import scipy.special  # 0.3 s that the first answer should not take
-
-    del scipy
+    importlib.import_module("scipy.special")  # 0.3 s that the first answer should not take
     threading.Thread(target=catalogue.warm, daemon=True).start()
     api = Api(catalogue, limits or Limits(), Actions(catalogue) if allowed.may_act else None)
     files = {path.name: _file(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}

@@ -38,7 +38,7 @@ class Channel:
 
     def __init__(self, read: Callable[[], dict[str, Any]]) -> None:
         self._read = read
-        self._changed = asyncio.Condition()
+        self._changed = asyncio.Event()
         self._text = self._shot = ""
         self._task: asyncio.Task[None] | None = None
         self.n_viewers = 0
@@ -58,13 +58,11 @@ class Channel:
         seen, shot_seen, is_first = 0, "", True
         try:
             while True:
-                async with self._changed:
+                if self.version == seen:
                     with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(
-                            self._changed.wait_for(lambda seen=seen: self.version > seen), HEARTBEAT_S
-                        )
-                    text, shot, is_new = self._text, self._shot, self.version > seen
-                    seen = self.version
+                        await asyncio.wait_for(self._changed.wait(), HEARTBEAT_S)
+                text, shot, is_new = self._text, self._shot, self.version > seen
+                seen = self.version
                 if not is_new:
                     yield ": still here\n\n"
                 elif not (is_first and after == _id_of(text + shot)):
@@ -81,10 +79,10 @@ class Channel:
             state = await in_thread(self._read)
             shot, text = encode(state.pop("shot", None)), encode(state)
             if (text, shot) != (self._text, self._shot):
-                async with self._changed:
-                    self._text, self._shot = text, shot
-                    self.version += 1
-                    self._changed.notify_all()
+                self._text, self._shot = text, shot
+                self.version += 1
+                self._changed.set()
+                self._changed = asyncio.Event()
             is_running = (state.get("run") or {}).get("status") == "running"
             await asyncio.sleep(POLL_S if is_running or state.get("error") else IDLE_S)
 

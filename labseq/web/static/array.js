@@ -91,6 +91,8 @@ export function drawFrame(canvas, bitmap, reduced, sites, occupancy) {
     prepared(canvas, box[3] / box[2]);
   }
   const scale = width / box[2];
+  const [a, b] = [sites?.[0]?.[0], sites?.[0]?.[1] ?? sites?.[1]?.[0]];  // neighbours
+  const radius = a && b ? Math.max(2, 0.34 * Math.hypot(a[0] - b[0], a[1] - b[1]) / reduced * scale) : 4;
   ctx.imageSmoothingEnabled = scale < 1;
   ctx.drawImage(bitmap, box[0], box[1], box[2], box[3], 0, 0, width, box[3] * scale);
   if (!sites) return;
@@ -99,7 +101,7 @@ export function drawFrame(canvas, bitmap, reduced, sites, occupancy) {
   ctx.beginPath();
   sites.forEach((row, r) => row.forEach(([y, x], c) => {
     if (occupancy[r]?.[c] !== "1") return;
-    const [px, py] = [(x / reduced + 0.5 / reduced - box[0]) * scale, (y / reduced + 0.5 / reduced - box[1]) * scale], radius = Math.max(2, 3.4 / reduced * scale);
+    const [px, py] = [(x / reduced + 0.5 / reduced - box[0]) * scale, (y / reduced + 0.5 / reduced - box[1]) * scale];
     ctx.moveTo(px + radius, py);
     ctx.arc(px, py, radius, 0, 2 * Math.PI);
   }));

@@ -109,7 +109,7 @@ function makeView(main) {
   return { update, arrays };
 }
 
-const chartHeight = () => (document.documentElement.classList.contains("wall") ? Math.round(innerHeight * 0.24) : 180);
+const chartHeight = () => (document.documentElement.classList.contains("wall") ? Math.round(innerHeight * 0.18) : 180);
 
 export function headOf(run, state) {
   const others = (state.running ?? []).filter((id) => id !== run.id);
