@@ -70,7 +70,7 @@ SETTINGS: Final = (
 
 def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimate]]:
     """Simulated and predicted, for atoms lost and shots without a defect."""
-    losses = replace(LossSpec(image=0.00314), **setting.losses)
+    losses = replace(LossSpec(image=0.00314, passing=0.0), **setting.losses)
     motion = MotionSpec(losses=losses, speed_m_s=setting.speed_m_s)
     settings = SimulationSettings.model_validate(
         {

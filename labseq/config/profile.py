@@ -410,6 +410,11 @@ class LossSettings(Settings):
         default=_LOSSES.landing,
         description="loss of an atom that stands where a tweezer without an atom is ramped down",
     )
+    passing: Annotated[Fraction, Field(lt=1)] = Field(
+        default=_LOSSES.passing,
+        description="loss of an atom that a tweezer passes in a lane, half-way between two lines of sites; "
+        "the tweezer's own atom is then lost too",
+    )
     spread: Annotated[float, Field(ge=0, le=5)] = Field(
         default=_LOSSES.spread,
         description="spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor "

@@ -88,6 +88,8 @@ class LossSpec:
         tone: Added to it for each tone on beyond one per axis.
         distance_per_m: Added to it per metre of the way.
         landing: Loss of an atom that stands where a tweezer without an atom is ramped down.
+        passing: Loss of an atom that a tweezer passes in a lane, half-way between two lines of sites; the
+            tweezer's own atom is then lost too (ours: simulated for the paper's lattice and depths at 15 uK).
         spread: Spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor with
             mean 1, common to all atoms.
         image: Loss of an atom by one image (the paper's, 0.45 %), beyond that of the moves.
@@ -98,12 +100,13 @@ class LossSpec:
     tone: float = 0.0
     distance_per_m: float = 0.0
     landing: float = 0.0
+    passing: float = 0.0027
     spread: float = 0.5
     image: float = 0.0045
     lifetime_s: float = 33.0
 
     def __post_init__(self) -> None:
-        if any(not 0 <= loss < 1 for loss in (self.move, self.tone, self.landing, self.image)):
+        if any(not 0 <= loss < 1 for loss in (self.move, self.tone, self.landing, self.passing, self.image)):
             raise ValueError("a loss is a probability from 0 to below 1")
         if not (0 <= self.distance_per_m < math.inf and 0 <= self.spread < math.inf):
             raise ValueError("the loss per metre and the spread of losses cannot be negative")

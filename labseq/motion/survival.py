@@ -5,12 +5,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.model import Batch, LossSpec, MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
+from labseq.model import (
+    Batch,
+    LossSpec,
+    MotionSpec,
+    Occupancy,
+    Plan,
+    PlanReport,
+    SiteGrid,
+    TargetPattern,
+    TonePaths,
+)
 
 Floats = NDArray[np.float64]
 
@@ -27,14 +38,18 @@ class Survival:
         n_lost: Expected number of atoms lost until then, over the whole grid.
         n_lost_moved: Those of them lost by moves.
         n_lost_landing: Those lost because an empty tweezer was ramped down on them.
+        n_lost_passing: Those lost because a tweezer passed them, or because it took such an atom along.
         n_landings: Empty tweezers that are ramped down on an atom.
+        n_passes: How often a tweezer passes a standing atom in a lane.
     """
 
     p_defect_free: float
     n_lost: float
     n_lost_moved: float
     n_lost_landing: float
+    n_lost_passing: float
     n_landings: int
+    n_passes: int
 
 
 def predict_survival(
@@ -74,24 +89,24 @@ def predict_survival(
         0.9
     """
     losses = motion.losses
-    moved, landed, n_landings = _hazards(plan, np.asarray(occupancy, np.bool_), grid, losses)
+    hazards, n_landings, n_passes = _hazards(plan, np.asarray(occupancy, np.bool_), grid, losses)
     duration_s = report.duration_s + wait_s
     standing = duration_s / losses.lifetime_s - math.log1p(-losses.image)
     factors, weights = _factors(losses.spread)
-    kept = np.exp(-np.multiply.outer(factors, moved + landed))
-    atoms = report.predicted
-    n_lost_here = weights @ (1.0 - math.exp(-standing) * kept[:, atoms]).sum(axis=1)
-    by_moves = weights @ (1.0 - np.exp(-np.multiply.outer(factors, moved[atoms]))).sum(axis=1)
-    by_landing = weights @ (1.0 - np.exp(-np.multiply.outer(factors, landed[atoms]))).sum(axis=1)
-    wanted = target.fill
-    chance = weights @ np.exp(-factors * (moved + landed)[wanted].sum())
-    chance *= math.exp(-standing * np.count_nonzero(wanted))
+    total = hazards.sum(axis=0)
+    kept = np.exp(-np.multiply.outer(factors, total[report.predicted]))
+    by_cause = [
+        float(weights @ -np.expm1(-np.multiply.outer(factors, cause[report.predicted])).sum(axis=1))
+        for cause in hazards
+    ]
+    chance = weights @ np.exp(-factors * total[target.fill].sum())
+    chance *= math.exp(-standing * target.n_atoms)
     return Survival(
-        p_defect_free=float(chance) if report.n_defects == 0 else 0.0,
-        n_lost=float(n_lost_here),
-        n_lost_moved=float(by_moves),
-        n_lost_landing=float(by_landing),
+        float(chance) if report.n_defects == 0 else 0.0,
+        float(weights @ (1.0 - math.exp(-standing) * kept).sum(axis=1)),
+        *by_cause,
         n_landings=n_landings,
+        n_passes=n_passes,
     )
 
 
@@ -104,25 +119,36 @@ def _factors(spread: float) -> tuple[Floats, Floats]:
     return np.exp(spread * nodes - spread**2 / 2), weights / weights.sum()
 
 
-def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) -> tuple[Floats, Floats, int]:
-    """Hazards of the atom that ends on each site, by moves and by landings, and the number of landings."""
-    moved, landed = np.zeros(grid.shape), np.zeros(grid.shape)
-    atoms, n_landings = occupied.copy(), 0
+MOVED, LANDED, PASSED = range(3)
+"""Causes of the hazards."""
+
+
+def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) -> tuple[Floats, int, int]:
+    """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
+    hazards = np.zeros((3, *grid.shape))
+    atoms, n_landings, n_passes = occupied.copy(), 0, 0
     for batch in plan.batches:
         row, col = batch.from_sites.T
-        before = np.stack([moved[row, col], landed[row, col]])
-        before[0] += _batch_hazard(batch, grid, losses)
+        before = hazards[:, row, col]
+        before[MOVED] += _batch_hazard(batch, grid, losses)
         atoms[row, col] = False
-        moved[row, col] = landed[row, col] = 0.0
-        for at in _landings(batch, atoms):
-            landed[at] -= math.log1p(-losses.landing)
-            n_landings += 1
+        hazards[:, row, col] = 0.0
+        if batch.tones is not None:
+            for at in _landings(batch, batch.tones, atoms):
+                hazards[LANDED][at] -= math.log1p(-losses.landing)
+                n_landings += 1
+            if losses.passing > 0:
+                passes = _passes(batch.tones, atoms, grid)
+                hazard, tones = -math.log1p(-losses.passing), batch.tones.tones_of(batch.from_sites)
+                hazards[PASSED][atoms] += hazard * passes.sum(axis=(0, 1))
+                before[PASSED] += hazard * passes.sum(axis=2)[tones[:, 0], tones[:, 1]]
+                n_passes += int(passes.sum())
         to_row, to_col = batch.to_sites.T
         stays = (to_row >= 0) & (to_row < grid.n_rows) & (to_col >= 0) & (to_col < grid.n_cols)
         goal = to_row[stays], to_col[stays]
         atoms[goal] = True
-        moved[goal], landed[goal] = before[:, stays]
-    return moved, landed, n_landings
+        hazards[:, *goal] = before[:, stays]
+    return hazards, n_landings, n_passes
 
 
 def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
@@ -145,11 +171,9 @@ def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
     return -np.log1p(-loss)
 
 
-def _landings(batch: Batch, atoms: Occupancy) -> list[tuple[int, int]]:
+def _landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[int, int]]:
     """Sites of atoms that stand where an empty tweezer of a batch is ramped down."""
-    if batch.tones is None:
-        return []
-    paths, found = batch.tones, list[tuple[int, int]]()
+    found: list[tuple[int, int]] = []
     carried = {(int(i), int(j)) for i, j in paths.tones_of(batch.from_sites)}
     for i, row_off in enumerate(paths.row_off.tolist()):
         for j, column_off in enumerate(paths.column_off.tolist()):
@@ -161,3 +185,27 @@ def _landings(batch: Batch, atoms: Occupancy) -> list[tuple[int, int]]:
             if atoms[int(row), int(col)]:
                 found.append((int(row), int(col)))
     return found
+
+
+BESIDE: Final = 0.6
+"""A tweezer passes an atom if it comes closer than this part of the grid's spacing: a lane is at most 0.5."""
+
+
+def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> NDArray[np.bool_]:
+    """Which crossings pass which standing atoms in a lane, bool (n_row_tones, n_column_tones, n_atoms)."""
+    a1, a2 = grid.axes
+    row, col = np.nonzero(atoms)
+    sites = row[:, None] * a2 + col[:, None] * a1
+    place = paths.row[:, :, None, None] * a2 + paths.column[:, None, :, None] * a1
+    passed = np.zeros((*place.shape[1:3], len(row)), np.bool_)
+    off = np.minimum.outer(paths.row_off, paths.column_off)
+    for knot, (start, end) in enumerate(pairwise(place)):
+        way = end - start
+        square = (way**2).sum(axis=2)
+        apart = sites - start[:, :, None]
+        along = (apart * way[:, :, None]).sum(axis=3) / np.where(square > 0, square, 1.0)[..., None]
+        nearest = apart - np.clip(along, 0.0, 1.0)[..., None] * way[:, :, None]
+        near = (nearest**2).sum(axis=3) < (BESIDE * grid.spacing_m) ** 2
+        on_site = (nearest**2).sum(axis=3) < (0.1 * grid.spacing_m) ** 2  # it ends there: a landing
+        passed |= near & ~on_site & (off > knot)[..., None] & (square > 0)[..., None]
+    return passed

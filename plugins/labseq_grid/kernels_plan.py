@@ -30,6 +30,7 @@ from labseq_grid.kernels_rows import (
     N_KEPT,
     N_ROWS,
     ORIENTATION,
+    SLACK,
     TO,
     try_rows,
 )
@@ -37,6 +38,8 @@ from labseq_grid.kernels_rows import (
 UNWANTED: Final = 3
 """An atom on a site that must be empty; elsewhere an atom is SPARE or STAYS."""
 SCATTER: Final = 3.0
+WAY: Final = 0.05
+"""Weight of one site of an atom's way: on long ways tweezers pass many atoms."""
 """Weight of the vacancies that are left, against one atom carried."""
 GRID: Final = const("bool_", 2)
 LIMITS: Final = "UniTuple(int64, 3)"
@@ -136,7 +139,7 @@ def scatter(marks: Bytes) -> float:
 
 @helper_kernel(f"float64({SITES}, {TABLE}, int64, boolean, {SITES})")
 def worth(kind: Bytes, moves: Ints, n: int, fills: bool, marks: Bytes) -> float:
-    """Worth of a batch of ``n`` moves: atoms carried, less how scattered those are that are left.
+    """Worth of a batch of ``n`` moves: atoms carried, less ways and the scatter of what is left.
 
     ``marks`` is changed: the vacancies left if the batch ``fills``, else the unwanted atoms left.
     """
@@ -145,7 +148,10 @@ def worth(kind: Bytes, moves: Ints, n: int, fills: bool, marks: Bytes) -> float:
         total += kind[moves[i, 0], moves[i, 1]] == UNWANTED
         side = 2 if fills else 0
         marks[moves[i, side], moves[i, side + 1]] = 0
-    return total - SCATTER * scatter(marks)
+    way = 0
+    for i in range(n):
+        way += abs(moves[i, 2] - moves[i, 0]) + abs(moves[i, 3] - moves[i, 1])
+    return total - SCATTER * scatter(marks) - WAY * way
 
 
 Growing = tuple[NDArray[np.int16], NDArray[np.int32], NDArray[np.int32], Floats, NDArray[np.int32]]
@@ -273,7 +279,7 @@ def add_batches(
             n_kept = find_candidates(source, vacant, limits, slots, n_left, kept, n_beside)
             source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
             for i in range(n_kept):
-                if kept[i, ATOMS] < kept[0, ATOMS] - 1:
+                if kept[i, ATOMS] < kept[0, ATOMS] - SLACK:
                     break
                 swapped = kept[i, ORIENTATION]
                 n_lines = kind.shape[0 if swapped else 1] + 2 * (slots - n_beside) - 1

@@ -35,9 +35,9 @@ GOAL_ROWS: Final = 22
 """Number of goal rows that are considered for three rows; for two rows three times as many."""
 TRIALS: Final = 100
 """Maximum number of pairs of choices that are tried for each number of rows."""
-N_KEPT: Final = 8
+N_KEPT: Final = 16
 """Number of candidates that are kept."""
-SLACK: Final = 1
+SLACK: Final = 2
 """A candidate is kept if it carries at most so many atoms fewer than the best."""
 
 ATOMS: Final = 0

@@ -122,7 +122,7 @@ CHANGES: dict[str, Any] = {
     "column_amplitudes": ["5 %", 0.1],
     "phases": "low_crest",
     "snap_within": "5 nm",
-    **dict.fromkeys(("move", "tone", "landing", "image", "spread"), 0.25),
+    **dict.fromkeys(("move", "tone", "landing", "passing", "image", "spread"), 0.25),
 }
 
 

@@ -1,0 +1,89 @@
+"""How often a tweezer that passes in a lane takes an atom that stands beside it: the table of its page.
+
+    python docs/make_passes.py [--atoms 20000]
+
+The command replaces the part of ``docs/explanation/grid-planner.md`` between ``<!-- measured: passes -->``
+and ``<!-- end -->``. Atoms move by Newton's law in the light of a static tweezer and of a mobile one that
+passes at constant speed, as in the simulation of played samples (``labseq_virtual.flight``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from itertools import product
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from labseq_virtual.flight import KELVIN, STEP_S, draw_atoms
+from labseq_virtual.flight_kernels import N_COLUMNS, energies, follow_atoms
+from labseq_virtual.settings import SimulationSettings
+
+from labseq.model import MotionSpec
+
+PAGE: Final = Path(__file__).parent / "explanation" / "grid-planner.md"
+FRAME_S: Final = 0.5e-6
+"""Time between two points of a path, in seconds."""
+GROUP: Final = 100
+"""Atoms followed together, each in a static tweezer of its own, APART_M from the next."""
+APART_M: Final = 30e-6
+REACH_M: Final = 6e-6
+"""How far from the atom the tweezer comes on and goes off, along its way."""
+STATIC: Final = SimulationSettings()
+LANES_M: Final = {"triangular": 1.944e-6, "square": 2.245e-6}
+"""Half the distance of two rows of 4.49 um, by lattice."""
+DEPTHS_K: Final = (2.1e-3, 1.6e-3, 1.3e-3, 1.0e-3, 0.7e-3)
+TEMPERATURES_K: Final = (15e-6, 5e-6)
+
+
+def n_taken(lane_m: float, depth_k: float, temperature_k: float, rng: np.random.Generator) -> int:
+    """Let a tweezer pass each of a group of atoms once; count those that their static tweezer loses."""
+    waists = np.array([STATIC.static_waist, STATIC.mobile_light.waist])
+    rayleigh = math.pi * waists**2 / [STATIC.static_wavelength, STATIC.mobile_light.wavelength]
+    beams = np.array([waists[0], rayleigh[0], waists[1], rayleigh[1]])
+    depth = np.full(GROUP, KELVIN * STATIC.static_depth)
+    state = draw_atoms(depth, KELVIN * temperature_k, beams[0], beams[1], rng)
+    sites = np.zeros((GROUP, 2))
+    sites[:, 0] = APART_M * np.arange(GROUP)
+    state[:, :2] += sites
+    down, right = np.array([0.0, REACH_M]), np.array([APART_M, 0.0])
+    plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
+    n_frames = round(2 * REACH_M / MotionSpec().speed_m_s / FRAME_S)
+    rows = np.linspace(1.0, -1.0, n_frames + 1)[:, None].copy()
+    columns = np.tile(np.arange(float(GROUP)) + lane_m / APART_M, (n_frames + 1, 1))
+    alive, record = np.ones(GROUP, np.bool_), np.full((GROUP, N_COLUMNS), np.nan)
+    follow_atoms(
+        state, alive, record, rows, np.ones_like(rows), columns, np.ones_like(columns),
+        FRAME_S * np.arange(n_frames + 1, dtype=np.float64), depth[None], KELVIN * depth_k,
+        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S),
+    )  # fmt: skip
+    kept = alive & (energies(state, sites, depth, beams[0], beams[1]) < 0)
+    return int(np.count_nonzero(~kept))
+
+
+def main() -> None:
+    """Write the table into the page."""
+    parser = argparse.ArgumentParser(description="Measure what passing tweezers take along.")
+    parser.add_argument("--atoms", type=int, default=20_000, help="atoms for each row of the table")
+    n_groups = math.ceil(parser.parse_args().atoms / GROUP)
+    lines = ["| lane | atoms at | mobile tweezers | taken per pass |", "| --- | --- | --- | --- |"]
+    for (lattice, lane_m), kelvin, depth_k in product(LANES_M.items(), TEMPERATURES_K, DEPTHS_K):
+        rng = np.random.default_rng(1)
+        n = n_groups * GROUP
+        taken = sum(n_taken(lane_m, depth_k, kelvin, rng) for _ in range(n_groups)) / n
+        error = math.sqrt(max(taken * (1 - taken), 1 / n) / n)
+        lane = f"{lattice}, {1e6 * lane_m:.3f} µm | {1e6 * kelvin:g} µK | {1e3 * depth_k:g} mK"
+        lines.append(f"| {lane} | {100 * taken:.3f}({100 * error:.3f}) % |")
+        sys.stdout.write(lines[-1] + "\n")
+        sys.stdout.flush()
+    text = PAGE.read_text(encoding="utf-8")
+    part = re.compile(r"(?<=<!-- measured: passes -->\n).*?(?=<!-- end -->)", re.DOTALL)
+    body = "\n".join(["", *lines, "", ""])
+    PAGE.write_text(part.sub(lambda _: body, text), encoding="utf-8", newline="\n")
+
+
+if __name__ == "__main__":
+    main()
