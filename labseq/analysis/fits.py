@@ -103,6 +103,58 @@ def _guess_linear(x: Floats, y: Floats) -> dict[str, float]:
     return {"slope": float(slope), "intercept": float(intercept)}
 
 
+def _saturation(x: Floats, level: float, time: float) -> Floats:
+    return level * (1 - np.exp(-x / time))
+
+
+def _guess_saturation(x: Floats, y: Floats) -> dict[str, float]:
+    level = float(y.max())
+    rises = x[np.argmax(y >= 0.63 * level)]
+    return {"level": level, "time": float(rises) or float(np.ptp(x)) / 3}
+
+
+def _step(x: Floats, before: float, after: float, centre: float, width: float) -> Floats:
+    from scipy.special import ndtr
+
+    return before + (after - before) * ndtr((x - centre) / width)
+
+
+def _guess_step(x: Floats, y: Floats) -> dict[str, float]:
+    centre = float(np.interp(0.0, *_rising((y[0] + y[-1]) / 2 - y, x)))
+    return {"before": float(y[0]), "after": float(y[-1]), "centre": centre, "width": float(np.ptp(x)) / 8}
+
+
+def _rising(y: Floats, x: Floats) -> tuple[Floats, Floats]:
+    order = np.argsort(y)
+    return y[order], x[order]
+
+
+LOWERING: Final = (1.6, 0.56)
+"""Scale and exponent of the energy up to which a ramp keeps atoms, relative to the depth before."""
+
+
+def _lowering(x: Floats, temperature: float, amplitude: float, depth: float) -> Floats:
+    """Fraction of atoms that stay in a tweezer whose depth is slowly reduced to a fraction x.
+
+    An adiabatic ramp keeps atoms below an energy that goes as a power of the depth; scale and exponent
+    describe atoms moved by Newton's equations in a Gaussian beam (``labseq_virtual.response_tables``).
+    Energies are distributed as in a harmonic well.
+
+    Args:
+        x: Depths at the end, as fractions of the one before.
+        temperature: Temperature before, in K.
+        amplitude: Fraction that stays if x is large.
+        depth: Depth before, in K.
+    """
+    energy = LOWERING[0] * depth / temperature * x ** LOWERING[1]
+    return amplitude * (1 - np.exp(-energy) * (1 + energy + energy**2 / 2))
+
+
+def _guess_lowering(x: Floats, y: Floats) -> dict[str, float]:
+    del x
+    return {"temperature": 20e-6, "amplitude": float(y.max())}
+
+
 @cache
 def _draws() -> Floats:
     """Standard normal positions and velocities of atoms, float64 (6, n): the same ones every time."""
@@ -182,6 +234,30 @@ MODELS: Final[Mapping[str, FitModel]] = {
     ),
     "linear": FitModel(
         "slope x + intercept", {"slope": "y/x", "intercept": "y"}, _linear, _guess_linear, {}, {}
+    ),
+    "saturation": FitModel(
+        "level (1 - exp(-x / time))",
+        {"level": "y", "time": "x"},
+        _saturation,
+        _guess_saturation,
+        {},
+        {"time": 0.0},
+    ),
+    "step": FitModel(
+        "from before to after at centre, as the integral of a Gaussian of s.d. width",
+        {"before": "y", "after": "y", "centre": "x", "width": "x"},
+        _step,
+        _guess_step,
+        {},
+        {"width": 1e-12},
+    ),
+    "lowering": FitModel(
+        "atoms that stay when the depth is slowly reduced to a fraction x",
+        {"temperature": "K", "amplitude": "y", "depth": "K"},
+        _lowering,
+        _guess_lowering,
+        {"depth": math.nan},
+        {"temperature": 1e-9, "amplitude": 0.0},
     ),
     "release_recapture": FitModel(
         "recapture of atoms after a free flight of duration x",

@@ -78,6 +78,10 @@ class Simulation(ABC):
         """(height, width) in pixels of the sensor that frames come from; also before ``open()``."""
         raise NotImplementedError("this simulation does not describe its sensor")
 
+    def warnings(self) -> Sequence[str]:
+        """What ``labseq check`` and a run warn of, such as settings beyond the range of the model."""
+        return ()
+
     def readout_fraction(self, mode: SensorMode) -> float:
         """Time to read a frame, relative to that of the whole sensor without binning."""
         del mode

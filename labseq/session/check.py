@@ -381,8 +381,8 @@ def _warnings(points: _Points, each: Mapping[int, Point]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
     found: dict[Any, tuple[Problem, list[int]]] = {}
     is_adaptive = points.session.scan_run.is_adaptive
-    judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings, _device_warnings
-    for judge in judges:
+    judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings
+    for judge in (*judges, _device_warnings, _simulation_warnings):
         for n, point in each.items():
             if n and is_adaptive and judge is _window_warnings:
                 continue  # the search is there to find out about the corners
@@ -532,6 +532,14 @@ def _deadline_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Pro
             loc = (*points.session.assembly.sequence.shot[number].loc, "for")
             hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
             yield number, point.document.problem(loc, what, hint=hint)
+
+
+def _simulation_warnings(points: _Points, point: Point) -> Iterator[tuple[str, Problem]]:
+    """What the simulation warns of."""
+    simulation = points.lab(point).simulation
+    if simulation is not None and offers(simulation, "warnings"):
+        for text in points.guard.call("simulation", WARM_S, simulation.warnings):
+            yield text, Problem(text)
 
 
 def _device_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:  # noqa: ARG001

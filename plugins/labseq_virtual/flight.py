@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
-from labseq_virtual.handover import full_amplitudes
+from labseq_virtual.handover import KELVIN, full_amplitudes
 from labseq_virtual.jumps import JUMPS, find_jumps
 from labseq_virtual.rf_analysis import (
     WINDOW,
@@ -38,7 +38,7 @@ PROPOSALS: Final = 32
 
 
 def draw_atoms(
-    depth: Floats, temperature: float, waist: float, rayleigh: float, rng: np.random.Generator
+    depth: Floats, temperature: float | Floats, waist: float, rayleigh: float, rng: np.random.Generator
 ) -> Floats:
     """Draw atoms from the Boltzmann distribution in a Gaussian beam, restricted to bound atoms.
 
@@ -50,7 +50,7 @@ def draw_atoms(
 
     Args:
         depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
-        temperature: kT per mass.
+        temperature: kT per mass, of all or of each atom.
         waist: 1/e^2 radius of the intensity.
         rayleigh: Rayleigh length.
         rng: Random numbers.
@@ -90,11 +90,6 @@ def draw_atoms(
 
 
 Mask = NDArray[np.bool_]
-
-BOLTZMANN: Final = 1.380649e-23
-RB87_KG: Final = 86.909180531 * 1.66053906660e-27
-KELVIN: Final = BOLTZMANN / RB87_KG
-"""m^2/s^2 per kelvin: energies here are per mass of 87Rb (AME2020, CODATA 2018)."""
 
 STEP_S: Final = 0.1e-6
 """Step of the integration, in seconds: a seventieth of a period in a tweezer of 2.1 mK."""
@@ -200,7 +195,14 @@ class RfTransport:
         return {"flights": flights.view(FLIGHTS), "jumps": jumps.view(JUMPS)}  # with their descriptions
 
     def carry(
-        self, occupied: Mask, pulse: RfPulse, depth: Floats, rng: np.random.Generator, loss_factor: float
+        self,
+        occupied: Mask,
+        pulse: RfPulse,
+        depth: Floats,
+        rng: np.random.Generator,
+        loss_factor: float,
+        thermal: Floats | None = None,
+        relax: Callable[[Floats, Floats], Floats] = lambda heat, _elapsed_s: heat,
     ) -> Counter[str]:
         """Move the atoms in the light of a pulse.
 
@@ -210,13 +212,22 @@ class RfTransport:
             depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
             rng: Random numbers of the shot.
             loss_factor: The shot's factor on the transport loss.
+            thermal: float64 (2, n_rows, n_cols), temperatures of the atoms, as they would be at the nominal
+                depth, and the times that they belong to; changed in place. By default that of the settings.
+            relax: Temperatures after a time without moves, in s.
 
         Returns:
             Number of atoms lost by each cause: hand_over, transport, collision, ejected.
         """
         lost: Counter[str] = Counter()
-        for tones, t_s in self._find_tones(pulse):
-            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor)
+        if thermal is None:
+            thermal = np.stack(
+                [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
+            )
+        for tones, t_s in self.find_tones(pulse):
+            thermal[0] = relax(thermal[0], np.maximum(0.0, t_s[0] - thermal[1]))
+            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor, thermal[0])
+            thermal[1] = t_s[-1]
         return lost
 
     def _carry_batch(
@@ -227,6 +238,7 @@ class RfTransport:
         depth: Floats,
         rng: np.random.Generator,
         loss_factor: float,
+        heat: Floats,
     ) -> Counter[str]:
         from labseq_virtual.flight_kernels import (
             COLLIDED,
@@ -241,7 +253,7 @@ class RfTransport:
         rows, row_depth, cols, col_depth = tones
         row, col = np.nonzero(occupied & self._near(rows, cols) & (depth > 0))
         static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
-        kt = KELVIN * self._settings.temperature
+        kt = KELVIN * heat[row, col] * np.sqrt(depth[row, col])
         state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
         state[:, :2] += self._grid.positions_m[row, col]
         alive = np.ones(len(row), np.bool_)
@@ -252,7 +264,8 @@ class RfTransport:
             state, alive, record, rows, row_depth, cols, col_depth, t_s,
             static, full, self._plane, self._beams, n_steps,
         )  # fmt: skip
-        to_row, to_col, bound = self._arrivals(state, static)
+        to_row, to_col, energy = self._arrivals(state, static)
+        bound = energy < 0
         held = ~np.isnan(record[:, HELD_S])
         flights = np.zeros(len(row), FLIGHTS)
         flights["held_s"], flights["offset_m"] = record[:, HELD_S], record[:, OFFSET]
@@ -267,10 +280,13 @@ class RfTransport:
         kept = flights["fate"] == b"kept"
         occupied[row, col] = False
         occupied[to_row[kept], to_col[kept]] = True
+        moved = kept & held
+        at = to_row[moved], to_col[moved]
+        heat[at] = (energy[moved] + static[at]) / 3 / KELVIN / np.sqrt(depth[at])
         self._flights.append(flights[held | ~kept])
         return Counter(fate.decode() for fate in flights["fate"][~kept].tolist())
 
-    def _find_tones(self, pulse: RfPulse) -> Iterator[tuple[tuple[Floats, ...], Floats]]:
+    def find_tones(self, pulse: RfPulse) -> Iterator[tuple[tuple[Floats, ...], Floats]]:
         """Positions (in sites) and depth factors of row and column tones, and the times of the frames.
 
         Those of one batch after the other: batches without a pause are told apart by the dark between them.
@@ -303,8 +319,8 @@ class RfTransport:
         n_rows, n_cols = self._grid.shape
         return _lines(rows, n_rows).T.astype(np.float32) @ _lines(cols, n_cols).astype(np.float32) > 0
 
-    def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
-        """Row and column of the site nearest to each atom (-1: beyond the grid), and if it binds the atom."""
+    def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+        """Row, column of the site nearest to each atom, its energy there; -1 and inf beyond the grid."""
         from labseq_virtual.flight_kernels import energies
 
         waist, rayleigh = self._beams[:2]
@@ -312,8 +328,8 @@ class RfTransport:
         inside = ((place >= 0) & (place < self._grid.shape)).all(axis=1)
         row, col = np.where(inside[:, None], place, 0).T
         sites = self._grid.positions_m[row, col]
-        bound = inside & (energies(state, sites, static[row, col], waist, rayleigh) < 0)
-        return np.where(inside, row, -1), np.where(inside, col, -1), bound
+        energy = np.where(inside, energies(state, sites, static[row, col], waist, rayleigh), np.inf)
+        return np.where(inside, row, -1), np.where(inside, col, -1), energy
 
     def _assign_fates(
         self, flights: NDArray[Any], alive: Mask, paired: Mask, bound: Mask, unlucky: Mask, end_s: float

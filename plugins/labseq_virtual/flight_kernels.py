@@ -283,3 +283,39 @@ def follow_atoms(
                     alive[i] = alive[j] = False
                     record_loss(state[i], plane, record[i], t_s[k + 1], 1.0)
                     record_loss(state[j], plane, record[j], t_s[k + 1], 1.0)
+
+
+@kernel(f"void(float64[:, ::1], {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, float64, int64)")
+def follow_in_row(
+    state: Floats,
+    static: Floats,
+    mobile: Floats,
+    place: Floats,
+    spacing: float,
+    beams: Floats,
+    frame_s: float,
+    n_steps: int,
+) -> None:
+    """Follow atoms, each alone, in a row of static tweezers along x and one mobile tweezer on that line.
+
+    Args:
+        state: The atoms, (n_atoms, 6); changed in place. Those that are far away stop.
+        static: Depth of the static tweezers in each frame (n_frames,).
+        mobile: Depth of the mobile tweezer, likewise.
+        place: Its position, likewise.
+        spacing: Distance of the static tweezers.
+        beams: The beams.
+        frame_s: Time from frame to frame.
+        n_steps: Integration steps from frame to frame.
+    """
+    site, tweezer = np.zeros(2), np.zeros(9)
+    for i in range(len(state)):
+        for k in range(len(static) - 1):
+            atom = state[i]
+            site[0] = spacing * round(atom[0] / spacing)
+            tweezer[0], tweezer[2] = place[k], place[k + 1] - place[k]
+            tweezer[4], tweezer[5], tweezer[7] = 1.0, 1.0, mobile[k]
+            tweezer[8] = mobile[k + 1] - mobile[k]
+            move(atom, site, 0.5 * (static[k] + static[k + 1]), tweezer, beams, frame_s, n_steps)
+            if abs(atom[2]) > 2.0 * HIGH * beams[1] or abs(atom[1]) > 4.0 * GONE * beams[0]:
+                break

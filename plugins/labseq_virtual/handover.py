@@ -6,12 +6,10 @@ those of ``settings.py``. Energies are in kelvin. The formulas are in ``transpor
 1. *Pick-up.* A static well of depth U_s and waist w_s and a mobile one of U_m and w_m at a distance d form
    one well as long as d is below :func:`merging_distance`. Then the atom follows the mobile tweezer if
    that is the deeper one; otherwise it stays.
-2. *Drop-off.* In a slow ramp an atom follows its well back; where the wells separate in between (distances
-   above about a waist) it falls from one into the other and gains energy: :data:`SLOW`. In a sudden one it
-   has the kinetic energy of an atom compressed by the deeper well, kT sqrt(1 + U_m / U_s), in addition to
-   the potential energy U_s (1 - exp(-2 d^2 / w_s^2)) at its position; it is lost if the sum exceeds U_s. A
-   ramp of duration t counts as sudden with weight exp(-(t / 25 us)^2). All of this was checked against
-   atoms moved by Newton's equations (``flight.py``).
+2. *Heat.* Atoms have a temperature. What pick-up, transport and drop-off do to it, and the atoms that they
+   lose, is taken from tables made by moving atoms by Newton's equations (``responses.py``): it depends on the
+   ramps, on the distance between both tweezers, on their depths, on the speed and its course. Between moves
+   atoms are cooled, or the noise of the intensity heats them.
 3. *Hand-over loss.* Pick-up and drop-off together lose ``transport_loss`` at the nominal depths. The loss
    is proportional to U_m / U_s: the deeper the mobile tweezer is relative to the static one, the less
    adiabatic the change (the paper observes this and gives no formula).
@@ -35,20 +33,13 @@ from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
 
+KELVIN: Final = 1.380649e-23 / (86.909180531 * 1.66053906660e-27)
+"""m^2/s^2 per kelvin: energies per mass of 87Rb (AME2020, CODATA 2018)."""
+
 REFERENCE_SPEED_M_S: Final = 0.13
 """Speed that the setting ``adiabatic_depth`` belongs to: the paper's."""
 REFERENCE_TONES: Final = 19
 """Further tones that the setting ``intermodulation`` belongs to: the paper measured it on 20 tweezers."""
-SUDDEN_S: Final = 25e-6
-"""Duration of a drop-off between sudden and slow, in seconds: 1.4 periods in a static tweezer of 300 uK."""
-SLOW: Final = np.array(
-    [
-        [0.0, 0.82, 0.92, 1.02, 1.12, 1.22, 1.33, 1.43, 1.53, 1.63, 1.84],
-        [0.0, 0.003, 0.018, 0.13, 0.25, 0.25, 0.23, 0.33, 0.54, 0.72, 1.0],
-    ]
-)
-"""Loss by slow pick-up and drop-off, against the distance in waists: 400 atoms each at 15 uK, moved by
-Newton's law in tweezers of 0.3 and 2.1 mK with ramps of 60 us. Further out nothing is picked up."""
 (
     SPACING,
     SKEW,
@@ -63,7 +54,9 @@ Newton's law in tweezers of 0.3 and 2.1 mK with ramps of 60 us. Further out noth
     INTERMODULATION,
     ADIABATIC_DEPTH,
     SHALLOW_LOSS,
-) = range(13)
+    COOLING_HZ,
+    NOISE_HZ,
+) = range(15)
 """Indices of the constants in the array that the kernels take."""
 
 
@@ -92,8 +85,18 @@ def merging_distance(static_waist_m: float, mobile_waist_m: float) -> tuple[Floa
     return log_ratio, merged
 
 
+def noise_hz(settings: SimulationSettings) -> float:
+    """Rate at which noise of the intensity heats an atom in a static tweezer of nominal depth.
+
+    ``pi^2 nu^2 S(2 nu)`` (T. Savard, K. O'Hara, J. Thomas, Phys. Rev. A 56, R1095, 1997), mean over the axes:
+    the radial ones count.
+    """
+    stiffness = 4 * KELVIN * settings.static_depth / settings.static_waist**2
+    return 2 / 3 * stiffness / 4 * settings.intensity_noise
+
+
 def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
-    """The constants for the kernels, float64 (13,), in the order of the names above, in SI."""
+    """The constants for the kernels, float64 (15,), in the order of the names above, in SI."""
     a1, a2 = grid.axes
     light = settings.mobile_light
     named = {
@@ -110,6 +113,8 @@ def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
         INTERMODULATION: light.intermodulation,
         ADIABATIC_DEPTH: light.adiabatic_depth,
         SHALLOW_LOSS: light.shallow_loss,
+        COOLING_HZ: 1 / settings.cooling_time,
+        NOISE_HZ: noise_hz(settings),
     }
     return np.array([named[place] for place in range(len(named))])
 

@@ -233,6 +233,23 @@ NonNegativeLength = Annotated[Length, Field(ge=0)]
 NonNegativeTemperature = Annotated[Temperature, Field(ge=0)]
 
 
+class ToneComb(Settings):
+    """True frequencies of the tones that put tweezers onto the rows or columns."""
+
+    centre: Annotated[Frequency, Field(gt=0)] = Field(
+        default=100e6, description="frequency of the grid's centre (ours)"
+    )
+    step: Frequency = Field(
+        default=1.6e6, description="frequency from one row or column to the next; negative if it falls (ours)"
+    )
+
+    @model_validator(mode="after")
+    def _has_step(self) -> Self:
+        if self.step == 0:
+            raise ValueError("step is 0; expected a frequency other than 0")
+        return self
+
+
 class MobileLightSettings(Settings):
     """The light of the mobile tweezers."""
 
@@ -257,6 +274,12 @@ class MobileLightSettings(Settings):
         description="relative s.d. of the depth that each row's and each column's tone gives at the "
         "profile's amplitude, fixed for a seed: what a calibration of amplitudes can equalise (ours)",
     )
+    row_tones: ToneComb | None = Field(
+        default=None,
+        description="which tones the machine really needs for its rows, whatever the profile believes; none: "
+        "those of the profile's grid (ours)",
+    )
+    column_tones: ToneComb | None = Field(default=None, description="the same for its columns (ours)")
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),
         description="[along a row, from row to row]: displacement of the mobile tweezers from the sites that "
@@ -377,6 +400,20 @@ class SimulationSettings(Settings):
         default=15e-6,
         description="temperature of the atoms in the static tweezers, at most half of `static_depth` (ours: "
         "typical of gray molasses)",
+    )
+    imaging_temperature: PositiveTemperature | None = Field(
+        default=None,
+        description="temperature of the atoms after an exposure; none: `temperature` (ours: the light "
+        "cools, too)",
+    )
+    cooling_time: PositiveDuration = Field(
+        default=1e-3,
+        description="time constant with which the cooling light brings atoms back to `temperature` (ours)",
+    )
+    intensity_noise: NonNegativeFloat = Field(
+        default=0.0,
+        description="power spectral density of the relative noise of the tweezers' intensity at twice the "
+        "trap frequency, in 1/Hz; it heats atoms that are not cooled (ours)",
     )
     mobile_light: MobileLightSettings = Field(
         default=MobileLightSettings(), description="the mobile tweezers' light"

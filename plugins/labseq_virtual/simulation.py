@@ -6,6 +6,7 @@ import importlib
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final, cast
 
 import numpy as np
@@ -30,9 +31,11 @@ from labseq.plugin import (
     TweezerAmplitudes,
 )
 from labseq_virtual.flight import RfTransport
+from labseq_virtual.handover import noise_hz
 from labseq_virtual.images import Exposure
 from labseq_virtual.lights import Lights
 from labseq_virtual.mobile_light import MobileLight, MobileTones, with_true_response
+from labseq_virtual.responses import beyond
 from labseq_virtual.rf_analysis import PulseReceiver
 from labseq_virtual.sensors import View
 from labseq_virtual.settings import SimulationSettings
@@ -41,6 +44,10 @@ from labseq_virtual.tone_positions import TonePositions
 from labseq_virtual.transport import CAUSES, RunningProgram, Transport
 from labseq_virtual.tweezer_view import TweezerView
 
+MIN_LEVEL: Final = 1e-3
+"""Depth, relative to the nominal one, below which a static tweezer counts as having this one."""
+NO_RISK: Final = 1e-4
+"""Probability of evaporation below which it is left out."""
 ROUNDING_S: Final = 1e-6
 """Tolerance for events out of order, in seconds: sums of times are rounded."""
 
@@ -67,11 +74,13 @@ class VirtualSimulation(Simulation):
         self._positions = TonePositions(context.grid, settings.mobile_light)
         self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
         motion = with_true_response(context.grid, context.motion, settings.mobile_light, self._seed)
+        self._motion = motion
         self._transport = Transport(context.grid, motion, settings, self._positions)
         self._flight = RfTransport(context.grid, motion, settings, self._positions)
         self._mobile_light = MobileLight(context.grid, motion, settings.mobile_light, self._positions)
         self._static = StaticArray(context.grid, settings)
         self._pulse_receiver: PulseReceiver | None = None
+        self._noise_hz = noise_hz(settings)
         self._lights = Lights(settings.lights, context.lines)
         self._exposure = Exposure(context.grid, settings, self._seed)
         self._is_open = False
@@ -96,6 +105,10 @@ class VirtualSimulation(Simulation):
         """Compute what all frames of a mode have in common, and load the kernels."""
         importlib.import_module("labseq_virtual.image_kernels")
         self._exposure.prepare(mode)
+
+    def warnings(self) -> list[str]:
+        """Settings beyond the range that the responses of the atoms were derived for."""
+        return beyond(self._motion, self._settings)
 
     @property
     def loading_probability(self) -> float:
@@ -150,6 +163,8 @@ class VirtualSimulation(Simulation):
         reloaded = (draws[0] < reload_probability) & self._static.holds()
         self._occupied = np.where(reloaded, draws[1] < self._settings.loading, self._occupied)
         self._now_s = t_start_s + duration_s
+        self._thermal[0][reloaded] = self._at_nominal(self._settings.temperature)[reloaded]
+        self._thermal[1] = self._now_s
 
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
         """Apply a device's output to the atoms, from ``t_start_s`` on.
@@ -213,11 +228,17 @@ class VirtualSimulation(Simulation):
         if not exposure_s > 0:
             raise LimitError("the exposure", f"{exposure_s} s", "more than 0")
         self._begin_event(t_start_s, "an exposure")
+        self._evaporate()
         light_on = self._lights.fraction_on("imaging", t_start_s, t_start_s + exposure_s)
         power, rng = self._static.depth, self._random.shot
         image, lost = self._exposure.take(self._occupied, exposure_s, rng, mode, light_on, power)
         self._lost += lost
         self._now_s = t_start_s + exposure_s
+        aim = self._at_nominal(self._settings.imaging_temperature or self._settings.temperature)
+        self._thermal[0] = aim + (self._thermal[0] - aim) * math.exp(
+            -exposure_s * light_on / self._settings.cooling_time
+        )
+        self._thermal[1] = self._now_s
         return Frame(image, exposure_s, t_start_s)
 
     def truth(self) -> Occupancy:
@@ -227,8 +248,10 @@ class VirtualSimulation(Simulation):
         return self._occupied.copy()
 
     def losses(self) -> Mapping[str, int]:
-        """Atoms lost since the shot began, by cause: vacuum, imaging, weak light, release, transport."""
-        return {cause: self._lost[cause] for cause in ("vacuum", "imaging", "light", "release", *CAUSES)}
+        """Atoms lost since the shot began, by cause."""
+        return {
+            cause: self._lost[cause] for cause in ("vacuum", "imaging", "light", "release", "heat", *CAUSES)
+        }
 
     def spot_powers(self) -> NDArray[np.float64]:
         """Power of each static tweezer now relative to the nominal one, float64 (n_rows, n_cols)."""
@@ -282,13 +305,15 @@ class VirtualSimulation(Simulation):
         self._finish_program()
         self._apply_output(t_start_s)
         self._begin_event(max(t_start_s, self._now_s), "a ramp of the static tweezers")
-        self._lost["light"] += self._static.ramp(ramp, self._occupied)
+        self._lost["light"] += self._static.ramp(ramp, self._occupied, self._random.shot, self._thermal[0])
         self._now_s += ramp.duration_s
 
     def _release(self, t_start_s: float, dark_s: float) -> None:
         self._begin_event(t_start_s, "a release")
-        self._lost["release"] += self._static.release(dark_s, self._occupied, self._random.shot)
+        rng, heat = self._random.shot, self._thermal[0]
+        self._lost["release"] += self._static.release(dark_s, self._occupied, rng, heat)
         self._now_s = t_start_s + dark_s
+        self._thermal[1] = self._now_s
 
     def _finish_program(self, until_s: float = math.inf) -> None:
         """Carry out the running program up to a time."""
@@ -296,9 +321,13 @@ class VirtualSimulation(Simulation):
             return
         playing, self._playing = self._playing, None
         n_played = playing.n_segments_until(until_s + ROUNDING_S)
-        factor = self._loss_factor * self._heating(playing.t_start_s, min(playing.t_end_s, until_s))
+        start_s, end_s = playing.t_start_s, min(playing.t_end_s, until_s)
+        factor = self._loss_factor * self._heating(start_s, end_s)
         depth, rng = self._static.depth, self._random.shot
-        self._lost += self._transport.carry(self._occupied, playing.program, n_played, depth, rng, factor)
+        cooled = self._lights.fraction_on("cooling", start_s, end_s)
+        self._lost += self._transport.carry(
+            self._occupied, playing.program, n_played, depth, rng, factor, self._thermal, start_s, cooled
+        )
         self._lose_to_vacuum(max(playing.t_start_s, min(playing.t_end_s, until_s)))
 
     def _apply_output(self, until_s: float) -> None:
@@ -311,7 +340,11 @@ class VirtualSimulation(Simulation):
             factor = self._loss_factor * self._heating(pulse.start_s, pulse.end_s)
             depth, rng = self._static.depth, self._random.shot
             if self._occupied.any():
-                self._lost += self._flight.carry(self._occupied, pulse, depth, rng, factor)
+                cooled = self._lights.fraction_on("cooling", pulse.start_s, pulse.end_s)
+                relax = partial(self._relaxed, cooled=cooled)
+                self._lost += self._flight.carry(
+                    self._occupied, pulse, depth, rng, factor, self._thermal, relax
+                )
             self._lose_to_vacuum(pulse.end_s)
         self._lost += self._static.receive_until(until_s, self._occupied, self._random.shot)
 
@@ -338,13 +371,44 @@ class VirtualSimulation(Simulation):
         self._now_s = max(self._now_s, t_s)
         if not self._occupied.any():  # includes the first event, before which elapsed_s is infinite
             return
+        cooled = self._lights.fraction_on("cooling", self._now_s - elapsed_s, self._now_s)
+        self._thermal[0] = self._relaxed(
+            self._thermal[0], np.maximum(0.0, self._now_s - self._thermal[1]), cooled
+        )
+        self._thermal[1] = self._now_s
         stays = math.exp(-elapsed_s / self._settings.lifetime)
         gone = self._occupied & (self._random.shot.random(self._grid.shape) >= stays)
         self._lost["vacuum"] += int(np.count_nonzero(gone))
         self._occupied &= ~gone
 
+    def _relaxed(self, heat: NDArray[np.float64], elapsed_s: NDArray[np.float64], cooled: float) -> Any:
+        """Temperatures after times in the static tweezers: cooled, or heated by noise of the intensity."""
+        if cooled > 0:
+            aim = self._at_nominal(self._settings.temperature)
+            return aim + (heat - aim) * np.exp(-elapsed_s * cooled / self._settings.cooling_time)
+        return heat * np.exp(np.minimum(elapsed_s * self._noise_hz, 20.0))
+
+    def _at_nominal(self, temperature: float) -> NDArray[np.float64]:
+        """Temperature that atoms of a given one would have in tweezers ramped to the nominal depth."""
+        return temperature / np.sqrt(np.maximum(self._static.depth, MIN_LEVEL))
+
+    def _evaporate(self) -> None:
+        """Remove atoms that noise has heated beyond the depth, with the energies of a harmonic well."""
+        if self._noise_hz == 0:
+            return
+        depth = self._settings.static_depth * np.maximum(self._static.depth, MIN_LEVEL)
+        x = np.minimum(np.sqrt(depth * self._settings.static_depth) / self._thermal[0], 500.0)
+        risk = np.exp(-x) * (1 + x + x**2 / 2) * self._occupied
+        if risk.max() < NO_RISK:
+            return
+        gone = self._random.shot.random(self._grid.shape) < risk
+        self._lost["heat"] += int(np.count_nonzero(gone))
+        self._occupied &= ~gone
+
     def _reset(self) -> None:
         self._occupied: Occupancy = np.zeros(self._grid.shape, np.bool_)
+        self._thermal = np.zeros((2, *self._grid.shape))
+        self._thermal[0] = self._settings.temperature
         self._playing: RunningProgram | None = None
         self._now_s = -math.inf
         self._loss_factor = 1.0

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from labseq.plugin import DepthRamp, SiteGrid, ToneSource, TweezerAmplitudes
 from labseq_virtual.flight import KELVIN, draw_atoms
+from labseq_virtual.responses import lowering
 from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
@@ -100,36 +101,74 @@ class StaticArray:
         occupied &= self.holds()
         return int(before - np.count_nonzero(occupied))
 
-    def release(self, dark_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator) -> int:
+    def release(
+        self, dark_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator, heat: Floats | None = None
+    ) -> int:
         """Let the atoms fly while the light is off, and recapture those that the same tweezer then binds.
 
-        Atoms begin with the temperature of the settings and fly straight on: gravity and neighbouring
-        tweezers are left out.
+        Atoms fly straight on: gravity and neighbouring tweezers are left out.
+
+        Args:
+            dark_s: How long the light is off.
+            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            rng: Random numbers of the shot.
+            heat: float64 (n_rows, n_cols), temperatures of the atoms, as they would be at the nominal depth;
+                changed in place. By default that of the settings.
 
         Returns:
             Number of atoms lost.
         """
         settings = self._settings
-        row, col = np.nonzero(occupied & self.holds())
-        depth = KELVIN * settings.static_depth * self.depth[row, col]
+        if heat is None:
+            heat = np.full(self._grid.shape, settings.temperature)
+        row, col = np.nonzero(occupied & (self.depth > 0))
+        level = self.depth[row, col]
+        depth = KELVIN * settings.static_depth * level
         waist = settings.static_waist
         rayleigh = np.pi * waist**2 / settings.static_wavelength
-        state = draw_atoms(depth, KELVIN * settings.temperature, waist, rayleigh, rng)
+        state = draw_atoms(depth, KELVIN * heat[row, col] * np.sqrt(level), waist, rayleigh, rng)
         x, y, z = (state[:, :3] + dark_s * state[:, 3:]).T
         width = 1 + (z / rayleigh) ** 2
         light = depth / width * np.exp(-2 * (x**2 + y**2) / (waist**2 * width))
-        bound = 0.5 * (state[:, 3:] ** 2).sum(axis=1) < light
+        kinetic = 0.5 * (state[:, 3:] ** 2).sum(axis=1)
+        bound = kinetic < light
         occupied[row, col] = bound
+        heat[row, col] = np.maximum(kinetic + depth - light, 0.0) / 3 / KELVIN / np.sqrt(level)
         return int(np.count_nonzero(~bound))
 
-    def ramp(self, ramp: DepthRamp, occupied: NDArray[np.bool_]) -> int:
-        """Change the depth; atoms in tweezers that become too shallow leave ``occupied``.
+    def ramp(
+        self,
+        ramp: DepthRamp,
+        occupied: NDArray[np.bool_],
+        rng: np.random.Generator,
+        heat: Floats | None = None,
+    ) -> int:
+        """Change the depth; atoms too hot for tweezers that become shallower leave ``occupied``.
+
+        Args:
+            ramp: The ramp.
+            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            rng: Random numbers of the shot.
+            heat: As for :meth:`release`.
 
         Returns:
             Number of atoms lost.
         """
+        if heat is None:
+            heat = np.full(self._grid.shape, self._settings.temperature)
         before = np.count_nonzero(occupied)
-        for level in (ramp.start, ramp.end):
-            self._level = level
-            occupied &= self.holds()
+        for start, end, duration_s in (
+            (self._level, ramp.start, 0.0),
+            (ramp.start, ramp.end, ramp.duration_s),
+        ):
+            self._level = start
+            row, col = np.nonzero(occupied)
+            level = self.depth[row, col]
+            self._level = end
+            if end < start and len(row):
+                temperature = heat[row, col] * np.sqrt(level)
+                depth = np.maximum(self._settings.static_depth * level, 1e-12)
+                loss, warmer = lowering(end / start, duration_s, depth, temperature)
+                occupied[row, col] = (rng.random(len(row)) >= loss) & (level > 0)
+                heat[row, col] *= warmer
         return int(before - np.count_nonzero(occupied))

@@ -51,8 +51,9 @@ class FrequencyMap:
 class TonePositions:
     """The true positions of row and column tones, with the errors that a calibration has to find.
 
-    The grid says where each tone is intended to be. The true position differs by a common offset, a
-    magnification, and an error of each tone (``settings.py``, ``mobile_light``).
+    The grid says where each tone is intended to be. The true position follows from the machine's own tones,
+    if the settings give them, a common offset, a magnification, and an error of each tone (``settings.py``,
+    ``mobile_light``).
     """
 
     def __init__(self, grid: SiteGrid, light: MobileLightSettings) -> None:
@@ -62,6 +63,8 @@ class TonePositions:
             FrequencyMap(grid.row_frequency_hz, lone_step_hz, "row"),
             FrequencyMap(grid.column_frequency_hz, lone_step_hz, "column"),
         )
+        self._combs = light.row_tones, light.column_tones
+        self._middle = [(n - 1) / 2 for n in grid.shape]
         self._spacing_m = grid.spacing_m
         self._light = light
         along_row, from_row_to_row = light.offset
@@ -84,7 +87,11 @@ class TonePositions:
 
     def actual(self, axis: int, frequency_hz: Floats) -> Floats:
         """True positions of tones of the rows (axis 0) or columns (axis 1), in sites."""
-        intended, errors = self._maps[axis].sites(frequency_hz), self._errors[axis]
+        comb, errors = self._combs[axis], self._errors[axis]
+        if comb is None:
+            place = self._maps[axis].sites(frequency_hz)
+        else:
+            place = self._middle[axis] + (frequency_hz - comb.centre) / comb.step
         if not errors.any():
-            return intended
-        return intended + np.interp(intended, np.arange(len(errors)), errors)
+            return place
+        return place + np.interp(place, np.arange(len(errors)), errors)

@@ -32,7 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
-from labseq_virtual.handover import constants, full_amplitudes, merging_distance, tone_table
+from labseq_virtual.handover import COOLING_HZ, constants, full_amplitudes, merging_distance, tone_table
+from labseq_virtual.responses import move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import TonePositions
 
@@ -83,6 +84,7 @@ class Transport:
         self._settings = settings
         self._positions = positions or TonePositions(grid, settings.mobile_light)
         self._full = full_amplitudes(grid, motion)
+        self._grid = grid
         self._constants = constants(grid, settings)
         self._merging = np.stack(merging_distance(settings.static_waist, settings.mobile_light.waist))
 
@@ -94,6 +96,9 @@ class Transport:
         depth: Floats,
         rng: np.random.Generator,
         loss_factor: float,
+        thermal: Floats | None = None,
+        start_s: float = 0.0,
+        cooled: float = 1.0,
     ) -> Counter[str]:
         """Carry out the first segments of a program.
 
@@ -104,6 +109,10 @@ class Transport:
             depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
             rng: Random numbers of the shot; the number of draws depends on the program alone.
             loss_factor: The shot's factor on the transport loss.
+            thermal: float64 (2, n_rows, n_cols), temperatures of the atoms, as they would be at the nominal
+                depth, and the times that they belong to; changed in place. By default that of the settings.
+            start_s: When the program starts.
+            cooled: Fraction of the time with cooling light.
 
         Returns:
             Number of atoms lost by each of :data:`CAUSES` that lost any.
@@ -114,10 +123,15 @@ class Transport:
         offsets = program.row.offsets, program.column.offsets
         n_segments = min(n_segments, program.n_segments)
         draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), 3))
+        self._constants[COOLING_HZ] = cooled / self._settings.cooling_time
+        if thermal is None:
+            thermal = np.stack(
+                [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
+            )
         lost = carry_atoms(
-            occupied, depth * self._settings.static_depth, rows, offsets[0], cols, offsets[1],
-            program.duration_s, FASTEST[program.course], n_segments, loss_factor, draws, self._constants,
-            self._merging,
+            occupied, thermal, start_s, depth * self._settings.static_depth, rows, offsets[0], cols,
+            offsets[1], program.duration_s, program.course, n_segments, loss_factor, draws, self._constants,
+            self._merging, move_tables(),
         )  # fmt: skip
         by_cause: Counter[str] = Counter(dict(zip(CAUSES, lost.tolist(), strict=True)))
         return +by_cause

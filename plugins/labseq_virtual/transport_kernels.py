@@ -31,6 +31,7 @@ from labseq_virtual.handover import (
     MIXING,
     MOBILE_DEPTH,
     NEW,
+    NOISE_HZ,
     ON_END,
     ON_START,
     PER_TONE,
@@ -40,17 +41,14 @@ from labseq_virtual.handover import (
     REFERENCE_TONES,
     SHALLOW_LOSS,
     SKEW,
-    SLOW,
     SPACING,
     START,
     STATIC_DEPTH,
-    STATIC_WAIST,
-    SUDDEN_S,
-    TEMPERATURE,
     TOLERANCE,
     TRANSPORT_LOSS,
 )
-from labseq_virtual.transport import COLLISION, EJECTED, HAND_OVER, PROGRAM, TRANSPORT
+from labseq_virtual.response_kernels import carry, hand_over, relaxed
+from labseq_virtual.transport import COLLISION, EJECTED, FASTEST, HAND_OVER, PROGRAM, TRANSPORT
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -59,10 +57,26 @@ Mask = NDArray[np.bool_]
 
 TABLE = const("float64", 2)
 
-RISK, PEAK, RISE_S, FALL_S = range(4)
-"""Columns of a course: the probability that an atom fell out, the greatest depth in kelvin, and the durations
-of the ramps at its start and at its end."""
-N_COURSE = 4
+(
+    RISK,
+    PEAK,
+    RISE_S,
+    FALL_S,
+    SITE_DEPTH,
+    AWAY,
+    HEAT,
+    LOST,
+    IS_PICKED,
+    DOWN,
+    RIGHT,
+) = range(11)
+"""Columns of a course: the probability that the atom fell out because the tweezer was too shallow; the
+greatest depth in kelvin; the durations of the ramps at start and end; depth and distance of the site that it
+came from; its temperature, as it would be in a static tweezer of nominal depth; the probability that it was
+lost so far; whether the pick-up is contained in both; the velocity, in sites per second."""
+N_COURSE = 11
+NEW_LEG = 0.2
+"""Change of the velocity, relative to the greater one, from which on a tweezer has started anew."""
 RAMP = 0.7
 """Ratio of the powers at the two ends of a segment below which it is part of a ramp: tones that give depths
 that differ from site to site change less."""
@@ -205,6 +219,7 @@ SITES = "boolean[:, ::1]"
 STATES = "int8[:, ::1]"
 NUMBERS = "int64[::1]"
 COURSES = "float64[:, :, ::1]"
+THERMAL = "float64[:, :, ::1]"
 
 
 @helper_kernel(f"float64(float64, {TABLE})")
@@ -224,13 +239,6 @@ def exceeds(energy_over_kt: float) -> float:
     """Probability that the thermal energy in a harmonic well in three dimensions exceeds a value."""
     x = max(energy_over_kt, 0.0)
     return math.exp(-x) * (1.0 + x + x * x / 2.0)
-
-
-@helper_kernel("float64(float64)")
-def kinetic_exceeds(energy_over_kt: float) -> float:
-    """Probability that the kinetic energy in three dimensions exceeds a value (Maxwell's constants)."""
-    root = math.sqrt(max(energy_over_kt, 0.0))
-    return math.erfc(root) + 2.0 / math.sqrt(math.pi) * root * math.exp(-root * root)
 
 
 @helper_kernel(f"float64(float64, int64, {VECTOR})")
@@ -264,63 +272,116 @@ def shallow(mobile: float, speed_m_s: float, n_further: int, constants: Floats) 
     return float(constants[SHALLOW_LOSS] * part)
 
 
-@helper_kernel(f"float64(float64, float64, float64, float64, {VECTOR})")
-def spilled(static: float, ratio: float, distance_m: float, ramp_s: float, constants: Floats) -> float:
-    """Probability that an atom dropped off near a site does not stay there.
+@helper_kernel(f"void(float64[::1], {VECTOR}, {VECTOR})")
+def settle(course: Floats, constants: Floats, tables: Floats) -> None:
+    """Add the pick-up to the course of a crossing that holds an atom, unless it is contained."""
+    if course[IS_PICKED] > 0.0:
+        return
+    course[IS_PICKED] = 1.0
+    loss, warmer = hand_over(
+        0, course[SITE_DEPTH], course[PEAK], course[AWAY], course[RISE_S], course[HEAT], constants, tables
+    )
+    course[LOST], course[HEAT] = loss, course[HEAT] * warmer
+
+
+@helper_kernel(
+    "void(float64[::1], boolean, float64, float64, float64, float64, float64, float64, int64, int64, "
+    f"{VECTOR}, {VECTOR})"
+)
+def advance(
+    course: Floats,
+    is_held: bool,
+    start: float,
+    end: float,
+    depth: float,
+    down: float,
+    right: float,
+    duration_s: float,
+    kind: int,
+    n_further: int,
+    constants: Floats,
+    tables: Floats,
+) -> None:
+    """Continue the course of a crossing over a segment.
 
     Args:
-        static: Depth of the site, in kelvin.
-        ratio: Depth of the mobile tweezer while it was on, relative to ``static``.
-        distance_m: Distance of the atom from the site.
-        ramp_s: Duration of the drop-off.
+        course: The course; changed in place.
+        is_held: Whether it holds an atom.
+        start: Power of its tones at the start, relative to the intended one.
+        end: The same at the end.
+        depth: Its greatest depth in the segment, in kelvin.
+        down: Its displacement along the columns, in sites.
+        right: Its displacement along a row.
+        duration_s: Duration of the segment.
+        kind: Course of the frequencies.
+        n_further: Tones that are on beyond one per axis.
         constants: The constants.
+        tables: The tables.
     """
-    waists = distance_m / constants[STATIC_WAIST]
-    slow = max(interpolate(waists, SLOW), exceeds(static / constants[TEMPERATURE]))
-    left = static * math.exp(-2.0 * waists * waists)
-    sudden = kinetic_exceeds(left / (constants[TEMPERATURE] * math.sqrt(1.0 + ratio)))
-    part = math.exp(-((ramp_s / SUDDEN_S) ** 2))
-    return slow + part * (max(sudden, slow) - slow)
+    duration_s = max(duration_s, INSTANT_S)
+    course[PEAK] = max(course[PEAK], depth)
+    if start < RAMP * end:
+        course[RISE_S] += duration_s
+    course[FALL_S] = course[FALL_S] + duration_s if end < RAMP * start else 0.0
+    ratio = depth / constants[STATIC_DEPTH]
+    course[HEAT] *= math.exp(min(duration_s * constants[NOISE_HZ] * ratio, 20.0))
+    down_hz, right_hz = down / duration_s, right / duration_s
+    change = math.hypot(down_hz - course[DOWN], right_hz - course[RIGHT])
+    starts = change > NEW_LEG * max(math.hypot(down_hz, right_hz), math.hypot(course[DOWN], course[RIGHT]))
+    course[DOWN], course[RIGHT] = down_hz, right_hz
+    length_m = math.hypot(down, right) * constants[SPACING]
+    if length_m == 0.0:
+        return
+    risk = shallow(depth, length_m / duration_s * FASTEST[kind], n_further, constants)
+    course[RISK] = max(course[RISK], risk)
+    if is_held and starts:
+        settle(course, constants, tables)
+        loss, warmer = carry(kind, length_m / duration_s, length_m, depth, course[HEAT], constants, tables)
+        course[LOST] = 1.0 - (1.0 - course[LOST]) * (1.0 - loss)
+        course[HEAT] *= warmer
 
 
-@helper_kernel(f"UniTuple(float64, 3)(float64, float64, float64, float64, int64, float64, float64, {VECTOR})")
+@helper_kernel(f"UniTuple(float64, 4)(float64, float64[::1], float64, int64, float64, {VECTOR}, {VECTOR})")
 def risks(
     static: float,
-    mobile: float,
+    course: Floats,
     distance_m: float,
-    fallen: float,
     n_further: int,
-    ramp_s: float,
     factor: float,
     constants: Floats,
-) -> tuple[float, float, float]:
+    tables: Floats,
+) -> tuple[float, float, float, float]:
     """Probabilities that an atom dropped off near a site is lost.
 
     Args:
         static: Depth of the site, in kelvin.
-        mobile: Depth of the mobile tweezer while it was on.
+        course: Course of the tweezer that holds it.
         distance_m: Distance of the atom from the site.
-        fallen: Probability of :func:`shallow` during the motion.
         n_further: Tones that were on beyond one per axis.
-        ramp_s: Duration of the drop-off, in seconds.
         factor: The shot's factor on the losses.
         constants: The constants.
+        tables: The tables.
 
     Returns:
-        The probabilities of losing it to heating at the site, to pick-up and drop-off, and in motion.
+        The probabilities of losing it to heat, to pick-up and drop-off, and in motion; and its temperature.
     """
-    ratio = math.inf if mobile > 0.0 else 0.0
+    settle(course, constants, tables)
+    ratio = math.inf if course[PEAK] > 0.0 else 0.0
     if static > 0.0:
-        ratio = mobile / static
-    hand_over = 0.0
+        ratio = course[PEAK] / static
+    by_hand_over = 0.0
     if constants[TRANSPORT_LOSS] * factor > 0.0:
         nominal = constants[MOBILE_DEPTH] / constants[STATIC_DEPTH]
-        hand_over = min(1.0, factor * constants[TRANSPORT_LOSS] * ratio / nominal)
+        by_hand_over = min(1.0, factor * constants[TRANSPORT_LOSS] * ratio / nominal)
     per_tone = min(1.0, factor * constants[PER_TONE] * n_further)
+    loss, warmer = hand_over(
+        1, static, course[PEAK], distance_m, course[FALL_S], course[HEAT], constants, tables
+    )
     return (
-        spilled(static, ratio, distance_m, ramp_s, constants),
-        hand_over,
-        1.0 - (1.0 - per_tone) * (1.0 - fallen),
+        1.0 - (1.0 - course[LOST]) * (1.0 - loss),
+        by_hand_over,
+        1.0 - (1.0 - per_tone) * (1.0 - course[RISK]),
+        course[HEAT] * warmer,
     )
 
 
@@ -338,14 +399,20 @@ def nearest_site(row: float, col: float, static: Floats, constants: Floats) -> t
     return r, c, away_m, inside
 
 
-@helper_kernel(f"void({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {VECTOR}, {TABLE})")
+@helper_kernel(
+    f"void({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {COURSES}, {VECTOR}, "
+    f"{TABLE})"
+)
 def pick_up(
     occupied: Mask,
+    thermal: Floats,
+    now_s: float,
     static: Floats,
     row: Floats,
     col: Floats,
     state: States,
     depth: Floats,
+    course: Floats,
     constants: Floats,
     merging: Floats,
 ) -> None:
@@ -360,6 +427,9 @@ def pick_up(
             if inside and occupied[r, c] and takes(depth[i, j], static[r, c], away_m, merging):
                 state[i, j] = HELD
                 occupied[r, c] = False
+                course[i, j, SITE_DEPTH], course[i, j, AWAY] = static[r, c], away_m
+                course[i, j, HEAT] = relaxed(thermal[0, r, c], now_s - thermal[1, r, c], constants)
+                course[i, j, IS_PICKED] = 0.0
 
 
 @helper_kernel("int64(boolean[:, ::1], int64[::1], int64)")
@@ -382,11 +452,13 @@ def land(occupied: Mask, sites: Ints, n: int) -> int:
 
 
 @helper_kernel(
-    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {COURSES}, int64, float64, {TABLE}, int64, "
-    f"{VECTOR}, {NUMBERS}, {NUMBERS})"
+    f"int64({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {COURSES}, int64, float64, "
+    f"{TABLE}, int64, {VECTOR}, {VECTOR}, {NUMBERS}, {NUMBERS})"
 )
 def set_down(
     occupied: Mask,
+    thermal: Floats,
+    now_s: float,
     static: Floats,
     row: Floats,
     col: Floats,
@@ -397,6 +469,7 @@ def set_down(
     draws: Floats,
     n_drawn: int,
     constants: Floats,
+    tables: Floats,
     work: Ints,
     lost: Ints,
 ) -> int:
@@ -410,20 +483,20 @@ def set_down(
             if not held:
                 continue
             r, c, away_m, inside = nearest_site(row[i, END], col[j, END], static, constants)
-            spilled, hand_over, transport = risks(
-                static[r, c], course[i, j, PEAK], away_m, course[i, j, RISK], n_further,
-                course[i, j, FALL_S], factor, constants,
-            )  # fmt: skip
+            by_heat, by_hand_over, in_motion, heat = risks(
+                static[r, c], course[i, j], away_m, n_further, factor, constants, tables
+            )
             draw = draws[n_drawn]
             n_drawn += 1
             if not inside:
                 lost[EJECTED] += 1
-            elif draw[0] < spilled or draw[1] < hand_over:
+            elif draw[0] < by_heat or draw[1] < by_hand_over:
                 lost[HAND_OVER] += 1
-            elif draw[2] < transport:
+            elif draw[2] < in_motion:
                 lost[TRANSPORT] += 1
             else:
                 work[n] = r * static.shape[1] + c
+                thermal[0, r, c], thermal[1, r, c] = heat, now_s
                 n += 1
     lost[COLLISION] += land(occupied, work, n)
     return n_drawn
@@ -432,6 +505,7 @@ def set_down(
 Offsets = NDArray[np.int32]
 
 OFFSETS = const("int32", 1)
+KINDS = const("int8", 1)
 OUTPUT = "float64[:, ::1]"
 
 INSTANT_S = 1e-12
@@ -546,32 +620,6 @@ def follow(
                 state[i, j], course[i, j] = NEW if lit else DARK, 0.0
 
 
-@helper_kernel(f"void({TABLE}, {TABLE}, {TABLE}, {COURSES}, int64, float64, float64, {VECTOR})")
-def run_courses(
-    row: Floats,
-    col: Floats,
-    depth: Floats,
-    course: Floats,
-    n_further: int,
-    duration_s: float,
-    fastest: float,
-    constants: Floats,
-) -> None:
-    """Continue the courses of crossings; ``fastest``: peak speed relative to the mean one."""
-    speed = fastest * constants[SPACING] / max(duration_s, INSTANT_S)
-    for i in range(len(row)):
-        for j in range(len(col)):
-            start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
-            course[i, j, PEAK] = max(course[i, j, PEAK], depth[i, j])
-            if start < RAMP * end:
-                course[i, j, RISE_S] += duration_s
-            course[i, j, FALL_S] = course[i, j, FALL_S] + duration_s if end < RAMP * start else 0.0
-            down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
-            if down != 0.0 or right != 0.0:
-                risk = shallow(depth[i, j], math.hypot(down, right) * speed, n_further, constants)
-                course[i, j, RISK] = max(course[i, j, RISK], risk)
-
-
 @helper_kernel(f"int64({OFFSETS}, int64)")
 def max_tones(offsets: Offsets, n_segments: int) -> int:
     """Largest number of tones of an axis in one of the first segments."""
@@ -582,11 +630,13 @@ def max_tones(offsets: Offsets, n_segments: int) -> int:
 
 
 @helper_kernel(
-    f"int64({SITES}, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {COURSES}, float64, float64, float64, "
-    f"{TABLE}, int64, {VECTOR}, {TABLE}, {OUTPUT}, {NUMBERS}, {NUMBERS})"
+    f"int64({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {COURSES}, float64, "
+    f"int64, float64, {TABLE}, int64, {VECTOR}, {TABLE}, {VECTOR}, {OUTPUT}, {NUMBERS}, {NUMBERS})"
 )
 def play(
     occupied: Mask,
+    thermal: Floats,
+    now_s: float,
     static: Floats,
     row: Floats,
     col: Floats,
@@ -594,12 +644,13 @@ def play(
     depth: Floats,
     course: Floats,
     duration_s: float,
-    fastest: float,
+    kind: int,
     factor: float,
     draws: Floats,
     n_drawn: int,
     constants: Floats,
     merging: Floats,
+    tables: Floats,
     paths: Floats,
     work: Ints,
     lost: Ints,
@@ -610,53 +661,69 @@ def play(
         for j in range(len(col)):
             start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
             depth[i, j] = mobile_depth(max(start, end), n_further, constants)
-    pick_up(occupied, static, row, col, state, depth, constants, merging)
+    pick_up(occupied, thermal, now_s, static, row, col, state, depth, course, constants, merging)
     lost[COLLISION] += mix(row, col, state)
     if moves(row) or moves(col):
         lost[COLLISION] += sweep(
             occupied, row, col, state, depth, constants[STATIC_DEPTH], constants[TOLERANCE], paths, work
         )
-    run_courses(row, col, depth, course, n_further, duration_s, fastest, constants)
+    for i in range(len(row)):
+        for j in range(len(col)):
+            start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
+            down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
+            if state[i, j] != DARK:
+                advance(
+                    course[i, j], state[i, j] == HELD, start, end, depth[i, j], down, right, duration_s, kind,
+                    n_further, constants, tables,
+                )  # fmt: skip
     return set_down(
-        occupied, static, row, col, state, course, n_further, factor, draws, n_drawn, constants, work, lost
-    )
+        occupied, thermal, now_s + duration_s, static, row, col, state, course, n_further, factor, draws,
+        n_drawn, constants, tables, work, lost,
+    )  # fmt: skip
 
 
 @kernel(
-    f"{NUMBERS}({SITES}, {TABLE}, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {VECTOR}, {VECTOR}, int64, "
-    f"float64, {TABLE}, {VECTOR}, {TABLE})"
+    f"{NUMBERS}({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {VECTOR}, "
+    f"{KINDS}, int64, float64, {TABLE}, {VECTOR}, {TABLE}, {VECTOR})"
 )
 def carry_atoms(
     occupied: Mask,
+    thermal: Floats,
+    now_s: float,
     static: Floats,
     rows: Floats,
     row_offsets: Offsets,
     cols: Floats,
     col_offsets: Offsets,
     duration_s: Floats,
-    fastest: Floats,
+    kinds: NDArray[np.int8],
     n_segments: int,
     factor: float,
     draws: Floats,
     constants: Floats,
     merging: Floats,
+    tables: Floats,
 ) -> Ints:
     """Carry atoms by the first segments of a program.
 
     Args:
         occupied: Sites that hold an atom (n_rows, n_cols); changed in place.
+        thermal: Temperature of the atom on each site, as it would be at the nominal depth, and the time
+            that it belongs to (2, n_rows, n_cols); changed in place.
+        now_s: When the program starts.
         static: Depths of the static tweezers (n_rows, n_cols).
         rows: Row tones of all segments (n_row_tones, N_COLUMNS).
         row_offsets: The first of each segment (at least n_segments + 1,).
         cols: Column tones, likewise.
         col_offsets: Likewise.
         duration_s: Durations of the segments.
-        fastest: Their greatest speed relative to their mean speed.
+        kinds: Their courses of the frequency.
         n_segments: Number of segments played.
         factor: The shot's factor on the transport loss.
         draws: Uniform random numbers (at least :func:`max_drop_offs`, 3).
         constants: The constants.
         merging: The merging distances.
+        tables: The tables of ``response_kernels.py``.
 
     Returns:
         Number of atoms lost by each cause (5,).
@@ -678,12 +745,13 @@ def carry_atoms(
             follow(old_row, old_col, old_state, old_course, row, col, state, course, constants[TOLERANCE])
             lost[PROGRAM] -= count_held(state, row, col)
             n_drawn = play(
-                occupied, static, row, col, state, depth, course, duration_s[k], fastest[k], factor, draws,
-                n_drawn, constants, merging, paths, work, lost,
+                occupied, thermal, now_s, static, row, col, state, depth, course, duration_s[k], kinds[k],
+                factor, draws, n_drawn, constants, merging, tables, paths, work, lost,
             )  # fmt: skip
             old_row, old_col, old_state, state = row, col, state, old_state
             old_course, course = course, old_course
         else:
             old_row, old_col = row[:0], col[:0]
+        now_s += duration_s[k]
     lost[PROGRAM] += count_held(old_state, old_row, old_col)
     return lost

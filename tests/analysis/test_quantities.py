@@ -163,6 +163,9 @@ TRUTH = {
     "gaussian": {"amplitude": -0.6, "centre": 0.041, "sigma": 0.006, "offset": 0.9},
     "lorentzian": {"amplitude": 0.5, "centre": 0.055, "fwhm": 0.02, "offset": 0.1},
     "linear": {"slope": -3.0, "intercept": 0.7},
+    "saturation": {"level": 0.8, "time": 0.03},
+    "step": {"before": 0.95, "after": 0.1, "centre": 0.04, "width": 0.01},
+    "lowering": {"temperature": 15e-6, "amplitude": 0.98},
     "release_recapture": {"temperature": 25e-6, "amplitude": 0.98},
 }
 
@@ -173,6 +176,8 @@ def fitted(model: str, n: int = 15, given: dict[str, str] | None = None, setting
     rest = (
         {"depth": 300e-6, "waist": 0.98e-6, "wavelength": 808e-9, "mass": 87.0}
         if model == "release_recapture"
+        else {"depth": 300e-6}
+        if model == "lowering"
         else {}
     )
     y = MODELS[model].evaluate(x, **TRUTH[model], **rest) + np.random.default_rng(3).normal(0, 0.01, n)

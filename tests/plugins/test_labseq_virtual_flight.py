@@ -426,9 +426,9 @@ class CachedTransport(RfTransport):
         super().__init__(*arguments)
         self.found: dict[int, Any] = {}
 
-    def _find_tones(self, pulse: RfPulse) -> Any:
+    def find_tones(self, pulse: RfPulse) -> Any:
         if id(pulse) not in self.found:
-            self.found[id(pulse)] = list(super()._find_tones(pulse))
+            self.found[id(pulse)] = list(super().find_tones(pulse))
         return self.found[id(pulse)]
 
 

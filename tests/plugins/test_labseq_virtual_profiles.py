@@ -46,6 +46,11 @@ def test_the_virtual_profile_states_the_defaults() -> None:
     for role, model in MODELS.items():
         read = document.validate(model, (role,), drop={"use", *MOTION_KEYS})
         stated, default = flat(read.model_dump()), flat(model().model_dump())
+        if role == "simulation":  # the profile says what the machine is; by default it is what the grid says
+            for axis in ("row_tones", "column_tones"):
+                true = [stated.pop(f"mobile_light.{axis}.{key}") for key in ("centre", "step")]
+                assert true == [100e6, 1.6e6]
+                assert default.pop(f"mobile_light.{axis}") is None
         assert stated.keys() == default.keys()
         for key, value in default.items():
             expected = pytest.approx(value) if isinstance(value, float) else value

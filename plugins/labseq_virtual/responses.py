@@ -1,0 +1,140 @@
+"""How atoms respond to moves and ramps: tables made from the simulation in three dimensions.
+
+Each table gives the loss and the ratio of the temperatures after and before, on a grid of the axes below. It
+belongs to a static tweezer of :data:`REFERENCE`. Other depths and waists follow by the scaling of Newton's
+equations: lengths in waists, energies in depths, times in periods of the static tweezer. Temperatures are
+those that the atom has in the static tweezer, or would have if it were brought back there adiabatically.
+
+``response_tables.py`` makes them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.plugin import MotionSpec, format_quantity
+from labseq_virtual.settings import SimulationSettings
+
+Floats = NDArray[np.float64]
+
+TABLES: Final = Path(__file__).with_name("responses.npz")
+
+
+DEPTH_K: Final = 300e-6
+WAIST_M: Final = 0.98e-6
+SITE_M: Final = 4.49e-6
+"""Depth and waist of the static tweezers that the tables belong to, and their distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The tweezers that the tables belong to; lengths in metres, ``depth`` in kelvin."""
+
+    depth: float = DEPTH_K
+    waist: float = WAIST_M
+    spacing: float = SITE_M
+    static_wavelength: float = 808e-9
+    mobile_wavelength: float = 852e-9
+
+    @property
+    def beams(self) -> Floats:
+        """Waist and Rayleigh length of the static tweezers, then of the mobile ones, (4,)."""
+        static, mobile = (
+            math.pi * self.waist**2 / wavelength
+            for wavelength in (self.static_wavelength, self.mobile_wavelength)
+        )
+        return np.array([self.waist, static, self.waist, mobile])
+
+
+REFERENCE: Final = Reference()
+
+RAMPS_S: Final = (0.0, 10e-6, 20e-6, 40e-6, 80e-6, 160e-6)
+AWAY: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.6, 2.3)
+RATIOS: Final = (1.0, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 7.0, 12.0, 25.0)
+TEMPERATURES: Final = (5e-6, 10e-6, 15e-6, 20e-6, 27e-6, 36e-6, 50e-6, 75e-6, 120e-6)
+SPEEDS: Final = (
+    0.02, 0.06, 0.1, 0.115, 0.13, 0.145, 0.16, 0.18, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3, 0.32, 0.34, 0.37, 0.4,
+    0.45, 0.5, 0.6, 0.8, 1.1, 3.0,
+)  # fmt: skip
+FRACTIONS: Final = (0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.35, 0.6, 1.0)
+DURATIONS_S: Final = (10e-6, 100e-6, 300e-6, 1e-3, 3e-3, 10e-3)
+
+AXES: Final[dict[str, tuple[tuple[float, ...], ...]]] = {
+    "pick_up": (RAMPS_S, AWAY, RATIOS, TEMPERATURES),
+    "drop_off": (RAMPS_S, AWAY, RATIOS, TEMPERATURES),
+    "transport": ((0, 1, 2), SPEEDS, RATIOS, TEMPERATURES),
+    "lowering": (FRACTIONS, DURATIONS_S, TEMPERATURES),
+}
+"""Axes of each table: duration of a ramp (s), distance from the site (waists), mobile over static depth,
+temperature (K); course of the motion (:class:`labseq.model.FrequencyCourse`), mean speed (m/s; of a curved
+course over four sites); depth after the ramp over that before."""
+
+
+def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
+    """Which settings are beyond the range of the tables, in the words of a warning."""
+    static, light = settings.static_depth, settings.mobile_light
+    time = math.sqrt(static / DEPTH_K) * WAIST_M / settings.static_waist  # periods of the tables per second
+    length = WAIST_M / settings.static_waist
+    ranges = [
+        ("mobile_tweezers.pick_up", motion.pick_up_s, RAMPS_S, 1 / time, "time"),
+        ("mobile_tweezers.drop_off", motion.drop_off_s, RAMPS_S, 1 / time, "time"),
+        ("mobile_tweezers.speed", motion.speed_m_s, SPEEDS, time / length, "speed"),
+        ("simulation.mobile_light.depth", light.depth, RATIOS, static, "temperature"),
+        ("simulation.temperature", settings.temperature, TEMPERATURES, static / DEPTH_K, "temperature"),
+        ("simulation.mobile_light.waist", light.waist, (0.97, 1.03), settings.static_waist, "length"),
+    ]
+    texts: list[str] = []
+    for name, value, axis, unit, dimension in ranges:
+        low, high = axis[0] * unit, axis[-1] * unit
+        if not low * (1 - 1e-9) <= value <= high * (1 + 1e-9):
+            came, first, last = (format_quantity(each, dimension) for each in (value, low, high))
+            what = f"profile.{name} is {came}; the virtual lab knows heat and loss from {first} to {last}"
+            texts.append(f"{what} only, and takes the nearest end: its losses are not to be trusted")
+    return texts
+
+
+@cache
+def tables() -> dict[str, Floats]:
+    """Name -> float64 (2, ...): loss, and ratio of the temperatures, on its :data:`AXES`."""
+    with np.load(TABLES) as file:
+        return {name: file[name].astype(np.float64) for name in AXES}
+
+
+@cache
+def move_tables() -> Floats:
+    """The tables of pick-up, drop-off and transport as the kernels take them, float64 (n,)."""
+    flat = np.concatenate([tables()[name].ravel() for name in ("pick_up", "drop_off", "transport")])
+    flat.flags.writeable = False
+    return flat
+
+
+def lowering(
+    fraction: float, duration_s: float, depth_k: Floats, temperature_k: Floats
+) -> tuple[Floats, Floats]:
+    """What a ramp of the static tweezers to a lower depth does.
+
+    Args:
+        fraction: Depth after the ramp over that before, up to 1.
+        duration_s: Duration of the ramp.
+        depth_k: Depths before, in kelvin (n_atoms,).
+        temperature_k: Temperatures before (n_atoms,).
+
+    Returns:
+        Losses, and temperatures of the atoms that stay relative to an adiabatic change, (n_atoms,).
+    """
+    from scipy.interpolate import interpn
+
+    times = np.log([*DURATIONS_S])
+    duration = np.log(np.maximum(duration_s * np.sqrt(depth_k / DEPTH_K), DURATIONS_S[0]))
+    at = np.stack([np.full(len(depth_k), fraction), duration, temperature_k * DEPTH_K / depth_k], axis=1)
+    axes = (np.array(FRACTIONS), times, np.array(TEMPERATURES))
+    at = np.clip(at, [axis[0] for axis in axes], [axis[-1] for axis in axes])
+    loss, warmer = (interpn(axes, one, at) for one in tables()["lowering"])
+    return (loss, warmer) if fraction >= FRACTIONS[0] / 2 else (np.ones_like(loss), warmer)

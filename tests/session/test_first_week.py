@@ -1,0 +1,47 @@
+"""The sequences of the first week measure what the simulation is set to."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+import labseq
+from labseq.analysis.scanned import ScanRequest, scan_report
+from labseq.model.estimate import Estimate
+
+ROOT = Path(__file__).parents[2]
+SURVIVAL = "survival:before,after"
+IMAGE_HZ = -math.log1p(-0.00314) / 45e-3 + 1 / 33
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity", "fit", "parameter", "true", "tolerance"),
+    [
+        ("lifetime", SURVIVAL, "exponential", "decay", 33.0, 0.0),
+        ("loading_time", "loading", "saturation", "time", 50e-3, 0.0),
+        ("imaging_exposure", SURVIVAL, "exponential", "decay", 1 / IMAGE_HZ, 0.0),
+        (
+            "trap_depth",
+            SURVIVAL,
+            "lowering",
+            "temperature",
+            15e-6,
+            1.5e-6,
+        ),  # the law is a simple one
+        ("transport_speed", "analysis.survival.survival", "step", "centre", 0.35, 0.03),
+        ("parking", SURVIVAL, "gaussian", "centre", 0.0, 0.05e-6),
+    ],
+)
+def test_the_fitted_value_is_that_of_the_simulation(
+    name: str, quantity: str, fit: str, parameter: str, true: float, tolerance: float, tmp_path: Path
+) -> None:
+    sequence = ROOT / "sequences" / f"{name}.yaml"
+    with labseq.Session.open(sequence, seed=3, output=tmp_path, overrides=["repeats=2"]) as session:
+        run = session.run()
+    given = ("offset=0",) if fit == "gaussian" else ()
+    (found,) = scan_report(run, ScanRequest((quantity,), fit=fit, fit_settings=given)).fits
+    value: Estimate = found.values[parameter]
+    assert abs(value.value - true) < 3 * value.error + tolerance
+    assert value.error < 0.25 * abs(true) + tolerance
