@@ -480,6 +480,11 @@ class MotionSettings(Settings):
         description="least distance of a moving tweezer from atoms that stand, and of neighbouring lines of "
         "tweezers, where rows and columns move at once",
     )
+    path_depth: Annotated[Fraction, Field(gt=0)] = Field(
+        default=_MOTION.path_depth,
+        description="depth of the tweezers where rows and columns move at once, as a fraction of the full "
+        "depth: shallower ones take fewer of the atoms that they pass",
+    )
     empty_tweezers_may_land: bool = Field(
         default=_MOTION.empty_tweezers_may_land,
         description="whether a tweezer without an atom may end on a site that holds one, where rows and "
@@ -506,6 +511,7 @@ class MotionSettings(Settings):
             max_column_tones=self.max_column_tones,
             eject_slots=self.eject_slots,
             clearance_m=self.clearance,
+            path_depth=self.path_depth,
             empty_tweezers_may_land=self.empty_tweezers_may_land,
             rf=self.rf.spec(),
             losses=self.losses.spec(),

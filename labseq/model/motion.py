@@ -142,6 +142,8 @@ class MotionSpec:
             tweezers from one another, in batches with paths of tones (ours). Half-way between two rows
             of the paper's lattice it is 1.944 um; how many atoms are lost there depends on their
             temperature.
+        path_depth: Depth of the tweezers in batches with paths of tones, as a fraction of the full
+            depth: shallower ones take fewer of the atoms that they pass.
         empty_tweezers_may_land: Whether a tweezer without an atom may end on a site that holds one.
         rf: What drives the AODs.
         losses: How probably atoms are lost.
@@ -158,6 +160,7 @@ class MotionSpec:
     max_column_tones: int = 20
     eject_slots: int = 1
     clearance_m: float = 1.9e-6
+    path_depth: float = 1.0
     empty_tweezers_may_land: bool = False
     rf: RfSpec = field(default_factory=RfSpec)
     losses: LossSpec = field(default_factory=LossSpec)
@@ -174,6 +177,8 @@ class MotionSpec:
             raise ValueError("eject_slots cannot be negative")
         if not 0 < self.clearance_m < math.inf:
             raise ValueError(f"the clearance is {self.clearance_m} m; expected more than 0")
+        if not 0 < self.path_depth <= 1:
+            raise ValueError(f"path_depth is {self.path_depth}; expected a fraction, more than 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

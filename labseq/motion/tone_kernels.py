@@ -353,7 +353,8 @@ def start_sites(of: Batch, n_sites: int, tones: Ints) -> None:
 
 @kernel(
     f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, {PATHS}, float64, int64, int64,"
-    f" int64, {SITES_OF_AXIS}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS}, float64[:, ::1])"
+    f" int64, {SITES_OF_AXIS}, {SITES}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS},"
+    " float64[:, ::1])"
 )
 def build_axis(
     moves: Moves,
@@ -365,6 +366,7 @@ def build_axis(
     axis: int,
     n_other_sites: int,
     sites: Sites,
+    path_amplitude: Floats,
     preassigned: Floats,
     low_crest: bool,
     course: int,
@@ -393,6 +395,7 @@ def build_axis(
         axis: 0 for the row tones, 1 for the column tones.
         n_other_sites: Sites of the other axis.
         sites: The sites of the axis.
+        path_amplitude: float64 (n_sites,), amplitude of each site's tone in batches with paths.
         preassigned: float64 (n_sites,), phase of each site's tone at pick-up, in cycles.
         low_crest: See :func:`first_phases`.
         course: Of the transports, a value of :class:`labseq.model.FrequencyCourse`.
@@ -414,6 +417,7 @@ def build_axis(
     tones = np.empty((2, most), np.int64)
     others = np.empty((2, n_other_sites), np.int64)
     phase = np.zeros(most, np.float64)
+    path_sites = sites[0], sites[1], path_amplitude
     segments[3][0] = 0
     m = n = at_position = at_knot = 0
     for batch in range(n_batches):
@@ -423,7 +427,7 @@ def build_axis(
             of = positions, off, shape, axis, batch
             start_sites(of, n_sites, tones)
             first_phases(tones, shape[1 + axis], preassigned, low_crest, sites[2], phase)
-            m, n = add_path_batch(m, n, of, sites, course, cosine, times_s, segments, values, phase)
+            m, n = add_path_batch(m, n, of, path_sites, course, cosine, times_s, segments, values, phase)
             continue
         start, stop = batch_offsets[batch], batch_offsets[batch + 1]
         n_tones = collect_tones(moves, start, stop, axis, n_sites, tones)

@@ -107,7 +107,8 @@ def tone_program(
 
     In a batch with paths of tones each leg is a segment, whose longest way has the mean speed of the
     setting; between sites frequency and amplitude squared are interpolated. Row tones are ramped, and at
-    a knot before the last the tones that go off there, while the others wait.
+    a knot before the last the tones that go off there, while the others wait. The row tones are
+    weaker by the square root of ``path_depth``.
 
     Each site's tone has a preassigned amplitude; by default all are equal, such that
     the most tones an axis may have reach full scale together. During a transport at constant
@@ -175,6 +176,7 @@ def tone_program(
             axis,
             grid.shape[1 - axis],
             (driven.site_hz, driven.step_hz, driven.amplitude),
+            driven.amplitude if axis else driven.amplitude * math.sqrt(motion.path_depth),
             driven.phase,
             motion.rf.phases == "low_crest",
             course,

@@ -113,6 +113,7 @@ def test_defaults_are_those_of_the_core() -> None:
 CHANGES: dict[str, Any] = {
     "speed_profile": "minimum_jerk",
     "clearance": "1.5 um",
+    "path_depth": "50 %",
     "empty_tweezers_may_land": True,
     "rf": {"phases": "low_crest"},
     "losses": {"move": 0.5},

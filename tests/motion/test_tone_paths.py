@@ -73,6 +73,17 @@ def test_segments_of_staggered_paths() -> None:
     assert (program.row.end_amplitude[first_off] / program.row.start_amplitude[first_off]).tolist() == [0, 1]
 
 
+def test_tweezers_of_paths_may_be_shallower() -> None:
+    """The row tones of batches with paths alone, and only their amplitudes, change."""
+    full, shallow = (program_of(LINE, PATHS, path_depth=depth) for depth in (1.0, 0.25))
+    of_paths = np.repeat(full.batch == 1, np.diff(full.row.offsets))
+    for name in ("start_amplitude", "end_amplitude"):
+        expected = getattr(full.row, name) * np.where(of_paths, 0.5, 1.0)
+        np.testing.assert_allclose(getattr(shallow.row, name), expected)
+        np.testing.assert_array_equal(getattr(shallow.column, name), getattr(full.column, name))
+    np.testing.assert_array_equal(shallow.row.phase_rad, full.row.phase_rad)
+
+
 @pytest.mark.parametrize("grid", [GRID, CALIBRATED])
 def test_tones_are_where_the_paths_say_and_keep_their_phases(grid: SiteGrid) -> None:
     """Frequencies by interpolation between sites; phases by their integral; amplitudes between ramps."""
