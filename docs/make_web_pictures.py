@@ -7,6 +7,7 @@ Needs Debian's chromium. The runs have seeds; what the computer took for each st
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 DOCS = Path(__file__).parent
@@ -31,7 +33,6 @@ PICTURES = {
     "wall": ("/now?wall=1", "dark", 1600, 900),
     "shot": ("/runs/{compact}/shots/2", "light", 1280, 800),
     "scan": ("/scan?run={scan}", "light", 1280, 560),
-    "runs": ("/runs", "light", 1280, 360),
     "phone": ("/now", "light", 390, 844),
 }
 
@@ -101,7 +102,10 @@ def take(folder: Path = FOLDER, names: tuple[str, ...] = tuple(PICTURES), shots:
                 page.goto(address + page_of.format(**runs))
                 page.locator("main[aria-busy='false'] h1").first.wait_for()
                 page.wait_for_timeout(1500)  # frames are loaded one by one
-                page.screenshot(path=folder / f"{name}.png")
+                picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+                picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+                    folder / f"{name}.png", optimize=True
+                )
                 page.close()
         chromium.close()
 

@@ -63,7 +63,7 @@ function chartOptions(box, options) {
     cursor: { y: false, points: { size: 8 }, drag: { setScale: true, x: true, y: false } },
     scales: { x: { time: Boolean(options.isTime), range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low - 0.02 * (high - low), high + 0.02 * (high - low)]) },
       y: { range: () => rangeOf(box.points, options) } },
-    axes: [{ ...axis, size: 2 * rem, space: 4.5 * rem, values: options.formatX ? (_, all) => all.map(options.formatX) : undefined },
+    axes: [{ ...axis, size: 2 * rem, space: 4.5 * rem, ...(options.whole ? { incrs: WHOLE } : {}), values: options.formatX ? (_, all) => all.map(options.formatX) : undefined },
       { ...axis, size: 4.2 * rem, space: 2.4 * rem, values: (_, all) => all.map(options.format) }],
     series: [{}, { stroke: ink, width: options.line === false ? 0 : 1.6, spanGaps: true,
       points: { show: true, size: box.points.length > 60 ? 3 : 6, fill: ink, stroke: ink } }, { show: false }, { show: false }],
@@ -111,9 +111,10 @@ export function trendPoints(trend, name) {
     n: bin.n > 1 ? `${bin.n} shots` : "" }));
 }
 
+const WHOLE = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000, 1_000_000];
 const nice = (fraction) => `${Number((100 * fraction).toFixed(2))} %`;
-export const FILLING = { x: "shot", label: "Filling", format: nice, ink: "blue", highest: 1.0005, formatX: (x) => String(Math.round(x)) };
-export const DEFECT_FREE = { x: "shot", label: "Defect-free", format: nice, ink: "green", lowest: -0.02, highest: 1.02, formatX: (x) => String(Math.round(x)) };
+export const FILLING = { x: "shot", label: "Filling", format: nice, ink: "blue", whole: true, highest: 1.0005, formatX: (x) => String(Math.round(x)) };
+export const DEFECT_FREE = { x: "shot", label: "Defect-free", format: nice, ink: "green", whole: true, lowest: -0.02, highest: 1.02, formatX: (x) => String(Math.round(x)) };
 
 // A bar for each row: {name, value, error, text}
 export function bars(rows, label) {

@@ -89,8 +89,8 @@ function makeView(main) {
     const cycle = shot && !shot.error ? shot.cycles[picked ?? shot.cycles.length - 1] : null;
     const at = cycle ? images.findIndex((one) => one.step === cycle.step && one.cycle === cycle.cycle) : images.length - 1;
     const last = images[images.length - 1], end = images[at < 0 ? images.length - 1 : at], start = cycle ? images[Math.max(0, at - 1)] : images[0];
+    frame.node.hidden = !bitmap;  // before it is drawn: what is hidden has no width
     drawFrame(frame.canvas, bitmap, reduced, shot?.sites_px ?? null, last?.occupancy ?? []);
-    frame.node.hidden = !bitmap;
     frame.caption.textContent = last ? `Last frame: ${last.name}, ${count(last.n_atoms, "atom")}` : "";
     if (!end) { before.node.hidden = after.node.hidden = true; return; }
     before.node.hidden = !cycle;
@@ -109,7 +109,7 @@ function makeView(main) {
   return { update, arrays };
 }
 
-const chartHeight = () => (document.documentElement.classList.contains("wall") ? Math.round(innerHeight * 0.18) : 180);
+const chartHeight = () => (document.documentElement.classList.contains("wall") ? Math.round(innerHeight * 0.2) : 180);
 
 export function headOf(run, state) {
   const others = (state.running ?? []).filter((id) => id !== run.id);

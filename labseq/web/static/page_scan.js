@@ -63,7 +63,7 @@ function drawCurves(parts, scan) {
       const points = scan.points.map((point) => ({ x: axis.numbers ? axis.numbers[point.place[a]] : point.place[a], y: point[name],
         low: point[`${name}_interval`][0], high: point[`${name}_interval`][1], n: `${point.n_shots} shots`, text: axis.words[point.place[a]] })).sort((p, q) => p.x - q.x);
       const format = axis.numbers ? (x) => String(Number(x.toPrecision(4))) : (x) => axis.words[x] ?? "";
-      curve(parts.curves[box++], points, { ...options, x: `${shortName(axis.address)}${axis.unit ? ` in ${axis.unit}` : ""}`, formatX: format, line: scan.axes.length === 1, height: () => 240 });
+      curve(parts.curves[box++], points, { ...options, x: `${shortName(axis.address)}${axis.unit ? ` in ${axis.unit}` : ""}`, formatX: format, whole: false, line: scan.axes.length === 1, height: () => 240 });
     }
   });
 }
