@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import labseq
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.model.estimate import Estimate
+from labseq.session.check import check
 
 ROOT = Path(__file__).parents[2]
 SURVIVAL = "survival:before,after"
@@ -45,3 +47,23 @@ def test_the_fitted_value_is_that_of_the_simulation(
     value: Estimate = found.values[parameter]
     assert abs(value.value - true) < 3 * value.error + tolerance
     assert value.error < 0.25 * abs(true) + tolerance
+
+
+def test_a_wrong_step_of_the_tones_costs_atoms(tmp_path: Path) -> None:
+    lost: list[float] = []
+    for step in ("1.6 MHz", "1.65 MHz"):
+        overrides = [f"profile.grid.column_frequency.step={step}", "shot.2.rearrange.cycles=1"]
+        options: Any = {"shots": 3, "seed": 1, "output": tmp_path, "overrides": overrides}
+        with labseq.Session.open(ROOT / "sequences" / "compact_225.yaml", **options) as session:
+            run = session.run()
+        lost.append(sum(shot.readings["simulation.lost.hand_over"] for shot in run.shots))
+    assert lost[1] > 20 + 3 * lost[0]
+
+
+def test_settings_beyond_the_tables_of_the_virtual_lab_are_named() -> None:
+    scan = "scan={profile.mobile_tweezers.pick_up: [60 us, 400 us]}"
+    session = labseq.Session.open(ROOT / "sequences" / "transport_speed.yaml", overrides=[scan])
+    (warning,) = check(session).warnings
+    assert "profile.mobile_tweezers.pick_up is 400 us" in str(warning)
+    assert "from 0 s to 160 us only" in str(warning)
+    assert "at point 1 of the scan" in str(warning)
