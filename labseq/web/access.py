@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
 import ipaddress
@@ -56,6 +57,8 @@ _GUESSES_PER_S, _GUESSES = 0.2, 10.0
 _ACTIONS_PER_S, _ACTIONS = 2.0, 20.0
 """Requests of one address that change something."""
 _MAX_ADDRESSES: Final = 1000
+SEND_S: Final = 60.0
+"""For so long a browser may leave what is sent to it unread."""
 
 
 @dataclass(slots=True)
@@ -188,7 +191,8 @@ class Guard:
                 known = {name.lower() for name, _ in message["headers"]}
                 added = [(k.encode(), v.encode()) for k, v in _HEADERS.items() if k.encode() not in known]
                 message["headers"] = [*message["headers"], *added]
-            await send(message)
+            async with asyncio.timeout(SEND_S):  # a browser that no longer reads
+                await send(message)
 
         refusal = self._refusal(scope, headers, who)
         if refusal is not None:
@@ -196,7 +200,8 @@ class Guard:
         elif self._is_first_visit(scope):
             await _answer(send_safely, 303, "", self._welcome(scope))
         else:
-            await self._app(scope, receive, send_safely)
+            with suppress(TimeoutError):  # the connection is closed
+                await self._app(scope, receive, send_safely)
 
     def _refusal(self, scope: Scope, headers: dict[str, str], who: str) -> tuple[int, str] | None:
         """Status and reason if the request is refused."""

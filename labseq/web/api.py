@@ -20,6 +20,7 @@ from labseq.analysis.statistics import statistics_of
 from labseq.analysis.timing import StageTotals
 from labseq.errors import LabseqError, RecordingError
 from labseq.files import read_file
+from labseq.messages import format_error
 from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
@@ -424,10 +425,9 @@ async def answered(one: Endpoint, request: Request) -> Response:
         return JSONResponse({"error": text_of(error)}, 404)
     except (LabseqError, OSError) as error:
         return JSONResponse({"error": text_of(error)}, 409)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:  # a file with other values
-        return JSONResponse(
-            {"error": text_of(f"a file of this run has values that cannot be read: {error!r}")}, 409
-        )
+    except Exception as error:  # noqa: BLE001 - a file with other values than expected
+        what = f"a file of it has values that cannot be read: {format_error(error)}"
+        return JSONResponse({"error": text_of(what)}, 409)
     if isinstance(found, Response):
         return found
     content = encode(to_plain(found))

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final, TypeVar
 
 from labseq.errors import LabseqError
+from labseq.messages import format_error
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.state import Limits, RunState, alarm
 
@@ -121,8 +122,9 @@ class Live:
             if run is None:
                 return {"run": None, "running": [], "alarms": [], "error": ""}
             return self._state_of(run).update() | {"running": self._catalogue.running(), "error": ""}
-        except (LabseqError, OSError, NoSuchRun) as error:
-            text = text_of(error)
+        except Exception as error:  # noqa: BLE001 - whatever a damaged file leads to, the page goes on
+            is_known = isinstance(error, LabseqError | OSError | NoSuchRun)
+            text = text_of(error if is_known else format_error(error))
             found = alarm("error", "This cannot be shown", text)
             return {"run": None, "running": [], "alarms": [found], "error": text}
 

@@ -82,7 +82,7 @@ def serve(data: Path | None, how: Serving) -> None:
         say(line)
     config = uvicorn.Config(
         app,  # pyright: ignore[reportArgumentType]
-        log_level="error",
+        log_level="critical",  # what goes wrong is in the answers
         access_log=False,
         server_header=False,
         ws="none",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,34 @@ def test_too_many_requests_are_refused(tmp_path: Path) -> None:
     for i in range(5000):
         rate.allows(str(i))
     assert len(rate._left) <= 1000
+
+
+def test_connections_that_nobody_reads_are_closed(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq.web.access.SEND_S", 0.05)
+    app = client_of(run_dir.parent.parent).app
+    scope: dict[str, Any] = {
+        "type": "http",
+        "method": "GET",
+        "path": "/api/v1/events",
+        "query_string": b"",
+        "scheme": "http",
+        "headers": [(b"host", b"127.0.0.1")],
+        "client": ("127.0.0.1", 1),
+        "root_path": "",
+    }
+
+    async def never() -> Any:
+        await asyncio.Event().wait()
+
+    sent = list[str]()
+
+    async def send(message: Any) -> None:
+        sent.append(message["type"])
+        if message["type"] == "http.response.body":
+            await never()
+
+    asyncio.run(asyncio.wait_for(app(scope, never, send), 30.0))
+    assert sent == ["http.response.start", "http.response.body"]
 
 
 def test_static_files_are_those_of_the_folder(client: Client) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ import numpy as np
 import pytest
 
 from labseq.analysis.statistics import statistics_of
+from labseq.calibration.store import encode_entry
+from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.model.estimate import mean
+from labseq.plain import now
 from labseq.recording import open_run
 from labseq.recording.run_file import is_index_row
 from labseq.web.history import RunHistory
@@ -226,6 +230,20 @@ def test_no_path_leads_out_of_the_data_folder(path: str, client: Any, run_dir: P
     shutil.copytree(run_dir, secret)
     for page in ("", "/files/sequence", "/shots/0"):
         assert client.get(f"/api/v1/runs/{path}{page}").status_code in (403, 404, 405)
+
+
+def test_a_calibration_older_than_its_limit_is_an_alarm(run_dir: Path) -> None:
+    from labseq.web.state import calibration_alarms
+
+    quality, grid = {"error_m": 1e-8}, grid_facts(SiteGrid())
+    values = {"offset_m": np.array([1e-8, 0.0])}
+    taken = (now() - timedelta(days=3)).isoformat()
+    old = CalibrationEntry("overlay", values, quality, grid, {}, taken)
+    (run_dir / "calibration_overlay.json").write_bytes(encode_entry(old))
+    record = {"calibrations": {"overlay": old.id, "sites": "gone"}}
+    (found,) = calibration_alarms(run_dir, record, 86_400.0)
+    assert found["title"] == "The calibration 'overlay' is 3 days old"
+    assert calibration_alarms(run_dir, record, 7 * 86_400.0) == []
 
 
 def test_a_clock_that_jumped_and_a_full_disk(run_dir: Path, monkeypatch: Any) -> None:

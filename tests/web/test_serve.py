@@ -1,0 +1,59 @@
+"""The server beside a run: it is started once, answers, and ends with its terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from urllib.request import urlopen
+
+import psutil
+import pytest
+
+from labseq.web import serve
+
+PARENT = """
+import sys
+from pathlib import Path
+from labseq.web import serve
+serve.PORT = int(sys.argv[2])
+print(serve.start_beside(Path(sys.argv[1])), flush=True)
+sys.stdin.read()
+"""
+
+
+def free_port() -> int:
+    listener = serve._listener("127.0.0.1", 0)
+    port = listener.getsockname()[1]
+    listener.close()
+    return port
+
+
+def test_a_server_beside_a_run_is_started_once_and_ends_with_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shell is the terminal here; what it runs starts the server."""
+    monkeypatch.setattr(serve, "PORT", free_port())
+    arguments = [sys.executable, "-c", PARENT, str(tmp_path / "data"), str(serve.PORT)]
+    script = f"import subprocess; subprocess.run({arguments!r})"
+    terminal = subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert terminal.stdout is not None
+    said = terminal.stdout.readline()
+    address, pid = said.split()[0], int(re.findall(r"process (\d+)", said)[0])
+    server = psutil.Process(pid)
+    for _ in range(200):
+        if serve._serves(address, tmp_path / "data"):
+            break
+        with pytest.raises(psutil.TimeoutExpired):
+            server.wait(0.1)
+    with urlopen(f"{address}api/v1/server") as answer:
+        assert json.load(answer)["data"] == str(tmp_path / "data")
+    assert "process" not in serve.start_beside(tmp_path / "data")
+    assert os.getpid() != pid
+    terminal.communicate("")
+    server.wait(20)
