@@ -71,7 +71,7 @@ def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[
     assert session.assembly.target.fill.sum() == 177
     Path("lab/sequences/kagome.yaml").unlink()
     with pytest.raises(
-        ConfigError, match=r"climb_dop_ramp\.yaml: this file already exists \(and \d+ more files\)"
+        ConfigError, match=r"climb_dop_speed\.yaml: this file already exists \(and \d+ more files\)"
     ):
         demo.copy_files(Path("lab"))
     assert not Path("lab/sequences/kagome.yaml").exists()

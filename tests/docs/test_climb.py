@@ -15,7 +15,7 @@ from labseq.recording.points import scan_points
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "how-to" / "climb.md"
-SEQUENCE = ROOT / "sequences" / "climb_dop_ramp.yaml"
+SEQUENCE = ROOT / "sequences" / "climb_dop_speed.yaml"
 PROFILE = str(ROOT / "hardware_profiles" / "virtual.yaml")
 
 
@@ -41,10 +41,10 @@ def test_the_climb_of_the_page(tmp_path: Path, capfd: pytest.CaptureFixture[str]
     filling = [sum(shot.filling_fraction for shot in point.shots) for point in points]
     assert points[0].written == {
         "planner.degree_of_parallelism": "15",
-        "profile.mobile_tweezers.pick_up": "60 us",
+        "profile.mobile_tweezers.speed": "130 um/ms",
     }
     assert max(filling[1:]) > filling[0]
     show_run(run.path, as_json=False, tables=Tables(scan=ScanRequest()))
     lines = capfd.readouterr().out.splitlines()
-    assert lines[1].split()[:3] == ["15", "60", "us"]
+    assert lines[1].split()[:3] == ["15", "130", "um/ms"]
     assert len(lines) == 1 + len(points)
