@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import math
 import time
@@ -45,7 +46,6 @@ _FRAME_S, _MAX_FRAMES = 2.0, 8
 """For so long a frame is kept, and so many."""
 _RUN: Final = "/runs/{day}/{name}"
 _TEXTS: Final = {"sequence": SEQUENCE_FILE, "profile": PROFILE_FILE}
-_KINDS: Final[Mapping[str, str]] = {"n": "integer", "shot": "integer", "image": "integer"}
 _DESCRIPTIONS: Final = {
     "day": "date of the run's folder, 2026-11-20",
     "name": "name of the run's folder, 0001_compact-225",
@@ -103,7 +103,7 @@ class Api:
         self._live = Live(catalogue, limits)
         self._actions = actions
         self._started_s = time.monotonic()
-        self._frames: OrderedDict[str, tuple[float, tuple[bytes, int]]] = OrderedDict()
+        self._frames: OrderedDict[str, tuple[float, asyncio.Future[tuple[bytes, int]]]] = OrderedDict()
 
     def endpoints(self) -> list[Endpoint]:
         """All endpoints of this server."""
@@ -249,11 +249,14 @@ class Api:
         """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""
         key, now_s = str(request.url), time.monotonic()
         kept = self._frames.get(key)
-        if kept is None or now_s - kept[0] > _FRAME_S:  # else many pages ask for the same one
-            kept = self._frames[key] = (now_s, await in_thread(partial(self._frame, request)))
+        if kept is None or now_s - kept[0] > _FRAME_S:  # else many pages ask for the same one, at once
+            kept = self._frames[key] = (
+                now_s,
+                asyncio.ensure_future(in_thread(partial(self._frame, request))),
+            )
             while len(self._frames) > _MAX_FRAMES:
                 self._frames.popitem(last=False)
-        png, factor = kept[1]
+        png, factor = await asyncio.shield(kept[1])
         headers = {"cache-control": "private, max-age=600", "x-reduced": str(factor)}
         return Response(png, media_type="image/png", headers=headers)
 

@@ -86,7 +86,7 @@ class RunState:
             self.run.history.update()
             self.run.read_events()
             columns = self.run.history.columns()
-            self._open_shots(record)
+            self._open_shots(record, status)
             return {
                 "run": self._head(record, status, error),
                 "figures": figures_of(columns),
@@ -110,10 +110,11 @@ class RunState:
             return None
         return taken_s / n_new * max(0, head["n_shots"] - head["n_done"])
 
-    def _open_shots(self, record: Mapping[str, Any]) -> None:
-        """Read the newest shots, unless some have just been read: a later update does it then."""
+    def _open_shots(self, record: Mapping[str, Any], status: str) -> None:
+        """Read the newest shots; during a run not if some have just been read: a later update does it."""
         lines = len(self.run.history)
-        if lines == self._n_opened or time.monotonic() - self._opened_s < _OPEN_S:
+        is_too_soon = status == "running" and time.monotonic() - self._opened_s < _OPEN_S
+        if lines == self._n_opened or is_too_soon:
             return
         self._opened_s, self._shot_error = time.monotonic(), ""
         if lines < self._n_opened:  # the index was replaced

@@ -31,8 +31,7 @@ export function drawArray(canvas, lattice, fill, occupancy, batches = [], upTo =
   const atom = colour("atom"), bad = colour("warn"), site = colour("site"), goal = colour("goal");
   const dot = (i, r) => { const [x, y] = place(i); ctx.moveTo(x + r, y); ctx.arc(x, y, r, 0, 2 * Math.PI); };
   const each = (test, draw) => { ctx.beginPath(); at.forEach((_, i) => test(i) && draw(i)); };
-  const [n, m] = [lattice.cols, lattice.rows];
-  const has = (rows, i) => rows[Math.floor(i / n)]?.[i % n] === "1";
+  const has = (rows, i) => rows[Math.floor(i / lattice.cols)]?.[i % lattice.cols] === "1";
 
   ctx.fillStyle = goal;
   each((i) => has(fill, i), (i) => dot(i, 0.52 * unit));
@@ -51,7 +50,6 @@ export function drawArray(canvas, lattice, fill, occupancy, batches = [], upTo =
   });
   ctx.stroke();
   drawMoves(ctx, lattice, batches.slice(0, upTo), unit, low);
-  return { n, m };
 }
 
 function drawMoves(ctx, lattice, batches, unit, low) {

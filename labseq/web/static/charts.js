@@ -1,5 +1,5 @@
 // Charts: curves with error bars by uPlot; maps and bars as SVG.
-import { colour, el, percent, svg, time } from "./dom.js";
+import { colour, el, svg } from "./dom.js";
 
 const open = new Set();
 const observer = new ResizeObserver((entries) => {
@@ -165,5 +165,3 @@ export function heatMap(axes, cells, label, format) {
     el("table.heat", {}, el("caption", {}, `${axes[0].address} down, ${axes[1].address} across`),
       el("thead", {}, el("tr", {}, el("td", {}, ""), axes[1].words.map((word) => el("th", { scope: "col" }, word)))), el("tbody", {}, body)));
 }
-
-export { percent, time };

@@ -1,6 +1,6 @@
 // The scan of the newest run, or of one run, as it fills.
 import { setLink } from "./app.js";
-import { bars, closeCharts, curve, DEFECT_FREE, FILLING, heatMap } from "./charts.js";
+import { closeCharts, curve, DEFECT_FREE, FILLING, heatMap } from "./charts.js";
 import { el, getJson, panel, percent, percentWithError, replace, runPath, table } from "./dom.js";
 import { follow } from "./live.js";
 import { alarmList, headOf } from "./page_now.js";
@@ -86,4 +86,3 @@ function pointTable(scan) {
   return table(heads, scan.points.map((point) => [...point.written, String(point.n_shots), percentWithError(point.filling, point.filling_interval), percent(point.defect_free)]), { label: "Points of the scan" });
 }
 
-export { bars };
