@@ -85,7 +85,7 @@ def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
     ranges = [
         ("mobile_tweezers.pick_up", motion.pick_up_s, RAMPS_S, 1 / time, "time"),
         ("mobile_tweezers.drop_off", motion.drop_off_s, RAMPS_S, 1 / time, "time"),
-        ("mobile_tweezers.speed", motion.speed_m_s, SPEEDS, time / length, "speed"),
+        ("mobile_tweezers.speed", motion.speed_m_s, (0.0, SPEEDS[-1]), time / length, "speed"),
         ("simulation.mobile_light.depth", light.depth, RATIOS, static, "temperature"),
         ("simulation.temperature", settings.temperature, TEMPERATURES, static / DEPTH_K, "temperature"),
         ("simulation.mobile_light.waist", light.waist, (0.97, 1.03), settings.static_waist, "length"),

@@ -420,8 +420,8 @@ class SimulationSettings(Settings):
     )
     lost_below_depth: Fraction = Field(
         default=0.1,
-        description="fraction of the nominal depth below which a static tweezer loses its atom and loads "
-        "none (ours)",
+        description="fraction of the nominal depth below which a static tweezer loads no atom, and loses its "
+        "own if it came there without a ramp (ours)",
     )
     site_tolerance: float = Field(
         default=0.25,

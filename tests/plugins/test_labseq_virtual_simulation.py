@@ -483,3 +483,31 @@ def test_preassigned_amplitudes_give_the_full_depth(clock: FakeClock) -> None:
     after(clock)
     flights = simulation.atom_events(0.0)["flights"]
     assert flights["depth_K"][flights["from_row"] == 5] == pytest.approx([2.1e-3], rel=0.02)
+
+
+def test_noise_of_the_intensity_heats_atoms_that_no_light_cools() -> None:
+    line = LineSpec("molasses", 3, frozenset({"load"}))
+    noisy = {
+        "loading": 1.0,
+        "intensity_noise": 2e-8,
+        "lights": {"cooling": ["molasses"]},
+        "depth_disorder": 0.0,
+    }
+    n_left: list[int] = []
+    for hold_s in (0.0, 2e-3, 10e-3):
+        simulation = VirtualSimulation(
+            SimulationSettings.model_validate(noisy), Context("simulation", ARRAY_GRID, lines=(line,))
+        )
+        simulation.open()
+        simulation.begin_shot()
+        simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+        simulation.load(1.0, 0.5)
+        dark = LineProgram("idle", ("molasses",), np.zeros(1), np.zeros((1, 1), np.bool_), 0.0, 1.0)
+        simulation.play("lines", dark, 1.5)
+        simulation.expose(1.5 + hold_s, 1e-3)
+        n_left.append(n_atoms(simulation))
+    rate_hz = 2 / 3 * np.pi**2 * 54.7e3**2 * 2e-8  # 55 kHz in a well of 300 uK
+    x = 20 * np.exp(-rate_hz * 10e-3)
+    lost = np.exp(-x) * (1 + x + x**2 / 2)
+    assert n_left[0] >= n_left[1] > n_left[2]
+    assert 1 - n_left[2] / n_left[0] == pytest.approx(lost, abs=0.1)
