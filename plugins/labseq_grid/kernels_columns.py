@@ -118,46 +118,34 @@ def most_carried(spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, mo
 
 
 AFTER_ALL: Final = 1 << 14
+ENDS: Final = "int16[:, :, ::1]"
+Ends = NDArray[np.int16]
 
 
-@helper_kernel(f"void({TABLE}, int64, {SITES}, {NUMBERS}, int64, int64, int16[:, :, ::1], {TABLE})")
+@helper_kernel(f"void({TABLE}, {TABLE}, int64, int64, int64, {ENDS}, {TABLE})")
 def trace_back(
-    spare: Ints,
-    n: int,
-    vacant: Bytes,
-    goals: Ints,
-    n_chosen: int,
-    atoms: int,
-    ends: NDArray[np.int16],
-    chosen: Ints,
+    spare: Ints, wanted: Ints, n_wanted: int, n_chosen: int, atoms: int, ends: Ends, chosen: Ints
 ) -> None:
     """Read the choice of columns from the finished programme of :func:`trace_columns`, backwards."""
-    col = vacant.shape[1]
+    k = n_wanted
     for taken in range(n_chosen, 0, -1):
-        while ends[col - 1, taken, atoms] == ends[col, taken, atoms]:
-            col -= 1
-        col -= 1
-        part = wanted = pattern_of(vacant, goals, n, col)
+        while ends[k - 1, taken, atoms] == ends[k, taken, atoms]:
+            k -= 1
+        k -= 1
+        part = wanted[0, k]
         while True:
             before = atoms - n_bits(part)
-            start = ends[col, taken - 1, before] if before >= 0 else AFTER_ALL
-            if start < AFTER_ALL and spare[part, start] + 1 == ends[col + 1, taken, atoms]:
+            start = ends[k, taken - 1, before] if before >= 0 else AFTER_ALL
+            if start < AFTER_ALL and spare[part, start] + 1 == ends[k + 1, taken, atoms]:
                 break
-            part = (part - 1) & wanted
+            part = (part - 1) & wanted[0, k]
         atoms = before
-        chosen[0, taken - 1], chosen[1, taken - 1] = part, col
+        chosen[0, taken - 1], chosen[1, taken - 1] = part, wanted[1, k]
 
 
-@helper_kernel(f"int64({TABLE}, int64, {SITES}, {NUMBERS}, int64, int64, int16[:, :, ::1], {TABLE})")
+@helper_kernel(f"int64({TABLE}, int64, {SITES}, {NUMBERS}, int64, int64, {TABLE})")
 def trace_columns(
-    spare: Ints,
-    n: int,
-    vacant: Bytes,
-    goals: Ints,
-    limit: int,
-    gain: int,
-    ends: NDArray[np.int16],
-    chosen: Ints,
+    spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, gain: int, chosen: Ints
 ) -> int:
     """Find a choice of columns that carries ``gain`` atoms, by the programme of :func:`most_carried`.
 
@@ -168,35 +156,34 @@ def trace_columns(
         goals: int64 (n,), the goal rows.
         limit: Maximum number of columns.
         gain: What :func:`most_carried` returned.
-        ends: Work space, int16 (n_cols + 1, > limit, > gain).
         chosen: Result, int64 (>= 2, n_cols): pattern and goal of each column.
 
     Returns:
         Number of columns, the fewest that carry as many.
     """
     n_cols = vacant.shape[1]
-    for taken in range(limit + 1):
-        for atoms in range(gain + 1):
-            ends[0, taken, atoms] = AFTER_ALL
-    ends[0, 0, 0] = 0
+    wanted, n_wanted = np.empty((2, n_cols), np.int64), 0
     for col in range(n_cols):
-        wanted = pattern_of(vacant, goals, n, col)
-        for taken in range(limit + 1):
-            for atoms in range(gain + 1):
-                ends[col + 1, taken, atoms] = ends[col, taken, atoms]
-        for taken in range(limit if wanted else 0):
+        wanted[0, n_wanted], wanted[1, n_wanted] = pattern_of(vacant, goals, n, col), col
+        n_wanted += wanted[0, n_wanted] != 0
+    ends = np.empty((n_wanted + 1, limit + 1, gain + 1), np.int16)
+    ends[0] = AFTER_ALL
+    ends[0, 0, 0] = 0
+    for k in range(n_wanted):
+        ends[k + 1] = ends[k]
+        for taken in range(min(limit, k + 1)):
             for atoms in range(min(gain, n * taken) + 1):
-                start = ends[col, taken, atoms]
-                part = wanted if start < n_cols else 0
+                start = ends[k, taken, atoms]
+                part = wanted[0, k] if start < n_cols else 0
                 while part > 0:
                     total = atoms + n_bits(part)
-                    if total <= gain and spare[part, start] + 1 < ends[col + 1, taken + 1, total]:
-                        ends[col + 1, taken + 1, total] = spare[part, start] + 1
-                    part = (part - 1) & wanted
+                    if total <= gain and spare[part, start] + 1 < ends[k + 1, taken + 1, total]:
+                        ends[k + 1, taken + 1, total] = spare[part, start] + 1
+                    part = (part - 1) & wanted[0, k]
     n_chosen = 0
-    while ends[n_cols, n_chosen, gain] == AFTER_ALL:
+    while ends[n_wanted, n_chosen, gain] == AFTER_ALL:
         n_chosen += 1
-    trace_back(spare, n, vacant, goals, n_chosen, gain, ends, chosen)
+    trace_back(spare, wanted, n_wanted, n_chosen, gain, ends, chosen)
     return n_chosen
 
 

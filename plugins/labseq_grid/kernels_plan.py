@@ -99,8 +99,7 @@ def complete(source: Bytes, vacant: Bytes, limits: Limits, n_lines: int, candida
     spare = np.empty((1 << n, n_cols + 1), np.int64)
     find_spare(source, rows[0], n, spare)
     chosen = np.empty((3, n_cols), np.int64)
-    ends = np.empty((n_cols + 1, limit + 1, atoms + 1), np.int16)
-    m = trace_columns(spare, n, vacant, rows[1], limit, atoms, ends, chosen)
+    m = trace_columns(spare, n, vacant, rows[1], limit, atoms, chosen)
     take_nearest(spare, m, chosen, np.empty((m + 1, n_cols + 1), np.int64))
     return swapped, m, rows, chosen
 
