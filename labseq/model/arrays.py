@@ -29,7 +29,7 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
     """
     wanted = np.dtype(dtype)
     array: NDArray[Any] = np.asarray(values)
-    if array.dtype == wanted and _fits(array.shape, shape):
+    if array.dtype == wanted and (array.shape == shape or _fits(array.shape, shape)):
         flags = array.flags
         if not flags.writeable and flags.c_contiguous:
             return array

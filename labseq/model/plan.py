@@ -258,12 +258,13 @@ class Plan:
 
     def part(self, start: int, stop: int) -> Plan:
         """Batches ``start`` to ``stop - 1``; a chain of linked batches must not be cut."""
-        offsets, shapes = self.batch_offsets[start : stop + 1], self.path_shapes[start:stop]
+        offsets = self.batch_offsets[start : stop + 1]
+        batches = self.moves[offsets[0] : offsets[-1]], offsets - offsets[0], self.linked[start:stop]
+        if not self.has_paths:
+            return Plan(*batches)
         (at, off_at), (end, off_end) = (_path_ends(self.path_shapes[:n]) for n in (start, stop))
-        paths = shapes, self.path_positions[at:end], self.path_off[off_at:off_end]
-        return Plan(
-            self.moves[offsets[0] : offsets[-1]], offsets - offsets[0], self.linked[start:stop], *paths
-        )
+        paths = self.path_shapes[start:stop], self.path_positions[at:end], self.path_off[off_at:off_end]
+        return Plan(*batches, *paths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -155,6 +155,14 @@ class SimulatedCard:
             return self._machine.memory.read(setup[r.SPC_MEMSIZE], len(setup.channels)).copy()
 
     @property
+    def levels(self) -> tuple[float, float]:
+        """Bytes of a stream that wait in the computer, and on the card with its output FIFO."""
+        with self._lock:
+            self._advance()
+            fifo = self._machine.fifo
+            return (0.0, 0.0) if fifo is None else fifo.levels
+
+    @property
     def running(self) -> bool:
         """Whether it is started and has not come to its end."""
         with self._lock:

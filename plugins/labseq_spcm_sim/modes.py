@@ -272,6 +272,11 @@ class Fifo:
         return self._buffer.n_bytes - (self._handed - notified)
 
     @property
+    def levels(self) -> tuple[float, float]:
+        """Bytes that were handed over and wait in the computer, and that wait on the card."""
+        return self._handed - self._transferred, self._transferred - self._consumed
+
+    @property
     def block_ready(self) -> bool:
         """Whether there is room for a block, or all was transferred."""
         return self.user_bytes >= max(1, self._buffer.notify_bytes) or self._transferred >= self._handed

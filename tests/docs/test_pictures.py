@@ -69,3 +69,9 @@ def test_the_picture_of_outputs_after_a_kill_can_be_drawn_again(tmp_path: Path) 
     script.draw(watched, alone, tmp_path / "off.png")
     with Image.open(tmp_path / "off.png") as made, Image.open(STATIC / "off_after_kill.png") as kept:
         assert made.size == kept.size
+
+
+def test_the_picture_of_a_stream_can_be_made_again(tmp_path: Path) -> None:
+    load_script("make_stream_picture").draw(tmp_path / "levels.png")
+    with Image.open(tmp_path / "levels.png") as made, Image.open(STATIC / "stream_levels.png") as kept:
+        assert made.size == kept.size
