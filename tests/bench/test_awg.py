@@ -32,8 +32,9 @@ SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 N_SHOTS = int(os.environ.get("LABSEQ_SHOTS", "1"))
 MOBILE = "profile.mobile_tweezers"
 TRIGGER = "awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, triggers: mobile_tweezers}"
-TRIGGERED = (f"profile.lines={{use: virtual, channels: {{{TRIGGER}}}}}",)
-STREAM = (f"{MOBILE}.mode=stream",)
+TIMING = f"{MOBILE}.overhead_per_cycle=13 ms"  # the same in every mode, so that the atoms wait equally long
+TRIGGERED = (TIMING, f"profile.lines={{use: virtual, channels: {{{TRIGGER}}}}}")
+STREAM = (TIMING, f"{MOBILE}.mode=stream")
 DDS = (*TRIGGERED, f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE}.max_column_tones=5")
 
 UNEVEN = tuple(
