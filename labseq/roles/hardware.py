@@ -258,7 +258,7 @@ class MobileTweezers(Hardware):
 
     @property
     def start_delay_s(self) -> float:
-        """Time from ``play``, or from the trigger, to the first tones at the outputs; known once open."""
+        """Time from the end of ``play``, or from the trigger, to the first tones at the outputs."""
         return 0.0
 
     @property

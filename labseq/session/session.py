@@ -15,7 +15,7 @@ from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord, TimelineEntry
-from labseq.realtime import lock_memory
+from labseq.realtime import prepare_process
 from labseq.recording import Run, RunWriter, Shot, clear_active, data_root, mark_active, open_run
 from labseq.recording.best import best_point
 from labseq.recording.folders import later_day
@@ -248,7 +248,7 @@ class Session:
 
     def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
         if not lab.clock.virtual:
-            lock_memory()
+            prepare_process()
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
         first = self.scan_run.first
         changes = {address: change["value"] for address, change in record.overrides.items()}

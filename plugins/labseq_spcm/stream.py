@@ -23,8 +23,8 @@ from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES
 from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 
-FIRST: Final = 1 << 15
-"""Samples of a program that are rendered before it starts: 52 us at 625 MS/s, behind 0.25 ms of silence."""
+FIRST: Final = 1 << 17
+"""Samples of a program that are rendered before it starts: 0.21 ms at 625 MS/s, behind 0.25 ms of silence."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 LOCKED_S: Final = 10e-6
@@ -47,6 +47,7 @@ class Stream:
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
         delay_s: From ``start`` to the first sample at the output, at most.
+        left_s: How much of that was left when the last ``start`` returned.
 
     Raises:
         DeviceError: The bus is too slow for the sample rate.
@@ -67,7 +68,7 @@ class Stream:
         self._to_start = settings.card_buffer // FRAME_BYTES // block * block
         ahead = settings.look_ahead_s(sample_rate_hz) * sample_rate_hz - self._on_card
         self._ahead = max(2, int(ahead / block)) * block
-        self.delay_s = (self._ahead + self._on_card) / sample_rate_hz
+        self.delay_s = self.left_s = (self._ahead + self._on_card) / sample_rate_hz
         least = 2 * self._whole_blocks(self._ahead + self._on_card)
         n_samples = max(self._whole_blocks(math.ceil(settings.fill_s * sample_rate_hz)), least)
         self._ring = Buffer().reserve(n_samples)
@@ -78,7 +79,7 @@ class Stream:
         self._chunk = np.zeros((2, CHUNK), np.int16)
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._streams = self._fills = False
+        self._streams = self._fills = self._has_thread = False
         self._failure: LabseqError | None = None
         self._prepared: InterleavedRenderer | None = None
         self._program: InterleavedRenderer | None = None
@@ -122,7 +123,8 @@ class Stream:
                 return
             self._begin()
             self._streams, self._stop = True, threading.Event()
-        if not self._card.library.call_in_virtual_time(self._step):
+        self._has_thread = not self._card.library.call_in_virtual_time(self._step)
+        if self._has_thread:
             threading.Thread(target=self._run, args=(self._stop,), name="spcm stream", daemon=True).start()
 
     def halt(self) -> None:
@@ -152,8 +154,11 @@ class Stream:
             if program is not None:  # else another thread has made the card safe
                 self._revive()
                 self._splice(program)
-                while self._handed < self._start + self._n_rendered and self._supply() == 0.0:
-                    pass
+                self._supply_until(self._start + self._n_rendered)
+                spliced_s = time.perf_counter()
+                # a beginning as a whole: this thread makes the rest next, and keeps others from Python
+                self._supply_until(min(self._end, self._handed + int(BEGINNING_S * self._rate_hz)))
+                self.left_s = self.delay_s - (time.perf_counter() - spliced_s)
 
     def append(self, program: ToneProgram) -> float:
         """Have the rest of a program follow its beginning, or the silence after it."""
@@ -161,7 +166,7 @@ class Stream:
         self._check_failure()
         with self._lock:
             self._rest = renderer
-            self._supply()
+            self._supply_until(self._handed + self._on_card)
         return renderer.n_samples / self._rate_hz
 
     def triggered(self) -> bool:
@@ -178,7 +183,8 @@ class Stream:
 
     def _check_failure(self) -> None:
         """Let a virtual clock's steps be done, and raise the error that ended the stream."""
-        _ = self._card.status
+        if not self._has_thread:  # beside a thread, a call could meet an error that is the thread's
+            _ = self._card.status
         with self._lock:
             failure, self._failure = self._failure, None
         if failure is not None:
@@ -206,6 +212,11 @@ class Stream:
         finally:
             self._lock.release()
 
+    def _supply_until(self, handed: int) -> None:
+        """Hand over as many samples, or as there is room for."""
+        while self._handed < handed and self._supply() == 0.0:
+            pass
+
     def _supply(self) -> float:
         """Hand over what there is room for; returns after how many seconds that is due again."""
         in_ring = self._revive()
@@ -218,14 +229,19 @@ class Stream:
             return 0.0
 
     def _fill(self, in_ring: int) -> float:
-        """The same, with ``in_ring`` samples in the ring; parts of a program grow with what precedes them."""
+        """The same, with ``in_ring`` samples in the ring.
+
+        A part of a program is as long as what is ahead of the outputs: each part costs 0.1 ms for the tables
+        of its tones, and a longer one takes less time than it plays.
+        """
         if self._rest is not None and self._handed >= self._end:
             rest, self._rest, self._n_rendered = self._rest, None, 0
             self._splice(rest)
         if self._program is not None and self._handed < self._end:
             room = min(len(self._ring) - in_ring, self._end - self._handed)
             if room:
-                part = max(self._block, min(CHUNK, in_ring // 2 // self._block * self._block))
+                ahead = (in_ring + self._on_card) // self._block * self._block
+                part = max(self._block, min(CHUNK, ahead))
                 self._hand_over_program(self._program, min(room, part))
                 return 0.0
             return min(IN_MOTION_S, len(self._ring) / 8 / self._rate_hz)

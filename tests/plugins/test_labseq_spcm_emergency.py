@@ -35,9 +35,12 @@ from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
+from labseq_spcm import stream
 from labseq_spcm.stream import Stream
 
-Stream._check_bus = lambda self: None  # samples go through a pipe, which may be slow, hence look_ahead
+# samples go through a pipe, which may be slow
+Stream._check_bus = lambda self: None
+stream.CHUNK = 1 << 15
 tones = np.linspace(12e6, 18e6, 5)
 grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
