@@ -35,12 +35,11 @@ from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm import stream
 from labseq_spcm.stream import Stream
 
 # samples go through a pipe, which may be slow
 Stream._check_bus = lambda self: None
-stream.CHUNK = 1 << 15
+SpcmSettings.look_ahead_s = lambda self, rate_hz: 0.1
 tones = np.linspace(12e6, 18e6, 5)
 grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
@@ -51,7 +50,7 @@ def tweezers(state, mode, speed_m_s, n_batches, trigger="software", keep_warm=No
     motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=speed_m_s, eject_slots=0, rf=rf)
     card = f"simulated@{sys.argv[1]}/{state}"
     settings = dict(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=0.1, keep_warm=keep_warm)
-    settings = SpcmSettings.model_validate(settings | {"look_ahead": 0.01})
+    settings = SpcmSettings.model_validate(settings)
     device = SpcmMobileTweezers(settings, Context("mobile_tweezers", grid, motion=motion))
     device.open()
     if n_batches:
@@ -63,9 +62,9 @@ devices = {
     "played": tweezers("played", "replay", 0.130, 1),
     "locked": tweezers("locked", "dds", 1e-5, 50),
     "dds": tweezers("dds", "dds", 1e-5, 50),
-    "replay": tweezers("replay", "replay", 1.5e-5, 1),
     "fifo": tweezers("fifo", "fifo", 1e-5, 50),
     "stream": tweezers("stream", "stream", 1e-5, 50),
+    "replay": tweezers("replay", "replay", 1.5e-5, 1),  # played last: its program lasts for 0.3 s
 }
 parked = {"row_frequency": 10e6, "column_frequency": 10e6}
 idle = {
