@@ -258,7 +258,12 @@ class MobileTweezers(Hardware):
 
     @property
     def start_delay_s(self) -> float:
-        """Time from the end of ``play``, or from the trigger, to the first tones at the outputs."""
+        """Time from ``play``, or from the trigger, to the first tones at the outputs; known once open."""
+        return 0.0
+
+    @property
+    def after_start_s(self) -> float:
+        """How long the last ``play`` went on, on the computer's clock, after the start was under way."""
         return 0.0
 
     @property

@@ -268,10 +268,13 @@ class SpcmMobileTweezers(MobileTweezers):
 
     @property
     def start_delay_s(self) -> float:
-        """Delay of the outputs; in the mode ``stream`` what was left of the silence ahead of them."""
-        if isinstance(self._mode, Stream):
-            return self._mode.left_s
+        """Delay of the outputs; in the mode ``stream`` with the silence ahead of them."""
         return float(self._facts.get("trigger_delay_s", 0.0))
+
+    @property
+    def after_start_s(self) -> float:
+        """In the mode ``stream`` the time for more samples than the first."""
+        return self._mode.after_start_s if isinstance(self._mode, Stream) else 0.0
 
     @property
     def beginning_s(self) -> float:
@@ -294,7 +297,7 @@ class SpcmMobileTweezers(MobileTweezers):
         playing_s = mode.prepare(program, continues=continues)
         took_s += time.perf_counter() - start_s
         self._timings = {"render": mode.render_s, "upload": took_s - mode.render_s}
-        duration_s = max(playing_s, program.total_duration_s) + float(self._facts["trigger_delay_s"])
+        duration_s = max(playing_s, program.total_duration_s) + self.start_delay_s
         self._duration_s = duration_s
         return duration_s
 

@@ -47,7 +47,7 @@ class Stream:
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
         delay_s: From ``start`` to the first sample at the output, at most.
-        left_s: How much of that was left when the last ``start`` returned.
+        after_start_s: How long the last ``start`` went on after it had handed the first samples over.
 
     Raises:
         DeviceError: The bus is too slow for the sample rate.
@@ -55,7 +55,7 @@ class Stream:
 
     max_wait_s = IN_MOTION_S
     beginning_s = BEGINNING_S
-    render_s = 0.0
+    render_s = after_start_s = 0.0
 
     def __init__(
         self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
@@ -68,7 +68,7 @@ class Stream:
         self._to_start = settings.card_buffer // FRAME_BYTES // block * block
         ahead = settings.look_ahead_s(sample_rate_hz) * sample_rate_hz - self._on_card
         self._ahead = max(2, int(ahead / block)) * block
-        self.delay_s = self.left_s = (self._ahead + self._on_card) / sample_rate_hz
+        self.delay_s = (self._ahead + self._on_card) / sample_rate_hz
         least = 2 * self._whole_blocks(self._ahead + self._on_card)
         n_samples = max(self._whole_blocks(math.ceil(settings.fill_s * sample_rate_hz)), least)
         self._ring = Buffer().reserve(n_samples)
@@ -158,7 +158,7 @@ class Stream:
                 spliced_s = time.perf_counter()
                 # a beginning as a whole: this thread makes the rest next, and keeps others from Python
                 self._supply_until(min(self._end, self._handed + int(BEGINNING_S * self._rate_hz)))
-                self.left_s = self.delay_s - (time.perf_counter() - spliced_s)
+                self.after_start_s = time.perf_counter() - spliced_s
 
     def append(self, program: ToneProgram) -> float:
         """Have the rest of a program follow its beginning, or the silence after it."""
