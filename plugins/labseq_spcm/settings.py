@@ -14,7 +14,7 @@ Channel: TypeAlias = Literal[0, 1]
 
 LOOK_AHEAD_S: Final = 250e-6
 FILL_S: Final = {"fifo": 8e-3, "stream": 20e-3}
-OVERHEAD_S: Final = {"replay": 20e-3, "fifo": 13e-3, "stream": 3e-3, "dds": 5e-3}
+OVERHEAD_S: Final = {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3, "dds": 5e-3}
 NO_TRIGGER: Final = (
     "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
 )

@@ -15,7 +15,10 @@ from .running import labseq
 from .scripts import load_script
 
 STATIC = ROOT / "docs" / "_static"
-BY_OTHERS = ("patterns/", "planners/", "paper/", "run.svg", "off_after_kill.png")
+BY_OTHERS = (
+    *("patterns/", "planners/", "paper/", "virtual/", "web/"),
+    *("run.svg", "off_after_kill.png", "stream_levels.png"),
+)
 """Made by scripts with tests of their own."""
 
 
