@@ -74,7 +74,8 @@ class ResolvedProfile:
         Without a calibration or a value in the profile, that time is what the driver's settings say it takes.
         """
         motion, mobile = self.profile.motion, self.profile.mobile_tweezers
-        typical_s = getattr(self.chosen["mobile_tweezers"].settings, "overhead_per_cycle_s", None)
+        driver = self.chosen.get("mobile_tweezers")  # None if it has an error, and others are made safe
+        typical_s = getattr(driver and driver.settings, "overhead_per_cycle_s", None)
         if typical_s is not None and "overhead_per_cycle" not in mobile.model_fields_set:
             motion = replace(motion, overhead_per_cycle_s=typical_s)
         return with_calibrations(motion, self.calibrations)

@@ -34,9 +34,9 @@ def test_numpy_reads_what_the_awg_would_play(made: PlannedWaveform, tmp_path: Pa
         assert file["volts_per_sample"].tolist() == pytest.approx([1.6 / 32767] * 2)
         assert file["batch"].tolist() == [1, 2]
         assert set(file["segment_batch"].tolist()) == {1, 2}
-        kind, start = file["segment_kind"], file["segment_start"]
+        kind, start, batch = file["segment_kind"], file["segment_start"], file["segment_batch"]
     assert start[0] == 0
-    assert batch_start.tolist() == start[kind == 1].tolist()
+    assert batch_start.tolist() == start[np.flatnonzero(np.diff(batch, prepend=0))].tolist()
     pauses = [(a, b) for a, b, k in zip(start, start[1:], kind, strict=False) if k == 0]
     assert not any(samples[:, a:b].any() for a, b in pauses)
     assert all(samples[:, a : a + 100].any(axis=1).any() for a in batch_start)
