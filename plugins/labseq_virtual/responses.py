@@ -129,6 +129,8 @@ def lowering(
     Returns:
         Losses, and temperatures of the atoms that stay relative to an adiabatic change, (n_atoms,).
     """
+    if fraction < FRACTIONS[0] / 2:  # off: nothing stays, and a safe state does not wait for an import
+        return np.ones(len(depth_k)), np.ones(len(depth_k))
     from scipy.interpolate import interpn
 
     times = np.log([*DURATIONS_S])
@@ -137,4 +139,4 @@ def lowering(
     axes = (np.array(FRACTIONS), times, np.array(TEMPERATURES))
     at = np.clip(at, [axis[0] for axis in axes], [axis[-1] for axis in axes])
     loss, warmer = (interpn(axes, one, at) for one in tables()["lowering"])
-    return (loss, warmer) if fraction >= FRACTIONS[0] / 2 else (np.ones_like(loss), warmer)
+    return loss, warmer
