@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.console.output import as_line, say
-from labseq.console.runs import runs_in
 from labseq.console.text import columns, plural, size_text
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_lines
 from labseq.messages import visible
 from labseq.recording import data_root
-from labseq.recording.folders import INDEX_FILE
+from labseq.recording.folders import INDEX_FILE, runs_in
 from labseq.recording.run_file import read_run, read_state
 
 _HEADER: Final = ("run", "started", "profile", "shots", "status", "hardware", "seed", "size")

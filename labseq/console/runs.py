@@ -7,7 +7,7 @@ from pathlib import Path
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, visible
 from labseq.recording import Run, data_root, open_run
-from labseq.recording.folders import RUN_FILE, find_run
+from labseq.recording.folders import RUN_FILE, counter_of, find_run, runs_in
 
 
 def chosen_run(path: Path | None) -> Run:
@@ -48,7 +48,7 @@ def named_run(name: str, root: Path) -> Path:
     """
     day, _, last = name.rpartition("/")
     for folder in reversed(runs_in(root)):
-        is_number = last.isdecimal() and int(last) == _counter(folder)
+        is_number = last.isdecimal() and int(last) == counter_of(folder)
         if day in ("", folder.parent.name) and (
             is_number or last in (folder.name, folder.name.partition("_")[2])
         ):
@@ -67,14 +67,3 @@ def newest_run(root: Path) -> Path:
     if not folders:
         raise ConfigError(f"{root} holds no runs; give a run's folder, or set LABSEQ_DATA")
     return folders[-1]
-
-
-def runs_in(root: Path) -> list[Path]:
-    """The folders of runs in a data folder, damaged ones included, the newest last."""
-    found = [folder for folder in root.glob("*-*-*/*_*") if _counter(folder) >= 0 and folder.is_dir()]
-    return sorted(found, key=lambda folder: (folder.parent.name, _counter(folder)))
-
-
-def _counter(folder: Path) -> int:
-    number = folder.name.partition("_")[0]
-    return int(number) if number.isdecimal() else -1

@@ -16,7 +16,7 @@ from pydantic import Field, PositiveInt, field_validator
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.files import open_ordinary
 from labseq.model import Frame, SiteGrid
-from labseq.model.arrays import read_only
+from labseq.model.grid import read_only
 from labseq.roles import Context
 from labseq.settings import Angle, FilePath, Length, Settings
 

@@ -1,6 +1,5 @@
 """The frozen domain types: what the rest of labseq talks about."""
 
-from labseq.model.arrays import Occupancy, as_occupancy, read_only
 from labseq.model.calibration import (
     CALIBRATION_KINDS,
     CalibrationEntry,
@@ -9,7 +8,7 @@ from labseq.model.calibration import (
     same_grid,
 )
 from labseq.model.camera import CameraFacts, Flip, Frame, Orientation, SensorMode
-from labseq.model.grid import SiteGrid, TargetPattern
+from labseq.model.grid import Occupancy, SiteGrid, TargetPattern, as_occupancy, read_only
 from labseq.model.lines import LineProgram, LinesFacts, LineSpec
 from labseq.model.motion import LossSpec, MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport, TonePaths

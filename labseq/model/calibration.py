@@ -15,8 +15,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.model.arrays import read_only
-from labseq.model.grid import SiteGrid
+from labseq.model.grid import SiteGrid, read_only
 
 CalibrationKind = Literal["sites", "thresholds", "tweezers", "amplitudes", "frequencies", "overlay", "timing"]
 CALIBRATION_KINDS: Final[tuple[CalibrationKind, ...]] = get_args(CalibrationKind)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LimitError
-from labseq.model.arrays import read_only
+from labseq.model.grid import read_only
 from labseq.units import format_quantity
 
 BLOCK: Final = 32

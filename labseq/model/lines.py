@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model.arrays import read_only
+from labseq.model.grid import read_only
 
 IDLE: Final = "idle"
 """The kind of the time between steps, and before and after a shot."""

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model.arrays import read_only
+from labseq.model.grid import read_only
 
 SpeedProfile = Literal["constant", "minimum_jerk", "constant_jerk"]
 PhaseChoice = Literal["random", "low_crest"]

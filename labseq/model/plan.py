@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.model.arrays import read_only
+from labseq.model.grid import read_only
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,9 +9,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model.arrays import Occupancy
 from labseq.model.camera import Frame
-from labseq.model.grid import TargetPattern
+from labseq.model.grid import Occupancy, TargetPattern
 from labseq.model.plan import Plan, PlanReport
 
 ShotStatus = Literal["complete", "interrupted", "failed"]

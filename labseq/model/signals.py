@@ -9,7 +9,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model.arrays import read_only
+from labseq.model.grid import read_only
 
 
 class SegmentKind(IntEnum):

@@ -13,7 +13,8 @@ from labseq.console.output import say
 from labseq.console.text import columns, plural
 from labseq.messages import MAX_ERROR, clean, visible
 from labseq.plain import dumps
-from labseq.queue.queue import Entry, Opening, Queue, QueueRun
+from labseq.queue.queue import Entry, Queue
+from labseq.queue.running import Opening, QueueRun, add_checked
 from labseq.recording import data_root
 from labseq.session.options import Options
 
@@ -22,7 +23,7 @@ _HEADER = ("id", "state", "sequence", "added", "options")
 
 def add_entry(sequence: Path, options: Options) -> None:
     """Check a sequence and add it to the queue."""
-    entry, checked = Queue(data_root()).add(sequence, options)
+    entry, checked = add_checked(Queue(data_root()), sequence, options)
     for warning in checked.warnings:
         say(*warning_lines(warning), stream=sys.stderr)
     say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, with its present text")

@@ -115,6 +115,18 @@ def _counters(day: Path, *, claims: bool = True) -> list[int]:
     return [int(match[1]) for match in found if match]
 
 
+def runs_in(root: Path) -> list[Path]:
+    """The folders of runs in a data folder, damaged ones included, the newest last."""
+    found = [folder for folder in root.glob("*-*-*/*_*") if counter_of(folder) >= 0 and folder.is_dir()]
+    return sorted(found, key=lambda folder: (folder.parent.name, counter_of(folder)))
+
+
+def counter_of(folder: Path) -> int:
+    """The number of a run, from the name of its folder; -1 if it has none."""
+    number = folder.name.partition("_")[0]
+    return int(number) if number.isdecimal() else -1
+
+
 def find_run(path: Path) -> Path:
     """Find the folder of the run that a path belongs to.
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from starlette.requests import Request
 
@@ -22,12 +22,9 @@ from labseq.messages import clean
 from labseq.queue.queue import Queue
 from labseq.recording.run_file import read_state
 from labseq.session.stopping import ask_to_stop
+from labseq.web.endpoint import Endpoint, in_thread
 from labseq.web.form import form_fields
-from labseq.web.live import in_thread
 from labseq.web.runs import MAX_NOTE, Catalogue, NoSuchRun, text_of, write_notes
-
-if TYPE_CHECKING:
-    from labseq.web.api import Endpoint
 
 MAX_BODY: Final = 64 << 10
 CHECK_S: Final = 60.0
@@ -51,8 +48,6 @@ class Actions:
 
     def endpoints(self) -> list[Endpoint]:
         """The endpoints, for the API."""
-        from labseq.web.api import Endpoint
-
         run = "/runs/{day}/{name}"
         number = {"entry": "number of the entry"}
         return [

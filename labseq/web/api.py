@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, cast
 
@@ -19,19 +17,16 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 import labseq
 from labseq.analysis.statistics import statistics_of
 from labseq.analysis.timing import StageTotals
-from labseq.errors import LabseqError, RecordingError
+from labseq.errors import RecordingError
 from labseq.files import read_file
-from labseq.messages import format_error
-from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
-from labseq.web.acting import Actions
+from labseq.web.endpoint import Endpoint, describe, in_thread
 from labseq.web.history import finite
-from labseq.web.live import MAX_VIEWERS, Live, encode, in_thread
+from labseq.web.live import MAX_VIEWERS, Live
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
-from labseq.web.scans import scan_values
 from labseq.web.shots import frame_png, readings_of, shot_values
-from labseq.web.state import N_BINS, Limits, figures_of, head_of, losses_of, stage_rows
+from labseq.web.state import N_BINS, Limits, figures_of, head_of, losses_of, scan_values, stage_rows
 from labseq.web.store import calibration_picture, calibrations, queue_values
 
 BASE: Final = "/api/v1"
@@ -46,47 +41,6 @@ _FRAME_S, _MAX_FRAMES = 2.0, 8
 """For so long a frame is kept, and so many."""
 _RUN: Final = "/runs/{day}/{name}"
 _TEXTS: Final = {"sequence": SEQUENCE_FILE, "profile": PROFILE_FILE}
-_DESCRIPTIONS: Final = {
-    "day": "date of the run's folder, 2026-11-20",
-    "name": "name of the run's folder, 0001_compact-225",
-    "shot": "index of the shot, from 0",
-    "image": "index of the image in the shot, from 0",
-    "attempt": "an attempt that does not count; without it the shot that counts",
-    "q": "words that date, name, profile, outcome, comment or tags must contain",
-    "status": "running, complete, stopped, failed or damaged",
-    "first": "number of rows to leave out",
-    "n": "maximum number of rows",
-    "width": "maximum height and width of the picture, in pixels",
-    "kind": "which file or calibration",
-    "store": "which folder of calibrations, from the list",
-    "file": "name of the calibration's file",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Endpoint:
-    """An address of the API; its description is the docstring of its function.
-
-    Attributes:
-        path: Below /api/v1.
-        answer: Makes the answer from the request; called in a thread unless it is a coroutine.
-        query: Names of its query parameters.
-        content: Media type of the answer.
-        method: "GET" or "POST".
-        body: Names of the values in the body of a POST, and what they are.
-    """
-
-    path: str
-    answer: Callable[..., Any]
-    query: tuple[str, ...] = ()
-    content: str = "application/json"
-    method: str = "GET"
-    body: Mapping[str, str] | None = None
-
-    @property
-    def description(self) -> str:
-        """What it answers."""
-        return inspect.cleandoc(self.answer.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
 
 
 class Api:
@@ -95,10 +49,10 @@ class Api:
     Args:
         catalogue: The runs.
         limits: When alarms are raised.
-        actions: What visitors may do; None if the server only shows.
+        actions: Endpoints of what visitors may do; none if the server only shows.
     """
 
-    def __init__(self, catalogue: Catalogue, limits: Limits, actions: Actions | None) -> None:
+    def __init__(self, catalogue: Catalogue, limits: Limits, actions: Sequence[Endpoint] = ()) -> None:
         self._runs = catalogue
         self._live = Live(catalogue, limits)
         self._actions = actions
@@ -126,14 +80,14 @@ class Api:
             Endpoint("/calibrations", self.calibrations),
             Endpoint("/calibrations/{store}/{file}.png", self.calibration_picture, content="image/png"),
         ]
-        return reading + (self._actions.endpoints() if self._actions is not None else [])
+        return [*reading, *self._actions]
 
     def server(self, _: Request) -> Any:
         """What this server is: version, data folder, whether visitors may act."""
         return {
             "labseq": labseq.__version__,
             "data": text_of(self._runs.root),
-            "may_act": self._actions is not None,
+            "may_act": bool(self._actions),
             "up_s": round(time.monotonic() - self._started_s, 1),
             "viewers": self._live.n_viewers,
         }
@@ -308,7 +262,7 @@ class Api:
         """The API as an OpenAPI document."""
         paths: dict[str, dict[str, Any]] = {}
         for one in self.endpoints():
-            paths.setdefault(BASE + one.path, {})[one.method.lower()] = _operation(one)
+            paths.setdefault(BASE + one.path, {})[one.method.lower()] = describe(one)
         about = {"title": "labseq", "version": labseq.__version__, "description": _ABOUT}
         return {"openapi": "3.1.0", "info": about, "paths": paths}
 
@@ -354,37 +308,6 @@ _ABOUT: Final = (
 )
 
 
-def _operation(one: Endpoint) -> dict[str, Any]:
-    in_path = [part.partition("}")[0] for part in one.path.split("{")[1:]]
-    parameters = [_parameter(name, "path") for name in in_path] + [_parameter(n, "query") for n in one.query]
-    found: dict[str, Any] = {
-        "operationId": getattr(one.answer, "__name__", "answer"),
-        "summary": one.description,
-        "parameters": parameters,
-        "responses": {
-            "200": {"description": "as described", "content": {one.content: {}}},
-            "404": {"description": "there is no such thing"},
-            "409": {"description": "it cannot be read, or not be done; 'error' says why"},
-        },
-    }
-    if one.body is not None:
-        keys = {name: {"description": about} for name, about in one.body.items()}
-        schema = {"type": "object", "properties": keys}
-        found["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
-    return found
-
-
-def _parameter(name: str, place: str) -> dict[str, Any]:
-    is_number = name in ("shot", "image", "attempt", "first", "n", "width")
-    return {
-        "name": name,
-        "in": place,
-        "required": place == "path",
-        "description": _DESCRIPTIONS.get(name, name),
-        "schema": {"type": "integer" if is_number else "string"},
-    }
-
-
 def _unfolded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values with those of the mappings in it: "git.commit"."""
     found: dict[str, Any] = {}
@@ -415,23 +338,3 @@ def _number(values: Mapping[str, Any], name: str, default: int) -> int:
 def _evenly(items: Any, n_most: int) -> list[Any]:
     step = max(1, math.ceil(len(items) / n_most))
     return list(items[::step])
-
-
-async def answered(one: Endpoint, request: Request) -> Response:
-    """Answer a request; what cannot be shown is a reason in the answer, never a crash."""
-    try:
-        if inspect.iscoroutinefunction(one.answer):
-            found = await one.answer(request)
-        else:
-            found = await in_thread(partial(one.answer, request))
-    except NoSuchRun as error:
-        return JSONResponse({"error": text_of(error)}, 404)
-    except (LabseqError, OSError) as error:
-        return JSONResponse({"error": text_of(error)}, 409)
-    except Exception as error:  # noqa: BLE001 - a file with other values than expected
-        what = f"a file of it has values that cannot be read: {format_error(error)}"
-        return JSONResponse({"error": text_of(what)}, 409)
-    if isinstance(found, Response):
-        return found
-    content = encode(to_plain(found))
-    return Response(content, media_type="application/json", headers={"cache-control": "no-store"})

@@ -16,8 +16,8 @@ from starlette.routing import Route
 
 from labseq.web.access import Access, App, Guard
 from labseq.web.acting import Actions
-from labseq.web.api import BASE, Api, Endpoint, answered
-from labseq.web.live import in_thread
+from labseq.web.api import BASE, Api
+from labseq.web.endpoint import Endpoint, answered, in_thread
 from labseq.web.runs import Catalogue
 from labseq.web.state import Limits
 
@@ -41,7 +41,7 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
     catalogue = Catalogue(root)
     importlib.import_module("scipy.special")  # 0.3 s that the first answer should not take
     threading.Thread(target=catalogue.warm, daemon=True).start()
-    api = Api(catalogue, limits or Limits(), Actions(catalogue) if allowed.may_act else None)
+    api = Api(catalogue, limits or Limits(), Actions(catalogue).endpoints() if allowed.may_act else ())
     files = {path.name: _file(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}
     page = files["index.html"]
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import zlib
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from labseq.errors import LabseqError
 from labseq.messages import format_error
+from labseq.web.endpoint import encode, in_thread
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.state import Limits, RunState, alarm
-
-T = TypeVar("T")
-_THREADS: Final = ThreadPoolExecutor(6, "labseq web")
 
 POLL_S: Final = 0.1
 """Interval at which the files of a run are looked at while somebody watches it."""
@@ -135,16 +131,6 @@ class Live:
             while len(self._states) > 8:
                 del self._states[next(iter(self._states))]
         return state
-
-
-async def in_thread(work: Callable[[], T]) -> T:
-    """Do what takes time in one of a few threads: each keeps memory of its own."""
-    return await asyncio.get_running_loop().run_in_executor(_THREADS, work)
-
-
-def encode(values: object) -> str:
-    """A value as JSON of one line."""
-    return json.dumps(values, allow_nan=False, separators=(",", ":"), default=str)
 
 
 def _id_of(text: str) -> str:

@@ -1,4 +1,4 @@
-"""What the page of a run shows while it runs: figures, trend, stages, losses, last shot and alarms."""
+"""What the page of a run shows while it runs: figures, trend, stages, losses, last shot, alarms, scan."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, cast
 
+from labseq.analysis.scanned import Scanned, scanned
 from labseq.analysis.timing import StageTotals
 from labseq.calibration.store import read_entry
 from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, percent, plural, size_text
 from labseq.errors import LabseqError, RecordingError
 from labseq.model import StageTiming
+from labseq.model.estimate import Rate, mean
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
-from labseq.recording import Shot
+from labseq.recording import Shot, open_run
 from labseq.recording.folders import STOP_FILE
+from labseq.recording.points import SCANNER, ScanPoint
 from labseq.recording.run_file import read_state
 from labseq.web.history import Columns, finite, interval_of
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
-from labseq.web.scans import scan_values
 from labseq.web.shots import rows_of, shot_values
 
 N_BINS: Final = 40
@@ -40,6 +42,8 @@ _OPEN_S: Final = 0.5
 _SILENT_FACTOR: Final = 10
 _SILENT_S: Final = 120.0
 _LEAST_FREE: Final = 2e9
+_MAX_POINTS: Final = 2000
+"""Maximum number of points of a scan, and of visits of points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,3 +349,78 @@ def log_line(event: Mapping[str, Any]) -> dict[str, str]:
         else:
             text = event_text(name, values, None)
     return {"t_utc": event["t_utc"], "event": text_of(name, 60), "text": text_of(text or name, 400)}
+
+
+def scan_values(run: OpenRun) -> dict[str, Any]:
+    """The scan of a run, JSON-ready; "error" if it cannot be shown."""
+    scan = run.record["scan"]
+    try:
+        found = scanned(open_run(run.folder) if SCANNER in scan else run.outline())
+    except (LabseqError, KeyError, IndexError, TypeError, ValueError) as error:
+        return {"error": text_of(f"the scan cannot be shown: {error}", 400)}
+    if found is None:
+        addresses = [text_of(one, 200) for one in scan.get("addresses") or ()]
+        return {"axes": [{"address": one, "words": [], "numbers": None} for one in addresses], "points": []}
+    values = {
+        "axes": [_axis(found, i) for i in range(len(found.axes))],
+        "is_map": found.is_map,
+        "n_planned": None if SCANNER in scan else len(scan.get("points") or ()),
+        "points": [
+            _point(point, place)
+            for point, place in list(zip(found.points, found.places, strict=True))[:_MAX_POINTS]
+        ],
+    }
+    return values | _adaptive(run) if SCANNER in scan else values
+
+
+def _axis(found: Scanned, index: int) -> dict[str, Any]:
+    axis = found.axes[index]
+    numbers = axis.numbers
+    return {
+        "address": text_of(axis.address, 200),
+        "words": [text_of(word, 60) for word in axis.words],
+        "numbers": None if numbers is None else [finite(number) for number in numbers[0]],
+        "unit": "" if numbers is None else numbers[1],
+    }
+
+
+def _point(point: ScanPoint, place: tuple[int, ...]) -> dict[str, Any]:
+    judged = [shot for shot in point.shots if not math.isnan(shot.filling_fraction)]
+    filling = mean([shot.filling_fraction for shot in judged])
+    rate = Rate(sum(shot.success for shot in judged), len(judged))
+    return {
+        "place": list(place),
+        "written": [text_of(word, 60) for word in point.written.values()],
+        "n_shots": len(point.shots),
+        "filling": finite(filling.value),
+        "filling_interval": interval_of(filling),
+        "defect_free": finite(rate.value),
+        "defect_free_interval": interval_of(rate) if rate.n_trials else [None, None],
+    }
+
+
+def _adaptive(run: OpenRun) -> dict[str, Any]:
+    """What the scanner optimises, its value at each visit of a point, and the best so far."""
+    scan = run.record["scan"]
+    visits = [
+        {"point": event.get("point"), "value": event.get("value"), "written": _words(event.get("written"))}
+        for event in run.scan_events[-_MAX_POINTS:]
+    ]
+    last: Any = run.scan_events[-1].get("best") if run.scan_events else None
+    best = None
+    if isinstance(last, dict):
+        best = {
+            "point": last.get("point"),
+            "value": last.get("value"),
+            "written": _words(last.get("written")),
+        }
+    return {
+        "figure": text_of(scan.get("figure") or "", 120),
+        "maximise": bool(scan.get("maximise", True)),
+        "visits": visits,
+        "best": best,
+    }
+
+
+def _words(written: Any) -> dict[str, str]:
+    return {text_of(k, 200): text_of(v, 60) for k, v in written.items()} if isinstance(written, dict) else {}

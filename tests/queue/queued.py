@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from labseq.errors import LabseqError
-from labseq.queue.queue import Entry, Opening, Queue, QueueRun
+from labseq.queue.queue import Entry, Queue
+from labseq.queue.running import Opening, QueueRun, add_checked
 from labseq.session.options import Options
 
 SEQUENCE = """
@@ -45,7 +46,7 @@ def queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Queue:
 
 
 def add(queue: Queue, sequence: str = "s.yaml", **options: object) -> Entry:
-    return queue.add(Path(sequence), Options(**options))[0]  # pyright: ignore[reportArgumentType]
+    return add_checked(queue, Path(sequence), Options(**options))[0]  # pyright: ignore[reportArgumentType]
 
 
 class Taking:

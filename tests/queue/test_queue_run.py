@@ -12,7 +12,8 @@ import pytest
 
 from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.processes import Process
-from labseq.queue.queue import Opening, Queue, QueueRun
+from labseq.queue.queue import Queue
+from labseq.queue.running import Opening, QueueRun
 from labseq.recording import open_run
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import yaml
 
-from labseq.queue.queue import Entry, Queue, QueueRun
+from labseq.queue.queue import Entry, Queue
+from labseq.queue.running import QueueRun
 from labseq.scaffold.schemas import file_schema
 from labseq.session.chosen import load_plugins
 from labseq.session.options import Options
@@ -99,7 +100,7 @@ def test_a_paused_queue_waits_and_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
         waited.append(queue.entries()[0].status == "waiting")
         queue.pause(False)
 
-    monkeypatch.setattr("labseq.queue.queue.time.sleep", wait)
+    monkeypatch.setattr("labseq.queue.running.time.sleep", wait)
     begun = list[int]()
     QueueRun(queue, lambda opening: None, lambda one: begun.append(one.id), lambda _: None).run()
     assert (waited, begun) == ([True], [1])
