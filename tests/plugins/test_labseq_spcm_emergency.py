@@ -63,7 +63,6 @@ devices = {
     "locked": tweezers("locked", "dds", 1e-5, 50),
     "dds": tweezers("dds", "dds", 1e-5, 50),
     "fifo": tweezers("fifo", "fifo", 1e-5, 50),
-    "stream": tweezers("stream", "stream", 1e-5, 50),
     "replay": tweezers("replay", "replay", 1.5e-5, 1),  # played last: its program lasts for 0.3 s
 }
 parked = {"row_frequency": 10e6, "column_frequency": 10e6}
@@ -71,6 +70,7 @@ idle = {
     "prepared": tweezers("prepared", "replay", 0.130, 1),
     "warm": tweezers("warm", "replay", 0.130, 0, keep_warm=parked),
     "warm_dds": tweezers("warm_dds", "dds", 0.130, 0, keep_warm=parked),
+    "stream": tweezers("stream", "stream", 0.130, 0, keep_warm=parked),  # a program could run dry
 }
 jobs = {
     state: (str(found.script), dict(found.arguments))
@@ -81,6 +81,7 @@ print(json.dumps(jobs), flush=True)
 sys.stdin.readline()
 idle["warm"].settle()
 idle["warm_dds"].settle()
+idle["stream"].settle()
 for device in devices.values():
     device.play()
 threading.Thread(target=devices["fifo"].wait, args=(1e3,), daemon=True).start()

@@ -227,6 +227,8 @@ class TestFaultsOfThePackage:
     def test_a_closed_card_is_not_closed_again_by_the_garbage_collector(
         self, driver: Any, unraisable: list[object]
     ) -> None:
+        gc.collect()
+        unraisable.clear()  # what other tests left behind
         with driver("dds") as lab:
             lab.card.write(AMP0, 9000)  # also with an error pending
         gc.collect()
