@@ -37,7 +37,7 @@ from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output, versions
 from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
-from labseq_spcm.stream import Stream
+from labseq_spcm.stream import Stream, check_rendering
 
 RAMP_S: Final = 0.3e-3
 """How long the amplifiers take to ramp down a program that is cut short."""
@@ -135,6 +135,7 @@ class SpcmMobileTweezers(MobileTweezers):
                 raise ConfigError(f"{self._name}: a line triggers it, but mode: stream {NO_TRIGGER}")
             settings = settings.model_copy(update={"trigger": "external"})
         self._settings = settings
+        self._context = context
         self._clock = context.clock
         self._rf = context.motion.rf
         self._amplitude_mv = limits.full_scale_mv(self._name, self._rf)
@@ -188,7 +189,8 @@ class SpcmMobileTweezers(MobileTweezers):
 
         Raises:
             DeviceError: No package or driver library, no such card, another program holds it, it
-                is of another type, or it does not take a setting.
+                is of another type, or it does not take a setting; or the bus or this computer is too
+                slow for the mode ``stream``.
         """
         if self._card is not None:
             return
@@ -206,6 +208,8 @@ class SpcmMobileTweezers(MobileTweezers):
             return Dds(card, self._cores, self._keep_warm)
         rate_hz = self._facts["sample_rate_hz"]
         if self._settings.mode == "stream":
+            if not self._clock.virtual:  # virtual time waits for the rendering
+                check_rendering(self._name, self._context, rate_hz, self._settings.row_channel)
             stream = Stream(card, self._settings, rate_hz, self._keep_warm)
             self._facts["trigger_delay_s"] = stream.delay_s
             return stream

@@ -10,12 +10,15 @@ from typing import Final
 import numpy as np
 
 from labseq.plugin import (
+    Context,
     DeviceError,
     LabseqError,
+    Plan,
     ToneProgram,
     TransientError,
     format_quantity,
     raise_priority,
+    tone_program,
 )
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples
@@ -33,6 +36,36 @@ IN_MOTION_S: Final = 1e-3
 """Longest time between two looks at the ring while a program plays."""
 BUS_SAMPLES: Final = 1 << 22
 """Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
+
+
+def check_rendering(name: str, context: Context, sample_rate_hz: float, row_channel: int) -> None:
+    """Render programs with as many tones as the profile allows; the fastest of three tries counts.
+
+    Raises:
+        DeviceError: This computer renders more slowly than the card plays.
+    """
+    grid, motion = context.grid, context.motion
+    along = 1 if grid.n_cols > 1 else 0  # a site is a pair (row, column)
+    most = min(motion.max_tweezers, (motion.max_row_tones, motion.max_column_tones)[along])
+    n_tones = max(1, min(most, grid.shape[along] - 1))
+    here = np.zeros((n_tones, 2), np.int16)
+    here[:, along] = np.arange(n_tones)
+    there = here.copy()
+    there[:, along] += grid.shape[along] > 1
+    moves = Plan.from_batches([(here, there), (there, here)] * 5)
+    renderer = InterleavedRenderer(tone_program(moves, grid, motion), sample_rate_hz, row_channel)
+    out = np.empty((renderer.n_samples, 2), np.int16)
+    took_s = math.inf
+    for _ in range(3):
+        start_s = time.perf_counter()
+        renderer.write(0, out)
+        took_s = min(took_s, time.perf_counter() - start_s)
+        if took_s < len(out) / sample_rate_hz:
+            return
+    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, len(out) / took_s))
+    text = f"mode: stream at {wanted}, but this computer renders {n_tones} moving tones at {made}"
+    hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: replay"
+    raise DeviceError(name, f"{text}; {hint}")
 
 
 class Stream:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import threading
 import time
+from contextlib import nullcontext
 from dataclasses import replace
+from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.stream import check_rendering
 from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
 
 from labseq.motion import render, tone_program
@@ -192,6 +196,19 @@ def test_a_bus_that_cannot_stream_is_reported_when_the_card_is_opened(driver: An
         pass
     with driver("stream", model=slow, sample_rate=300e6) as lab:
         lab.play(lab.program(1))
+
+
+@pytest.mark.parametrize("shape", [(20, 20), (1, 20), (20, 1), (1, 1)])
+def test_a_computer_that_renders_too_slowly_is_reported(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
+) -> None:
+    context = Context(grid=SiteGrid(*shape))
+    for step_s in (1e-6, 1.0):
+        clock = SimpleNamespace(perf_counter=count(0.0, step_s).__next__)
+        monkeypatch.setattr("labseq_spcm.stream.time", clock)
+        slow = pytest.raises(DeviceError, match=r"renders \d+ moving tones at .*; use a lower sample_rate")
+        with slow if step_s == 1.0 else nullcontext():
+            check_rendering("awg", context, 250e6, 0)
 
 
 def test_an_error_of_the_card_in_silence_ends_the_stream_and_is_raised_by_the_next_call(driver: Any) -> None:
