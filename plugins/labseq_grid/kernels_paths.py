@@ -7,6 +7,7 @@ Everything is written for tones of the rows first; with rows and columns swapped
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -20,8 +21,8 @@ Bools = NDArray[np.bool_]
 
 LANE: Final = 0.5
 """Distance of a lane from the lines of sites on both sides."""
-KNOTS: Final = 24
-"""More than the number of knots of any batch: 5, and 2 for each further row that is put down on its own."""
+PARTS: Final = 8
+"""Knots per site of a tweezer's way along a lane that weaves."""
 KNOTS_OF: Final = "float64[:, ::1]"
 
 
@@ -79,6 +80,133 @@ def add_knot(rows: Floats, columns: Floats, n_knots: int, row: Floats, column: F
     return n_knots + 1
 
 
+@helper_kernel("int64(int64, int64)")
+def max_knots(n_rows: int, n_cols: int) -> int:
+    """More than the number of knots of any batch on a grid, lines outside of it included.
+
+    Each site of the way along rows and columns takes PARTS, half a site more where tweezers go both ways,
+    and each row that is put down on its own 4.
+    """
+    return PARTS * (n_rows + n_cols + 2) + 24
+
+
+@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64)")
+def add_travel(
+    moving: Floats, crossing: Floats, n_knots: int, to: Floats, lanes: Floats, weave: float
+) -> int:
+    """Add the way of the moving tones along the lanes of the others; return the number of knots.
+
+    On a triangular lattice a straight lane is 0.43 spacings from the sites on both sides, while the
+    middles of the lattice's triangles and of their edges are 0.5 or more from all sites. So all tweezers
+    weave from one middle to the next: the lanes swing to and fro once in each site of the way. Tones that
+    wait, on the middle of an edge too, swing with them straight across that edge. Tones that move
+    the other way need the opposite swing, and so start half a site later.
+
+    Args:
+        moving: float64 (>= n_knots, n), the tones that move along the lanes, up to here.
+        crossing: float64 (>= n_knots, m), the others, which are in their lanes.
+        n_knots: Number of knots so far.
+        to: float64 (n,), where the moving tones end, whole sites from where they are.
+        lanes: float64 (m,), where the others are.
+        weave: How far the lanes swing, in lines; below 0 on a lattice that is sheared the other way.
+    """
+    if weave == 0.0:
+        return add_knot(moving, crossing, n_knots, to, lanes)
+    start = moving[n_knots - 1, : len(to)].copy()
+    up = max(0, round((to - start).max()))
+    down = max(0, round((start - to).max()))
+    first = 1 if up >= down else -1  # the direction that starts at once
+    half, shear = PARTS // 2, 1 if weave > 0.0 else -1
+    n_parts = max(PARTS * max(up, down), PARTS * min(up, down) + half if min(up, down) > 0 else 0)
+    at = np.empty(len(to))
+    for part in range(1, n_parts + 1):
+        swing = first * weave * math.sin(2.0 * math.pi * part / PARTS) if part % half else 0.0
+        for i in range(len(to)):
+            way = to[i] - start[i]
+            went = part - (half if way * first < 0.0 else 0)
+            if went <= 0:
+                at[i] = start[i] + swing * shear
+            elif went < PARTS * abs(way):
+                at[i] = start[i] + math.copysign(went / PARTS, way)
+            else:
+                at[i] = to[i] + swing * shear
+        n_knots = add_knot(moving, crossing, n_knots, at, lanes + swing)
+    return n_knots
+
+
+@helper_kernel(f"float64[::1]({KNOTS_OF}, int64, float64[::1], float64)")
+def half_way(path: Floats, n_knots: int, to: Floats, swing: float) -> Floats:
+    """Where tones are half-way through half a site, while those that wait swing out of the way.
+
+    A tone in a lane goes as far as the other axis' tones, one on a line twice as far to the other side: both
+    straight away from the edge of a triangle that its tweezers are on.
+    """
+    at = np.empty(len(to))
+    for i in range(len(to)):
+        here = path[n_knots - 1, i]
+        at[i] = 0.5 * (here + to[i])
+        if here == to[i]:
+            at[i] += -2.0 * swing if here % 1.0 == 0.0 else swing
+    return at
+
+
+@helper_kernel(f"int64({KNOTS_OF}, int64, float64[::1])")
+def side(path: Floats, n_knots: int, to: Floats) -> int:
+    """1 if the tones that move do so between a lane and the line above it, -1 below it, 0 if they differ."""
+    above = below = 0
+    for i in range(len(to)):
+        here = path[n_knots - 1, i]
+        up = (to[i] > here) == (here % 1.0 != 0.0)
+        above |= up and here != to[i]
+        below |= not up and here != to[i]
+    return above - below
+
+
+@helper_kernel("float64(float64[::1])")
+def least_gap(tones: Floats) -> float:
+    """Least distance of two tones that follow one another."""
+    gap = math.inf
+    for i in range(1, len(tones)):
+        gap = min(gap, tones[i] - tones[i - 1])
+    return gap
+
+
+@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64, int64)")
+def add_middle(
+    rows: Floats, columns: Floats, n_knots: int, row: Floats, column: Floats, weave: float, way: int
+) -> int:
+    """Add a knot half-way through half a site, unless tones come too near to one another there.
+
+    ``way`` is the side to which tweezers on the edges go: 1 up along the rows, -1 down, 0 neither.
+    """
+    at = half_way(rows, n_knots, row, way * abs(weave))
+    across = half_way(columns, n_knots, column, way * weave)
+    if way == 0 or min(least_gap(at), least_gap(across)) < LANE:
+        return n_knots
+    return add_knot(rows, columns, n_knots, at, across)
+
+
+@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64)")
+def add_half_site(
+    rows: Floats, columns: Floats, n_knots: int, row: Floats, column: Floats, weave: float
+) -> int:
+    """Add a way of half a site from lanes to lines or back, by the middle of a triangle.
+
+    All tweezers are on middles of edges, or go from or to their sites; see :func:`add_travel`.
+    """
+    sides = side(rows, n_knots, row), side(columns, n_knots, column)
+    shear = 1 if weave > 0.0 else -1
+    if weave != 0.0 and sides[0] * sides[1] * shear < 0:  # first the columns alone
+        here = rows[n_knots - 1, : len(row)].copy()
+        n_knots = add_middle(rows, columns, n_knots, here, column, weave, shear * sides[1])
+        n_knots = add_knot(rows, columns, n_knots, here, column)
+        n_knots = add_middle(rows, columns, n_knots, row, column, weave, sides[0])
+    elif weave != 0.0:
+        way = sides[0] if sides[0] != 0 else shear * sides[1]
+        n_knots = add_middle(rows, columns, n_knots, row, column, weave, way)
+    return add_knot(rows, columns, n_knots, row, column)
+
+
 @helper_kernel("void(bool_[:, ::1], int64[::1], int64, int64, bool_[::1], bool_[::1])")
 def next_to_put_down(free: Bools, goes_off: Ints, n: int, m: int, together: Bools, used: Bools) -> None:
     """Choose the rows that are put down together: those that leave no empty tweezer on an atom.
@@ -111,7 +239,7 @@ def next_to_put_down(free: Bools, goes_off: Ints, n: int, m: int, together: Bool
 
 @helper_kernel(
     f"int64({NUMBERS}, {NUMBERS}, {NUMBERS}, {NUMBERS}, bool_[:, ::1], int64, int64, int64, int64, "
-    f"{KNOTS_OF}, {KNOTS_OF}, {NUMBERS})"
+    f"float64, {KNOTS_OF}, {KNOTS_OF}, {NUMBERS})"
 )
 def find_paths(
     row: Ints,
@@ -123,6 +251,7 @@ def find_paths(
     n_cols: int,
     slots: int,
     stages: int,
+    weave: float,
     rows: Floats,
     columns: Floats,
     goes_off: Ints,
@@ -139,8 +268,9 @@ def find_paths(
         n_cols: Columns of the grid.
         slots: Lines beyond the grid that the tones reach.
         stages: Whether rows are put down in stages, so that only free crossings are put down.
-        rows: Result, float64 (KNOTS, n), positions of the row tones at each knot.
-        columns: Result, float64 (KNOTS, m), of the column tones.
+        weave: How far lanes swing, see :func:`add_travel`; 0 for straight ones.
+        rows: Result, float64 (max_knots, n), positions of the row tones at each knot.
+        columns: Result, float64 (max_knots, m), of the column tones.
         goes_off: Result, int64 (n,), the knot at which each row tone is ramped down.
 
     Returns:
@@ -165,8 +295,8 @@ def find_paths(
     find_lanes(to_column, m, left, right, side if still else -side, beside)
     n_knots = add_knot(rows, columns, 0, row.astype(np.float64), column.astype(np.float64))
     n_knots = add_knot(rows, columns, n_knots, here, across)
-    n_knots = add_knot(rows, columns, n_knots, here, beside)
-    n_knots = add_knot(rows, columns, n_knots, there, beside)
+    n_knots = add_travel(columns, rows, n_knots, beside, here, weave)
+    n_knots = add_travel(rows, columns, n_knots, there, beside, weave)
     goes_off[:] = 0
     together, used = np.ones(n, np.bool_), np.ones(m, np.bool_)
     first = True
@@ -175,12 +305,12 @@ def find_paths(
             next_to_put_down(free, goes_off, n, m, together, used)
         at = np.where(used, to_column.astype(np.float64), beside)
         if not first:
-            n_knots = add_knot(rows, columns, n_knots, there, at)
+            n_knots = add_half_site(rows, columns, n_knots, there, at, weave)
         first = False
         for i in range(n):
             if together[i]:
                 there[i] = to_row[i]
-        n_knots = add_knot(rows, columns, n_knots, there, at)
+        n_knots = add_half_site(rows, columns, n_knots, there, at, weave)
         n_on = 0
         for i in range(n):
             if together[i]:

@@ -21,7 +21,7 @@ from labseq_grid.kernels_columns import (
     take_nearest,
     trace_columns,
 )
-from labseq_grid.kernels_paths import KNOTS, Bools, Floats, find_paths
+from labseq_grid.kernels_paths import Bools, Floats, find_paths, max_knots
 from labseq_grid.kernels_rows import (
     ATOMS,
     CANDIDATE,
@@ -160,9 +160,18 @@ Ends = tuple[int, int, int]
 """Number of batches, of positions and of knots so far."""
 
 
-@helper_kernel(f"UniTuple(int64, 3)({GROWING}, UniTuple(int64, 3), {SITES}, int64, int64, {CHOSEN}, boolean)")
+@helper_kernel(
+    f"UniTuple(int64, 3)({GROWING}, UniTuple(int64, 3), {SITES}, int64, int64, {CHOSEN}, boolean, float64)"
+)
 def add_batch(
-    plan: Growing, ends: Ends, kind: Bytes, n_beside: int, slots: int, chosen: Chosen, may_land: bool
+    plan: Growing,
+    ends: Ends,
+    kind: Bytes,
+    n_beside: int,
+    slots: int,
+    chosen: Chosen,
+    may_land: bool,
+    weave: float,
 ) -> Ends:
     """Add a batch to the plan: its atom moves and the paths of its tones.
 
@@ -193,7 +202,8 @@ def add_batch(
             free[n_rows + i, j] = free[i, j] or kind[r, c] == EMPTY
     lines = kind.shape[1] if swapped else kind.shape[0]
     across = kind.shape[0] if swapped else kind.shape[1]
-    row_path, column_path = np.empty((KNOTS, n_rows)), np.empty((KNOTS, m))
+    most = max_knots(lines + 2 * slots, across + 2 * slots)
+    row_path, column_path = np.empty((most, n_rows)), np.empty((most, m))
     goes_off = np.empty(n_rows, np.int64)
     n_knots = find_paths(
         row - n_beside,
@@ -205,6 +215,7 @@ def add_batch(
         across - 2 * n_beside,
         slots,
         not may_land,
+        weave,
         row_path,
         column_path,
         goes_off,
@@ -252,7 +263,7 @@ def find_sources(kind: Bytes, fills: bool, only_unwanted: bool, source: Bytes) -
 
 @helper_kernel(
     f"UniTuple(int64, 3)({GROWING}, UniTuple(int64, 3), {SITES}, {SITES}, {LIMITS}, int64, int64, boolean, "
-    "boolean, int64)"
+    "boolean, int64, float64)"
 )
 def add_batches(
     plan: Growing,
@@ -265,6 +276,7 @@ def add_batches(
     may_land: bool,
     fills: bool,
     n_left: int,
+    weave: float,
 ) -> Ends:
     """Add batches until ``n_left`` atoms have been carried, or no more can be."""
     source = np.empty_like(kind)
@@ -295,15 +307,22 @@ def add_batches(
                     chosen = found
         if chosen[1] == 0:
             break
-        ends = add_batch(plan, ends, kind, n_beside, slots, chosen, may_land)
+        ends = add_batch(plan, ends, kind, n_beside, slots, chosen, may_land, weave)
         n_left -= carry_out(kind, vacant, chosen, n_beside)
         n_unwanted = np.count_nonzero(kind == UNWANTED)
     return ends
 
 
-@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, {GRID}, {LIMITS}, int64, boolean)")
+@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, {GRID}, {LIMITS}, int64, boolean, float64)")
 def plan_grid(
-    occupied: Bools, fill: Bools, wanted: Bools, clear: Bools, limits: Limits, slots: int, may_land: bool
+    occupied: Bools,
+    fill: Bools,
+    wanted: Bools,
+    clear: Bools,
+    limits: Limits,
+    slots: int,
+    may_land: bool,
+    weave: float,
 ) -> Growing:
     """Plan all batches: fill vacancies, then bring unwanted atoms to the reservoir, then eject the rest.
 
@@ -315,6 +334,7 @@ def plan_grid(
         limits: Maximum number of tweezers, row tones and column tones.
         slots: Lines beyond the grid that the tones reach on each side.
         may_land: Whether a tweezer without an atom may be ramped down on an atom.
+        weave: How far lanes swing, see :func:`labseq_grid.kernels_paths.add_travel`.
 
     Returns:
         The arrays of a :class:`labseq.plugin.Plan`, without ``linked``.
@@ -338,10 +358,12 @@ def plan_grid(
         np.empty((n_most, 4), np.int16),
         np.zeros(n_most + 1, np.int32),
         np.empty((n_most, 3), np.int32),
-        np.empty(2 * KNOTS * n_most),
+        np.empty(2 * max_knots(n_rows + 2 * slots, n_cols + 2 * slots) * n_most),
         np.empty(2 * n_most, np.int32),
     )
-    ends = add_batches(plan, (0, 0, 0), kind, vacant, limits, n_beside, slots, may_land, True, n_vacant)
+    ends = add_batches(
+        plan, (0, 0, 0), kind, vacant, limits, n_beside, slots, may_land, True, n_vacant, weave
+    )
     for outside in range(2 if n_unwanted > 0 else 0):
         vacant[:] = 0
         for row in range(shape[0]):
@@ -353,7 +375,7 @@ def plan_grid(
                 elif on_grid and not (wanted[r, c] or clear[r, c]):
                     vacant[row, col] = kind[row, col] == EMPTY
         n_left = int(np.count_nonzero(kind == UNWANTED))
-        ends = add_batches(plan, ends, kind, vacant, limits, n_beside, slots, may_land, False, n_left)
+        ends = add_batches(plan, ends, kind, vacant, limits, n_beside, slots, may_land, False, n_left, weave)
     n_batches, n_positions, n_off = ends
     moves, offsets, shapes, positions, off = plan
     n_moves = offsets[n_batches]

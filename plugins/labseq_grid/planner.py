@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,6 +55,18 @@ def check_lanes(grid: SiteGrid, motion: MotionSpec) -> None:
         )
 
 
+WEAVE: Final = 0.1
+"""How far a lane of the triangular lattice swings, in lines: tweezers come no nearer to atoms than 2.2 um."""
+
+
+def lane_weave(grid: SiteGrid, motion: MotionSpec) -> float:
+    """How far lanes swing: 0 on a square lattice, and where each leg starts and ends at rest."""
+    if motion.speed_profile != "constant":
+        return 0.0
+    a1, a2 = grid.axes / grid.spacing_m
+    return 2.0 * WEAVE * float(a1 @ a2)
+
+
 class GridPlanner:
     """Rows x columns of reservoir atoms go straight to vacancies, through lanes between the sites.
 
@@ -84,6 +96,7 @@ class GridPlanner:
         self._slots = motion.eject_slots
         self._may_land = motion.empty_tweezers_may_land
         self._grid = context.grid
+        self._weave = lane_weave(context.grid, motion)
         self._kernel: Callable[..., Any] | None = None
 
     def warm(self) -> None:
@@ -118,7 +131,7 @@ class GridPlanner:
         assert self._kernel is not None
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
         arrays = self._kernel(
-            occupied, fill, target.fill, target.clear, self._limits, self._slots, self._may_land
+            occupied, fill, target.fill, target.clear, self._limits, self._slots, self._may_land, self._weave
         )
         for array in arrays:
             array.flags.writeable = False  # otherwise Plan would copy them
