@@ -99,7 +99,8 @@ def add_travel(
     On a triangular lattice a straight lane is 0.43 spacings from the sites on both sides, while the
     middles of the lattice's triangles and of their edges are 0.5 or more from all sites. So all tweezers
     weave from one middle to the next: the lanes swing to and fro once in each site of the way. Tones that
-    wait, on the middle of an edge too, swing with them straight across that edge. Tones that move
+    wait, on the middle of an edge too, swing with them straight across that edge. Those that move are
+    shifted so that their tweezers, which the swing takes along the other axis, go evenly. Tones that move
     the other way need the opposite swing, and so start half a site later.
 
     Args:
@@ -127,7 +128,7 @@ def add_travel(
             if went <= 0:
                 at[i] = start[i] + swing * shear
             elif went < PARTS * abs(way):
-                at[i] = start[i] + math.copysign(went / PARTS, way)
+                at[i] = start[i] + math.copysign(went / PARTS, way) - 0.5 * shear * swing
             else:
                 at[i] = to[i] + swing * shear
         n_knots = add_knot(moving, crossing, n_knots, at, lanes + swing)
@@ -152,58 +153,71 @@ def half_way(path: Floats, n_knots: int, to: Floats, swing: float) -> Floats:
 
 @helper_kernel(f"int64({KNOTS_OF}, int64, float64[::1])")
 def side(path: Floats, n_knots: int, to: Floats) -> int:
-    """1 if the tones that move do so between a lane and the line above it, -1 below it, 0 if they differ."""
+    """1 if tones move between a lane and the next higher line, -1 the next lower one, 0 neither, 2 both."""
     above = below = 0
     for i in range(len(to)):
         here = path[n_knots - 1, i]
         up = (to[i] > here) == (here % 1.0 != 0.0)
         above |= up and here != to[i]
         below |= not up and here != to[i]
-    return above - below
+    return 2 if above & below else above - below
 
 
-@helper_kernel("float64(float64[::1])")
-def least_gap(tones: Floats) -> float:
-    """Least distance of two tones that follow one another."""
-    gap = math.inf
+@helper_kernel("boolean(float64[::1], int64, int64)")
+def are_apart(tones: Floats, first: int, last: int) -> bool:
+    """Whether the tones of an axis are within its band and at least half a line apart."""
+    apart = tones[0] >= first and tones[-1] <= last
     for i in range(1, len(tones)):
-        gap = min(gap, tones[i] - tones[i - 1])
-    return gap
+        apart = apart and tones[i] - tones[i - 1] >= LANE
+    return apart
 
 
-@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64, int64)")
+Band = tuple[int, int, int, int]
+BAND: Final = "UniTuple(int64, 4)"
+"""First and last row, first and last column that the tones reach."""
+
+
+@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64, {BAND}, int64)")
 def add_middle(
-    rows: Floats, columns: Floats, n_knots: int, row: Floats, column: Floats, weave: float, way: int
+    rows: Floats,
+    columns: Floats,
+    n_knots: int,
+    row: Floats,
+    column: Floats,
+    weave: float,
+    band: Band,
+    way: int,
 ) -> int:
-    """Add a knot half-way through half a site, unless tones come too near to one another there.
+    """Add a knot half-way through half a site, unless tones are too near to one another there or too far out.
 
     ``way`` is the side to which tweezers on the edges go: 1 up along the rows, -1 down, 0 neither.
     """
     at = half_way(rows, n_knots, row, way * abs(weave))
     across = half_way(columns, n_knots, column, way * weave)
-    if way == 0 or min(least_gap(at), least_gap(across)) < LANE:
-        return n_knots
-    return add_knot(rows, columns, n_knots, at, across)
+    if way != 0 and are_apart(at, band[0], band[1]) and are_apart(across, band[2], band[3]):
+        n_knots = add_knot(rows, columns, n_knots, at, across)
+    return n_knots
 
 
-@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64)")
+@helper_kernel(f"int64({KNOTS_OF}, {KNOTS_OF}, int64, float64[::1], float64[::1], float64, {BAND})")
 def add_half_site(
-    rows: Floats, columns: Floats, n_knots: int, row: Floats, column: Floats, weave: float
+    rows: Floats, columns: Floats, n_knots: int, row: Floats, column: Floats, weave: float, band: Band
 ) -> int:
     """Add a way of half a site from lanes to lines or back, by the middle of a triangle.
 
     All tweezers are on middles of edges, or go from or to their sites; see :func:`add_travel`.
     """
     sides = side(rows, n_knots, row), side(columns, n_knots, column)
+    if weave == 0.0 or max(sides) == 2:
+        return add_knot(rows, columns, n_knots, row, column)
     shear = 1 if weave > 0.0 else -1
-    if weave != 0.0 and sides[0] * sides[1] * shear < 0:  # first the columns alone
+    if sides[0] * sides[1] * shear < 0:  # first the columns alone
         here = rows[n_knots - 1, : len(row)].copy()
-        n_knots = add_middle(rows, columns, n_knots, here, column, weave, shear * sides[1])
+        n_knots = add_middle(rows, columns, n_knots, here, column, weave, band, shear * sides[1])
         n_knots = add_knot(rows, columns, n_knots, here, column)
-        n_knots = add_middle(rows, columns, n_knots, row, column, weave, sides[0])
-    elif weave != 0.0:
-        way = sides[0] if sides[0] != 0 else shear * sides[1]
-        n_knots = add_middle(rows, columns, n_knots, row, column, weave, way)
+        sides = sides[0], 0
+    way = sides[0] if sides[0] != 0 else shear * sides[1]
+    n_knots = add_middle(rows, columns, n_knots, row, column, weave, band, way)
     return add_knot(rows, columns, n_knots, row, column)
 
 
@@ -279,6 +293,7 @@ def find_paths(
     n, m = len(row), len(column)
     low, high = -slots, n_rows - 1 + slots
     left, right = -slots, n_cols - 1 + slots
+    band = low, high, left, right
     here, across = np.empty(n), np.empty(m)
     there, beside = np.empty(n), np.empty(m)
     side = main_side(row, to_row, n)
@@ -305,12 +320,12 @@ def find_paths(
             next_to_put_down(free, goes_off, n, m, together, used)
         at = np.where(used, to_column.astype(np.float64), beside)
         if not first:
-            n_knots = add_half_site(rows, columns, n_knots, there, at, weave)
+            n_knots = add_half_site(rows, columns, n_knots, there, at, weave, band)
         first = False
         for i in range(n):
             if together[i]:
                 there[i] = to_row[i]
-        n_knots = add_half_site(rows, columns, n_knots, there, at, weave)
+        n_knots = add_half_site(rows, columns, n_knots, there, at, weave if stages else 0.0, band)
         n_on = 0
         for i in range(n):
             if together[i]:

@@ -55,8 +55,8 @@ def check_lanes(grid: SiteGrid, motion: MotionSpec) -> None:
         )
 
 
-WEAVE: Final = 0.1
-"""How far a lane of the triangular lattice swings, in lines: tweezers come no nearer to atoms than 2.2 um."""
+WEAVE: Final = 0.11
+"""How far a lane of the triangular lattice swings, in lines: tweezers so keep about 2.2 um from atoms."""
 
 
 def lane_weave(grid: SiteGrid, motion: MotionSpec) -> float:

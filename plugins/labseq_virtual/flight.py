@@ -225,9 +225,11 @@ class RfTransport:
                 [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
             )
         for tones, t_s in self.find_tones(pulse):
-            thermal[0] = relax(thermal[0], np.maximum(0.0, t_s[0] - thermal[1]))
-            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor, thermal[0])
-            thermal[1] = t_s[-1]
+            bright = np.flatnonzero(_light([tones[1], tones[3]]) > DARK)
+            on_s, off_s = t_s[bright[[0, -1]]] if len(bright) else t_s[[0, -1]]
+            thermal[0] = relax(thermal[0], np.maximum(0.0, on_s - thermal[1]))
+            thermal[1] = on_s
+            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor, thermal, off_s)
         return lost
 
     def _carry_batch(
@@ -238,7 +240,8 @@ class RfTransport:
         depth: Floats,
         rng: np.random.Generator,
         loss_factor: float,
-        heat: Floats,
+        thermal: Floats,
+        off_s: float,
     ) -> Counter[str]:
         from labseq_virtual.flight_kernels import (
             COLLIDED,
@@ -251,6 +254,7 @@ class RfTransport:
         )
 
         rows, row_depth, cols, col_depth = tones
+        heat, since_s = thermal
         row, col = np.nonzero(occupied & self._near(rows, cols) & (depth > 0))
         static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
         kt = KELVIN * heat[row, col] * np.sqrt(depth[row, col])
@@ -283,6 +287,7 @@ class RfTransport:
         moved = kept & held
         at = to_row[moved], to_col[moved]
         heat[at] = (energy[moved] + static[at]) / 3 / KELVIN / np.sqrt(depth[at])
+        since_s[at] = off_s
         self._flights.append(flights[held | ~kept])
         return Counter(fate.decode() for fate in flights["fate"][~kept].tolist())
 

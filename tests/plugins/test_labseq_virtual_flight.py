@@ -232,6 +232,24 @@ def test_each_batch_moves_its_atoms_anew(pause_s: float) -> None:
     assert flights["fate"].tolist() == [b"hand_over"]
 
 
+def test_an_atom_is_cooled_between_batches() -> None:
+    program = program_of(batch(((5, 2), (5, 4))), batch(((9, 2), (9, 4))), overhead_per_batch_s=0.5e-3)
+    (pulse,) = PulseReceiver(PlayedRfSource(played(program)), 1e-3).receive_until(START_S + 10.0)
+    occupied = np.zeros(GRID.shape, np.bool_)
+    occupied[[5, 9], [2, 2]] = True
+    thermal = np.stack([np.full(GRID.shape, 15e-6), np.full(GRID.shape, START_S - 1.0)])
+    waited: list[float] = []
+
+    def relax(heat: NDArray[np.float64], elapsed_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        waited.append(float(elapsed_s[5, 4]))
+        return heat
+
+    RfTransport(GRID, spec(), SURE).carry(
+        occupied, pulse, np.ones(GRID.shape), np.random.default_rng(1), 1.0, thermal, relax
+    )
+    assert waited[1] == pytest.approx(0.5e-3, abs=0.05e-3)
+
+
 def test_a_row_that_moves_by_a_site_keeps_all_atoms() -> None:
     row = range(3, 10)
     sites, _, _ = fly(program_of(batch(*(((4, c), (4, c + 1)) for c in row))), [(4, c) for c in row])

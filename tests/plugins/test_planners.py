@@ -115,7 +115,8 @@ def test_atoms_on_one_side_reach_a_target_on_the_other(name: str) -> None:
 @pytest.mark.parametrize("grid", [SiteGrid(shear=-1), SiteGrid(lattice="square")], ids=["mirrored", "square"])
 def test_too_few_atoms_fill_the_target_from_its_centre(name: str, grid: SiteGrid) -> None:
     atoms = loadings(1, filling=0.3)[0]
-    report = check_plan(EACH[name](Context(grid=grid), 7).plan(atoms, COMPACT), atoms, COMPACT, 7)
+    plan = EACH[name](Context(grid=grid), 7).plan(atoms, COMPACT)
+    report = check_plan(plan, atoms, COMPACT, 7, grid)
     filled = report.predicted & COMPACT.fill
     centre = grid.positions_m[COMPACT.fill].mean(axis=0)
     distance = np.linalg.norm(grid.positions_m - centre, axis=-1)
