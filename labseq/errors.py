@@ -10,16 +10,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 Loc: TypeAlias = tuple[str | int, ...]
 """Location of a value in a document: keys and list indices from the top, ("shot", 2, "rearrange")."""
 
 
 class LabseqError(Exception):
-    """Base of all errors that labseq raises on purpose."""
+    """Base of all errors that labseq raises on purpose; all of them can be pickled."""
 
     exit_code: ClassVar[int] = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self.args, vars(self))
+
+
+def _restored(kind: type[LabseqError], args: tuple[Any, ...], values: dict[str, Any]) -> LabseqError:
+    """An error that was pickled; the constructors of most take other arguments than their text."""
+    error = kind.__new__(kind)
+    error.args = args
+    vars(error).update(values)
+    return error
 
 
 @dataclass(frozen=True, slots=True)

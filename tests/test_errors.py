@@ -2,6 +2,7 @@ import pytest
 
 from labseq import errors
 from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.workers import portable
 
 
 def tree():
@@ -48,3 +49,19 @@ def test_errors_carry_their_values():
     assert str(errors.UnknownPluginError("planner", "x", ["a", "b"])) == (
         "unknown planner 'x'; expected one of 'a', 'b'"
     )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        errors.ConfigError(errors.Problem("wrong", "file", 1, 2)),
+        errors.DeviceTimeoutError("camera", "no frame", 1.5),
+        errors.UnknownPluginError("planner", "x", ("psca",)),
+        errors.InvalidPlanError("order", "sites", batch=2, planner="p"),
+        errors.StopRequested(15, after_shot=True),
+    ],
+)
+def test_errors_of_workers_arrive_as_they_were(error):
+    arrived = portable(error)
+    assert type(arrived) is type(error)
+    assert (str(arrived), vars(arrived)) == (str(error), vars(error))

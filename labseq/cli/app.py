@@ -34,6 +34,7 @@ from labseq.console.options import (
     SequenceFile,
     Shots,
     Where,
+    Workers,
     dry_run_mode,
     profile_option,
     run_argument,
@@ -149,6 +150,7 @@ def run(
     output: Output = None,
     as_json: Json = False,
     realtime: Realtime = False,
+    workers: Workers = 1,
     web: Annotated[
         bool, typer.Option("--web", help="Also show the run in a browser, as `labseq web` does.")
     ] = False,
@@ -159,7 +161,7 @@ def run(
     from labseq.session.options import Options
 
     options = Options(
-        profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime
+        profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime, workers
     )
     run_sequence(sequence, options, as_json=as_json, web=web)
 
@@ -176,12 +178,13 @@ def resume(
     ] = False,
     as_json: Json = False,
     realtime: Realtime = False,
+    workers: Workers = 1,
     _plugins: Plugins = None,
 ) -> None:
     """Take the missing shots of a run that was stopped, failed or crashed."""
     from labseq.cli.run import resume_run
 
-    resume_run(run, accept_changes=accept_changes, realtime=realtime, as_json=as_json)
+    resume_run(run, accept_changes=accept_changes, realtime=realtime, workers=workers, as_json=as_json)
 
 
 @app.command(short_help="End a run in progress after its current shot.")

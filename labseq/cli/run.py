@@ -44,12 +44,12 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool =
     run_session(start, as_json=as_json)
 
 
-def resume_run(path: Path, *, accept_changes: bool, realtime: bool, as_json: bool) -> None:
+def resume_run(path: Path, *, accept_changes: bool, realtime: bool, workers: int, as_json: bool) -> None:
     """Resume a run that ended early, and print the result."""
 
     def resume(observer: RunObserver | None) -> Session:
-        options = {"accept_changes": accept_changes, "realtime": realtime}
-        return Session.resume(existing_run(path), **options, observer=observer)
+        changed = {"accept_changes": accept_changes, "realtime": realtime}
+        return Session.resume(existing_run(path), **changed, workers=workers, observer=observer)
 
     run_session(resume, as_json=as_json)
 

@@ -168,6 +168,14 @@ Output = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")
 ]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
+Workers = Annotated[
+    int,
+    typer.Option(
+        metavar="N",
+        min=1,
+        help="Number of processes that take the shots of a simulated run; the data do not depend on it.",
+    ),
+]
 RunFolder = Annotated[
     Path | None,
     run_argument("The run's folder, or its name or number as in labseq runs; default: the newest run."),

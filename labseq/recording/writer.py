@@ -35,6 +35,7 @@ class RunWriter:
 
     Attributes:
         run_dir: The run's folder.
+        run: The run's record, of which each shot has a copy.
         n_written: Shots written that count; failed attempts do not count.
         last_row: The line in the index of the attempt that was written last; empty before the first.
     """
@@ -43,7 +44,7 @@ class RunWriter:
         self.run_dir = run_dir
         self.n_written = 0
         self.last_row: Mapping[str, Any] = {}
-        self._run = run
+        self.run = run
         self._encoder = self._make_encoder()
         self._index = LineLog(run_dir / folders.INDEX_FILE)
         self._events = LineLog(run_dir / folders.EVENTS_FILE)
@@ -78,7 +79,7 @@ class RunWriter:
             for name, content in {**texts, **(extra_files or {})}.items():
                 write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
             writer = cls(run_dir, run)
-            write_file(run_dir / folders.RUN_FILE, encode_run(run, _run_id(run_dir)))
+            write_file(run_dir / folders.RUN_FILE, encode_run(run, run_id_of(run_dir)))
             with explained(run_dir):
                 sync_folder(run_dir)
         except BaseException:
@@ -113,10 +114,10 @@ class RunWriter:
         Raises:
             RecordingError: The disk is full.
         """
-        self._run = replace(self._run, devices=devices)
+        self.run = replace(self.run, devices=devices)
         self._encoder = self._make_encoder()
         if self._before is None:
-            write_file(self.run_dir / folders.RUN_FILE, encode_run(self._run, _run_id(self.run_dir)))
+            write_file(self.run_dir / folders.RUN_FILE, encode_run(self.run, run_id_of(self.run_dir)))
         elif not self._before.get("devices"):  # it ended before its devices were open
             self._before["devices"] = devices
             write_file(self.run_dir / folders.RUN_FILE, dumps(self._before, indent=1).encode() + b"\n")
@@ -124,7 +125,7 @@ class RunWriter:
     def _make_encoder(self) -> ShotEncoder:
         from labseq.recording.shot_file import ShotEncoder  # h5py takes 0.1 s to import
 
-        return ShotEncoder(self._run, _run_id(self.run_dir))
+        return ShotEncoder(self.run, run_id_of(self.run_dir))
 
     def write_shot(self, shot: ShotRecord) -> Path:
         """Write an attempt at a shot; it counts if it is complete.
@@ -136,18 +137,31 @@ class RunWriter:
             RecordingError: The disk is full, or the record contradicts itself.
                 The shots written before are intact, and this one may be written again.
         """
-        counts = shot.status == "complete"
-        file = self._free_name(shot, counts=counts)
-        path = self.run_dir / file
-        data = self._encoder.encode(shot)
-        with ThreadPoolExecutor(1) as beside:  # while the disk writes
-            checksum = beside.submit(lambda: hashlib.sha256(data).hexdigest())
-            write_file(path, data)
-            sha256 = checksum.result()
-        row = index_row(shot, self._run.target, file=file, sha256=sha256, n_bytes=data.nbytes)
+        return self.add_shot(*encoded(self._encoder, self.run, shot))
+
+    def add_shot(self, row: Mapping[str, Any], data: bytes | memoryview | Path) -> Path:
+        """Write an attempt at a shot that was made into a file elsewhere.
+
+        Args:
+            row: Its line in the index, as :func:`encoded` or :func:`write_encoded` give it.
+            data: The bytes of its file; or that file, on the disk and in the folder of the shots, which is
+                renamed.
+
+        Raises:
+            RecordingError: As for :meth:`write_shot`.
+        """
+        file = self._free_name(row["shot"], row["attempt"], counts=row["counts"])
+        path, sha256 = self.run_dir / file, str(row["sha256"])
+        if isinstance(data, Path):
+            with explained(path):
+                data.replace(path)
+                sync_folder(path.parent)
+        else:
+            sha256 = _write_hashed(path, data)
+        row = {**row, "file": file, "sha256": sha256}
         self._index.append(row, sync=True)
         self.last_row = row
-        self.n_written += counts
+        self.n_written += row["counts"]
         return path
 
     def skip(self, shots: Sequence[int], why: str) -> None:
@@ -162,10 +176,10 @@ class RunWriter:
         with explained(self.run_dir):
             sync_folder(self.run_dir)  # the file may not exist yet
 
-    def _free_name(self, shot: ShotRecord, *, counts: bool) -> str:
+    def _free_name(self, shot_index: int, attempt: int, *, counts: bool) -> str:
         """The name of a shot's file, different from those that the run had before it was resumed."""
         for take in itertools.count(1):
-            file = folders.shot_file_name(shot.shot_index, shot.attempt, counts=counts, take=take)
+            file = folders.shot_file_name(shot_index, attempt, counts=counts, take=take)
             if Path(file).name not in self._kept:
                 return file
         raise AssertionError
@@ -203,5 +217,36 @@ class RunWriter:
         write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error))
 
 
-def _run_id(run_dir: Path) -> str:
+def encoded(encoder: ShotEncoder, run: RunRecord, shot: ShotRecord) -> tuple[dict[str, Any], memoryview]:
+    """An attempt at a shot for :meth:`RunWriter.add_shot`: its line in the index, and the bytes of its file.
+
+    Raises:
+        RecordingError: The record contradicts itself.
+    """
+    data = encoder.encode(shot)
+    return index_row(shot, run.target, file="", sha256="", n_bytes=data.nbytes), data
+
+
+def write_encoded(
+    encoder: ShotEncoder, run: RunRecord, shot: ShotRecord, path: Path
+) -> tuple[dict[str, Any], Path]:
+    """The same, with its file already on the disk, at ``path``.
+
+    Raises:
+        RecordingError: The disk is full, or the record contradicts itself.
+    """
+    row, data = encoded(encoder, run, shot)
+    return {**row, "sha256": _write_hashed(path, data)}, path
+
+
+def _write_hashed(path: Path, data: bytes | memoryview) -> str:
+    """Write a file; returns its SHA-256, which is computed while the disk writes."""
+    with ThreadPoolExecutor(1) as beside:
+        checksum = beside.submit(lambda: hashlib.sha256(data).hexdigest())
+        write_file(path, data)
+        return checksum.result()
+
+
+def run_id_of(run_dir: Path) -> str:
+    """The id of a run: the names of its last two folders."""
     return f"{run_dir.parent.name}/{run_dir.name}"

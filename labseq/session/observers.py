@@ -60,6 +60,11 @@ class Observers:
         if name == "shot_finished" and self._analyses is not None:
             self._analyses.look()
 
+    @property
+    def need_frames(self) -> bool:
+        """Whether a plugin receives the shots, with their frames."""
+        return any(True for _ in self._host.listeners("labseq_shot_finished", shot=None))
+
     def warn(self, text: str) -> None:
         """Report a warning."""
         self.event("warning", {"text": text})

@@ -41,6 +41,7 @@ class Options:
         dry_run: "full": every device by its simulator if its plugin has one, else by its virtual twin;
             "fast": virtual twins only; or "off".
         realtime: Let virtual time pass at the speed of real time.
+        workers: Number of processes that take the shots of a simulated run.
     """
 
     profile: str | Path | None = None
@@ -50,6 +51,7 @@ class Options:
     output: Path | None = None
     dry_run: DryRun = "off"
     realtime: bool = False
+    workers: int = 1
 
     def __post_init__(self) -> None:
         if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]

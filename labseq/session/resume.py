@@ -277,7 +277,7 @@ def changes_between(then: Mapping[str, Any], today: RunRecord) -> list[Change]:
         then: The run's run.json.
         today: The same run, assembled today.
     """
-    folder, now = then["provenance"].get("folder"), _plain(today)
+    folder, now = then["provenance"].get("folder"), plain_record(today)
     return [
         *_differences(_made_with(then), _made_with(now), folder),
         *differences(then, today, "resolved"),
@@ -288,12 +288,13 @@ def differences(then: Mapping[str, Any], today: RunRecord, name: str) -> list[Ch
     """The changes in one value of run.json, address by address."""
     before, after = (
         {address or name: value for address, value in _leaves(record.get(name, {}), "")}
-        for record in (then, _plain(today))
+        for record in (then, plain_record(today))
     )
     return _differences(before, after, then["provenance"].get("folder"))
 
 
-def _plain(record: RunRecord) -> dict[str, Any]:
+def plain_record(record: RunRecord) -> dict[str, Any]:
+    """A run's record as it is in run.json."""
     return json.loads(encode_run(record, ""))
 
 

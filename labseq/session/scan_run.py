@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 from labseq.errors import DeviceError
 from labseq.guard import Guard, StopFlag
@@ -22,7 +22,6 @@ from labseq.recording.quantities import Quantity, make_quantity
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver, Scanner
-from labseq.sequencer.lab import Lab
 from labseq.sequencer.run import Sequencer
 from labseq.session.assembly import CLIMBED, Assembly, Search
 from labseq.session.awaited import AwaitedResults
@@ -31,6 +30,51 @@ from labseq.session.lab import rebuild_lab
 from labseq.session.policies import ShotHooks, missing_figure
 from labseq.session.scan import Point
 from labseq.units import written
+
+
+class ShotTaker(Protocol):
+    """Takes the shots of a run one after the other."""
+
+    def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
+        """Take and record a shot.
+
+        Args:
+            shot: Its index.
+            point: Its settings.
+            skipped: Shots that will not be taken.
+
+        Returns:
+            The shot and why, if it failed for good.
+
+        Raises:
+            LabseqError: The error that ends the run.
+        """
+        ...
+
+
+class OwnShots:
+    """Takes the shots in this process.
+
+    Args:
+        sequencer: Open, at the point of the first shot.
+        point: That point.
+        changes: Address -> value of what differs from the files in every shot.
+        seed: The run's seed.
+    """
+
+    def __init__(self, sequencer: Sequencer, point: Point, changes: Mapping[str, Any], seed: int) -> None:
+        self._sequencer = sequencer
+        self._point = point
+        self._changes = changes
+        self._seed = seed
+
+    def take(self, shot: int, point: Point, skipped: Collection[int] = ()) -> Mapping[int, str]:  # noqa: ARG002
+        """See :class:`ShotTaker`."""
+        if point is not self._point:
+            lab, reopened = rebuild_lab(self._sequencer.lab, self._point, point, self._seed)
+            self._sequencer.change(lab, point.steps, {**self._changes, **point.parameters}, reopened)
+            self._point = point
+        return self._sequencer.run([shot])
 
 
 class ScanRun:
@@ -98,19 +142,17 @@ class ScanRun:
     def follow(self, writer: RunWriter, observer: RunObserver) -> None:
         """Connect the recorded results and the observer of events; called before :meth:`run`."""
 
-    def run(self, sequencer: Sequencer, lab: Lab, changes: Mapping[str, Any], shot_hooks: ShotHooks) -> None:
+    def run(self, taker: ShotTaker, shot_hooks: ShotHooks) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
 
         Args:
-            sequencer: Open, at the point of the first shot.
-            lab: The open devices.
-            changes: Address -> value of what differs from the files in every shot.
+            taker: Takes each of them.
             shot_hooks: Called between two shots; their exceptions end the run.
 
         Raises:
             LabseqError: The error that ended the run before its last shot.
         """
-        before, skipped = self.first, set(self._skip_before(shot_hooks))
+        skipped = set(self._skip_before(shot_hooks))
         for shot in self.shots:
             if shot in skipped:
                 continue
@@ -119,11 +161,7 @@ class ScanRun:
             if point is None:
                 self._scanner_ended(shot)
                 return
-            if point is not before:
-                lab, reopened = rebuild_lab(lab, before, point, self._seed)
-                sequencer.change(lab, point.steps, {**changes, **point.parameters}, reopened)
-                before = point
-            given_up = sequencer.run([shot])
+            given_up = taker.take(shot, point, skipped)
             self._add_result(shot)
             skipped.update(self._skip(shot, given_up, shot_hooks))
             self._report_point(shot, skipped)
@@ -150,7 +188,7 @@ class ScanRun:
             "point_of_shot": self.points,
         }
 
-    def _place(self, shot: int) -> int:
+    def place_of(self, shot: int) -> int:
         """Index of the point of a shot."""
         return self.points[shot]
 
@@ -160,7 +198,7 @@ class ScanRun:
 
     def _point_of(self, shot: int) -> Point | None:
         """The settings of a shot; the same object for following shots of the same point."""
-        place = self._place(shot)
+        place = self.place_of(shot)
         if self._current[0] != place:
             self._current = place, self._settings(place)
         return self._current[1]
@@ -169,8 +207,8 @@ class ScanRun:
         """Shots still to take at the point of a shot; none without a scan, where each shot is separate."""
         if self.assembly.scanned is None:
             return []
-        place = self._place(shot)
-        return [later for later in self.shots if later > shot and self._place(later) == place]
+        place = self.place_of(shot)
+        return [later for later in self.shots if later > shot and self.place_of(later) == place]
 
     def _skip_before(self, shot_hooks: ShotHooks) -> list[int]:
         """Record the shots to skip if an earlier process died before it could record them."""
@@ -303,7 +341,7 @@ class AdaptiveScanRun(ScanRun):
 
     def _report_point(self, shot: int, skipped: Collection[int]) -> None:
         if set(skipped).issuperset(self._later_at_its_point(shot)):
-            self._log_event("scan_point", self._results.progress(self._place(shot)))
+            self._log_event("scan_point", self._results.progress(self.place_of(shot)))
 
     def _log_event(self, name: str, values: Mapping[str, Any]) -> None:
         if self._observer is not None:

@@ -6,7 +6,8 @@ import gc
 import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, closing, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ParamSpec, Self
@@ -36,7 +37,8 @@ from labseq.session.policies import Checks, ShotHooks
 from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import make_safe_after_crash
 from labseq.session.scan import Point
-from labseq.session.scan_run import scan_run_of
+from labseq.session.scan_run import OwnShots, scan_run_of
+from labseq.session.workers import WorkersShots, refuse_workers
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
@@ -92,6 +94,7 @@ class Session:
         output: str | Path | None = None,
         dry_run: DryRun = "off",
         realtime: bool = False,
+        workers: int = 1,
         observer: RunObserver | None = None,
     ) -> Session:
         """Read and check sequence and profile; nothing is opened yet.
@@ -105,6 +108,7 @@ class Session:
             output: Folder for the data.
             dry_run: "off", "full" or "fast".
             realtime: Let virtual time pass at the speed of real time.
+            workers: Number of processes that take the shots of a simulated run; the data do not depend on it.
             observer: Receives every event.
 
         Raises:
@@ -113,7 +117,7 @@ class Session:
             PluginLoadError: A plugin that is named failed to load.
         """
         folder = None if output is None else path_of(output, "output")
-        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime)
+        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime, workers)
         return cls(assemble(path_of(sequence, "sequence"), options), options, observer)
 
     @classmethod
@@ -123,6 +127,7 @@ class Session:
         *,
         accept_changes: bool = False,
         realtime: bool = False,
+        workers: int = 1,
         observer: RunObserver | None = None,
     ) -> Session:
         """Read back a run that ended before its last shot, in order to take the missing shots.
@@ -135,6 +140,7 @@ class Session:
             accept_changes: Whether to continue although code, plugins or settings have changed; run.json
                 records the changes.
             realtime: Let virtual time pass at the speed of real time.
+            workers: Number of processes, as for :meth:`open`.
             observer: Receives every event.
 
         Raises:
@@ -145,7 +151,7 @@ class Session:
 
         path = path_of(run, "run")
         assembly, options, earlier = reopened(path, accept_changes=accept_changes, realtime=realtime)
-        return cls(assembly, options, observer, earlier)
+        return cls(assembly, replace(options, workers=workers), observer, earlier)
 
     def __enter__(self) -> Self:
         return self
@@ -201,6 +207,7 @@ class Session:
             warnings = [str(problem) for problem in check(self, runs=True).warnings]
             labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
             lab = next(labs)
+            refuse_workers(self.assembly, self.options, lab)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
             if gc.get_freeze_count():  # by an earlier run in this process
@@ -284,7 +291,13 @@ class Session:
 
         checks = Checks(settings, before, self._warn, values_of)
         self.scan_run.follow(writer, self._observers)
-        self.scan_run.run(sequencer, lab, changes, ShotHooks(writer, checks, self._observers.event))
+        hooks = ShotHooks(writer, checks, self._observers.event)
+        if self.options.workers == 1:
+            self.scan_run.run(OwnShots(sequencer, first, changes, record.seed), hooks)
+            return
+        shots = WorkersShots(self.scan_run, self.options, writer, self._observers, self.stop_flag)
+        with closing(shots):
+            self.scan_run.run(shots, hooks)
 
     def _awaited_results(self, run: Run | None) -> AwaitedResults:
         """The results of analyses without which the run cannot be continued, or a check cannot be made."""

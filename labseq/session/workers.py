@@ -1,0 +1,314 @@
+"""A simulated run whose shots are taken by workers; this process records them in order.
+
+Each shot draws its random numbers from the run's seed and its own index, so that it does not matter where it
+is taken. A worker assembles the run from its record, as a resumed run does, takes whole shots, and writes or
+sends their files. A file gets its name, and its line in the index, when all shots before it have theirs.
+"""
+
+from __future__ import annotations
+
+import gc
+import io
+import os
+import pickle
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.config.document import StoredText
+from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.guard import StopFlag
+from labseq.model import Frame, RunRecord, ShotRecord
+from labseq.recording import RunWriter
+from labseq.recording.folders import SHOTS_FOLDER
+from labseq.recording.writer import encoded, run_id_of, write_encoded
+from labseq.sequencer.clock import VirtualClock
+from labseq.sequencer.lab import Lab
+from labseq.sequencer.leader import leaders
+from labseq.sequencer.run import Sequencer
+from labseq.session.assembly import Assembly, assemble
+from labseq.session.chosen import HARDWARE_KINDS
+from labseq.session.lab import build_lab, warm
+from labseq.session.observers import Observers
+from labseq.session.options import Options
+from labseq.session.profile import RecordedSetup
+from labseq.session.provenance import run_record
+from labseq.session.resume import changes_between, plain_record
+from labseq.session.scan import Point
+from labseq.session.scan_run import OwnShots, ScanRun
+from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Workers, portable
+
+_AHEAD: Final = 1
+"""Shots per worker that may wait to be recorded, besides those that are handed out."""
+_LEFT_BY: Final = "worker"
+_UNSEEN: Final = "state"
+"""Event of workers that is not passed on."""
+
+Place = int | Mapping[str, float]
+"""The index of a point, or the values of one that a scanner has chosen."""
+
+
+def refuse_workers(assembly: Assembly, options: Options, lab: Lab) -> None:
+    """Check that the shots of a run can be taken by several workers, if they are to be.
+
+    Args:
+        assembly: The run.
+        options: Its options.
+        lab: Its devices; none is open.
+
+    Raises:
+        ConfigError: They cannot, and why.
+    """
+    if options.workers < 1:
+        raise ConfigError(Problem(f"workers is {options.workers}", expected="1 or more"))
+    if options.workers == 1:
+        return
+    problem = _problem_of(assembly, options, lab)
+    if problem is not None:
+        raise ConfigError(
+            replace(problem, what=f"{options.workers} workers cannot take the shots: {problem.what}")
+        )
+
+
+def _problem_of(assembly: Assembly, options: Options, lab: Lab) -> Problem | None:
+    """Why only one process can take the shots of a run."""
+    name = f"'{assembly.hardware.profile.name}'"
+    if not assembly.virtual_time:
+        chosen = assembly.hardware.chosen.items()
+        real = [role for role, one in chosen if one.entry.kind in HARDWARE_KINDS and not one.virtual_time]
+        what = f"the profile {name} has real hardware ({', '.join(real)})"
+        return Problem(what, expected="simulated hardware", hint="add --dry-run, or leave out --workers")
+    if options.realtime:
+        return Problem("simulated time cannot pass at the speed of real time", hint="leave out --realtime")
+    hardware = dict(lab.hardware())
+    led = [leader for leader, _ in leaders(hardware)]
+    for device in [*led, *(one for one, part in hardware.items() if getattr(part, "shots_in_order", False))]:
+        return Problem(f"with '{device}' of the profile {name}, shots must be taken in order")
+    for step, made in assembly.steps:
+        if made.shots_in_order:
+            return Problem(f"what the step '{step}' does stays in effect for later shots")
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What a worker needs to know of a run.
+
+    Attributes:
+        record: The run's record, with the descriptions of its devices.
+        run_id: Its id.
+        options: Its options.
+        folder: Where the worker writes the files of shots; None: it sends them.
+        keeps_frames: Whether the frames of a shot are sent too.
+    """
+
+    record: RunRecord
+    run_id: str
+    options: Options
+    folder: Path | None
+    keeps_frames: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TakenShot:
+    """A shot that a worker has taken.
+
+    Attributes:
+        events: In order: the events, name and values, and the attempts at the shot: the line in the index,
+            and the bytes of the file or its path.
+        given_up: The shot, and why, if it failed for good.
+        error: The error that ends the run, or None.
+    """
+
+    events: list[tuple[Any, Any]]
+    given_up: Mapping[int, str]
+    error: LabseqError | None
+
+
+class _WithoutFrames(pickle.Pickler):
+    """Leaves out frames, by far the largest part of a shot: they are in its file."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        """None in place of a frame."""
+        return (_nothing, ()) if isinstance(obj, Frame) else NotImplemented
+
+
+def _nothing() -> None:
+    return None
+
+
+class ShotWorker:
+    """Takes shots of a run in a process of its own.
+
+    Raises:
+        ConfigError: The run cannot be assembled here, or would be another one.
+        LabseqError: A simulated device fails.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        from labseq.recording.shot_file import ShotEncoder
+
+        self._recipe, self._record = recipe, recipe.record
+        self._assembly = _assembled_again(recipe)
+        self._encoder = ShotEncoder(recipe.record, recipe.run_id)
+        self._stop = StopFlag()
+        self._warmed: set[tuple[int, int]] = set()
+        self._place: Place | None = None
+        self._point: Point | None = None
+        self._own: OwnShots | None = None
+        self._events: list[tuple[Any, Any]] = []
+
+    def __call__(self, task: tuple[int, Place]) -> bytes:
+        """Take a shot; returns its :class:`TakenShot`, pickled."""
+        shot, place = task
+        point = self._point_at(place)
+        if self._own is None:
+            self._own = self._open(point)
+        self._events = []
+        given_up, error = dict[int, str](), None
+        try:
+            given_up = dict(self._own.take(shot, point))
+        except LabseqError as failure:
+            error = portable(failure)
+        taken, buffer = TakenShot(self._events, given_up, error), io.BytesIO()
+        pickler = pickle.Pickler if self._recipe.keeps_frames else _WithoutFrames
+        pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(taken)
+        return buffer.getvalue()
+
+    def _point_at(self, place: Place) -> Point:
+        """The settings of a point; the same object for following shots of the same point."""
+        if self._point is None or place != self._place:
+            search = self._assembly.search
+            if isinstance(place, int):
+                self._point = self._assembly.at(place)
+            else:
+                assert search is not None
+                self._point = search.at(place)
+            self._place = place
+        return self._point
+
+    def _open(self, point: Point) -> OwnShots:
+        lab = build_lab(point, self._assembly.target, VirtualClock(self._stop), self._record.seed)
+        warm(lab, self._stop, self)
+        changes = {address: change["value"] for address, change in self._record.overrides.items()}
+        sequencer = Sequencer(
+            lab,
+            point.steps,
+            self._stop,
+            self,
+            self,
+            seed=self._record.seed,
+            policy=self._assembly.policy,
+            parameters={**changes, **point.parameters},
+        )
+        gc.freeze()
+        sequencer.open()
+        return OwnShots(sequencer, point, changes, self._record.seed)
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep an event for the process that records the run."""
+        if name != _UNSEEN:
+            self._events.append((name, dict(values)))
+
+    def write_shot(self, shot: ShotRecord) -> None:
+        """Write or keep the file of an attempt at a shot."""
+        if self._recipe.folder is None:
+            row, data = encoded(self._encoder, self._record, shot)
+            self._events.append((row, bytes(data)))
+        else:
+            name = f"shot_{shot.shot_index:06}_{shot.attempt}.{os.getpid()}.{_LEFT_BY}.part"
+            path = self._recipe.folder / SHOTS_FOLDER / name
+            self._events.append(write_encoded(self._encoder, self._record, shot, path))
+
+
+def _assembled_again(recipe: Recipe) -> Assembly:
+    """Assemble a run from its record.
+
+    Raises:
+        ConfigError: That is not possible here, or its shots would differ.
+    """
+    record = recipe.record
+    assembly = assemble(
+        Path(record.sequence_path),
+        replace(recipe.options, profile=record.profile_path),
+        kept=StoredText(record.sequence_text, record.sequence_path),
+        again=RecordedSetup(StoredText(record.profile_text, record.profile_path), record.calibrations),
+    )
+    folder = Path(record.provenance["folder"])
+    today = run_record(assembly, record.seed, recipe.options.changes(), {}, folder)
+    if changes := changes_between(plain_record(record), today):
+        host = today.provenance["host"]
+        raise ConfigError([Problem(f"a worker on {host} would take other shots: {one}") for one in changes])
+    return assembly
+
+
+class WorkersShots:
+    """Has the shots of a run taken by workers, a bounded number ahead, and records them in order.
+
+    Args:
+        scan_run: The run's shots and points.
+        options: Its options.
+        writer: Its folder.
+        observers: Receive the events of each shot when it is recorded.
+        stop: The request to stop.
+
+    Raises:
+        LabseqError: No worker can be started.
+    """
+
+    def __init__(
+        self, scan_run: ScanRun, options: Options, writer: RunWriter, observers: Observers, stop: StopFlag
+    ) -> None:
+        self._scan_run = scan_run
+        self._writer = writer
+        self._observers = observers
+        self._stop = stop
+        self._n_handed_out = 0  # of the shots of the run, those skipped included
+        self._out: set[int] = set()
+        self._done: dict[int, bytes] = {}
+        recipe = Recipe(writer.run, run_id_of(writer.run_dir), options, writer.run_dir, observers.need_frames)
+        self._workers: Workers = ProcessWorkers(options.workers, ShotWorker, recipe, "shot")
+
+    def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
+        """Wait for a shot, and record it; see :class:`labseq.session.scan_run.ShotTaker`."""
+        self._out.difference_update(skipped)
+        for late in self._done.keys() & skipped:
+            del self._done[late]
+        self._stop.check()
+        self._hand_out(shot, point, skipped)
+        while shot not in self._done:
+            self._stop.check()
+            found = self._workers.finished(POLL_S)
+            self._done.update((one, taken) for one, taken in found if one in self._out)
+            self._hand_out(shot, point, skipped)
+        self._out.remove(shot)
+        taken: TakenShot = pickle.loads(self._done.pop(shot))  # noqa: S301 - of our own worker
+        for name, values in taken.events:
+            if isinstance(name, str):
+                self._observers.event(name, values)
+            else:
+                self._writer.add_shot(name, values)
+        if taken.error is not None:
+            raise taken.error
+        return taken.given_up
+
+    def _hand_out(self, current: int, point: Point, skipped: Collection[int]) -> None:
+        """Hand out as many shots as may be under way, those of later points only if they are known."""
+        run, limit = self._scan_run, (QUEUED + _AHEAD) * self._workers.n_workers
+        while len(self._out) < limit and self._n_handed_out < len(run.shots):
+            shot = run.shots[self._n_handed_out]
+            place = run.place_of(shot)
+            if run.is_adaptive and place != run.place_of(current):
+                return
+            self._n_handed_out += 1
+            if shot not in skipped:
+                self._out.add(shot)
+                chosen: Place = dict(point.parameters) if run.is_adaptive else place
+                self._workers.submit(shot, (shot, chosen))
+
+    def close(self) -> None:
+        """End the workers, and remove the files of shots that were not recorded."""
+        self._workers.close()
+        for path in (self._writer.run_dir / SHOTS_FOLDER).glob(f"*.{_LEFT_BY}.part*"):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,217 @@
+"""Workers: processes on this computer that carry out numbered tasks, whichever of them die on the way.
+
+Each task goes to one worker. If that worker is lost, another one gets its tasks, and a new worker takes its
+place. A task that has ended several workers ends the work.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Final, Protocol, Self, cast
+
+from labseq.errors import LabseqError
+from labseq.messages import error_text
+
+Do = Callable[[Any], Any]
+"""Carries out the task with this argument."""
+Make = Callable[[Any], Do]
+"""Prepares a worker from the recipe that all workers get; a function of a module, for it is sent by name."""
+
+POLL_S: Final = 0.1
+"""Interval at which waiting for results is interrupted, in seconds: on Windows, Ctrl-C does not end it."""
+QUEUED: Final = 2
+"""Tasks that a worker is given at once, so that it need not wait for the next one."""
+MAX_LOST: Final = 3
+"""Workers that a task may end before the work ends too: perhaps it needs more memory than there is."""
+_READY: Final = -1
+"""In place of the number of a task: the worker is prepared."""
+_FAREWELL_S: Final = 1.0
+
+
+class Workers(Protocol):
+    """Carries out tasks; used by one thread."""
+
+    @property
+    def n_workers(self) -> int:
+        """Number of workers now; at least 1."""
+        ...
+
+    def submit(self, task: int, argument: Any) -> None:
+        """Hand out a task.
+
+        Args:
+            task: Its number, used once.
+            argument: The argument of ``Do``; small, and pickled.
+        """
+        ...
+
+    def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+        """Wait until at least one task is done, or time is up; number and result of each that is.
+
+        Raises:
+            LabseqError: A worker cannot be prepared, a task failed, or it has ended :data:`MAX_LOST` workers.
+        """
+        ...
+
+    def close(self) -> None:
+        """End all workers at once, whatever they are doing; legal at any time."""
+        ...
+
+
+def portable(error: Exception) -> LabseqError:
+    """An error as another process can receive it: as it is, or its text if it cannot be pickled."""
+    if isinstance(error, LabseqError):
+        with suppress(Exception):
+            return pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
+    return LabseqError(error_text(error))
+
+
+@dataclass(slots=True, eq=False)
+class _Worker:
+    """A worker process, and the tasks that it has been given: number -> argument, the first one in work."""
+
+    connection: Connection
+    process: BaseProcess
+    is_ready: bool = False
+    tasks: dict[int, Any] = field(default_factory=dict[int, Any])
+
+    @classmethod
+    def start(cls, make: Make, recipe: Any) -> Self:
+        context: Any = multiprocessing.get_context("spawn")  # the same everywhere, and no locks are inherited
+        ours, theirs = context.Pipe()
+        process: BaseProcess = context.Process(target=_serve, args=(theirs, make, recipe), daemon=True)
+        with _ignored(signal.SIGINT):  # which the process then ignores, too
+            process.start()
+        theirs.close()
+        return cls(ours, process)
+
+    def send(self, task: int, argument: Any) -> None:
+        self.tasks[task] = argument
+        with suppress(OSError):  # it has died, which is found when its answers are read
+            self.connection.send((task, argument))
+
+    def end(self) -> None:
+        self.process.terminate()
+        self.connection.close()
+        self.process.join(_FAREWELL_S)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join(_FAREWELL_S)
+
+
+class ProcessWorkers:
+    """Worker processes on this computer.
+
+    Args:
+        n_workers: Their number.
+        make: Prepares each of them.
+        recipe: The argument of ``make``, pickled.
+        what: What a task is, in messages: "shot".
+    """
+
+    def __init__(self, n_workers: int, make: Make, recipe: Any, what: str) -> None:
+        self._make, self._recipe, self._what = make, recipe, what
+        self._n_lost = Counter[int]()
+        self._workers: list[_Worker] = []
+        try:
+            for _ in range(n_workers):
+                self._workers.append(_Worker.start(make, recipe))
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def n_workers(self) -> int:
+        """Number of workers."""
+        return len(self._workers)
+
+    def submit(self, task: int, argument: Any) -> None:
+        """Give a task to the worker that has the fewest."""
+        min(self._workers, key=lambda worker: len(worker.tasks)).send(task, argument)
+
+    def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+        """See :class:`Workers`."""
+        found: list[tuple[int, Any]] = []
+        ready = wait([worker.connection for worker in self._workers], timeout_s)
+        for number, worker in enumerate(self._workers):
+            if worker.connection not in ready:
+                continue
+            try:
+                task, answer, error = cast("tuple[int, Any, LabseqError | None]", worker.connection.recv())
+            except (EOFError, OSError):
+                self._workers[number] = self._replacement(worker)
+                continue
+            if error is not None:
+                raise error
+            if task == _READY:
+                worker.is_ready = True
+                self._n_lost[_READY] = 0
+            else:
+                del worker.tasks[task]
+                found.append((task, answer))
+        return found
+
+    def _replacement(self, lost: _Worker) -> _Worker:
+        """A new worker that has the tasks of a lost one.
+
+        Raises:
+            LabseqError: The task that it was at, or the start, has ended too many workers.
+        """
+        lost.end()
+        task = next(iter(lost.tasks), None) if lost.is_ready else _READY
+        if task is not None:
+            self._n_lost[task] += 1
+            if self._n_lost[task] >= MAX_LOST:
+                what = "starting" if task == _READY else f"{self._what} {task}"
+                code = lost.process.exitcode
+                raise LabseqError(
+                    f"{what} has ended {MAX_LOST} worker processes (exit code {code}); perhaps the memory "
+                    "was used up: try again with fewer --workers"
+                )
+        new = _Worker.start(self._make, self._recipe)
+        for task, argument in lost.tasks.items():
+            new.send(task, argument)
+        return new
+
+    def close(self) -> None:
+        """See :class:`Workers`."""
+        for worker in self._workers:
+            worker.process.terminate()
+        for worker in self._workers:
+            worker.end()
+
+
+def _serve(connection: Connection, make: Make, recipe: Any) -> None:
+    """Carry out tasks in a worker process until the connection is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
+    with suppress(EOFError, OSError):  # the first process has ended
+        try:
+            do = make(recipe)
+            connection.send((_READY, None, None))
+            while True:
+                task, argument = connection.recv()
+                connection.send((task, do(argument), None))
+        except Exception as error:  # noqa: BLE001 - the first process raises it
+            connection.send((_READY, None, portable(error)))
+
+
+@contextmanager
+def _ignored(number: int) -> Generator[None]:
+    """Ignore a signal for a while; other threads than the main one get none."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)

@@ -1,0 +1,106 @@
+"""Runs whose shots are taken by workers: the same data as from one process, whatever happens to them."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.errors import ConfigError
+from labseq.session.options import Options
+from labseq.session.workers import Recipe, ShotWorker
+from labseq.testing.fakes import RecordingObserver
+
+from .small_runs import OWN_DEVICE, PROFILE, interrupted, resumed, table, write
+
+TIMES = {"t_start_utc", "t_end_utc", "stage_s", "sha256", "bytes"}
+"""Entries of the index that depend on the time, or on files that contain times."""
+
+
+class Killing(RecordingObserver):
+    """Kills a worker after each of the first shots."""
+
+    n_kills = 0
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        super().event(name, values)
+        if name == "shot_finished" and self.n_kills < 2:
+            multiprocessing.active_children()[self.n_kills % 2].kill()
+            self.n_kills += 1
+
+
+def index(run: labseq.Run) -> list[dict[str, Any]]:
+    lines = (run.path / "index.jsonl").read_text(encoding="utf-8").splitlines()
+    return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
+
+
+def alone(sequence: Path) -> labseq.Run:
+    with labseq.Session.open(sequence, seed=5, output=sequence.parent / "alone") as session:
+        return session.run()
+
+
+def test_a_scan_that_is_stopped_and_resumed_while_workers_are_killed(tmp_path: Path) -> None:
+    sequence, observer = write(tmp_path, "planner"), Killing()
+    run_dir = interrupted(sequence, "shot_finished", 2, workers=2)
+    assert len(labseq.open_run(run_dir).shots) == 2
+    run, expected = resumed(run_dir, observer, workers=2), alone(sequence)
+    assert observer.n_kills == 2
+    assert table(run) == table(expected)
+    assert index(run) == index(expected)
+    names = [sorted(path.name for path in (one.path / "shots").iterdir()) for one in (run, expected)]
+    assert names[0] == names[1]
+    assert not multiprocessing.active_children()
+
+
+def test_an_adaptive_scan_chooses_the_same_points(tmp_path: Path) -> None:
+    sequence, observer = write(tmp_path, "adaptive"), RecordingObserver()
+    with labseq.Session.open(
+        sequence, seed=5, output=tmp_path / "data", workers=2, observer=observer
+    ) as session:
+        run = session.run()
+    assert index(run) == index(alone(sequence))
+    shots = [values["shot"] for values in observer.of("shot_started")]
+    assert shots == sorted(shots) == list(range(len(run.shots)))
+    assert observer.of("image")[0]["image"].frame is None
+
+
+@pytest.mark.parametrize(
+    ("profile", "options", "message"),
+    [
+        (f"{PROFILE}devices: {{laser: {{use: mine}}}}\n", {}, r"has real hardware \(laser\).*add --dry-run"),
+        (PROFILE, {"realtime": True}, "at the speed of real time; leave out --realtime"),
+        (PROFILE, {"workers": 0}, "workers is 0; expected 1 or more"),
+    ],
+)
+def test_runs_that_only_one_process_can_take(
+    tmp_path: Path, profile: str, options: dict[str, Any], message: str
+) -> None:
+    (tmp_path / "mine.py").write_text(OWN_DEVICE, encoding="utf-8")
+    sequence = write(tmp_path)
+    (tmp_path / "p.yaml").write_text(f"{profile}plugin_folders: [.]\n", encoding="utf-8")
+    options = {"workers": 2, **options}
+    with (
+        labseq.Session.open(sequence, output=tmp_path / "data", **options) as session,
+        pytest.raises(ConfigError, match=message),
+    ):
+        session.run()
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
+    observer = RecordingObserver()
+    with labseq.Session.open(
+        write(tmp_path), shots=1, output=tmp_path / "data", observer=observer
+    ) as session:
+        session.run()
+    record = observer.of("run_started")[0]["record"]
+    plugins = tuple({**one, "version": "0.0"} if one["name"] == "psca" else one for one in record.plugins)
+    other = replace(record, provenance={**record.provenance, "labseq": "0.0"}, plugins=plugins)
+    with pytest.raises(ConfigError, match=r"a worker on .* would take other shots: labseq was 0.0"):
+        ShotWorker(Recipe(other, "x", Options(shots=1), None, keeps_frames=False))

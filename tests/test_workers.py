@@ -1,0 +1,56 @@
+"""Worker processes: what becomes of tasks whose workers die."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from labseq.errors import ConfigError, LabseqError
+from labseq.workers import MAX_LOST, ProcessWorkers
+
+
+def make(folder: Path | None) -> Callable[[int], int]:
+    """Tasks of which number 1 ends its first worker, and number 3 each of them."""
+    if folder is None:
+        raise ConfigError("this worker lacks a plugin")
+
+    def do(number: int) -> int:
+        tries = folder / str(number)
+        n_before = len(tries.read_text()) if tries.exists() else 0
+        tries.write_text("x" * (n_before + 1))
+        if number == 3 or (number == 1 and not n_before):
+            os._exit(7)
+        return number**2
+
+    return do
+
+
+def finished(workers: ProcessWorkers, n_tasks: int) -> dict[int, int]:
+    found = dict[int, int]()
+    while len(found) < n_tasks:
+        found.update(workers.finished(1.0))
+    return found
+
+
+def test_tasks_of_a_lost_worker_are_done_by_others_and_a_task_that_ends_all_ends_the_work(
+    tmp_path: Path,
+) -> None:
+    with closing(ProcessWorkers(1, make, tmp_path, "job")) as workers:
+        for number in range(3):
+            workers.submit(number, number)
+        assert finished(workers, 3) == {0: 0, 1: 1, 2: 4}
+        workers.submit(3, 3)
+        with pytest.raises(LabseqError, match=f"job 3 has ended {MAX_LOST} worker processes .exit code 7"):
+            finished(workers, 1)
+    assert (tmp_path / "3").read_text() == "x" * MAX_LOST
+
+
+def test_a_worker_that_cannot_be_prepared_is_an_error_of_its_own_kind() -> None:
+    with closing(ProcessWorkers(1, make, None, "job")) as workers:
+        workers.submit(0, 0)
+        with pytest.raises(ConfigError, match="this worker lacks a plugin"):
+            finished(workers, 1)
