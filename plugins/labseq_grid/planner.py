@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from labseq_psca.planner import PscaPlanner, PscaSettings
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from labseq.plugin import (
@@ -32,26 +33,63 @@ class GridSettings(Settings):
         description="maximum number of mobile tweezers on at once, those without an atom included; the "
         "profile's limits hold too",
     )
+    without_lanes: Literal["refuse", "psca"] = Field(
+        default="refuse",
+        description="what happens if the profile's clearance, band or tones leave no lane between the sites: "
+        "refuse: an error; psca: batches of single lines, by the planner psca",
+    )
+
+
+OUTERMOST: Final = 0.61
+"""How far beyond the last line of sites a tone in a lane goes, in lines: half a line, and the swing."""
 
 
 def check_lanes(grid: SiteGrid, motion: MotionSpec) -> None:
     """Raise a LimitError if there is no lane in which tweezers can pass the atoms."""
     a1, a2 = grid.axes
-    area = abs(float(a1[0] * a2[1] - a1[1] * a2[0]))
-    lane_m = area / grid.spacing_m / 2
-    other = "planners of line batches such as psca need no lanes"
+    lane_m = abs(float(a1[0] * a2[1] - a1[1] * a2[0])) / grid.spacing_m / 2
     if lane_m < motion.clearance_m:
         clearance, lane = (f"{length_m * 1e6:.4g} um" for length_m in (motion.clearance_m, lane_m))
         raise LimitError(
             "the clearance of moving tweezers",
             clearance,
-            f"at most {lane}, half-way between two lines; {other}",
+            f"at most {lane}, half-way between two lines of sites",
+            f"lower mobile_tweezers.clearance in the profile, or {OTHERWISE}",
         )
     if motion.eject_slots == 0 and min(grid.shape) == 1:
         raise LimitError(
             "the number of ejection slots",
             0,
-            f"at least 1 where the grid has a single line, for a lane; {other}",
+            "at least 1 where the grid has a single line, for a lane",
+            f"raise mobile_tweezers.eject_slots in the profile, or {OTHERWISE}",
+        )
+    axes = (("row", grid.row_frequency_hz), ("column", grid.column_frequency_hz))
+    for (axis, hz), band in zip(axes, (motion.rf.row_band_hz, motion.rf.column_band_hz), strict=True):
+        if len(hz) > 1:
+            _check_tones(axis, np.sort(hz), band, motion)
+
+
+OTHERWISE: Final = "choose a planner of line batches such as psca, or `without_lanes: psca` for this one"
+
+
+def _check_tones(axis: str, hz: NDArray[np.float64], band: tuple[float, float], motion: MotionSpec) -> None:
+    """Raise a LimitError if tones in lanes are too near to those on lines, or out of the band."""
+    half_hz = float(np.diff(hz).min()) / 2
+    if not motion.empty_tweezers_may_land and half_hz < motion.rf.min_spacing_hz * (1 - 1e-9):
+        raise LimitError(
+            f"the distance of a {axis} tone in a lane from one on the next line",
+            f"{half_hz / 1e6:.6g} MHz",
+            f"{motion.rf.min_spacing_hz / 1e6:.6g} MHz at least",
+            f"lower mobile_tweezers.rf.min_spacing in the profile, or {OTHERWISE}",
+        )
+    ends = hz[0] - OUTERMOST * (hz[1] - hz[0]), hz[-1] + OUTERMOST * (hz[-1] - hz[-2])
+    if motion.eject_slots > 0 and not (band[0] <= ends[0] and ends[1] <= band[1]):
+        outside = ends[0] if ends[0] < band[0] else ends[1]
+        raise LimitError(
+            f"the frequency of a {axis} tone in the outermost lane",
+            f"{outside / 1e6:.6g} MHz",
+            f"the band of {band[0] / 1e6:.6g} to {band[1] / 1e6:.6g} MHz",
+            f"set mobile_tweezers.eject_slots: 0 in the profile, for no lane beyond the grid, or {OTHERWISE}",
         )
 
 
@@ -79,7 +117,8 @@ class GridPlanner:
         degree_of_parallelism: Maximum number of tweezers on at once.
 
     Raises:
-        LimitError: There is no lane in which tweezers keep the clearance.
+        LimitError: There is no lane in which tweezers keep the clearance, or whose tones can be played, and
+            the settings want no line batches instead.
 
     Example:
         >>> target = TargetPattern(fill=[[True, True, False]], clear=[[False, False, False]])
@@ -91,7 +130,13 @@ class GridPlanner:
     def __init__(self, settings: GridSettings, context: Context) -> None:
         motion = context.motion
         dop = self.degree_of_parallelism = min(settings.degree_of_parallelism, motion.max_tweezers)
-        check_lanes(context.grid, motion)
+        self._in_lines: PscaPlanner | None = None
+        try:
+            check_lanes(context.grid, motion)
+        except LimitError:
+            if settings.without_lanes == "refuse":
+                raise
+            self._in_lines = PscaPlanner(PscaSettings(degree_of_parallelism=dop), context)
         self._limits = dop, motion.max_row_tones, motion.max_column_tones
         self._slots = motion.eject_slots
         self._may_land = motion.empty_tweezers_may_land
@@ -101,6 +146,9 @@ class GridPlanner:
 
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
+        if self._in_lines is not None:
+            self._in_lines.warm()
+            return
         from labseq_grid.kernels_plan import plan_grid
 
         self._kernel = plan_grid
@@ -122,6 +170,8 @@ class GridPlanner:
             PlanError: The occupancy is not an array of zeros and ones in the
                 target's shape.
         """
+        if self._in_lines is not None:
+            return self._in_lines.plan(occupancy, target)
         try:
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_grid.planner import GridPlanner, GridSettings
 
-from labseq.plugin import Context, LimitError, MotionSpec, SiteGrid
+from labseq.plugin import Context, LimitError, MotionSpec, RfSpec, SiteGrid, TargetPattern, check_plan
 from labseq.testing import PlannerContract
 
 from .planning import COMPACT, grid, in_the_middle, loadings, plan_and_check
@@ -59,11 +59,24 @@ def test_few_defects_take_one_batch(defects: set[int], seed: int) -> None:
     [
         (SiteGrid(), MotionSpec(clearance_m=2e-6), r"clearance.*2 um.*at most 1\.944 um"),
         (SiteGrid(1, 8), MotionSpec(eject_slots=0), "single line"),
+        (SiteGrid(), MotionSpec(rf=RfSpec(min_spacing_hz=0.9e6)), r"row tone.*0\.8 MHz.*rf\.min_spacing"),
+        (
+            SiteGrid(),
+            MotionSpec(rf=RfSpec(column_band_hz=(84e6, 118e6))),
+            r"column tone.*83\.824 MHz.*84 to 118 MHz.*eject_slots: 0",
+        ),
     ],
 )
 def test_a_machine_without_lanes_is_refused(site_grid: SiteGrid, motion: MotionSpec, text: str) -> None:
     with pytest.raises(LimitError, match=text):
         GridPlanner(GridSettings(), Context(grid=site_grid, motion=motion))
+    atoms = np.ones(site_grid.shape, np.bool_)
+    atoms[0, 0] = False
+    target = TargetPattern(~atoms, np.zeros_like(atoms))
+    in_lines = GridPlanner(GridSettings(without_lanes="psca"), Context(grid=site_grid, motion=motion))
+    plan = in_lines.plan(atoms, target)
+    assert check_plan(plan, atoms, target, 15, site_grid, motion).meets_target
+    assert all(batch.tones is None for batch in plan.batches)
 
 
 def test_unwanted_atoms_are_the_first_to_fill_vacancies() -> None:
