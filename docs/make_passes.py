@@ -4,7 +4,7 @@
 
 The command replaces the part of ``docs/explanation/grid-planner.md`` between ``<!-- measured: passes -->``
 and ``<!-- end -->``. Atoms move by Newton's law in the light of a static tweezer and of a mobile one that
-passes at constant speed, as in the simulation of played samples (``labseq_virtual.flight``).
+passes at constant speed along the lane, as in the simulation of played samples (``labseq_virtual.flight``).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from labseq_grid.planner import WEAVE
 from labseq_virtual.flight import KELVIN, STEP_S, draw_atoms
 from labseq_virtual.flight_kernels import N_COLUMNS, energies, follow_atoms
 from labseq_virtual.settings import SimulationSettings
@@ -33,13 +34,20 @@ APART_M: Final = 30e-6
 REACH_M: Final = 6e-6
 """How far from the atom the tweezer comes on and goes off, along its way."""
 STATIC: Final = SimulationSettings()
-LANES_M: Final = {"triangular": 1.944e-6, "square": 2.245e-6}
-"""Half the distance of two rows of 4.49 um, by lattice."""
-DEPTHS_K: Final = (2.1e-3, 1.6e-3, 1.3e-3, 1.0e-3, 0.7e-3)
-TEMPERATURES_K: Final = (15e-6, 5e-6)
+SPACING_M: Final = 4.49e-6
+LANES_M: Final = {
+    "triangular, straight": (1.944e-6, 0.0),
+    "triangular, weaving": (1.944e-6, WEAVE * 2 * 1.944e-6),
+    "square": (2.245e-6, 0.0),
+}
+"""Half the distance of two rows of sites, and how far the lane swings, by lattice."""
+DEPTHS_K: Final = (2.1e-3, 1.5e-3, 1.0e-3, 0.7e-3)
+TEMPERATURES_K: Final = (30e-6, 15e-6, 5e-6)
 
 
-def n_taken(lane_m: float, depth_k: float, temperature_k: float, rng: np.random.Generator) -> int:
+def n_taken(
+    lane_m: float, swing_m: float, depth_k: float, temperature_k: float, rng: np.random.Generator
+) -> int:
     """Let a tweezer pass each of a group of atoms once; count those that their static tweezer loses."""
     waists = np.array([STATIC.static_waist, STATIC.mobile_light.waist])
     rayleigh = math.pi * waists**2 / [STATIC.static_wavelength, STATIC.mobile_light.wavelength]
@@ -53,7 +61,8 @@ def n_taken(lane_m: float, depth_k: float, temperature_k: float, rng: np.random.
     plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
     n_frames = round(2 * REACH_M / MotionSpec().speed_m_s / FRAME_S)
     rows = np.linspace(1.0, -1.0, n_frames + 1)[:, None].copy()
-    columns = np.tile(np.arange(float(GROUP)) + lane_m / APART_M, (n_frames + 1, 1))
+    swing = swing_m * np.cos(2 * math.pi * REACH_M / SPACING_M * rows)
+    columns = np.arange(float(GROUP)) + (lane_m + swing) / APART_M
     alive, record = np.ones(GROUP, np.bool_), np.full((GROUP, N_COLUMNS), np.nan)
     follow_atoms(
         state, alive, record, rows, np.ones_like(rows), columns, np.ones_like(columns),
@@ -70,13 +79,13 @@ def main() -> None:
     parser.add_argument("--atoms", type=int, default=20_000, help="atoms for each row of the table")
     n_groups = math.ceil(parser.parse_args().atoms / GROUP)
     lines = ["| lane | atoms at | mobile tweezers | taken per pass |", "| --- | --- | --- | --- |"]
-    for (lattice, lane_m), kelvin, depth_k in product(LANES_M.items(), TEMPERATURES_K, DEPTHS_K):
+    for (lattice, lane), kelvin, depth_k in product(LANES_M.items(), TEMPERATURES_K, DEPTHS_K):
         rng = np.random.default_rng(1)
         n = n_groups * GROUP
-        taken = sum(n_taken(lane_m, depth_k, kelvin, rng) for _ in range(n_groups)) / n
+        taken = sum(n_taken(*lane, depth_k, kelvin, rng) for _ in range(n_groups)) / n
         error = math.sqrt(max(taken * (1 - taken), 1 / n) / n)
-        lane = f"{lattice}, {1e6 * lane_m:.3f} µm | {1e6 * kelvin:g} µK | {1e3 * depth_k:g} mK"
-        lines.append(f"| {lane} | {100 * taken:.3f}({100 * error:.3f}) % |")
+        case = f"{lattice} | {1e6 * kelvin:g} µK | {1e3 * depth_k:g} mK"
+        lines.append(f"| {case} | {100 * taken:.3f}({100 * error:.3f}) % |")
         sys.stdout.write(lines[-1] + "\n")
         sys.stdout.flush()
     text = PAGE.read_text(encoding="utf-8")

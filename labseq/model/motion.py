@@ -88,8 +88,9 @@ class LossSpec:
         tone: Added to it for each tone on beyond one per axis.
         distance_per_m: Added to it per metre of the way.
         landing: Loss of an atom that stands where a tweezer without an atom is ramped down.
-        passing: Loss of an atom that a tweezer passes in a lane, half-way between two lines of sites; the
-            tweezer's own atom is then lost too (ours: simulated for the paper's lattice and depths at 15 uK).
+        passing: Loss of an atom that a tweezer passes at 1.944 um, as in a straight lane of the paper's
+            lattice, and a factor e less for each further 0.15 um; the tweezer's own atom is then lost
+            too (ours: simulated for the paper's depths and waists at 15 uK).
         spread: Spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor with
             mean 1, common to all atoms.
         image: Loss of an atom by one image (the paper's, 0.45 %), beyond that of the moves.

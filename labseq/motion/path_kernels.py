@@ -288,3 +288,64 @@ def check_motion(
                 if near[0] >= 0:
                     return PATH_LANDS, -1, near[0], near[1]
     return RIGHT, -1, 0, 0
+
+
+ON_SITE: Final = 0.1
+"""A tweezer that comes as near to a site, in spacings, ends there: it lands."""
+
+
+@helper_kernel(
+    f"int64({POSITIONS}, {KNOTS}, {SHAPE}, {const('bool_', 2)}, float64, UniTuple(float64, 3),"
+    " float64[:, ::1], float64[:, ::1])"
+)
+def add_passes(
+    positions: Floats,
+    off: Ints,
+    shape: Shape,
+    atoms: Bools,
+    cosine: float,
+    distances: tuple[float, float, float],
+    of_site: Floats,
+    of_tweezer: Floats,
+) -> int:
+    """Weigh passes of standing atoms by their distance, each pair once, at its nearest; return how many.
+
+    Args:
+        positions: The paths.
+        off: Likewise.
+        shape: Likewise.
+        atoms: bool (n_rows, n_cols), the atoms that stand.
+        cosine: Of the angle between rows and columns.
+        distances: In spacings: from where on a tweezer does not pass, where the weight is 1, and the
+            additional distance at which it is 1/e.
+        of_site: float64 (n_rows, n_cols), to which the weights of each site are added.
+        of_tweezer: float64 (n_row_tones, n_column_tones), to which those of each tweezer are added.
+    """
+    n_rows, n_cols = atoms.shape
+    beside, full, decay = distances
+    reach = beside / math.sqrt(1.0 - cosine * cosine)
+    nearest = np.full((n_rows, n_cols), math.inf)
+    n_passes = 0
+    for i in range(shape[1]):
+        for j in range(shape[2]):
+            nearest[:] = math.inf
+            for leg in range(min(off[i], off[shape[1] + j])):
+                row, col = position(positions, shape, 0, leg, i), position(positions, shape, 1, leg, j)
+                down = position(positions, shape, 0, leg + 1, i) - row
+                right = position(positions, shape, 1, leg + 1, j) - col
+                top, left = math.ceil(row + min(down, 0.0) - reach), math.ceil(col + min(right, 0.0) - reach)
+                bottom = math.floor(row + max(down, 0.0) + reach)
+                last = math.floor(col + max(right, 0.0) + reach)
+                for r in range(max(top, 0), min(bottom + 1, n_rows)):
+                    for c in range(max(left, 0), min(last + 1, n_cols)):
+                        if atoms[r, c] and (down != 0.0 or right != 0.0):
+                            away = distance(r - row, c - col, down, right, cosine)
+                            nearest[r, c] = min(nearest[r, c], away)
+            for r in range(n_rows):
+                for c in range(n_cols):
+                    if ON_SITE <= nearest[r, c] < beside:
+                        weight = math.exp((full - nearest[r, c]) / decay)
+                        of_site[r, c] += weight
+                        of_tweezer[i, j] += weight
+                        n_passes += 1
+    return n_passes

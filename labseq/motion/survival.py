@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -138,11 +137,11 @@ def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) 
                 hazards[LANDED][at] -= math.log1p(-losses.landing)
                 n_landings += 1
             if losses.passing > 0:
-                passes = _passes(batch.tones, atoms, grid)
                 hazard, tones = -math.log1p(-losses.passing), batch.tones.tones_of(batch.from_sites)
-                hazards[PASSED][atoms] += hazard * passes.sum(axis=(0, 1))
-                before[PASSED] += hazard * passes.sum(axis=2)[tones[:, 0], tones[:, 1]]
-                n_passes += int(passes.sum())
+                of_site, of_tweezer, n = _passes(batch.tones, atoms, grid)
+                hazards[PASSED] += hazard * of_site
+                before[PASSED] += hazard * of_tweezer[tones[:, 0], tones[:, 1]]
+                n_passes += n
         to_row, to_col = batch.to_sites.T
         stays = (to_row >= 0) & (to_row < grid.n_rows) & (to_col >= 0) & (to_col < grid.n_cols)
         goal = to_row[stays], to_col[stays]
@@ -189,23 +188,20 @@ def _landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[in
 
 BESIDE: Final = 0.6
 """A tweezer passes an atom if it comes closer than this part of the grid's spacing: a lane is at most 0.5."""
+LANE_M: Final = 1.944e-6
+"""Distance at which the loss by passing is that of the profile: in a straight lane of the paper's lattice."""
+DECAY_M: Final = 0.15e-6
+"""Additional distance at which it is 1/e of that, about: from the table of passes on the page of ``grid``."""
 
 
-def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> NDArray[np.bool_]:
-    """Which crossings pass which standing atoms in a lane, bool (n_row_tones, n_column_tones, n_atoms)."""
-    a1, a2 = grid.axes
-    row, col = np.nonzero(atoms)
-    sites = row[:, None] * a2 + col[:, None] * a1
-    place = paths.row[:, :, None, None] * a2 + paths.column[:, None, :, None] * a1
-    passed = np.zeros((*place.shape[1:3], len(row)), np.bool_)
-    off = np.minimum.outer(paths.row_off, paths.column_off)
-    for knot, (start, end) in enumerate(pairwise(place)):
-        way = end - start
-        square = (way**2).sum(axis=2)
-        apart = sites - start[:, :, None]
-        along = (apart * way[:, :, None]).sum(axis=3) / np.where(square > 0, square, 1.0)[..., None]
-        nearest = apart - np.clip(along, 0.0, 1.0)[..., None] * way[:, :, None]
-        near = (nearest**2).sum(axis=3) < (BESIDE * grid.spacing_m) ** 2
-        on_site = (nearest**2).sum(axis=3) < (0.1 * grid.spacing_m) ** 2  # it ends there: a landing
-        passed |= near & ~on_site & (off > knot)[..., None] & (square > 0)[..., None]
-    return passed
+def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats, Floats, int]:
+    """Weighted passes of tweezers by standing atoms, of each site and of each tweezer; how many there are."""
+    from labseq.motion.path_kernels import add_passes
+
+    of_site, of_tweezer = np.zeros(grid.shape), np.zeros(paths.shape[1:])
+    positions = np.concatenate([paths.row.ravel(), paths.column.ravel()])
+    off = np.concatenate([paths.row_off, paths.column_off]).astype(np.int32)
+    a1, a2 = grid.axes / grid.spacing_m
+    distances = BESIDE, LANE_M / grid.spacing_m, DECAY_M / grid.spacing_m
+    n = add_passes(positions, off, paths.shape, atoms, float(a1 @ a2), distances, of_site, of_tweezer)
+    return of_site, of_tweezer, n
