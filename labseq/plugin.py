@@ -5,6 +5,7 @@ A plugin needs no other module of labseq, except :mod:`labseq.testing` in its te
 
 from __future__ import annotations
 
+from labseq import wire
 from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle, wait_for
 from labseq.drivers.camera import check_step, nearest
 from labseq.drivers.serial_port import (
@@ -320,4 +321,5 @@ __all__ = [
     "visible",
     "wait_for",
     "warm_rendering",
+    "wire",
 ]

@@ -40,6 +40,7 @@ from labseq.console.options import (
     run_argument,
 )
 from labseq.queue.commands import queue
+from labseq.remote.commands import SERVE_EXAMPLES, keys, serve_devices
 from labseq.scaffold.commands import (
     EXPLAIN_EXAMPLES,
     NEW_EXAMPLES,
@@ -110,6 +111,7 @@ def common(
 
 app.add_typer(bench)
 app.add_typer(calibration)
+app.add_typer(keys)
 app.add_typer(queue)
 app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, tones, timing and more.")(calibrate)
 
@@ -261,6 +263,7 @@ def runs(
     list_runs(data, name, limit, as_json=as_json)
 
 
+app.command(epilog=SERVE_EXAMPLES, short_help="Serve devices to a labseq on another computer.")(serve_devices)
 app.command(epilog=WEB_EXAMPLES, name="web", short_help="Show runs, queue and calibrations in a browser.")(
     show_web
 )

@@ -1,0 +1,1 @@
+"""Serves devices of this computer to another one that runs sequences; keys of computers."""

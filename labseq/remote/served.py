@@ -1,0 +1,451 @@
+"""A device that is served: its thread and socket, and the sessions of clients with it.
+
+Each client has an object of the driver of its own, constructed from the context that it sends. One of them at
+a time, the owner, may open it; the others may ask for what is known without opening, and for what the owner's
+describes. All calls are made in the device's one thread, in the order of their numbers.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from labseq.errors import ConfigError, DeviceError, LabseqError
+from labseq.guard import StopFlag
+from labseq.kernel import load_kernels
+from labseq.messages import format_error
+from labseq.model import RandomStream
+from labseq.roles import Clock, Context, offers
+from labseq.sequencer.clock import RealClock, VirtualClock
+from labseq.session.chosen import ChosenPlugin
+from labseq.session.lab import construct
+from labseq.watchdog import Watchdog
+from labseq.wire import MessageError, pack, report_error, unpack
+
+LOOK_S: Final = 0.03
+"""How often threads that wait look for what else there is to do."""
+GRACE_S: Final = 0.3
+"""How long a call may take to end after it was aborted, before the device is made safe beside it."""
+RESCUE_S: Final = 5.0
+"""How long that may take; then the watchdog switches the device off."""
+
+_COMMON: Final = frozenset(
+    {"safe_state", "describe", "versions", "warm", "settle", "self_test", "poll", "check_interlocks"}
+)
+METHODS: Final[Mapping[str, frozenset[str]]] = {
+    "camera": _COMMON | {"arm", "disarm", "trigger", "read"},
+    "static_tweezers": _COMMON | {"load", "start", "ramp", "release", "leave_on"},
+    "mobile_tweezers": _COMMON | {"check_program", "prepare", "play", "wait", "prepare_beginning", "append"},
+    "device": _COMMON | {"command", "read", "check_command"},
+    "lines": _COMMON | {"check_program", "idle", "compile", "arm", "fire", "wait"},
+    "simulation": frozenset(
+        {"begin_shot", "load", "play", "expose", "describe", "truth", "losses", "atom_events", "warnings"}
+        | {"readout_fraction", "prepare_sensor"}
+    ),
+}
+"""Kind of device -> what clients may call, beside ``open`` and ``close``."""
+_OF_HARDWARE: Final = ("settling_timeout_s", "idle_output")
+_LIVE: Final = ("start_delay_s", "after_start_s", "beginning_s")
+PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
+    "camera": (*_OF_HARDWARE, "facts"),
+    "static_tweezers": (*_OF_HARDWARE, "facts"),
+    "mobile_tweezers": (*_OF_HARDWARE, "waits_for_trigger", *_LIVE),
+    "device": _OF_HARDWARE,
+    "lines": (*_OF_HARDWARE, "lines_facts"),
+    "simulation": ("sensor_shape", "loading_probability"),
+}
+_CHANGES_LIVE: Final = frozenset({"prepare", "prepare_beginning", "append", "play"})
+_LOOKS: Final = frozenset({"describe", "versions"})
+"""What a client that is not the owner gets from the owner's device."""
+
+
+class Abort(StopFlag):
+    """The request to end the call in progress; the next call begins without it."""
+
+    def clear(self) -> None:
+        """Take the request back."""
+        self._event.clear()
+
+
+class SharedTime(VirtualClock):
+    """The virtual time of a client's run, for all its devices here.
+
+    Attributes:
+        waits_s: The waits of the call in progress, which the client repeats on its own clock.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(StopFlag())
+        self.waits_s: list[float] = []
+
+    def sleep(self, duration_s: float) -> None:
+        """Advance virtual time, and remember it."""
+        super().sleep(duration_s)
+        self.waits_s.append(duration_s)
+
+    def begin_call(self, now_s: float) -> None:
+        """Take over the client's time."""
+        self._now_s, self.waits_s = now_s, []
+
+
+@dataclass(eq=False)
+class Run:
+    """What the sessions of one run of a client share: virtual time, random numbers and the simulation."""
+
+    clock: SharedTime = field(default_factory=SharedTime)
+    streams: list[RandomStream] = field(default_factory=list[RandomStream])
+    place: tuple[int, int] | None = None
+    simulation: Any = None
+
+    def begin_shot(self, place: tuple[int, int]) -> None:
+        """Start the random numbers of a shot, unless it is under way."""
+        if place != self.place:
+            self.place = place
+            for stream in self.streams:
+                stream.begin_shot(*place)
+
+
+@dataclass(eq=False)
+class Session:
+    """A client's connection to a device.
+
+    Attributes:
+        peer: The client's public key; "" without keys.
+        who: What the client calls itself, for other users.
+        run: See :class:`Run`.
+        token: Names the session in each message.
+        beat_s: When it last gave a sign of life.
+        ended: Why it is over; "" while it is not.
+        number: Number of the last call.
+        reply: The parts of its reply; empty while it is carried out.
+        running_s: When it began; nan while none is carried out.
+        aborted_s: When it was aborted, to be made safe beside it; inf if it was not.
+        rescue: The outcome of that: "", "under way", "safe", or why it failed.
+    """
+
+    peer: str
+    who: str
+    run: Run
+    token: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    beat_s: float = field(default_factory=time.monotonic)
+    ended: str = ""
+    number: int = 0
+    reply: list[Any] = field(default_factory=list[Any])
+    call: str = ""
+    running_s: float = float("nan")
+    aborted_s: float = float("inf")
+    rescue: str = ""
+    abort: Abort = field(default_factory=Abort)
+    clock: Clock | None = None
+    device: Any = None
+    is_open: bool = False
+    watchdog: Watchdog | None = None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a call is carried out."""
+        return self.running_s == self.running_s  # not nan
+
+
+class ServedDevice:
+    """A device, the thread that makes all calls into it, and the socket that they come from.
+
+    Args:
+        name: Its role, or its name in the profile.
+        chosen: Its plugin.
+        socket: A ROUTER; used in the device's thread only.
+        is_known: Whether a client's key is still known.
+        tell: Receives what happens, for the operator.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        chosen: ChosenPlugin,
+        socket: Any,
+        is_known: Callable[[str], bool],
+        tell: Callable[[str], object],
+    ) -> None:
+        self.name = name
+        self.kind = chosen.entry.kind
+        self.owner: Session | None = None
+        self.sessions: dict[bytes, Session] = {}
+        self._chosen = chosen
+        self._socket = socket
+        self._is_known = is_known
+        self._tell = tell
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name=f"labseq {name}", daemon=True)
+
+    def start(self) -> None:
+        """Start its thread."""
+        self._thread.start()
+
+    def end(self, timeout_s: float) -> bool:
+        """End all sessions, the device safe and closed; whether that was done in time."""
+        for session in list(self.sessions.values()):
+            self.end_session(session, "the server ends")
+        self._ended.set()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def end_session(self, session: Session, why: str) -> None:
+        """Have a session ended by the device's thread, at once or after the call in progress."""
+        if not session.ended:
+            session.ended = why
+            self.abort(session)
+
+    def abort(self, session: Session) -> None:
+        """Ask the call in progress to end."""
+        if session.is_running:
+            session.aborted_s = min(session.aborted_s, time.monotonic())
+            session.abort.request()
+
+    def rescue_if_stuck(self, session: Session) -> None:
+        """Make the device safe in another thread if a call does not end after it was aborted."""
+        if session.rescue or not session.is_running or time.monotonic() < session.aborted_s + GRACE_S:
+            return
+        session.rescue = "under way"
+        threading.Thread(target=self._rescue, args=[session], daemon=True).start()
+
+    def _rescue(self, session: Session) -> None:
+        outcome = ["it hangs"]
+
+        def make_safe() -> None:
+            try:
+                with session.abort.held():
+                    session.device.safe_state()
+                outcome[0] = ""
+            except Exception as error:  # noqa: BLE001 - of the driver's class
+                outcome[0] = format_error(error)
+
+        thread = threading.Thread(target=make_safe, daemon=True)
+        thread.start()
+        thread.join(RESCUE_S)
+        session.rescue = outcome[0] or "safe"
+        self._tell(f"{self.name}: {session.call}() does not return; made safe beside it: {session.rescue}")
+        if outcome[0] and session.watchdog is not None:
+            session.watchdog.end()  # it switches off what it was not asked to forget
+
+    def _serve(self) -> None:
+        import zmq
+
+        self._socket.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
+        while True:
+            try:
+                frames = self._socket.recv_multipart(copy=False)
+            except zmq.Again:
+                frames = []
+            if frames:
+                try:
+                    answer = self._answer(frames)
+                    if answer:
+                        self._socket.send_multipart([frames[0], *answer], copy=False)
+                except zmq.ZMQError:
+                    pass  # the client is gone
+                except Exception as error:  # noqa: BLE001 - no message may end this thread
+                    self._tell(f"{self.name}: a message could not be answered: {format_error(error)}")
+            for session in [one for one in self.sessions.values() if one.ended]:
+                self._close(session)
+            if self._ended.is_set() and not self.sessions:
+                self._socket.close()
+                return
+
+    def _answer(self, frames: list[Any]) -> list[Any]:
+        """The reply to a message; empty for one that is not answered."""
+        try:
+            message = unpack([frame.buffer for frame in frames[1:]])
+            session = self.sessions.get(message["session"])
+            number, call, args = message["n"], message["call"], message["args"]
+            now_s, place, named = message["now"], message["shot"], message["named"]
+            if type(number) is not int or type(call) is not str or not isinstance(args, list):
+                raise MessageError("it is no call")
+            if not isinstance(named, dict) or type(now_s) not in (float, type(None)):
+                raise MessageError("it is no call")
+        except MessageError as error:
+            return self._refusal(0, f"the server cannot read a message: {error}")
+        except (KeyError, TypeError) as error:
+            return self._refusal(0, f"the server cannot read a message: {format_error(error)}")
+        if session is None:
+            return self._refusal(number, "the connection has ended, or the server was started again")
+        peer = frames[-1].get("User-Id") if session.peer else ""
+        if peer != session.peer or session.ended:
+            return self._refusal(number, session.ended or "the connection belongs to another key")
+        if not self._is_known(session.peer):
+            self.end_session(session, "its key was withdrawn")
+            return self._refusal(number, session.ended)
+        if number <= session.number:
+            return session.reply if number == session.number else []  # sent twice, or an old one again
+        if number != session.number + 1:
+            self.end_session(session, f"its calls came out of order: {number} after {session.number}")
+            return self._refusal(number, session.ended)
+        session.number, session.call, session.reply = number, call, []
+        session.abort.clear()
+        session.aborted_s, session.rescue, session.running_s = float("inf"), "", time.monotonic()
+        try:
+            session.reply = self._reply(session, args, named, now_s, place)
+        finally:
+            session.running_s = float("nan")
+        return session.reply
+
+    def _refusal(self, number: int, text: str) -> list[Any]:
+        return pack({"n": number, "error": report_error(DeviceError(self.name, text)), "now": 0.0})
+
+    def _reply(
+        self, session: Session, args: list[Any], named: dict[str, Any], now_s: Any, place: Any
+    ) -> list[Any]:
+        time_ = session.run.clock
+        if now_s is not None:
+            time_.begin_call(now_s)
+        answer: dict[str, Any] = {"n": session.number}
+        try:
+            if isinstance(place, tuple) and len(place) == 2:
+                session.run.begin_shot((int(place[0]), int(place[1])))
+            answer["value"] = self._carry_out(session, args, named)
+            answer["state"] = self._state(session)
+        except BaseException as error:  # noqa: BLE001 - of the driver's class; it goes to the client
+            answer["error"] = report_error(error)
+        answer["now"] = time.monotonic()
+        answer["waits"] = time_.waits_s if now_s is not None else []
+        try:
+            return pack(answer)
+        except MessageError as error:
+            failure = DeviceError(self.name, f"what {session.call}() gave cannot be sent: {error}")
+            return pack({"n": session.number, "error": report_error(failure), "now": answer["now"]})
+
+    def _carry_out(self, session: Session, args: list[Any], named: dict[str, Any]) -> Any:
+        call = session.call
+        if call == "attach":
+            return self._attach(session, *args)
+        if session.device is None:
+            raise DeviceError(self.name, "the connection has no device yet")
+        if call == "open":
+            return self._open(session)
+        if call == "close":
+            return self._close_device(session)
+        if call not in METHODS[self.kind]:
+            raise DeviceError(self.name, f"a client cannot call {call[:40]!r}")
+        if call == "warm":
+            if offers(session.device, "warm"):
+                session.device.warm()
+            return load_kernels()
+        looks = call in _LOOKS and self.owner is not None and self.kind != "simulation"
+        device = self.owner.device if looks and self.owner is not None else session.device
+        if call == "safe_state":
+            if not session.is_open:
+                return None
+            with session.abort.held():
+                return device.safe_state()
+        value = getattr(device, call)(*args, **named)
+        if call == "leave_on" and value:
+            self._forget(session)
+        return dict(value) if isinstance(value, Mapping) else value
+
+    def _attach(self, session: Session, about: dict[str, Any]) -> dict[str, Any]:
+        """Construct the client's object of the driver."""
+        if about["virtual"] and not self._chosen.virtual_time:
+            text = f"'{self.name}' is a real device, and the profile says `simulated: true`"
+            raise ConfigError(text)
+        session.clock = session.run.clock if about["virtual"] else RealClock(session.abort)
+        context = Context(
+            about["name"],
+            about["grid"],
+            about["motion"],
+            session.clock,
+            calibrations=about["calibrations"],
+            lines=tuple(about["lines"]),
+            simulation=session.run.simulation,
+        )
+        role = "simulation" if self.kind == "simulation" else about["name"]
+        made, streams = construct({role: self._chosen}, context, about["seed"])
+        session.device = made[role]
+        session.run.streams += streams
+        if session.run.place is not None:
+            for stream in streams:
+                stream.begin_shot(*session.run.place)
+        if self.kind == "simulation":
+            session.run.simulation = session.device
+        return {
+            "abilities": [name for name in METHODS[self.kind] if offers(session.device, name)],
+            "plugin": self._chosen.entry.name,
+            "settings": self._chosen.dump(),
+        }
+
+    def _state(self, session: Session) -> dict[str, Any]:
+        """Values of properties that the last call may have changed."""
+        if session.call in ("attach", "open"):
+            names: tuple[str, ...] = PROPERTIES[self.kind]
+        elif session.call in _CHANGES_LIVE and self.kind == "mobile_tweezers":
+            names = _LIVE
+        else:
+            return {}
+        state = {name: getattr(session.device, name) for name in names if offers(session.device, name)}
+        if self.kind == "mobile_tweezers" and offers(session.device, "timings"):
+            state["timings"] = dict(session.device.timings())
+        return state
+
+    def _open(self, session: Session) -> None:
+        if self.kind == "simulation":
+            session.device.open()
+            return
+        if self.owner not in (None, session):
+            assert self.owner is not None
+            raise DeviceError(self.name, f"in use by {self.owner.who}; one at a time can use it")
+        if self.owner is None:
+            self._tell(f"{self.name}: in use by {session.who}")
+        self.owner, session.is_open = session, True
+        with session.abort.held():
+            session.device.open()
+        emergency = session.device.emergency() if offers(session.device, "emergency") else None
+        if emergency is not None and session.watchdog is None:
+            session.watchdog = Watchdog("labseq serve-devices")
+            session.watchdog.add(self.name, 0, emergency.script, dict(emergency.arguments))
+            for note in session.watchdog.notes():
+                self._tell(f"{self.name}: {note}")
+
+    def _close_device(self, session: Session) -> None:
+        """Close it; the owner gives it up."""
+        if self.kind == "simulation" or not session.is_open:
+            session.device.close()
+            return
+        with session.abort.held():
+            session.device.close()
+        self._forget(session)
+
+    def _forget(self, session: Session) -> None:
+        session.is_open = False
+        if self.owner is session:
+            self.owner = None
+        if session.watchdog is not None:
+            session.watchdog.forget([self.name])
+            session.watchdog.end()
+            session.watchdog = None
+
+    def _close(self, session: Session) -> None:
+        """End a session: its device is made safe and closed if the client has not done so."""
+        del self.sessions[session.token]
+        if session.device is None or not (session.is_open or self.kind == "simulation"):
+            return
+        failures: list[str] = []
+        begun_s = time.monotonic()
+        with session.abort.held():
+            for method in ("safe_state", "close") if session.is_open else ("close",):
+                try:
+                    getattr(session.device, method)()
+                except Exception as error:  # noqa: BLE001 - of the driver's class
+                    failures.append(f"{method}() failed: {format_error(error)}")
+        if not session.is_open:
+            return
+        after_s = time.monotonic() - begun_s
+        outcome = "; ".join(failures) or f"made safe in {1e3 * after_s:.0f} ms"
+        self._tell(f"{self.name}: the connection of {session.who} ended ({session.ended}); {outcome}")
+        if failures and session.watchdog is not None:
+            session.watchdog.end()
+            session.watchdog = None
+        with suppress(LabseqError):
+            self._forget(session)

@@ -1,0 +1,377 @@
+"""`labseq serve-devices`: serves the devices of a profile, each on a port of its own.
+
+The first port is for control: connections begin there, heartbeats go there, and calls that block are asked
+after and aborted there, by a thread that carries out no calls.
+"""
+
+from __future__ import annotations
+
+import platform
+import threading
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import labseq
+from labseq.config.addresses import profile_overrides
+from labseq.errors import ConfigError, DeviceError, LabseqError, Problem, StopRequested, one_of
+from labseq.guard import StopFlag, stop_on_signals
+from labseq.messages import clean, format_error
+from labseq.plain import now
+from labseq.remote.served import LOOK_S, Run, ServedDevice, Session
+from labseq.sequencer.clock import RealClock, VirtualClock
+from labseq.session.chosen import HARDWARE_KINDS
+from labseq.session.devices import check_each_device
+from labseq.session.lab import timeouts_of
+from labseq.session.locks import lock_devices
+from labseq.session.profile import ResolvedProfile, resolve_profile
+from labseq.session.safe import construct_hardware
+from labseq.wire import (
+    LOST_S,
+    PROTOCOL,
+    MessageError,
+    find_keys,
+    is_loopback,
+    keys_root,
+    known_keys,
+    pack,
+    parse_address,
+    report_error,
+    require_packages,
+    server_socket,
+    unpack,
+)
+
+LOOK_AT_KEYS_S: Final = 0.2
+"""How often the server looks which keys are known."""
+MAX_SESSIONS: Final = 64
+"""Connections at a time; of a client that makes more, something is wrong."""
+END_S: Final = 10.0
+"""How long the devices may take to become safe when the server ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """What is served, and where.
+
+    Attributes:
+        address: ``tcp://HOST:PORT``: the port of the control, and the first of those of the devices.
+        devices: Roles and names of devices; none for all that the profile writes down.
+        key: Which of this computer's keys; "" for the only one.
+        plain: Whether to serve without keys, on this computer only.
+    """
+
+    address: str
+    devices: tuple[str, ...] = ()
+    key: str = ""
+    plain: bool = False
+
+
+def serve_devices(
+    profile: str, overrides: Sequence[str], how: Serving, tell: Callable[[str], object]
+) -> None:
+    """Serve devices until Ctrl-C or SIGTERM; then they are made safe.
+
+    Each device is opened, tested, made safe and closed first: that shows that it works, and makes it safe
+    after a server that died.
+
+    Raises:
+        ConfigError: The profile, the address or the keys are wrong, or a device could not be constructed.
+        DeviceError: A device fails, or another process uses it.
+    """
+    require_packages()
+    stop = StopFlag()
+    with stop_on_signals(stop), serving(profile, overrides, how, tell) as server:
+        try:
+            while True:
+                stop.wait(LOOK_S)
+                server.check()
+        except StopRequested:
+            tell("ends; devices in use are made safe")
+
+
+@contextmanager
+def serving(
+    profile: str, overrides: Sequence[str], how: Serving, tell: Callable[[str], object]
+) -> Generator[Server]:
+    """The same within a block."""
+    try:
+        host, port = parse_address(how.address)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if how.plain and not is_loopback(host):
+        hint = "'labseq keys new' makes keys; --plain is for addresses such as tcp://127.0.0.1:5760"
+        raise ConfigError(Problem(f"{how.address} can be reached by others, and needs keys", hint=hint))
+    keys = None if how.plain else find_keys(keys_root(), how.key)
+    hardware = _served(resolve_profile(profile, overrides=profile_overrides(overrides)), how.devices)
+    with ExitStack() as stack:
+        stack.enter_context(lock_devices(hardware, "labseq serve-devices", tell))
+        _test(hardware, tell)
+        server = Server(hardware, host, port, keys, tell)
+        stack.callback(server.end)
+        server.start()
+        yield server
+
+
+def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> ResolvedProfile:
+    """The profile with the devices that are served, and no others."""
+    spec = hardware.profile
+    written = {*spec.model_fields_set, *spec.devices}
+    able = [
+        name
+        for name, one in hardware.chosen.items()
+        if one.entry.kind in HARDWARE_KINDS | {"simulation"} and name in written
+    ]
+    for name in names:
+        if name not in able:
+            expected = one_of(able)
+            raise ConfigError(Problem(f"the profile has no device '{clean(name)}'", expected=expected))
+    chosen = {name: hardware.chosen[name] for name in able if not names or name in names}
+    if not chosen:
+        raise ConfigError(Problem("the profile has no devices", str(hardware.document.path)))
+    if remote := [name for name, one in chosen.items() if one.entry.name == "remote"]:
+        raise ConfigError(f"'{remote[0]}' is itself on another computer; serve it there")
+    return replace(hardware, chosen=chosen)
+
+
+def _test(hardware: ResolvedProfile, tell: Callable[[str], object]) -> None:
+    """Raise the first failure of a device, after all were tried."""
+    is_virtual = hardware.virtual_time
+    clock = VirtualClock(StopFlag()) if is_virtual else RealClock(StopFlag())
+    made, refused = construct_hardware(hardware, clock)
+    simulation = made.pop("simulation", None)
+    failures: list[LabseqError] = [*refused.values()]
+    if simulation is not None or not is_virtual:
+        for found in check_each_device(
+            made.items(), timeouts_of(hardware.profile), StopFlag(), simulation, tell
+        ):
+            failures += [one for one in (found.failure, found.unsafe, found.unclosed) if one is not None]
+    for failure in failures[1:]:
+        tell(f"error: {failure}")
+    if failures:
+        raise failures[0]
+
+
+class Server:
+    """The devices and their control.
+
+    Args:
+        hardware: The profile, with the devices that are served.
+        host: Address to listen on.
+        port: The control's port; the devices have the next ones.
+        keys: Keys of this computer; None without keys.
+        tell: Receives what happens, for the operator.
+    """
+
+    def __init__(
+        self,
+        hardware: ResolvedProfile,
+        host: str,
+        port: int,
+        keys: Any,
+        tell: Callable[[str], object],
+    ) -> None:
+        import zmq
+
+        self._tell_to = tell
+        self._keys = keys
+        self._known: Mapping[bytes, str] = known_keys(keys_root()) if keys is not None else {}
+        self._zmq = zmq.Context()
+        self._auth: Any = None
+        self._runs: dict[tuple[str, bytes], Run] = {}
+        self._ended = threading.Event()
+        self._failure: BaseException | None = None
+        self._control = server_socket(self._zmq, host, port, keys)
+        self.devices: dict[str, ServedDevice] = {}
+        try:
+            for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
+                socket = server_socket(self._zmq, host, port + number, keys)
+                device = ServedDevice(name, chosen, socket, self.is_known, self._tell)
+                self.devices[name] = device
+        except ConfigError:
+            self._zmq.destroy(linger=0)
+            raise
+        self._ports = {name: port + number for number, name in enumerate(self.devices, 1)}
+        self._thread = threading.Thread(target=self._serve, name="labseq control", daemon=True)
+        self._host, self._port = host, port
+
+    def start(self) -> None:
+        """Begin to serve."""
+        if self._keys is not None:
+            from zmq.auth.thread import ThreadAuthenticator
+
+            self._auth = ThreadAuthenticator(self._zmq)
+            self._auth.start()
+            self._auth.configure_curve_callback("labseq", credentials_provider=_Credentials(self.is_known))
+        for device in self.devices.values():
+            device.start()
+        self._thread.start()
+        places = ", ".join(f"{name} at {port}" for name, port in self._ports.items())
+        self._tell(f"serves {places}; control at tcp://{self._host}:{self._port}; Ctrl-C ends it")
+        if self._keys is not None:
+            names = (
+                ", ".join(sorted(self._known.values())) or f"none: put public keys into {keys_root()}/known"
+            )
+            self._tell(f"known keys: {names}")
+
+    def end(self) -> None:
+        """Make all devices safe, and end all threads."""
+        late = [device.name for device in self.devices.values() if not device.end(END_S)]
+        self._ended.set()
+        self._thread.join(1.0)
+        if self._auth is not None:
+            self._auth.stop()
+        for name in late:
+            self._tell(f"{name}: NOT SAFE: a call does not return")
+        if not late:
+            self._zmq.destroy(linger=0)
+
+    def check(self) -> None:
+        """Raise what ended the thread of the control.
+
+        Raises:
+            DeviceError: It has ended.
+        """
+        if self._failure is not None:
+            raise DeviceError("serve-devices", format_error(self._failure)) from self._failure
+
+    def is_known(self, peer: str) -> bool:
+        """Whether a client's key is known, or none is needed."""
+        return self._keys is None or peer.encode() in self._known
+
+    def _tell(self, text: str) -> None:
+        self._tell_to(f"{now().astimezone():%H:%M:%S} {text}")
+
+    def _serve(self) -> None:
+        import zmq
+
+        self._control.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
+        looked_s = keys_s = time.monotonic()
+        try:
+            while not self._ended.is_set():
+                try:
+                    frames = self._control.recv_multipart(copy=False)
+                except zmq.Again:
+                    frames = []
+                if frames:
+                    with suppress(zmq.ZMQError):  # the client is gone
+                        self._control.send_multipart([frames[0], *self._answer(frames)])
+                if (now_s := time.monotonic()) - keys_s > LOOK_AT_KEYS_S and self._keys is not None:
+                    self._known, keys_s = known_keys(keys_root()), now_s
+                if now_s - looked_s > LOOK_S:
+                    self._look(now_s, now_s - looked_s)
+                    looked_s = time.monotonic()
+        except BaseException as error:  # noqa: BLE001 - the main thread ends the server
+            self._failure = error
+        finally:
+            self._control.close()
+
+    def _look(self, now_s: float, passed_s: float) -> None:
+        """End the sessions of clients that are gone, or no longer known."""
+        live: set[int] = set()
+        for device in self.devices.values():
+            for session in list(device.sessions.values()):
+                live.add(id(session.run))
+                if passed_s > LOST_S / 2:  # this computer stood still, not the client
+                    session.beat_s += passed_s
+                if now_s - session.beat_s > LOST_S:
+                    device.end_session(session, f"no sign of life for {LOST_S:g} s")
+                elif not self.is_known(session.peer):
+                    device.end_session(session, "its key was withdrawn")
+                device.rescue_if_stuck(session)
+        self._runs = {key: run for key, run in self._runs.items() if id(run) in live}
+
+    def _answer(self, frames: list[Any]) -> list[Any]:
+        peer = str(frames[-1].get("User-Id")) if self._keys is not None else ""
+        number = 0
+        try:
+            message = unpack([frame.buffer for frame in frames[1:]])
+            number, what = message["n"], message["op"]
+            if type(number) is not int:
+                raise MessageError("it has no number")
+            if not self.is_known(peer):
+                raise DeviceError("server", "the key was withdrawn")
+            act = {"hello": self._hello, "beat": self._beat, "bye": self._bye, "abort": self._abort}
+            if what == "status":
+                return pack({"n": number, "value": self._status()})
+            if what not in act:
+                raise MessageError("it asks for something unknown")
+            return pack({"n": number, "value": act[what](message, peer)})
+        except DeviceError as error:
+            return pack({"n": number, "error": report_error(error)})
+        except (MessageError, KeyError, TypeError, AttributeError) as error:
+            failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
+            return pack({"n": number if type(number) is int else 0, "error": report_error(failure)})
+
+    def _hello(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
+        about = {"protocol": PROTOCOL, "labseq": labseq.__version__, "host": platform.node()}
+        if message["protocol"] != PROTOCOL:
+            theirs = (
+                f"labseq {clean(str(message['labseq']))} speaks protocol {clean(str(message['protocol']))}"
+            )
+            text = f"{theirs}, and labseq {labseq.__version__} of the server speaks {PROTOCOL}; update one"
+            raise DeviceError("server", text)
+        device = self.devices.get(str(message["device"]))
+        if device is None:
+            text = f"there is no device '{clean(str(message['device']))}'; expected {one_of([*self.devices])}"
+            raise DeviceError("server", text)
+        if message["kind"] != device.kind:
+            used = clean(str(message["kind"]))
+            text = f"'{device.name}' is of the kind {device.kind}, and the profile uses it as {used}"
+            raise DeviceError("server", text)
+        if sum(len(one.sessions) for one in self.devices.values()) >= MAX_SESSIONS:
+            raise DeviceError("server", f"it has {MAX_SESSIONS} connections already")
+        if not isinstance(message["run"], bytes) or len(message["run"]) != 16:
+            raise MessageError("it names no run")
+        name = self._known.get(peer.encode(), "this computer")
+        run = self._runs.setdefault((peer, message["run"]), Run())
+        session = Session(peer, f"{name} ({clean(str(message['who']))})", run)
+        device.sessions[session.token] = session
+        return {**about, "session": session.token, "port": self._ports[device.name]}
+
+    def _of(self, message: Mapping[str, Any], peer: str) -> tuple[ServedDevice, Session]:
+        for device in self.devices.values():
+            session = device.sessions.get(message["session"])
+            if session is not None and session.peer == peer:
+                if session.ended:
+                    raise DeviceError(device.name, session.ended)
+                return device, session
+        raise DeviceError("server", "the connection has ended, or the server was started again")
+
+    def _beat(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
+        _, session = self._of(message, peer)
+        session.beat_s = time.monotonic()
+        return {"number": session.number, "running": session.is_running, "rescue": session.rescue}
+
+    def _bye(self, message: Mapping[str, Any], peer: str) -> None:
+        device, session = self._of(message, peer)
+        device.end_session(session, "closed")
+
+    def _abort(self, message: Mapping[str, Any], peer: str) -> None:
+        device, session = self._of(message, peer)
+        if session.number == message["number"]:
+            device.abort(session)
+
+    def _status(self) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        for device in self.devices.values():
+            owner = device.owner
+            call = owner.call if owner is not None and owner.is_running else ""
+            since_s = time.monotonic() - owner.running_s if owner is not None and call else 0.0
+            who = "" if owner is None else owner.who
+            rows.append({"device": device.name, "owner": who, "call": call, "for_s": since_s})
+        return rows
+
+
+class _Credentials:
+    """The keys that the authenticator asks for."""
+
+    def __init__(self, is_known: Callable[[str], bool]) -> None:
+        self._is_known = is_known
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Whether a client with this key may connect."""
+        del domain
+        return self._is_known(key.decode("ascii"))

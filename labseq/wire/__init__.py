@@ -1,0 +1,35 @@
+"""Messages between computers: values, keys and sockets, for drivers of remote devices and their server."""
+
+from labseq.wire.keys import find_keys, keys_root, known_keys, new_keys, read_public
+from labseq.wire.messages import MessageError, error_of, pack, report_error, unpack
+from labseq.wire.sockets import (
+    BEAT_S,
+    LOST_S,
+    PROTOCOL,
+    client_socket,
+    is_loopback,
+    parse_address,
+    require_packages,
+    server_socket,
+)
+
+__all__ = [
+    "BEAT_S",
+    "LOST_S",
+    "PROTOCOL",
+    "MessageError",
+    "client_socket",
+    "error_of",
+    "find_keys",
+    "is_loopback",
+    "keys_root",
+    "known_keys",
+    "new_keys",
+    "pack",
+    "parse_address",
+    "read_public",
+    "report_error",
+    "require_packages",
+    "server_socket",
+    "unpack",
+]

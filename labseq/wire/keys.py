@@ -1,0 +1,129 @@
+"""The keys of this computer and of those that it knows: a file for each.
+
+The folder of keys contains ``NAME.key_secret``, the own key of this computer, ``NAME.key``, its public part,
+which others need, and a folder ``known`` with the public keys of others.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.files import explained, read_file, write_file
+from labseq.messages import clean
+
+SECRET: Final = ".key_secret"  # noqa: S105 - the end of a file's name
+PUBLIC: Final = ".key"
+KNOWN: Final = "known"
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_LINE: Final = re.compile(rb'^\s*(public|secret)-key = "([!#-~]{40})"\s*$', re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Keys:
+    """The keys of this computer, as 40 characters of Z85 each."""
+
+    public: bytes
+    secret: bytes
+
+
+def keys_root() -> Path:
+    """Folder of keys: LABSEQ_KEYS, else ``keys`` in the user's folder of configurations."""
+    if own := os.environ.get("LABSEQ_KEYS"):
+        return Path(own).expanduser()
+    import platformdirs
+
+    return Path(platformdirs.user_config_dir("labseq", appauthor=False)) / "keys"
+
+
+def new_keys(name: str, folder: Path) -> tuple[Path, Path]:
+    """Make the keys of this computer.
+
+    Returns:
+        The files of the secret and of the public key.
+
+    Raises:
+        ConfigError: The name cannot be one of files, or there is such a key already.
+        RecordingError: The files cannot be written.
+    """
+    import zmq
+
+    if _NAME.fullmatch(name) is None:
+        raise ConfigError(
+            Problem(
+                f"'{clean(name)}' cannot be the name of a key", expected="letters, digits, '_', '.' and '-'"
+            )
+        )
+    secret, public = folder / f"{name}{SECRET}", folder / f"{name}{PUBLIC}"
+    for path in (secret, public):
+        if path.exists():
+            raise ConfigError(Problem("there is such a key already", str(path), hint="choose another name"))
+    public_key, secret_key = zmq.curve_keypair()
+    with explained(secret):
+        (folder / KNOWN).mkdir(parents=True, exist_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+        with os.fdopen(os.open(secret, flags, 0o600), "wb") as file:  # before anybody can read it
+            file.write(_content(public_key, secret_key))
+    write_file(public, _content(public_key))
+    return secret, public
+
+
+def _content(public: bytes, secret: bytes = b"") -> bytes:
+    text = b'curve\n    public-key = "' + public + b'"\n'
+    return text + (b'    secret-key = "' + secret + b'"\n' if secret else b"")
+
+
+def find_keys(folder: Path, name: str = "") -> Keys:
+    """The keys of this computer.
+
+    Args:
+        folder: The folder of keys.
+        name: Which of them; "" for the only one.
+
+    Raises:
+        ConfigError: There are none, or several and no name; or the file is damaged.
+    """
+    files = sorted(folder.glob(f"{name or '*'}{SECRET}"))
+    if len(files) != 1:
+        what = "there are several keys" if files else "there is no key of this computer"
+        hint = "name one of them with `key`" if files else "'labseq keys new' makes one"
+        raise ConfigError(Problem(what, str(folder), hint=hint))
+    found = _read(files[0])
+    if len(found) != 2:
+        raise ConfigError(Problem("it is damaged", str(files[0]), expected="a public and a secret key"))
+    return Keys(found[b"public"], found[b"secret"])
+
+
+def read_public(path: Path) -> bytes:
+    """The public key in a file.
+
+    Raises:
+        ConfigError: It does not exist, or is damaged.
+    """
+    found = _read(path)
+    if b"public" not in found:
+        raise ConfigError(Problem("it is damaged", str(path), expected="a public key"))
+    return found[b"public"]
+
+
+def known_keys(folder: Path) -> dict[bytes, str]:
+    """The public keys of other computers -> their names; files that are damaged are left out."""
+    known: dict[bytes, str] = {}
+    for path in sorted((folder / KNOWN).glob(f"*{PUBLIC}")):
+        try:
+            known[read_public(path)] = path.stem
+        except ConfigError:
+            continue
+    return known
+
+
+def _read(path: Path) -> dict[bytes, bytes]:
+    try:
+        return dict(_LINE.findall(read_file(path, 4096)))
+    except RecordingError as error:
+        hint = "copy the public key of that computer there" if path.parent.name == KNOWN else ""
+        raise ConfigError(Problem(str(error), hint=hint)) from error

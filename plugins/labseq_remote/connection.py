@@ -1,0 +1,297 @@
+"""A connection to one served device: calls on one socket; heartbeats, questions and aborts on another."""
+
+from __future__ import annotations
+
+import os
+import platform
+import secrets
+import threading
+import time
+import weakref
+from contextlib import suppress
+from importlib.metadata import version
+from typing import Any, Final
+
+from labseq.plugin import Clock, Context, DeviceError, Frame, LabseqError, StopRequested, wire
+from labseq_remote.settings import RemoteSettings
+
+POLL_S: Final = 0.05
+"""How often a call that waits looks for a stop request."""
+CONNECT_S: Final = 2.0
+"""How long connecting may take."""
+GRACE_S: Final = 1.0
+"""How long a call may take to end after it was aborted."""
+SAFE_S: Final = 4.0
+"""How long making a device safe beside a call that hangs may take."""
+
+_runs: weakref.WeakKeyDictionary[Clock, bytes] = weakref.WeakKeyDictionary()
+"""The session's clock -> what names the run at the servers: its devices there share one simulation."""
+
+
+class Connection:
+    """A session with a served device; it is made once, and stays broken when it is.
+
+    Args:
+        settings: Where the device is.
+        context: The driver's context, which the server constructs its driver with.
+        kind: Kind of the device, "camera".
+
+    Raises:
+        DeviceError: The server does not answer, refuses, or has another version.
+        ConfigError: Keys are missing, or the served driver refuses its settings.
+    """
+
+    def __init__(self, settings: RemoteSettings, context: Context, kind: str) -> None:
+        wire.require_packages()
+        self.address = settings.address
+        self._name = context.name or kind
+        self._clock = context.clock
+        self._random = context.random
+        self._calling = threading.Lock()
+        self._controlling = threading.Lock()
+        self._number = self._question = 0
+        self._lost = ""
+        self._ended = threading.Event()
+        self._heard_s = time.monotonic()
+        self._beat: dict[str, Any] = {"number": 0, "running": False, "rescue": ""}
+        self.state: dict[str, Any] = {}
+        keys, server = _keys(settings)
+        self._control = wire.client_socket(settings.host, settings.port, keys, server)
+        try:
+            self.about = self._hello(settings, kind)
+            self._token = self.about["session"]
+            self._calls = wire.client_socket(settings.host, self.about["port"], keys, server)
+        except BaseException:
+            self._control.close()
+            raise
+        threading.Thread(target=self._beats, name=f"labseq beats {self._name}", daemon=True).start()
+        try:
+            self.about |= self.call("attach", self._about(context))
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def lost(self) -> str:
+        """Why the connection is lost; "" while it is not."""
+        return self._lost
+
+    def call(self, name: str, *args: Any, stoppable: bool = True, **named: Any) -> Any:
+        """Have the server call a method of the device, and wait for its end.
+
+        Raises:
+            LabseqError: What the method raised there; or ``DeviceError``: the connection is lost.
+            StopRequested: The run was asked to stop; the call was aborted.
+        """
+        with self._calling:
+            if self._lost or self._ended.is_set():
+                raise self._failure(self._lost or "the connection is closed")
+            self._number += 1
+            message = {
+                "session": self._token,
+                "n": self._number,
+                "call": name,
+                "args": list(args),
+                "named": named,
+                "now": self._clock.now() if self._clock.virtual else None,
+                "shot": self._random.place,
+            }
+            try:
+                parts = wire.pack(message)
+            except wire.MessageError as error:
+                self._number -= 1
+                raise DeviceError(self._name, f"{name}(): {error}") from error
+            reply = self._await(name, parts, stoppable)
+        return self._result(reply)
+
+    def make_safe(self) -> None:
+        """Make the device safe, also while another call hangs.
+
+        Raises:
+            DeviceError: It could not be made safe, or the connection is lost.
+        """
+        if self._calling.acquire(blocking=False):
+            self._calling.release()
+            self.call("safe_state", stoppable=False)
+            return
+        number = self._number
+        self.ask("abort", number=number)
+        deadline_s = time.monotonic() + SAFE_S
+        while time.monotonic() < deadline_s and not self._lost:
+            if self._calling.acquire(timeout=POLL_S):
+                self._calling.release()
+                self.call("safe_state", stoppable=False)
+                return
+            rescue = self._beat["rescue"]
+            if rescue == "safe":
+                return
+            if rescue not in ("", "under way"):
+                raise self._failure(f"a call hangs, and safe_state() beside it failed: {rescue}")
+        raise self._failure(self._lost or "a call hangs, and the device could not be made safe")
+
+    def close(self) -> None:
+        """End the connection; the server makes the device safe if that was not done."""
+        if not self._ended.is_set():
+            if not self._lost:
+                with suppress(LabseqError):
+                    self.ask("bye")
+            self._ended.set()
+            with self._controlling:
+                self._control.close()
+            if self._calling.acquire(timeout=2 * POLL_S):
+                self._calls.close()
+                self._calling.release()
+
+    def ask(self, what: str, timeout_s: float = wire.LOST_S, **about: Any) -> Any:
+        """Ask the control of the server; also while a call is out.
+
+        Raises:
+            DeviceError: It refuses, or does not answer in time.
+        """
+        import zmq
+
+        with self._controlling:
+            if self._ended.is_set():
+                raise self._failure("the connection is closed")
+            self._question += 1
+            about |= {"n": self._question, "op": what}
+            if "session" not in about and what != "hello":
+                about["session"] = self._token
+            deadline_s = time.monotonic() + timeout_s
+            try:
+                self._control.send_multipart(wire.pack(about))
+                while (left_s := deadline_s - time.monotonic()) > 0:
+                    if not self._control.poll(int(1e3 * left_s) + 1):
+                        break
+                    answer = _read(self._control.recv_multipart())
+                    if answer.get("n") in (self._question, 0):
+                        if "error" in answer:
+                            raise wire.error_of(answer["error"], self._name, self.address)
+                        return answer.get("value")
+            except zmq.ZMQError as error:
+                raise self._failure(f"{error.strerror}") from error
+        raise self._failure(f"the server did not answer within {timeout_s:.3g} s")
+
+    def _hello(self, settings: RemoteSettings, kind: str) -> dict[str, Any]:
+        """Begin the session; if that fails, the events of the socket say why."""
+        from labseq_remote.events import reason_of
+
+        monitor = self._control.get_monitor_socket()
+        me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": _run_of(self._clock)}
+        who = f"{platform.node()}, process {os.getpid()}"
+        try:
+            about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
+        except DeviceError as error:
+            why = reason_of(monitor)
+            raise self._failure(why) if why else error from None
+        finally:
+            self._control.disable_monitor()
+            monitor.close()
+        if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
+            raise self._failure("it is no server of this version of labseq")
+        return about
+
+    def _about(self, context: Context) -> dict[str, Any]:
+        """What of the context the server's driver is constructed with."""
+        return {
+            "name": self._name,
+            "grid": context.grid,
+            "motion": context.motion,
+            "lines": list(context.lines),
+            "calibrations": dict(context.calibrations),
+            "seed": context.random.seed,
+            "virtual": bool(context.clock.virtual),
+        }
+
+    def _await(self, name: str, parts: list[Any], stoppable: bool) -> dict[str, Any]:
+        """Send a call and wait for its reply."""
+        import zmq
+
+        sent_s = time.monotonic()
+        stopped_s: float | None = None
+        try:
+            self._calls.send_multipart(parts, copy=False)
+            while not self._lost:
+                if self._calls.poll(int(1e3 * POLL_S)):
+                    reply = _read([part.buffer for part in self._calls.recv_multipart(copy=False)])
+                    if reply.get("n") in (self._number, 0):
+                        return reply
+                    continue
+                if self._is_missing(sent_s):
+                    self._lose(f"{name}() got no reply although the server has none under way")
+                if stoppable and stopped_s is None:
+                    try:
+                        self._clock.check()
+                    except StopRequested:
+                        stopped_s = time.monotonic()
+                        self.ask("abort", number=self._number)
+                if stopped_s is not None and time.monotonic() > stopped_s + GRACE_S:
+                    self._clock.check()
+        except zmq.ZMQError as error:
+            self._lose(str(error.strerror))
+        raise self._failure(self._lost)
+
+    def _is_missing(self, sent_s: float) -> bool:
+        """Whether the server has not got the call, or its reply was lost on the way."""
+        is_late = time.monotonic() > sent_s + wire.LOST_S and self._heard_s > sent_s + wire.LOST_S
+        return is_late and not self._beat["running"] and not self._calls.poll(0)
+
+    def _result(self, reply: dict[str, Any]) -> Any:
+        """The value of a reply, on the session's clock; its waits pass here, too."""
+        for duration_s in reply.get("waits", ()):
+            self._clock.sleep(float(duration_s))
+        if "error" in reply:
+            error = wire.error_of(reply["error"], self._name, self.address)
+            if isinstance(error, StopRequested):
+                self._clock.check()
+                raise DeviceError(self._name, f"the call was aborted (at {self.address})")
+            raise error
+        self.state |= reply.get("state", {})
+        value = reply["value"]
+        if isinstance(value, Frame) and not self._clock.virtual:
+            t_start_s = value.t_start_s + self._clock.now() - float(reply["now"])
+            value = Frame(
+                value.image, value.exposure_s, t_start_s, value.camera, value.number, value.device_time_s
+            )
+        return value
+
+    def _beats(self) -> None:
+        """Give signs of life, and notice when the server gives none."""
+        while not self._ended.wait(wire.BEAT_S):
+            asked_s = time.monotonic()
+            try:
+                self._beat = self.ask("beat")
+                self._heard_s = asked_s
+            except DeviceError as error:
+                text = str(error).removeprefix(f"{self._name}: ").removesuffix(f" (at {self.address})")
+                self._lose(text)
+                return
+
+    def _lose(self, why: str) -> None:
+        if not self._ended.is_set():
+            self._lost = self._lost or f"the connection is lost: {why}; the server makes the device safe"
+
+    def _failure(self, text: str) -> DeviceError:
+        return DeviceError(self._name, f"{text} (at {self.address})")
+
+
+def _read(parts: Any) -> dict[str, Any]:
+    """A message; one that cannot be read is as good as none."""
+    try:
+        message = wire.unpack(parts)
+    except wire.MessageError:
+        return {}
+    return message if isinstance(message, dict) else {}
+
+
+def _run_of(clock: Clock) -> bytes:
+    return _runs.setdefault(clock, secrets.token_bytes(16))
+
+
+def _keys(settings: RemoteSettings) -> tuple[Any, bytes | None]:
+    """The keys for a connection: this computer's, and the server's public one."""
+    if settings.plain:
+        return None, None
+    root = wire.keys_root()
+    name = settings.server_key or settings.host
+    return wire.find_keys(root, settings.key), wire.read_public(root / "known" / f"{name}.key")

@@ -1,0 +1,67 @@
+"""Where a device is, and the keys for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from labseq.plugin import Settings, Text, setting_error, wire
+
+
+def _address(value: str) -> str:
+    try:
+        wire.parse_address(value)
+    except ValueError as error:
+        raise setting_error(
+            f"'{value[:60]}' is no address", "tcp://HOST:PORT, as tcp://camera-pc:5760"
+        ) from error
+    return value
+
+
+class RemoteSettings(Settings):
+    """The server of a device, its name there, and the keys."""
+
+    address: Annotated[str, AfterValidator(_address)] = Field(
+        description="address of the server, as `labseq serve-devices` prints it: tcp://HOST:PORT"
+    )
+    device: Text = Field(description="role or name of the device in the profile of its computer")
+    simulated: bool = Field(
+        default=False,
+        description="whether the served device is simulated there and keeps to the clock of this run",
+    )
+    key: Text = Field(default="", description="which of this computer's keys; by default the only one")
+    server_key: Text = Field(
+        default="", description="name of the server's public key in the folder `known`; by default its host"
+    )
+
+    @property
+    def host(self) -> str:
+        """The server."""
+        return wire.parse_address(self.address)[0]
+
+    @property
+    def port(self) -> int:
+        """Its port."""
+        return wire.parse_address(self.address)[1]
+
+    @property
+    def plain(self) -> bool:
+        """Whether the server is on this computer and needs no keys."""
+        return wire.is_loopback(self.host) and not self.server_key
+
+    def identities(self) -> Sequence[str]:
+        """The device at its address."""
+        return (f"{self.device} at {self.address}",)
+
+    def keeps_to_clock(self) -> bool:
+        """Whether it is simulated."""
+        return self.simulated
+
+
+class RemoteSimulationSettings(RemoteSettings):
+    """The server of the simulation that simulated devices act on; they must be served by the same one."""
+
+    device: Text = Field(default="simulation", description="its name in the profile of its computer")
+    simulated: bool = Field(default=True, description="whether it keeps to the clock of this run: it does")
