@@ -45,7 +45,7 @@ if sys.dont_write_bytecode:  # else each process would compile the tests and num
 OPTIONAL = (
     *("PIL", "h5netcdf", "hdf5plugin", "matplotlib", "optuna", "pandas", "pyarrow", "pylablib", "pypylon"),
     *("ruff", "sphinx", "starlette", "tifffile", "uvicorn", "uvloop", "xarray"),
-    *("axe_playwright_python", "httptools", "playwright"),
+    *("axe_playwright_python", "httptools", "msgpack", "playwright", "zmq"),
 )
 _MISSING = [] if os.environ.get("LABSEQ_REQUIRE_ALL") else [m for m in OPTIONAL if find_spec(m) is None]
 _NEEDS_MISSING = re.compile(

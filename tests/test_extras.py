@@ -24,6 +24,7 @@ from labseq.pictures.figures import check_place
 from labseq.recording.export import check_export
 from labseq.recording.hdf5 import load_filter
 from labseq.web.serve import check_packages
+from labseq.wire import require_packages
 
 ROOT = Path(__file__).parents[1]
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
@@ -50,6 +51,8 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("plot", "matplotlib", "matplotlib"): lambda: check_place(Path("a.png")),
     ("plot", "pillow", "PIL"): lambda: read_drawing(ROOT / "docs" / "_static" / "plan_kagome.png", "#"),
     ("pylon", "pypylon", "pypylon.pylon"): lambda: load_pypylon("camera"),
+    ("remote", "pyzmq", "zmq"): require_packages,
+    ("remote", "msgpack", "msgpack"): require_packages,
     ("testing", "hypothesis", "hypothesis"): lambda: labseq.testing.CameraContract,
     ("testing", "pytest", "pytest"): lambda: labseq.testing.CameraContract,
     ("web", "starlette", "starlette"): check_packages,

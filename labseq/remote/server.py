@@ -108,6 +108,7 @@ def serving(
     hardware = _served(resolve_profile(profile, overrides=profile_overrides(overrides)), how.devices)
     with ExitStack() as stack:
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", tell))
+        tell(f"tests {', '.join(hardware.chosen)}")
         _test(hardware, tell)
         server = Server(hardware, host, port, keys, tell)
         stack.callback(server.end)

@@ -57,6 +57,8 @@ class _Link:
             DeviceError: The server does not answer, or refuses.
         """
         if self._connection is None:
+            if isinstance(self._context.simulation, RemoteSimulation):  # its devices are constructed with it
+                self._context.simulation.connect()
             self._connection = made = Connection(self.settings, self._context, self._kind)
             weakref.finalize(self, made.close)
             self._about = made.about
@@ -395,6 +397,10 @@ class RemoteSimulation(Simulation):
 
     def __init__(self, settings: RemoteSimulationSettings, context: Context) -> None:
         self._link = _Link(settings, context, "simulation")
+
+    def connect(self) -> None:
+        """Construct it at the server."""
+        self._link.connect()
 
     def open(self) -> None:
         """Draw the disorder of the machine."""
