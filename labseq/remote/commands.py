@@ -67,7 +67,7 @@ def serve_devices(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Serve this device, and no others that the profile names; may be given several times.",
+            help="Serve this device only; may be given several times. Default: all that are real, or else all.",
             show_default=False,
         ),
     ] = None,
@@ -83,7 +83,7 @@ def serve_devices(
     overrides: Overrides = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Serve the devices that a profile names to a labseq on another computer, which uses them as its own.
+    """Serve the devices of a profile to a labseq on another computer, which uses them as its own.
 
     Each device is tested and made safe first. A client that is gone is noticed within a second, and its
     devices are made safe. Ctrl-C makes all devices safe and ends it.

@@ -58,7 +58,7 @@ class Serving:
 
     Attributes:
         address: ``tcp://HOST:PORT``: the port of the control, and the first of those of the devices.
-        devices: Roles and names of devices; none for all that the profile writes down.
+        devices: Roles and names of devices; none for all real ones of the profile, or all if none is real.
         key: Which of this computer's keys; "" for the only one.
         plain: Whether to serve without keys, on this computer only.
     """
@@ -117,21 +117,15 @@ def serving(
 
 
 def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> ResolvedProfile:
-    """The profile with the devices that are served, and no others."""
-    spec = hardware.profile
-    written = {*spec.model_fields_set, *spec.devices}
-    able = [
-        name
-        for name, one in hardware.chosen.items()
-        if one.entry.kind in HARDWARE_KINDS | {"simulation"} and name in written
-    ]
+    """The profile with the devices that are served: those named, else the real ones, else all."""
+    kinds = HARDWARE_KINDS | {"simulation"}
+    able = {name: one for name, one in hardware.chosen.items() if one.entry.kind in kinds}
     for name in names:
         if name not in able:
-            expected = one_of(able)
+            expected = one_of([*able])
             raise ConfigError(Problem(f"the profile has no device '{clean(name)}'", expected=expected))
-    chosen = {name: hardware.chosen[name] for name in able if not names or name in names}
-    if not chosen:
-        raise ConfigError(Problem("the profile has no devices", str(hardware.document.path)))
+    real = [name for name, one in able.items() if not one.virtual_time]
+    chosen = {name: able[name] for name in names or real or able}
     if remote := [name for name, one in chosen.items() if one.entry.name == "remote"]:
         raise ConfigError(f"'{remote[0]}' is itself on another computer; serve it there")
     return replace(hardware, chosen=chosen)
