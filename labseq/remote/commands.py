@@ -67,7 +67,7 @@ def serve_devices(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Serve this device only; may be given several times. Default: all that are real, or else all.",
+            help="Serve this device only; may be given several times. Default: the real ones, else all.",
             show_default=False,
         ),
     ] = None,

@@ -31,9 +31,11 @@ class RemoteSettings(Settings):
         default=False,
         description="whether the served device is simulated there and keeps to the clock of this run",
     )
-    key: Text = Field(default="", description="which of this computer's keys; by default the only one")
-    server_key: Text = Field(
-        default="", description="name of the server's public key in the folder `known`; by default its host"
+    key: Text | None = Field(
+        default=None, description="which of this computer's keys; by default the only one"
+    )
+    server_key: Text | None = Field(
+        default=None, description="name of the server's public key in the folder `known`; by default its host"
     )
 
     @property
