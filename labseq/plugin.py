@@ -93,6 +93,7 @@ from labseq.model import (
 from labseq.motion import (
     Renderer,
     check_plan,
+    choose_plan,
     fitting_batches,
     render,
     tone_program,
@@ -277,6 +278,7 @@ __all__ = [
     "check_plan",
     "check_size",
     "check_step",
+    "choose_plan",
     "clean",
     "closest",
     "const",

@@ -29,7 +29,7 @@ from labseq.motion.overlay import (
     overlay_offset,
 )
 from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_chunks
-from labseq.motion.survival import Survival, predict_survival
+from labseq.motion.survival import Survival, choose_plan, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
 
 __all__ = [
@@ -48,6 +48,7 @@ __all__ = [
     "all_on_program",
     "calibrated",
     "check_plan",
+    "choose_plan",
     "comb_sample_rate",
     "cross_offsets_m",
     "drive",
@@ -71,7 +72,7 @@ __all__ = [
 
 def warm() -> None:
     """Compile the kernels of checks and tone programs, or load them from the cache."""
-    _load("check_kernels", "tone_kernels")
+    _load("check_kernels", "survival_kernels", "tone_kernels")
 
 
 def warm_rendering() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -21,6 +22,7 @@ from labseq.model import (
     TargetPattern,
     TonePaths,
 )
+from labseq.motion.check import check_plan
 
 Floats = NDArray[np.float64]
 
@@ -96,6 +98,8 @@ def predict_survival(
     kept = np.exp(-np.multiply.outer(factors, total[report.predicted]))
     by_cause = [
         float(weights @ -np.expm1(-np.multiply.outer(factors, cause[report.predicted])).sum(axis=1))
+        if cause.any()
+        else 0.0
         for cause in hazards
     ]
     chance = weights @ np.exp(-factors * total[target.fill].sum())
@@ -118,6 +122,39 @@ def _factors(spread: float) -> tuple[Floats, Floats]:
     return np.exp(spread * nodes - spread**2 / 2), weights / weights.sum()
 
 
+def choose_plan(
+    plans: Iterable[Plan],
+    occupancy: ArrayLike,
+    target: TargetPattern,
+    degree_of_parallelism: int,
+    grid: SiteGrid,
+    motion: MotionSpec,
+) -> Plan:
+    """Choose the plan that leaves fewest defects, then has the highest chance of a whole target.
+
+    Both are worked out by :func:`check_plan` and :func:`predict_survival`; of equal chances the plan
+    counts that loses fewest atoms.
+
+    Args:
+        plans: The candidates, at least one.
+        occupancy: bool (n_rows, n_cols), before the plan.
+        target: The target.
+        degree_of_parallelism: Maximum number of tweezers on at once.
+        grid: The grid of sites.
+        motion: How the tweezers move, with the losses.
+
+    Raises:
+        InvalidPlanError: A candidate breaks a rule of the check.
+    """
+
+    def rank(plan: Plan) -> tuple[int, float, float]:
+        report = check_plan(plan, occupancy, target, degree_of_parallelism, grid, motion)
+        expected = predict_survival(plan, report, occupancy, target, grid, motion)
+        return report.n_defects, -expected.p_defect_free, expected.n_lost
+
+    return min(plans, key=rank)
+
+
 MOVED, LANDED, PASSED = range(3)
 """Causes of the hazards."""
 
@@ -125,6 +162,13 @@ MOVED, LANDED, PASSED = range(3)
 def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) -> tuple[Floats, int, int]:
     """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
     hazards = np.zeros((3, *grid.shape))
+    if not len(plan.path_shapes):
+        from labseq.motion.survival_kernels import line_hazards
+
+        moved = losses.move, losses.tone, losses.distance_per_m
+        arrays = plan.moves, plan.batch_offsets, plan.linked
+        hazards[MOVED] = line_hazards(*arrays, *grid.shape, moved, grid.axes)
+        return hazards, 0, 0
     atoms, n_landings, n_passes = occupied.copy(), 0, 0
     for batch in plan.batches:
         row, col = batch.from_sites.T

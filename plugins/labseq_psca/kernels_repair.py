@@ -1,16 +1,20 @@
-"""Kernels of the repair of few defects: shifts that fill a defect with few atom moves.
+"""Kernels of the repair of few defects: each is filled in the way that costs fewest atoms.
 
-A shift is the row and the column of a defect, the step to the side that its atoms come
-from (rows, columns), the sites from the defect to the last atom that moves, and the steps
-from there to the atom that comes from beside the line, see :func:`nearest_beside`. The
-vocabulary is that of :mod:`labseq_psca.kernels_lines`.
+Costs are expected losses of atoms: ``costs`` are those of an atom that is moved, of the time of
+a batch, and of one site of way. A defect is filled by a *chain*, a path over sites from the defect
+to a surplus atom, with any turns: each atom on it moves along it to the place of the one before, the
+first to the defect. A chain of one atom is a direct move, straight or as an L. Several defects of
+one line may be filled by one *shift* along it. The vocabulary is that of
+:mod:`labseq_psca.kernels_lines`.
 """
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from labseq.plugin import helper_kernel, kernel
 from labseq_psca.kernels_lines import (
@@ -18,6 +22,7 @@ from labseq_psca.kernels_lines import (
     GROWING,
     Bools,
     Growing,
+    Ints,
     Moves,
     Offsets,
     add_line,
@@ -26,108 +31,151 @@ from labseq_psca.kernels_lines import (
     finished,
 )
 
-Shift = tuple[int, int, int, int, int, int]
-SHIFT: Final = "UniTuple(int64, 6)"
-
-# What a shift costs: moving an atom loses 1.8 % of one, and the about 1 ms of a batch 0.7 % of one out of
-# 225 atoms of 33 s lifetime (physics of the paper's experiment).
-ATOM_MOVE: Final = 3
-BATCH: Final = 1
-
-
-@helper_kernel("int64(bool_[:, ::1], bool_[:, ::1], int64, int64, int64, int64)")
-def nearest_beside(atoms: Bools, fill: Bools, row: int, col: int, down: int, right: int) -> int:
-    """Find the nearest surplus atom on either side of an empty site, with nothing in its way.
-
-    ``down`` and ``right`` are the step along the line to look in: (1, 0) or (0, 1).
-
-    Returns:
-        Steps to the atom, below 0 on the upper or left side; 0 if there is none.
-    """
-    n_rows, n_cols = atoms.shape
-    for n in range(1, max(n_rows, n_cols)):
-        for steps in (-n, n):
-            r, c = row + steps * down, col + steps * right
-            if 0 <= r < n_rows and 0 <= c < n_cols and atoms[r, c] and not fill[r, c]:
-                for i in range(1, n):
-                    way = i if steps > 0 else -i
-                    if atoms[row + way * down, col + way * right]:
-                        break
-                else:
-                    return steps
-    return 0
+Costs = tuple[float, float, float]
+COSTS: Final = "UniTuple(float64, 3)"
+Linked = NDArray[np.bool_]
+Shift = tuple[int, int, int, int, int]
+"""Row and column of a defect, the step to where its atoms come from, and the sites to the last of them."""
+SHIFT: Final = "UniTuple(int64, 5)"
 
 
-@helper_kernel("UniTuple(int64, 4)(bool_[:, ::1], bool_[:, ::1], int64, int64, int64, int64)")
+@helper_kernel(f"Tuple((float64, int64, int64))(bool_[:, ::1], {GRID}, int64, int64, int64, int64, {COSTS})")
 def shift_to(
-    atoms: Bools, fill: Bools, row: int, col: int, down: int, right: int
-) -> tuple[int, int, int, int]:
+    atoms: Bools, fill: Bools, row: int, col: int, down: int, right: int, costs: Costs
+) -> tuple[float, int, int]:
     """Find the cheapest shift that fills the defect at ``row`` and ``col`` from one side.
 
     The atoms between the defect and the nearest surplus atom, seen from the defect in the
     direction ``down`` and ``right``, move up by one fill site each. Defects on the way are
-    filled too if there are as many surplus atoms. A surplus atom may also come from
-    beside the line, onto the first free site outside of the target.
+    filled too if there are as many surplus atoms.
 
     Returns:
-        The cost, the number of defects that it fills, sites from the defect to the last
-        atom that moves, and steps from there to the atom that comes from beside. No
-        defects if there is no surplus atom.
+        The cost, the number of defects that it fills, and the sites from the defect to the last
+        atom that moves. No defects if there is no surplus atom.
     """
     n_rows, n_cols = atoms.shape
     n_sites = n_atoms = n_spare = n_defects = 0
-    best = (0, 0, 0, 0)
+    best_cost, best_defects, best_sites = 0.0, 0, 0
     while 0 <= row < n_rows and 0 <= col < n_cols:
-        found = (0, 0, 0, 0)
         if atoms[row, col]:
             n_atoms += 1
             n_spare += not fill[row, col]
             if not fill[row, col] and n_spare in (1, n_defects):
-                found = (ATOM_MOVE * n_atoms + BATCH, n_spare, n_sites, 0)
+                cost = costs[0] * n_atoms + costs[1] + costs[2] * n_sites
+                if best_defects == 0 or cost * best_defects < best_cost * n_spare:
+                    best_cost, best_defects, best_sites = cost, n_spare, n_sites
         elif fill[row, col]:
             n_defects += 1
-        elif n_spare == 0 and best[3] == 0:
-            steps = nearest_beside(atoms, fill, row, col, abs(right), abs(down))
-            if steps != 0:
-                found = (ATOM_MOVE * (n_atoms + 2) + 2 * BATCH, 1, n_sites, steps)
-        if found[1] * best[0] > best[1] * found[0] or best[1] == 0:
-            best = found
         if n_spare > 0 and n_spare == n_defects:
             break
         n_sites += 1
         row += down
         col += right
-    return best
+    return best_cost, best_defects, best_sites
 
 
-@helper_kernel(f"{SHIFT}(bool_[:, ::1], bool_[:, ::1])")
-def cheapest_shift(atoms: Bools, fill: Bools) -> Shift:
-    """Find the shift that costs least for each defect that it fills, of equal ones the shortest.
+@helper_kernel(f"Tuple((float64, int64, {SHIFT}))(bool_[:, ::1], {GRID}, int64, int64, {COSTS})")
+def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) -> tuple[float, int, Shift]:
+    """Find the shift that costs least for each defect that it fills; 0 defects if there is none."""
+    best = (row, col, 0, 0, 0)
+    best_cost, best_defects = 0.0, 0
+    for side in range(4):
+        down = (side == 0) - (side == 1)
+        right = (side == 2) - (side == 3)
+        cost, n_defects, n_sites = shift_to(atoms, fill, row, col, down, right, costs)
+        if n_defects > 0 and (best_defects == 0 or cost * best_defects < best_cost * n_defects):
+            best = (row, col, down, right, n_sites)
+            best_cost, best_defects = cost, n_defects
+    return best_cost, best_defects, best
 
-    All six numbers are 0 if there is none.
+
+@helper_kernel(f"Tuple((float64, int64[:, ::1]))(bool_[:, ::1], {GRID}, {GRID}, int64, int64, {COSTS})")
+def cheapest_chain(
+    atoms: Bools, fill: Bools, clear: Bools, row: int, col: int, costs: Costs
+) -> tuple[float, Ints]:
+    """Find the cheapest chain to the defect at ``row`` and ``col``, by Dijkstra's algorithm.
+
+    It starts at the defect; a state is a site and the side from which it was reached. An atom that must
+    leave its site anyway costs nothing. A turn costs a batch if there is an atom on the chain before it:
+    an atom alone turns with its tweezer on.
+
+    Returns:
+        The cost, and the chain's sites, int64 (n, 2); none if no surplus atom can be reached.
     """
     n_rows, n_cols = atoms.shape
-    best = (0, 0, 0, 0, 0, 0)
-    best_cost, best_defects = 1, 0
-    for row in range(n_rows):
-        for col in range(n_cols):
-            if not fill[row, col] or atoms[row, col]:
+    n_states = 4 * n_rows * n_cols
+    cost = np.full(n_states, np.inf)
+    parent = np.full(n_states, -1, np.int64)
+    has_atom = np.zeros(n_states, np.bool_)
+    heap = [(0.0, np.int64(-1))]
+    end, total = np.int64(-1), 0.0
+    while len(heap) > 0:
+        so_far, state = heappop(heap)
+        r, c, came_from = row, col, np.int64(-1)
+        if state >= 0:
+            if so_far > cost[state]:
                 continue
-            for side in range(4):
-                down = (side == 0) - (side == 1)
-                right = (side == 2) - (side == 3)
-                cost, n_defects, n_sites, steps = shift_to(atoms, fill, row, col, down, right)
-                ahead = n_defects * best_cost - best_defects * cost
-                if ahead > 0 or (ahead == 0 and n_defects > 0 and n_sites < best[4]):
-                    best = (row, col, down, right, n_sites, steps)
-                    best_cost, best_defects = cost, n_defects
-    return best
+            came_from = state % 4
+            r, c = state // 4 // n_cols, state // 4 % n_cols
+            if atoms[r, c] and not fill[r, c]:
+                end, total = state, so_far
+                break
+        for side in range(4):
+            down, right = (side == 0) - (side == 1), (side == 2) - (side == 3)
+            to_row, to_col = r + down, c + right
+            if not (0 <= to_row < n_rows and 0 <= to_col < n_cols):
+                continue
+            atom = atoms[to_row, to_col]
+            new = so_far + costs[2]
+            if atom and not clear[to_row, to_col]:
+                new += costs[0]
+            before = state >= 0 and has_atom[state]
+            if state < 0 or (side != came_from and before):
+                new += costs[1]
+            to = (to_row * n_cols + to_col) * 4 + side
+            if new < cost[to]:
+                cost[to] = new
+                parent[to] = state
+                has_atom[to] = atom or before
+                heappush(heap, (new, np.int64(to)))
+    n_sites = 0
+    state = end
+    while state >= 0:
+        n_sites += 1
+        state = parent[state]
+    sites = np.empty((n_sites + 1 if n_sites > 0 else 0, 2), np.int64)
+    state = end
+    for i in range(n_sites, 0, -1):
+        sites[i, 0], sites[i, 1] = state // 4 // n_cols, state // 4 % n_cols
+        state = parent[state]
+    if n_sites > 0:
+        sites[0, 0], sites[0, 1] = row, col
+    return total, sites
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], bool_[:, ::1], {SHIFT}, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64[::1], int64, int64, boolean, int64)")
+def add_run(
+    plan: Growing, atoms: Bools, source: Ints, goal: Ints, row: int, col: int, is_row: bool, limit: int
+) -> Growing:
+    """Move atoms of one line from ``source`` to ``goal``, both ascending; updates ``atoms``."""
+    for i in range(len(source)):
+        if is_row:
+            atoms[row, source[i]] = False
+        else:
+            atoms[source[i], col] = False
+    for i in range(len(goal)):
+        if is_row:
+            atoms[row, goal[i]] = True
+        else:
+            atoms[goal[i], col] = True
+    n_sites = atoms.shape[1] if is_row else atoms.shape[0]
+    return add_line(plan, source, goal, n_sites, row if is_row else col, is_row, limit, 0)
+
+
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {SHIFT}, int64)")
 def add_shift(plan: Growing, atoms: Bools, fill: Bools, shift: Shift, limit: int) -> Growing:
-    """Add the batches of a shift, without the atom from beside; updates ``atoms``."""
-    row, col, down, right, n_sites, _ = shift
+    """Add the batches of a shift; updates ``atoms``."""
+    row, col, down, right, n_sites = shift
     source, goal = np.empty(n_sites + 1, np.int64), np.empty(n_sites + 1, np.int64)
     n_atoms = n_goals = 0
     forwards = down + right > 0
@@ -143,42 +191,120 @@ def add_shift(plan: Growing, atoms: Bools, fill: Bools, shift: Shift, limit: int
             goal[n_goals] = site
             n_goals += 1
     first = 0 if forwards else n_goals - n_atoms  # the fill sites nearest to the defect
-    source, goal = source[:n_atoms], goal[first : first + n_atoms]
-    for site in goal:
-        if down != 0:
-            atoms[site, col] = True
-        else:
-            atoms[row, site] = True
-    if down != 0:
-        return add_line(plan, source, goal, atoms.shape[0], col, False, limit, 0)
-    return add_line(plan, source, goal, atoms.shape[1], row, True, limit, 0)
+    return add_run(plan, atoms, source[:n_atoms], goal[first : first + n_atoms], row, col, down == 0, limit)
 
 
-@kernel(f"Tuple((int16[:, ::1], int32[::1], bool_[:, ::1]))({GRID}, {GRID}, int64, int64)")
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[:, ::1], int64, int64, bool_[::1])")
+def add_bent(plan: Growing, atoms: Bools, sites: Ints, start: int, stop: int, linked: Linked) -> Growing:
+    """Move the atom on ``sites[start]`` along a chain to ``sites[stop]``, its tweezer on at each turn."""
+    corner = start
+    for i in range(start - 1, stop - 1, -1):
+        turns = i > stop and sites[i - 1, 0] != sites[i + 1, 0] and sites[i - 1, 1] != sites[i + 1, 1]
+        if i == stop or turns:
+            linked[plan[2]] = corner != start
+            plan = add_move(plan, atoms, sites[corner, 0], sites[corner, 1], sites[i, 0], sites[i, 1])
+            corner = i
+    return plan
+
+
+@helper_kernel("boolean(int64[:, ::1], int64, int64)")
+def is_straight(sites: Ints, start: int, stop: int) -> bool:
+    """Whether a part of a chain has no turn."""
+    way = abs(sites[stop, 0] - sites[start, 0]) + abs(sites[stop, 1] - sites[start, 1])
+    in_line = sites[stop, 0] == sites[start, 0] or sites[stop, 1] == sites[start, 1]
+    return in_line and way == stop - start
+
+
+@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[:, ::1], int64, int64, bool_[::1])")
+def add_chain(
+    plan: Growing, atoms: Bools, sites: Ints, row_limit: int, column_limit: int, linked: Linked
+) -> Growing:
+    """Add the batches of a chain, the atom next to the defect first; updates ``atoms`` and ``linked``."""
+    n_sites = len(sites)
+    at = np.empty(n_sites + 1, np.int64)  # where on the chain the defect and the atoms are
+    at[0] = 0
+    n_atoms = 1
+    for i in range(1, n_sites):
+        if atoms[sites[i, 0], sites[i, 1]]:
+            at[n_atoms] = i
+            n_atoms += 1
+    first = 0
+    while first < n_atoms - 1:
+        row, col = sites[at[first], 0], sites[at[first], 1]
+        last = first + 1
+        while last < n_atoms and sites[at[last], 0] == row and is_straight(sites, at[first], at[last]):
+            last += 1
+        is_row = last > first + 1
+        while (
+            not is_row
+            and last < n_atoms
+            and sites[at[last], 1] == col
+            and is_straight(sites, at[first], at[last])
+        ):
+            last += 1
+        if last == first + 1:
+            plan = add_bent(plan, atoms, sites, at[last], at[first], linked)
+            first = last
+            continue
+        n = last - first - 1
+        source, goal = np.empty(n, np.int64), np.empty(n, np.int64)
+        axis = 1 if is_row else 0
+        for i in range(n):
+            source[i], goal[i] = sites[at[first + 1 + i], axis], sites[at[first + i], axis]
+        limit = row_limit if is_row else column_limit
+        plan = add_run(plan, atoms, np.sort(source), np.sort(goal), row, col, is_row, limit)
+        first = last - 1
+    return plan
+
+
+@kernel(
+    f"Tuple((int16[:, ::1], int32[::1], bool_[::1], bool_[:, ::1]))"
+    f"({GRID}, {GRID}, {GRID}, int64, int64, {COSTS})"
+)
 def plan_repair(
-    occupied: Bools, fill: Bools, row_limit: int, column_limit: int
-) -> tuple[Moves, Offsets, Bools]:
-    """Fill defects from the side that takes fewest atoms, one shift after another.
+    occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, costs: Costs
+) -> tuple[Moves, Offsets, Linked, Bools]:
+    """Fill defects by chains and shifts, those first that cost most.
+
+    A chain may so pass through the defects that are nearer to its surplus atom, which saves it the atoms
+    that would fill them.
 
     Args:
         occupied: bool (n_rows, n_cols).
         fill: bool (n_rows, n_cols), sites that must hold an atom.
+        clear: bool (n_rows, n_cols), sites that must be empty.
         row_limit: Maximum number of atoms in a batch that moves along a row.
         column_limit: Maximum number of atoms in a batch that moves along a column.
+        costs: See the module.
 
     Returns:
-        moves, int16 (n_moves, 4), batch offsets, int32 (n_batches + 1,), and the
-        occupancy after them. Defects that no shift fills are left.
+        moves, int16 (n_moves, 4), batch offsets, int32 (n_batches + 1,), which batches are linked to the
+        one before, bool (n_batches,), and the occupancy after them. Defects that no chain reaches are left.
     """
-    atoms, sites = occupied.copy(), fill.copy()
+    atoms = occupied.copy()
     plan = empty_plan(atoms.size)
-    shift = cheapest_shift(atoms, sites)
-    while shift[4] > 0:
-        row, col, down, right, n_sites, steps = shift
-        if steps != 0:
-            r, c = row + n_sites * down, col + n_sites * right
-            plan = add_move(plan, atoms, r + steps * abs(right), c + steps * abs(down), r, c)
-        plan = add_shift(plan, atoms, sites, shift, column_limit if down != 0 else row_limit)
-        shift = cheapest_shift(atoms, sites)
+    n_rows, n_cols = atoms.shape
+    linked = np.zeros(4 * atoms.size, np.bool_)
+    left = fill & ~atoms
+    while plan[2] + atoms.size <= len(linked):  # a chain has fewer batches than there are sites
+        row = col = -1
+        highest = -1.0
+        for r in range(n_rows):
+            for c in range(n_cols):
+                if left[r, c]:
+                    cost, n_defects, _ = cheapest_shift(atoms, fill, r, c, costs)
+                    cost = np.inf if n_defects == 0 else cost
+                    if cost > highest:
+                        row, col, highest = r, c, cost
+        if row < 0:
+            break
+        cost, n_defects, shift = cheapest_shift(atoms, fill, row, col, costs)
+        chain_cost, sites = cheapest_chain(atoms, fill, clear, row, col, costs)
+        if n_defects > 1 and cost < chain_cost * n_defects:
+            plan = add_shift(plan, atoms, fill, shift, column_limit if shift[2] != 0 else row_limit)
+        elif len(sites) > 0:
+            plan = add_chain(plan, atoms, sites, row_limit, column_limit, linked)
+        left[row, col] = False
+        left &= ~atoms
     moves, offsets = finished(plan, False)
-    return moves, offsets, atoms
+    return moves, offsets, linked[: plan[2]].copy(), atoms

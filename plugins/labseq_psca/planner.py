@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +17,10 @@ from labseq.plugin import (
     Plan,
     PlanError,
     Settings,
+    SiteGrid,
     TargetPattern,
     as_occupancy,
+    choose_plan,
     nearest_to_centre,
 )
 
@@ -99,6 +102,7 @@ class PscaPlanner:
         self._eject_slots = motion.eject_slots
         self._order = _ORDERS[settings.row_order]
         self._grid = context.grid
+        self._motion = motion
         self._kernel: Kernel | None = None
 
     def warm(self) -> None:
@@ -134,14 +138,16 @@ class PscaPlanner:
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "psca") from error
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
-        moves, offsets = self._sort_and_compress(occupied, fill, target.clear)
+        plan = _plan(*self._sort_and_compress(occupied, fill, target.clear))
         if self._repair_below > 0:
             n_defects = int(np.count_nonzero(fill > occupied))
             if 0 < n_defects <= self._repair_below * target.n_atoms:
-                repaired = self._repair(occupied, fill, target.clear)
-                moves, offsets = min((moves, offsets), repaired, key=_cost)
-        moves.flags.writeable = offsets.flags.writeable = False  # otherwise Plan would copy them
-        return Plan(moves, offsets)
+                plans = (plan, self._repair(occupied, fill, target))
+                grid, dop = self._grid, self.degree_of_parallelism
+                if grid.shape != target.shape:
+                    grid = SiteGrid(*target.shape, grid.spacing_m, lattice=grid.lattice, shear=grid.shear)
+                return choose_plan(plans, occupied, target, dop, grid, self._motion)
+        return plan
 
     def _sort_and_compress(
         self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
@@ -151,20 +157,30 @@ class PscaPlanner:
         assert self._kernel is not None
         return self._kernel(occupied, fill, clear, *self._limits, self._eject_slots, self._order)
 
-    def _repair(
-        self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
-        """Fill each defect from the side that takes fewest atoms; sort and compress for the rest."""
+    def _repair(self, occupied: Occupancy, fill: NDArray[np.bool_], target: TargetPattern) -> Plan:
+        """Fill each defect in the way that is expected to lose fewest atoms; then sort and compress."""
         from labseq_psca.kernels_repair import plan_repair
 
-        moves, offsets, atoms = plan_repair(occupied, fill, *self._limits)
-        more_moves, more_offsets = self._sort_and_compress(atoms, fill, clear)
-        return np.concatenate([moves, more_moves]), np.concatenate([offsets, more_offsets[1:] + offsets[-1]])
+        motion, spacing_m = self._motion, self._grid.spacing_m
+        losses = motion.losses
+        per_second = target.n_atoms / losses.lifetime_s
+        batch_s = motion.overhead_per_batch_s + motion.pick_up_s + motion.drop_off_s
+        costs = (
+            -math.log1p(-losses.move),
+            per_second * batch_s,
+            spacing_m * (per_second / motion.speed_m_s + losses.distance_per_m),
+        )
+        moves, offsets, linked, atoms = plan_repair(occupied, fill, target.clear, *self._limits, costs)
+        more_moves, more_offsets = self._sort_and_compress(atoms, fill, target.clear)
+        return _plan(
+            np.concatenate([moves, more_moves]),
+            np.concatenate([offsets, more_offsets[1:] + offsets[-1]]),
+            np.concatenate([linked, np.zeros(len(more_offsets) - 1, np.bool_)]),
+        )
 
 
-def _cost(plan: tuple[NDArray[np.int16], NDArray[np.int32]]) -> int:
-    """Expected loss of atoms in a plan, in units of the weights of atom moves and batches."""
-    from labseq_psca.kernels_repair import ATOM_MOVE, BATCH
-
-    moves, offsets = plan
-    return ATOM_MOVE * len(moves) + BATCH * (len(offsets) - 1)
+def _plan(*arrays: NDArray[Any]) -> Plan:
+    """A plan of arrays that nothing else holds."""
+    for array in arrays:
+        array.flags.writeable = False  # otherwise Plan would copy them
+    return Plan(*arrays)

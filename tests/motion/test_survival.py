@@ -108,3 +108,20 @@ def test_a_plan_that_leaves_defects_has_no_chance() -> None:
 def test_losses_that_mean_nothing_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"probability|negative|more than 0"):
         LossSpec(**wrong)
+
+
+def test_line_batches_count_the_same_beside_paths_of_tones() -> None:
+    """Plans of lines alone are followed by a kernel, others by plain Python."""
+    target = TargetPattern(np.array([[True] * 3, [False] * 3]), np.zeros((2, 3), np.bool_))
+    atoms, grid = np.array([[1, 0, 0], [0, 1, 1]], np.bool_), SiteGrid(2, 3)
+    motion = MotionSpec(losses=LossSpec(move=0.1, tone=0.02, distance_per_m=2000.0, passing=0.0))
+    first = [([(0, 0)], [(0, 1)]), ([(0, 1)], [(0, 0)])]
+    source, goal = np.array([(1, 1), (1, 2)], np.int16), np.array([(0, 1), (0, 2)], np.int16)
+    way = TonePaths(np.array([[1.0], [0.0]]), np.array([[1.0, 2.0], [1.0, 2.0]]))
+    plans = [Plan.from_batches([*first, Batch(source, goal, tones=tones)]) for tones in (None, way)]
+    found = [
+        predict_survival(plan, check_plan(plan, atoms, target, 4, grid, motion), atoms, target, grid, motion)
+        for plan in plans
+    ]
+    assert found[0].n_lost_moved == pytest.approx(found[1].n_lost_moved)
+    assert found[0].p_defect_free == pytest.approx(found[1].p_defect_free)

@@ -273,12 +273,17 @@ class TestPaper:
 
 
 class TestRepair:
-    """Defects are filled from the side that costs least."""
+    """Defects are filled in the way that costs fewest atoms."""
 
     @staticmethod
-    def repair(atoms: Any, fill: Any) -> tuple[list[list[Sites]], NDArray[np.bool_]]:
-        moves, offsets, after = kernels_repair.plan_repair(bools(atoms), bools(fill), 9, 9)
-        return [moves[a:b].tolist() for a, b in pairwise(offsets.tolist())], after
+    def repair(
+        atoms: Any, fill: Any, clear: Any = None
+    ) -> tuple[list[list[Sites]], list[bool], NDArray[np.bool_]]:
+        clear = np.zeros(np.shape(fill), np.bool_) if clear is None else clear
+        moves, offsets, linked, after = kernels_repair.plan_repair(
+            bools(atoms), bools(fill), bools(clear), 9, 9, (0.02, 0.004, 0.0002)
+        )
+        return [moves[a:b].tolist() for a, b in pairwise(offsets.tolist())], linked.tolist(), after
 
     def test_the_nearest_of_the_four_sides(self) -> None:
         atoms = np.ones((7, 7), np.bool_)
@@ -288,20 +293,35 @@ class TestRepair:
         assert self.repair(atoms, fill)[0] == [[[3, 0, 3, 1]]]
 
     def test_atoms_between_move_up_by_one_fill_site(self) -> None:
-        batches, after = self.repair([[1, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
+        batches, _, _ = self.repair([[1, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
         assert batches == [[[0, 0, 0, 1]]]
-        batches, after = self.repair([[0, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
+        batches, _, after = self.repair([[0, 0, 1, 0, 1, 1]], [[0, 1, 1, 0, 1, 0]])
         assert batches == [[[0, 2, 0, 1], [0, 4, 0, 2], [0, 5, 0, 4]]]
         assert after.tolist() == [[False, True, True, False, True, False]]
 
-    def test_an_atom_comes_from_beside_where_the_line_has_none(self) -> None:
-        batches, _ = self.repair(
+    def test_an_atom_turns_with_its_tweezer_on(self) -> None:
+        batches, linked, _ = self.repair(
             [[0, 0, 0, 1], [1, 0, 1, 1], [1, 1, 1, 1]],
             [[0, 0, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1]],
         )
         assert batches == [[[0, 3, 0, 1]], [[0, 1, 1, 1]]]
+        assert linked == [False, True]
 
-    def test_what_no_shift_can_fill_is_left(self) -> None:
-        batches, after = self.repair([[1, 0], [0, 0]], [[1, 1], [0, 0]])
+    def test_a_chain_may_move_one_atom_straight_and_one_round_a_corner(self) -> None:
+        batches, linked, after = self.repair([[0, 1, 0], [1, 1, 1]], [[1, 1, 0], [1, 1, 0]])
+        assert batches == [[[0, 1, 0, 0]], [[1, 2, 0, 2]], [[0, 2, 0, 1]]]
+        assert linked == [False, False, True]
+        assert after.tolist() == [[True, True, False], [True, True, False]]
+
+    def test_an_atom_that_must_leave_anyway_comes_first(self) -> None:
+        clear = [[0, 0, 0, 0, 1]]
+        assert self.repair([[1, 0, 0, 0, 1]], [[0, 1, 0, 0, 0]], clear)[0] == [[[0, 4, 0, 1]]]
+
+    def test_defects_of_one_line_are_filled_by_one_shift(self) -> None:
+        batches, _, _ = self.repair([[1, 1, 1, 0, 1, 0]], [[0, 0, 1, 1, 1, 1]])
+        assert batches == [[[0, 0, 0, 2], [0, 1, 0, 3], [0, 2, 0, 4], [0, 4, 0, 5]]]
+
+    def test_what_no_chain_can_fill_is_left(self) -> None:
+        batches, _, after = self.repair([[1, 0], [0, 0]], [[1, 1], [0, 0]])
         assert batches == []
         assert after.tolist() == [[True, False], [False, False]]
