@@ -34,6 +34,9 @@ GRACE_S: Final = 0.3
 RESCUE_S: Final = 5.0
 """How long that may take; then the watchdog switches the device off."""
 
+MAX_REASONS: Final = 64
+"""Number of sessions whose end is remembered, for clients that ask later."""
+
 _COMMON: Final = frozenset(
     {"safe_state", "describe", "versions", "warm", "settle", "self_test", "poll", "check_interlocks"}
 )
@@ -155,6 +158,11 @@ class Session:
 class ServedDevice:
     """A device, the thread that makes all calls into it, and the socket that they come from.
 
+    Attributes:
+        owner: The session that opened the device, or None.
+        sessions: Token -> session.
+        ended: Token -> why that session ended, of the last ones.
+
     Args:
         name: Its role, or its name in the profile.
         chosen: Its plugin.
@@ -175,6 +183,7 @@ class ServedDevice:
         self.kind = chosen.entry.kind
         self.owner: Session | None = None
         self.sessions: dict[bytes, Session] = {}
+        self.ended: dict[bytes, str] = {}
         self._chosen = chosen
         self._socket = socket
         self._is_known = is_known
@@ -199,6 +208,10 @@ class ServedDevice:
         if not session.ended:
             session.ended = why
             self.abort(session)
+
+    def why_ended(self, token: Any) -> str:
+        """Why a session is not there."""
+        return self.ended.get(token, "the connection has ended, or the server was started again")
 
     def abort(self, session: Session) -> None:
         """Ask the call in progress to end."""
@@ -272,7 +285,7 @@ class ServedDevice:
         except (KeyError, TypeError) as error:
             return self._refusal(0, f"the server cannot read a message: {format_error(error)}")
         if session is None:
-            return self._refusal(number, "the connection has ended, or the server was started again")
+            return self._refusal(number, self.why_ended(message["session"]))
         peer = frames[-1].get("User-Id") if session.peer else ""
         if peer != session.peer or session.ended:
             return self._refusal(number, session.ended or "the connection belongs to another key")
@@ -428,6 +441,7 @@ class ServedDevice:
 
     def _close(self, session: Session) -> None:
         """End a session: its device is made safe and closed if the client has not done so."""
+        self.ended = {**dict([*self.ended.items()][-MAX_REASONS:]), session.token: session.ended}
         del self.sessions[session.token]
         if session.device is None or not (session.is_open or self.kind == "simulation"):
             return

@@ -327,13 +327,17 @@ class Server:
         return {**about, "session": session.token, "port": self._ports[device.name]}
 
     def _of(self, message: Mapping[str, Any], peer: str) -> tuple[ServedDevice, Session]:
+        token = message["session"]
         for device in self.devices.values():
-            session = device.sessions.get(message["session"])
+            session = device.sessions.get(token)
             if session is not None and session.peer == peer:
                 if session.ended:
                     raise DeviceError(device.name, session.ended)
                 return device, session
-        raise DeviceError("server", "the connection has ended, or the server was started again")
+        ended = [one.ended[token] for one in self.devices.values() if token in one.ended]
+        raise DeviceError(
+            "server", (ended or ["the connection has ended, or the server was started again"])[0]
+        )
 
     def _beat(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
         _, session = self._of(message, peer)

@@ -69,12 +69,10 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def client_socket(host: str, port: int, keys: Keys | None, server: bytes | None) -> zmq.Socket[Any]:
-    """A DEALER that connects to a server, once: a connection that breaks stays broken.
+def client_socket(keys: Keys | None, server: bytes | None) -> zmq.Socket[Any]:
+    """A DEALER, not connected yet, that connects once: a connection that breaks stays broken.
 
     Args:
-        host: The server.
-        port: Its port.
         keys: The keys of this computer; None on this computer only.
         server: The public key of the server; None likewise.
     """
@@ -89,9 +87,13 @@ def client_socket(host: str, port: int, keys: Keys | None, server: bytes | None)
             keys.secret,
             server,
         )
-    host = "127.0.0.1" if host == "localhost" else host
-    socket.connect(f"tcp://{f'[{host}]' if ':' in host else host}:{port}")
     return socket
+
+
+def endpoint(host: str, port: int) -> str:
+    """The address of a port, for ZeroMQ."""
+    host = "127.0.0.1" if host == "localhost" else host
+    return f"tcp://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | None) -> zmq.Socket[Any]:
@@ -107,9 +109,8 @@ def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | 
     if keys is not None:
         socket.zap_domain = b"labseq"
         socket.curve_server, socket.curve_secretkey = True, keys.secret
-    host = "127.0.0.1" if host == "localhost" else host
     try:
-        socket.bind(f"tcp://{f'[{host}]' if ':' in host else host}:{port}")
+        socket.bind(endpoint(host, port))
     except zmq.ZMQError as error:
         socket.close()
         hint = "choose another one with --bind; perhaps the server is already running"

@@ -21,11 +21,17 @@ CONNECT_S: Final = 2.0
 """How long connecting may take."""
 GRACE_S: Final = 1.0
 """How long a call may take to end after it was aborted."""
+BYE_S: Final = 0.1
+"""How long a server may take to answer the end of a connection that is lost."""
 SAFE_S: Final = 4.0
 """How long making a device safe beside a call that hangs may take."""
 
 _runs: weakref.WeakKeyDictionary[Clock, bytes] = weakref.WeakKeyDictionary()
 """The session's clock -> what names the run at the servers: its devices there share one simulation."""
+
+
+class _NoAnswer(DeviceError):  # noqa: N818 - it may be explained
+    """The control of the server did not answer."""
 
 
 class Connection:
@@ -56,11 +62,12 @@ class Connection:
         self._beat: dict[str, Any] = {"number": 0, "running": False, "rescue": ""}
         self.state: dict[str, Any] = {}
         keys, server = _keys(settings)
-        self._control = wire.client_socket(settings.host, settings.port, keys, server)
+        self._control = wire.client_socket(keys, server)
         try:
             self.about = self._hello(settings, kind)
             self._token = self.about["session"]
-            self._calls = wire.client_socket(settings.host, self.about["port"], keys, server)
+            self._calls = wire.client_socket(keys, server)
+            self._calls.connect(wire.endpoint(settings.host, int(self.about["port"])))
         except BaseException:
             self._control.close()
             raise
@@ -132,9 +139,8 @@ class Connection:
     def close(self) -> None:
         """End the connection; the server makes the device safe if that was not done."""
         if not self._ended.is_set():
-            if not self._lost:
-                with suppress(LabseqError):
-                    self.ask("bye")
+            with suppress(LabseqError):
+                self.ask("bye", BYE_S if self._lost else wire.LOST_S)
             self._ended.set()
             with self._controlling:
                 self._control.close()
@@ -170,18 +176,19 @@ class Connection:
                         return answer.get("value")
             except zmq.ZMQError as error:
                 raise self._failure(f"{error.strerror}") from error
-        raise self._failure(f"the server did not answer within {timeout_s:.3g} s")
+        raise _NoAnswer(self._name, f"the server did not answer within {timeout_s:.3g} s (at {self.address})")
 
     def _hello(self, settings: RemoteSettings, kind: str) -> dict[str, Any]:
         """Begin the session; if that fails, the events of the socket say why."""
         from labseq_remote.events import reason_of
 
         monitor = self._control.get_monitor_socket()
+        self._control.connect(wire.endpoint(settings.host, settings.port))
         me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": _run_of(self._clock)}
         who = f"{platform.node()}, process {os.getpid()}"
         try:
             about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
-        except DeviceError as error:
+        except _NoAnswer as error:
             why = reason_of(monitor)
             raise self._failure(why) if why else error from None
         finally:

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -60,7 +61,7 @@ class Served:
         self.port = port
         self.told = told
 
-    def settings(self, device: str, *, port: int = 0, **others: object) -> RemoteSettings:
+    def settings(self, device: str, *, port: int = 0, **others: Any) -> RemoteSettings:
         """For a client."""
         about = {"address": f"tcp://127.0.0.1:{port or self.port}", "device": device, "simulated": True}
         return RemoteSettings.model_validate({**about, **others})

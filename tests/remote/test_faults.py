@@ -1,0 +1,362 @@
+"""What a network, a stranger or a broken peer can do; a call is carried out once or not at all."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+from labseq_remote import connection
+from labseq_remote.drivers import RemoteCamera, RemoteDevice
+from labseq_remote.settings import RemoteSettings
+from labseq_virtual.devices import VirtualDevice
+
+from labseq import wire
+from labseq.plugin import ConfigError, Context, DeviceError, LimitError, SiteGrid
+from labseq.remote.server import Serving, serving
+from labseq.testing.fakes import FakeClock
+from tests.remote.conftest import PROFILE, Served, served
+from tests.remote.test_contracts import with_simulation
+
+Fault = Callable[[list[bytes]], list[list[bytes]]]
+PROXY = "127.0.0.2"
+"""Another address of this computer, so that a proxy has the same ports as the server."""
+
+
+def until(condition: Callable[[], bool], limit_s: float = 5.0) -> float:
+    """Wait for something; returns how long that took."""
+    begun_s = time.monotonic()
+    while not condition():
+        assert time.monotonic() < begun_s + limit_s, "it did not happen in time"
+        time.sleep(0.005)
+    return time.monotonic() - begun_s
+
+
+class Proxy:
+    """Passes messages on, with a fault in those of the device's port."""
+
+    def __init__(self, server: Served) -> None:
+        self.fault: Fault = lambda message: [message]
+        self.reply_fault: Fault = lambda message: [message]
+        self.is_cut = False
+        self._ended = threading.Event()
+        self._context = zmq.Context()
+        ports = range(server.port, server.port + 9)
+        self._threads = [threading.Thread(target=self._pass, args=[port], daemon=True) for port in ports]
+        for thread in self._threads:
+            thread.start()
+
+    def end(self) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(5.0)
+        self._context.destroy(linger=0)
+
+    def _pass(self, port: int) -> None:
+        front = self._context.socket(zmq.ROUTER)
+        front.bind(f"tcp://{PROXY}:{port}")
+        backs: dict[bytes, Any] = {}
+        poller = zmq.Poller()
+        poller.register(front, zmq.POLLIN)
+        while not self._ended.is_set():
+            for socket, _ in poller.poll(20):
+                parts = socket.recv_multipart()
+                if self.is_cut:
+                    continue
+                if socket is front:
+                    client, *message = parts
+                    if client not in backs:
+                        backs[client] = self._context.socket(zmq.DEALER)
+                        backs[client].connect(f"tcp://127.0.0.1:{port}")
+                        poller.register(backs[client], zmq.POLLIN)
+                    for one in self.fault(message) if is_call(message) else [message]:
+                        backs[client].send_multipart(one)
+                else:
+                    client = next(name for name, back in backs.items() if back is socket)
+                    for one in self.reply_fault(parts):
+                        front.send_multipart([client, *one])
+        for socket in (front, *backs.values()):
+            socket.close(linger=0)
+
+
+def is_call(message: list[bytes]) -> bool:
+    return b"call" in message[0]
+
+
+@pytest.fixture(scope="module")
+def faulty(server: Served) -> Generator[Proxy]:
+    proxy = Proxy(server)
+    yield proxy
+    proxy.end()
+
+
+@pytest.fixture(autouse=True)
+def _whole(request: pytest.FixtureRequest) -> Generator[None]:
+    yield
+    if "faulty" in request.fixturenames:
+        proxy = request.getfixturevalue("faulty")
+        proxy.is_cut, proxy.fault, proxy.reply_fault = False, lambda m: [m], lambda m: [m]
+
+
+@contextmanager
+def instrument(server: Served, host: str = "127.0.0.1", **settings: Any) -> Generator[RemoteDevice]:
+    """An open instrument."""
+    about: dict[str, Any] = {"device": "instrument", "address": f"tcp://{host}:{server.port}", **settings}
+    made = server.settings(**about)
+    device = RemoteDevice(made, Context("laser", SiteGrid(6, 7), clock=FakeClock()))
+    device.open()
+    try:
+        yield device
+    finally:
+        with suppress(DeviceError):
+            device.close()
+
+
+@contextmanager
+def camera(server: Served, host: str = "127.0.0.1") -> Generator[RemoteCamera]:
+    """An open camera."""
+    context = with_simulation(Context("camera", clock=FakeClock()))
+    assert context.simulation is not None
+    context.simulation.open()
+    context.simulation.begin_shot()
+    device = RemoteCamera(server.settings("camera", address=f"tcp://{host}:{server.port}"), context)
+    device.open()
+    try:
+        yield device
+    finally:
+        with suppress(DeviceError):
+            device.close()
+        context.simulation.close()
+
+
+@pytest.fixture(autouse=True)
+def _port(server: Served) -> None:
+    from tests.remote import test_contracts
+
+    test_contracts._port = server.port
+
+
+def test_a_call_that_arrives_twice_is_carried_out_once(server: Served, faulty: Proxy) -> None:
+    with camera(server, PROXY) as device:
+        device.arm(2, 0.01, "software")
+        faulty.fault = lambda message: [message, message]
+        for number in range(2):  # a third exposure would be refused
+            device.trigger()
+            assert device.read(1.0).number == number
+
+
+def test_an_old_call_is_not_carried_out_again(server: Served, faulty: Proxy) -> None:
+    old: list[list[bytes]] = []
+
+    def replay(message: list[bytes]) -> list[list[bytes]]:
+        old.append(message)
+        return [message, *old[:-1]]
+
+    with camera(server, PROXY) as device:
+        device.arm(3, 0.01, "software")
+        faulty.fault = replay
+        for number in range(3):
+            device.trigger()
+            assert device.read(1.0).number == number
+
+
+def test_a_call_out_of_order_ends_the_connection(server: Served, faulty: Proxy) -> None:
+    def renumber(message: list[bytes]) -> list[list[bytes]]:
+        content = wire.unpack(message)
+        return [[bytes(part) for part in wire.pack({**content, "n": content["n"] + 1})]]
+
+    with instrument(server, PROXY) as device:
+        faulty.fault = renumber
+        with pytest.raises(DeviceError, match=r"^laser: .*(out of order|lost)"):
+            device.command("open")
+        until(lambda: server.server.devices["instrument"].owner is None)
+    assert any("out of order" in text and "made safe" in text for text in server.told)
+
+
+def test_a_message_that_cannot_be_read_is_an_error_of_the_device(server: Served, faulty: Proxy) -> None:
+    with instrument(server, PROXY) as device:
+        faulty.fault = lambda message: [[b"\xc1call" + message[0]]]
+        with pytest.raises(DeviceError, match=r"^laser: .*cannot read a message"):
+            device.command("open")
+
+
+def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
+    def delay(message: list[bytes]) -> list[list[bytes]]:
+        time.sleep(0.2)
+        return [message]
+
+    with instrument(server, PROXY) as device:
+        faulty.reply_fault = delay
+        device.command("set", power=0.5)
+        assert device.read("power") == 0.5
+
+
+def test_both_sides_notice_a_cut_within_a_second(server: Served, faulty: Proxy) -> None:
+    with instrument(server, PROXY) as device:
+        n_told = len(server.told)
+        faulty.is_cut = True
+        begun_s = time.monotonic()
+        with pytest.raises(DeviceError, match=r"^laser: the connection is lost.*127\.0\.0\.2"):
+            [device.read("power") for _ in range(1000)]
+        failed_s = time.monotonic() - begun_s
+        until(lambda: any("made safe" in text for text in server.told[n_told:]))
+        assert max(failed_s, time.monotonic() - begun_s) < 2.0  # of which 0.75 s to notice
+        with pytest.raises(DeviceError):
+            device.safe_state()
+    with instrument(server) as again:
+        again.command("open")
+
+
+def test_a_lost_reply_ends_the_connection(server: Served, faulty: Proxy) -> None:
+    with instrument(server, PROXY) as device:
+        faulty.reply_fault = lambda message: [] if b"waits" in message[0] else [message]
+        with pytest.raises(DeviceError, match="no reply"):
+            device.command("open")
+
+
+def test_a_second_client_may_look_but_not_act(server: Served) -> None:
+    with instrument(server) as first:
+        first.command("open")
+        other = RemoteDevice(server.settings("instrument"), Context("laser", clock=FakeClock()))
+        with pytest.raises(DeviceError, match=r"^laser: in use by this computer \(.*process \d+\)"):
+            other.open()
+        with pytest.raises(DeviceError, match="not open"):
+            other.command("open")
+        assert other.describe()["remote"]["device"] == "instrument"
+        first.command("open")
+
+
+def test_a_device_is_made_safe_beside_a_call_that_hangs(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released, made_safe = threading.Event(), threading.Event()
+    monkeypatch.setattr(VirtualDevice, "command", lambda *_, **__: released.wait(20.0))
+    monkeypatch.setattr(VirtualDevice, "safe_state", lambda *_: made_safe.set())
+    with instrument(server) as device:
+        caller = threading.Thread(target=device.command, args=["open"], daemon=True)
+        caller.start()
+        until(lambda: "command" in [row["call"] for row in server.server._status()])
+        device.safe_state()
+        assert made_safe.is_set()
+        released.set()
+        caller.join(5.0)
+
+
+def test_errors_keep_their_class_and_values(server: Served) -> None:
+    with camera(server) as device, pytest.raises(LimitError) as caught:
+        device.arm(0, 0.01, "software")
+    assert (caught.value.value, caught.value.exit_code) == (0, 2)
+    assert f"tcp://127.0.0.1:{server.port}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"device": "laser_7"}, "no device 'laser_7'; expected one of"),
+        ({"device": "camera"}, "is of the kind camera, and the profile uses it as device"),
+    ],
+)
+def test_a_wrong_name_is_refused(server: Served, settings: dict[str, str], match: str) -> None:
+    with pytest.raises(DeviceError, match=match), instrument(server, **settings):
+        pass
+
+
+def test_another_version_is_named(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "PROTOCOL", 99)
+    with (
+        pytest.raises(DeviceError, match=r"speaks protocol 99, and labseq .* of the server speaks 1"),
+        instrument(server),
+    ):
+        pass
+
+
+def test_no_server_is_named(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "CONNECT_S", 0.2)
+    with pytest.raises(DeviceError, match="nothing answers there"):
+        RemoteCamera(server.settings("camera", port=1), Context("camera", clock=FakeClock())).open()
+
+
+def test_keys(tmp_path: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "CONNECT_S", 1.0)
+    with served(tmp_path, plain=False) as one:
+
+        def with_key(name: str | None = None) -> RemoteDevice:
+            settings = one.settings("instrument", server_key="here", key=name or "here")
+            return RemoteDevice(settings, Context("laser", clock=FakeClock()))
+
+        device = with_key()
+        device.open()
+        device.command("open")
+        wire.new_keys("stranger", keys)
+        with pytest.raises(DeviceError, match="does not know the key"):
+            with_key("stranger").open()
+        with pytest.raises(DeviceError, match="keys do not fit"):  # without keys
+            RemoteDevice(one.settings("instrument"), Context("laser", clock=FakeClock())).open()
+        secret = keys / "known" / "here.key"
+        withdrawn = secret.read_bytes()
+        secret.unlink()
+        until(lambda: any("withdrawn" in text and "made safe" in text for text in one.told))
+        with pytest.raises(DeviceError, match="withdrawn"):
+            device.command("open")
+        secret.write_bytes(withdrawn)
+        with suppress(DeviceError):
+            device.close()
+
+
+def test_a_server_without_keys_cannot_be_reached_by_others(tmp_path: Path, keys: Path) -> None:
+    path = tmp_path / "served.yaml"
+    path.write_text(PROFILE, encoding="utf-8")
+    everywhere = Serving("tcp://0.0.0.0:5760", plain=True)
+    with pytest.raises(ConfigError, match="needs keys"), serving(str(path), (), everywhere, print):
+        pass
+    settings = RemoteSettings(address="tcp://camera-pc:5760", device="camera")
+    with pytest.raises(ConfigError, match=r"camera-pc\.key.*cannot be read"):
+        RemoteCamera(settings, Context("camera", clock=FakeClock())).open()
+
+
+def test_no_message_ends_the_server(server: Served) -> None:
+    """A few hundred; `python -m tests.remote.fuzz` sends more."""
+    from tests.remote.fuzz import fuzz
+
+    with instrument(server) as device:
+        assert fuzz(server.port, 1 + len(server.server.devices), 300, seed=1) > 0
+        device.command("set", power=0.25)
+        assert device.read("power") == 0.25
+
+
+def test_a_message_beyond_the_limit_is_not_received(server: Served) -> None:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.linger = 0
+        socket.connect(f"tcp://127.0.0.1:{server.port}")
+        socket.send(bytes((1 << 26) + 1))
+        assert not socket.poll(200)
+    with instrument(server) as device:
+        device.command("open")
+
+
+def test_shapes_are_checked_before_arrays_are_made() -> None:
+    import msgpack
+
+    def message(index: int, dtype: object, shape: object) -> list[bytes]:
+        packb: Any = msgpack.packb
+        return [packb(msgpack.ExtType(1, packb([index, dtype, shape, {}]))), bytes(16)]
+
+    assert np.array_equal(wire.unpack(message(1, "<f8", [2])), np.zeros(2))
+    for wrong in (
+        (1, "<f8", [3]),
+        (1, "<f8", [-2]),
+        (1, "<f8", [1 << 40, 1 << 40]),
+        (1, "|O", [2]),
+        (1, "<f8", [2, 1, 1, 1, 1]),
+        (2, "<f8", [2]),
+        (0, "<f8", [2]),
+        (1, "<M8", [2]),
+    ):
+        with pytest.raises(wire.MessageError):
+            wire.unpack(message(*wrong))
