@@ -17,14 +17,9 @@ import pytest
 from labseq_aravis import load_library
 from labseq_soapy_sim import build_module
 from labseq_ttl_sim.simavr import runner
-from labseq_virtual.settings import SimulationSettings
-from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Run, Session
-from labseq.calibration.store import read_entry
 from labseq.cli import main
-from labseq.config.profile import load_profile
-from labseq.plugin import Context, DepthRamp, TweezerAmplitudes
 from labseq.recording.shot import Shot
 from tests.plugins.needs import need_library
 
@@ -120,53 +115,6 @@ def test_a_run_through_every_driver_is_the_one_through_virtual_devices(run: RunP
     bench, expected = run("bench", shots=1), run("bench_awg", *TRIGGERED, *UNEVEN)
     assert bench.simulated
     compare_flights(bench.shots[0], expected.shots[0])  # depths follow what the radio sent
-
-
-@pytest.mark.usefixtures("installed")
-def test_static_tweezers_of_bench_are_equalised_by_frames_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"^0$"):
-        main(["calibrate", "tweezers", "--profile", "bench", "--seed", "1", "--json"])
-    (path,) = Path("hardware_profiles/calibrations/bench").glob("tweezers-*.json")
-    values = read_entry(path).values
-    document, spec = load_profile("bench", beside=tmp_path)
-    physics = document.validate(SimulationSettings, ("simulation",), drop={"use"})
-    simulation = VirtualSimulation(physics, Context("simulation", spec.grid_model()))
-    simulation.open()
-    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
-    assert np.std(simulation.spot_powers()) > 0.14
-    amplitudes = TweezerAmplitudes(values["row_amplitudes"], values["column_amplitudes"])
-    simulation.play("static_tweezers", amplitudes, 0.0)
-    after = simulation.spot_powers()
-    print(f"r.m.s. {after.std() / after.mean():.2%}, at most {np.abs(after / after.mean() - 1).max():.2%}")
-    assert after.std() < 0.005 * after.mean()
-    assert np.abs(after / after.mean() - 1).max() < 0.015
-
-
-def spread_of_depths(done: Run) -> float:
-    """Of the greatest depth that each moved atom has seen."""
-    flights = done.shots[0].atom_events["flights"]
-    n_sites = abs(flights["to_row"] - flights["from_row"]) + abs(flights["to_col"] - flights["from_col"])
-    depth = flights["depth_K"][(flights["fate"] == b"kept") & (n_sites > 0)]
-    assert len(depth) > 50
-    return float(np.std(depth) / np.mean(depth))
-
-
-@pytest.mark.usefixtures("installed")
-def test_mobile_tweezers_of_bench_are_equalised_by_frames_alone(
-    run: RunProfile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = spread_of_depths(run("bench", shots=1))
-    with pytest.raises(SystemExit, match=r"^0$"):
-        main(["calibrate", "amplitudes", "--profile", "bench", "--seed", "1", "--json"])
-    found = json.loads(capfd.readouterr().out)["id"]
-    after = spread_of_depths(run("bench", f"profile.calibrations.use.amplitudes={found}", shots=1))
-    print(f"depths in moves differ by {before:.1%} before and {after:.2%} after")
-    assert before > 0.1
-    assert after < 0.01
 
 
 @pytest.mark.usefixtures("installed")

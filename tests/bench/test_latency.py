@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,8 +21,8 @@ SMALL = LatencyRequest(Path(__file__).parents[2] / "sequences" / "compact_225.ya
 SEQUENCE = str(SMALL.sequence)
 
 
-def measure(*overrides: str, profile: str | None = None) -> LatencyReport:
-    return measure_latency(replace(SMALL, overrides=overrides, profile=profile))
+def measure(*overrides: str, **options: Any) -> LatencyReport:
+    return measure_latency(replace(SMALL, overrides=overrides, **options))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,9 @@ def test_seed_and_settings_change_the_plans(report: LatencyReport) -> None:
 @pytest.mark.parametrize(("mode", "modelled"), [("replay", (2e-3, 10e-3)), ("stream", (0.2e-3, 0.25e-3))])
 def test_a_simulated_card_takes_modelled_time_too(mode: str, modelled: tuple[float, float]) -> None:
     settings = ("sample_rate=624 MHz", f"mode={mode}")
-    report = measure(*(f"profile.mobile_tweezers.{one}" for one in settings), profile="bench_awg")
+    report = measure(
+        *(f"profile.mobile_tweezers.{one}" for one in settings), profile="bench_awg", n_loadings=1
+    )
     assert (report.device, report.mode) == ("M4i.6631-x8", mode)
     low_s, high_s = modelled  # replay: the transfer; stream: the silence ahead of the outputs
     assert low_s < report.light.modelled_s < high_s

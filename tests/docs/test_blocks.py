@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Final
 
 import pytest
 import typer
@@ -39,9 +40,14 @@ def composed(draw: Callable[[], Figure], *_: object, **__: object) -> bytes:
 get_command = cache(typer.main.get_command)
 
 
+BY_OTHERS: Final = ("docs/tutorials/planner.md", "docs/tutorials/camera-driver.md")
+"""Pages whose every block :mod:`tests.docs.test_tutorials` runs."""
+
+
 def with_blocks() -> list[str]:
     """Pages with something to run."""
     names = [page.relative_to(ROOT).as_posix() for page in PAGES if page.exists()]
+    names = [name for name in names if name not in BY_OTHERS]
     return [name for name in names if any(b.is_run and b.language != "yaml" for b in blocks_of(ROOT / name))]
 
 

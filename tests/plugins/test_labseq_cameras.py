@@ -249,7 +249,9 @@ def test_every_orientation_shows_the_same_atoms(tmp_path: Path, name: str) -> No
     plain = site_pixels(SiteGrid(6, 9, 4.49e-6, "triangular"), 0.35e-6, ((height - 1) / 2, (width - 1) / 2))
     region = {"y": (512 - height) // 2, "x": (512 - width) // 2, "height": height, "width": width}
     seen: list[Any] = []
-    for transpose, flip in product((False, True), ("none", "rows", "columns", "both")):
+    every = [*product((False, True), ("none", "rows", "columns", "both"))]
+    differing = [(False, "none"), (False, "columns"), (True, "rows")]  # of each driver, how it passes them on
+    for transpose, flip in every if name == "virtual" else differing:
         sites, shape = (plain[..., ::-1], (width, height)) if transpose else (plain, (height, width))
         sites = np.array(sites)
         for axis, which in enumerate(("rows", "columns")):

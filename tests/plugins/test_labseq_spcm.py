@@ -422,13 +422,14 @@ class TestTones:
                 lab.tweezers.play()
                 lab.tweezers.append(parts[1])
                 lab.tweezers.wait(1.0)
+            played = lab.card.played(1)
             for start_s in begun:
                 joint_s = start_s + parts[0].total_duration_s + 166.4e-9  # the cores are silenced in between
                 for part, at_s in zip(parts, (start_s, joint_s), strict=True):
                     for u in np.linspace(0.013, 0.987, 50):
                         now = part.tones_at(u * part.total_duration_s).column
                         wanted = np.sort(now.frequency_hz[now.amplitude > 0.0])
-                        tones = _tones_at(lab.card.played(1), at_s + u * part.total_duration_s)
+                        tones = _tones_at(played, at_s + u * part.total_duration_s)
                         loud = np.sort([tone.frequency_hz for tone in tones if tone.amplitude > 0.0])
                         assert loud == pytest.approx(wanted, abs=2e4)
 

@@ -32,8 +32,9 @@ def safe_calls(calls):
     return [call for call in calls if call.endswith("safe_state")]
 
 
-@pytest.mark.parametrize("step", LONG_STEPS)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("step", "number"), [*((step, signal.SIGINT) for step in LONG_STEPS), ("image", signal.SIGTERM)]
+)
 def test_a_signal_in_any_step_ends_safely(bench, step, number):
     steps, call, slow = LONG_STEPS[step]
     bench.write_sequence(steps)
