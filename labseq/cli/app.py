@@ -1,7 +1,7 @@
 """The command line: all commands and their options; the code of a command is imported when it runs."""
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -16,12 +16,14 @@ from labseq.analysis.commands import (
 )
 from labseq.bench.commands import bench
 from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibration
+from labseq.campaign.commands import campaign
 from labseq.cli.plan_commands import PLAN_EXAMPLES, WAVEFORM_EXAMPLES, plan, waveform
 from labseq.console.options import (
     DryRun,
     FitModel,
     FitSettings,
     Json,
+    Keys,
     Output,
     Overrides,
     Plugins,
@@ -30,6 +32,7 @@ from labseq.console.options import (
     Realtime,
     RunFolder,
     ScanQuantities,
+    Scheduler,
     Seed,
     SequenceFile,
     Shots,
@@ -112,6 +115,7 @@ def common(
 app.add_typer(bench)
 app.add_typer(calibration)
 app.add_typer(keys)
+app.add_typer(campaign)
 app.add_typer(queue)
 app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, tones, timing and more.")(calibrate)
 
@@ -153,6 +157,8 @@ def run(
     as_json: Json = False,
     realtime: Realtime = False,
     workers: Workers = 1,
+    scheduler: Scheduler = None,
+    keys: Keys = None,
     web: Annotated[
         bool, typer.Option("--web", help="Also show the run in a browser, as `labseq web` does.")
     ] = False,
@@ -163,7 +169,16 @@ def run(
     from labseq.session.options import Options
 
     options = Options(
-        profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime, workers
+        profile,
+        shots,
+        seed,
+        tuple(overrides or ()),
+        output,
+        dry_run_mode(dry_run),
+        realtime,
+        workers,
+        scheduler,
+        keys,
     )
     run_sequence(sequence, options, as_json=as_json, web=web)
 
@@ -181,12 +196,15 @@ def resume(
     as_json: Json = False,
     realtime: Realtime = False,
     workers: Workers = 1,
+    scheduler: Scheduler = None,
+    keys: Keys = None,
     _plugins: Plugins = None,
 ) -> None:
     """Take the missing shots of a run that was stopped, failed or crashed."""
     from labseq.cli.run import resume_run
 
-    resume_run(run, accept_changes=accept_changes, realtime=realtime, workers=workers, as_json=as_json)
+    who: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "keys": keys}
+    resume_run(run, {"accept_changes": accept_changes, "realtime": realtime, **who}, as_json=as_json)
 
 
 @app.command(short_help="End a run in progress after its current shot.")

@@ -6,7 +6,7 @@ import importlib.util
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -44,12 +44,11 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool =
     run_session(start, as_json=as_json)
 
 
-def resume_run(path: Path, *, accept_changes: bool, realtime: bool, workers: int, as_json: bool) -> None:
-    """Resume a run that ended early, and print the result."""
+def resume_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None:
+    """Resume a run that ended early, and print the result; the options are those of ``Session.resume``."""
 
     def resume(observer: RunObserver | None) -> Session:
-        changed = {"accept_changes": accept_changes, "realtime": realtime}
-        return Session.resume(existing_run(path), **changed, workers=workers, observer=observer)
+        return Session.resume(existing_run(path), **options, observer=observer)
 
     run_session(resume, as_json=as_json)
 

@@ -176,6 +176,23 @@ Workers = Annotated[
         help="Number of processes that take the shots of a simulated run; the data do not depend on it.",
     ),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Scheduler of a dask cluster that takes the shots of a simulated run, tls://HOST:PORT "
+        "(extra labseq[campaign]).",
+    ),
+]
+Keys = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        envvar="LABSEQ_CAMPAIGN_KEYS",
+        help="Certificates of the cluster, as labseq campaign keys makes them.",
+        show_default=False,
+    ),
+]
 RunFolder = Annotated[
     Path | None,
     run_argument("The run's folder, or its name or number as in labseq runs; default: the newest run."),

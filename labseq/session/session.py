@@ -95,6 +95,8 @@ class Session:
         dry_run: DryRun = "off",
         realtime: bool = False,
         workers: int = 1,
+        scheduler: str | None = None,
+        keys: Path | None = None,
         observer: RunObserver | None = None,
     ) -> Session:
         """Read and check sequence and profile; nothing is opened yet.
@@ -109,6 +111,8 @@ class Session:
             dry_run: "off", "full" or "fast".
             realtime: Let virtual time pass at the speed of real time.
             workers: Number of processes that take the shots of a simulated run; the data do not depend on it.
+            scheduler: Address of a dask cluster that takes them instead.
+            keys: Folder of its certificates.
             observer: Receives every event.
 
         Raises:
@@ -117,7 +121,9 @@ class Session:
             PluginLoadError: A plugin that is named failed to load.
         """
         folder = None if output is None else path_of(output, "output")
-        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime, workers)
+        options = Options(
+            profile, shots, seed, overrides, folder, dry_run, realtime, workers, scheduler, keys
+        )
         return cls(assemble(path_of(sequence, "sequence"), options), options, observer)
 
     @classmethod
@@ -128,6 +134,8 @@ class Session:
         accept_changes: bool = False,
         realtime: bool = False,
         workers: int = 1,
+        scheduler: str | None = None,
+        keys: Path | None = None,
         observer: RunObserver | None = None,
     ) -> Session:
         """Read back a run that ended before its last shot, in order to take the missing shots.
@@ -141,6 +149,8 @@ class Session:
                 records the changes.
             realtime: Let virtual time pass at the speed of real time.
             workers: Number of processes, as for :meth:`open`.
+            scheduler: See there.
+            keys: See there.
             observer: Receives every event.
 
         Raises:
@@ -151,7 +161,9 @@ class Session:
 
         path = path_of(run, "run")
         assembly, options, earlier = reopened(path, accept_changes=accept_changes, realtime=realtime)
-        return cls(assembly, replace(options, workers=workers), observer, earlier)
+        return cls(
+            assembly, replace(options, workers=workers, scheduler=scheduler, keys=keys), observer, earlier
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -292,7 +304,7 @@ class Session:
         checks = Checks(settings, before, self._warn, values_of)
         self.scan_run.follow(writer, self._observers)
         hooks = ShotHooks(writer, checks, self._observers.event)
-        if self.options.workers == 1:
+        if not self.options.has_workers:
             self.scan_run.run(OwnShots(sequencer, first, changes, record.seed), hooks)
             return
         shots = WorkersShots(self.scan_run, self.options, writer, self._observers, self.stop_flag)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.cluster import ClusterWorkers, check_address
 from labseq.config.document import StoredText
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.guard import StopFlag
@@ -62,13 +63,16 @@ def refuse_workers(assembly: Assembly, options: Options, lab: Lab) -> None:
     """
     if options.workers < 1:
         raise ConfigError(Problem(f"workers is {options.workers}", expected="1 or more"))
-    if options.workers == 1:
+    if not options.has_workers:
         return
+    if options.scheduler is not None:
+        check_address(options.scheduler)
+        if options.workers != 1:
+            what = "the shots go to workers here or to a cluster"
+            raise ConfigError(Problem(what, expected="either --workers or --scheduler"))
     problem = _problem_of(assembly, options, lab)
     if problem is not None:
-        raise ConfigError(
-            replace(problem, what=f"{options.workers} workers cannot take the shots: {problem.what}")
-        )
+        raise ConfigError(replace(problem, what=f"workers cannot take the shots: {problem.what}"))
 
 
 def _problem_of(assembly: Assembly, options: Options, lab: Lab) -> Problem | None:
@@ -78,7 +82,7 @@ def _problem_of(assembly: Assembly, options: Options, lab: Lab) -> Problem | Non
         chosen = assembly.hardware.chosen.items()
         real = [role for role, one in chosen if one.entry.kind in HARDWARE_KINDS and not one.virtual_time]
         what = f"the profile {name} has real hardware ({', '.join(real)})"
-        return Problem(what, expected="simulated hardware", hint="add --dry-run, or leave out --workers")
+        return Problem(what, expected="simulated hardware", hint="add --dry-run, or take them in one process")
     if options.realtime:
         return Problem("simulated time cannot pass at the speed of real time", hint="leave out --realtime")
     hardware = dict(lab.hardware())
@@ -267,8 +271,14 @@ class WorkersShots:
         self._n_handed_out = 0  # of the shots of the run, those skipped included
         self._out: set[int] = set()
         self._done: dict[int, bytes] = {}
-        recipe = Recipe(writer.run, run_id_of(writer.run_dir), options, writer.run_dir, observers.need_frames)
-        self._workers: Workers = ProcessWorkers(options.workers, ShotWorker, recipe, "shot")
+        needs, folder = observers.need_frames, writer.run_dir if options.scheduler is None else None
+        for_worker = replace(options, output=None, keys=None)
+        recipe = Recipe(writer.run, run_id_of(writer.run_dir), for_worker, folder, needs)
+        self._workers: Workers
+        if options.scheduler is None:
+            self._workers = ProcessWorkers(options.workers, ShotWorker, recipe, "shot")
+        else:
+            self._workers = ClusterWorkers(options.scheduler, options.keys, ShotWorker, recipe, "shot")
 
     def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
         """Wait for a shot, and record it; see :class:`labseq.session.scan_run.ShotTaker`."""

@@ -165,7 +165,9 @@ def test_for_people(perform: Any) -> None:
 
 
 def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
-    options = Options("lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", realtime=True, workers=2)
+    options = Options(
+        "lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", realtime=True, workers=2, scheduler="tls://a:1"
+    )
     session, *_ = perform(options=options)
     given = {name: value for name, value in session.given.items() if name != "observer"}
     assert given == {
@@ -177,6 +179,8 @@ def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
         "dry_run": "fast",
         "realtime": True,
         "workers": 2,
+        "scheduler": "tls://a:1",
+        "keys": None,
     }
 
 

@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.campaign.keys import make_keys
+from labseq.cluster import ClusterWorkers
 from labseq.errors import ConfigError
 from labseq.session.options import Options
 from labseq.session.workers import Recipe, ShotWorker
@@ -73,7 +75,11 @@ def test_an_adaptive_scan_chooses_the_same_points(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("profile", "options", "message"),
     [
-        (f"{PROFILE}devices: {{laser: {{use: mine}}}}\n", {}, r"has real hardware \(laser\).*add --dry-run"),
+        (
+            f"{PROFILE}devices: {{laser: {{use: mine}}}}\n",
+            {},
+            r"has real hardware \(laser\).*add --dry-run, or take them in one process",
+        ),
         (PROFILE, {"realtime": True}, "at the speed of real time; leave out --realtime"),
         (PROFILE, {"workers": 0}, "workers is 0; expected 1 or more"),
     ],
@@ -104,3 +110,43 @@ def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
     other = replace(record, provenance={**record.provenance, "labseq": "0.0"}, plugins=plugins)
     with pytest.raises(ConfigError, match=r"a worker on .* would take other shots: labseq was 0.0"):
         ShotWorker(Recipe(other, "x", Options(shots=1), None, keeps_frames=False))
+
+
+def test_a_cluster_takes_the_same_shots(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    sequence, keys = write(tmp_path, "planner"), tmp_path / "keys"
+    ca, scheduler, worker, _ = map(str, make_keys(keys))
+    files = {"tls_ca_file": ca, "tls_scheduler_cert": scheduler, "tls_scheduler_key": scheduler}
+    files |= {"tls_worker_cert": worker, "tls_worker_key": worker}
+    files |= {"tls_client_cert": worker, "tls_client_key": worker}
+    about: dict[str, Any] = {"dashboard_address": ":0", "protocol": "tls", "processes": False}
+    about["security"] = distributed.Security(require_encryption=True, **files)
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, **about) as cluster:
+        options: dict[str, Any] = {"scheduler": cluster.scheduler_address, "keys": keys}
+        options["output"] = tmp_path / "data"
+        with labseq.Session.open(sequence, seed=5, **options) as session:
+            run = session.run()
+    assert index(run) == index(alone(sequence))
+
+
+@pytest.mark.parametrize(
+    ("address", "keys", "message"),
+    [
+        ("tcp://10.0.0.1:8786", None, "anybody on the network could have the workers run code; expected tls"),
+        (
+            "tls://lab:8786",
+            None,
+            "needs certificates; 'labseq campaign keys FOLDER' makes them",
+        ),
+        ("tls://lab:8786", Path("nowhere"), "there is no ca.pem in nowhere"),
+        ("lab:8786", None, "this is no address of a scheduler; expected tls://HOST:PORT"),
+        ("tcp://127.0.0.1:9", None, "no scheduler answers"),
+    ],
+)
+def test_a_cluster_that_cannot_be_used(
+    address: str, keys: Path | None, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("labseq.cluster._ANSWER_S", 0.5)
+    with pytest.raises(ConfigError, match=message):
+        ClusterWorkers(address, keys, ShotWorker, None, "shot")

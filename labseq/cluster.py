@@ -1,0 +1,236 @@
+"""Workers of a dask cluster; needs the extra `labseq[campaign]`.
+
+Each worker process prepares itself when it gets its first task, and again after it was restarted. Between
+machines everything is encrypted, and only machines with a certificate of the cluster take part: dask workers
+carry out whatever code they are sent.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import pickle
+import queue
+import re
+import threading
+import time
+import uuid
+import warnings
+from pathlib import Path
+from typing import Any, Final, cast
+
+from labseq import __version__
+from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.messages import clean, error_text, format_error, install_hint
+from labseq.workers import Do, Make
+
+CA_FILE: Final = "ca.pem"
+CLIENT_FILE: Final = "client.pem"
+
+_ADDRESS: Final = re.compile(r"(tls|tcp)://(\[[0-9a-fA-F:.]+\]|[^\s/:\[\]]+):(\d{1,5})")
+_ANSWER_S: Final = 10.0
+"""Time for the scheduler to answer, in seconds."""
+_JOIN_S: Final = 30.0
+"""Time for a worker to join a cluster without one, in seconds."""
+_COUNT_S: Final = 2.0
+"""Interval at which the workers are counted, in seconds."""
+_MAX_PREPARED: Final = 4
+"""Runs that a worker is prepared for at once."""
+
+
+class ClusterWorkers:
+    """The workers of a dask cluster; see :class:`labseq.workers.Workers`.
+
+    Args:
+        address: Address of its scheduler: "tls://lab-pc:8786", or "tcp://127.0.0.1:8786" on this computer.
+        keys: Folder of the certificates, as `labseq campaign keys` writes it; only for tls.
+        make: Prepares each worker.
+        recipe: The argument of ``make``, pickled.
+        what: What a task is, in messages: "shot".
+
+    Raises:
+        ConfigError: The address is not allowed, a certificate is missing, the scheduler does not answer, no
+            worker joins, or the extra is not installed.
+    """
+
+    def __init__(self, address: str, keys: Path | None, make: Make, recipe: Any, what: str) -> None:
+        check_address(address)
+        self._client = connect(address, keys)
+        self._address, self._what = address, what
+        self._run = uuid.uuid4().hex
+        self._pack = pickle.dumps((make, recipe))
+        self._arguments: dict[int, Any] = {}
+        self._futures: dict[int, Any] = {}
+        self._done = queue.SimpleQueue[tuple[int, Any]]()
+        self._n, self._counted_s, self._seen_s = 0, -_COUNT_S, time.monotonic()
+        try:
+            self._client.wait_for_workers(1, timeout=_JOIN_S)
+        except Exception as error:
+            self.close()
+            raise _problem(address, f"no worker has joined the cluster within {_JOIN_S:g} s") from error
+
+    @property
+    def n_workers(self) -> int:
+        """Number of workers now; at least 1, for others may join.
+
+        Raises:
+            LabseqError: The scheduler does not answer, or there has been no worker for some time.
+        """
+        now_s = time.monotonic()
+        if now_s - self._counted_s >= _COUNT_S:
+            self._counted_s = now_s
+            try:
+                self._n = len(self._client.nthreads())
+            except Exception as error:
+                raise LabseqError(f"the scheduler {self._address} is gone: {error_text(error)}") from error
+            if self._n:
+                self._seen_s = now_s
+            elif now_s - self._seen_s > _JOIN_S:
+                raise LabseqError(f"the cluster of {self._address} has had no worker for {_JOIN_S:g} s")
+        return max(1, self._n)
+
+    def submit(self, task: int, argument: Any) -> None:
+        """Hand out a task; earlier ones come first."""
+        self._arguments[task] = argument
+        self._send(task, None)
+
+    def _send(self, task: int, pack: bytes | None) -> None:
+        arguments = (self._run, __version__, self._arguments[task], pack)
+        future = self._client.submit(_carry_out, *arguments, pure=False, priority=-task)
+        self._futures[task] = future
+
+        def note(done: Any) -> None:
+            self._done.put((task, done))
+
+        future.add_done_callback(note)
+
+    def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+        """See :class:`labseq.workers.Workers`."""
+        try:
+            task, future = self._done.get(timeout=timeout_s)
+        except queue.Empty:
+            _ = self.n_workers  # raises if nothing can come any more
+            return []
+        if self._futures.get(task) is not future:
+            return []
+        if future.status == "error":
+            raise self._error(task, future.exception())
+        try:
+            answer = future.result(timeout=_ANSWER_S)
+        except Exception:  # noqa: BLE001 - its worker, or the scheduler, is gone: the task is sent again
+            self._send(task, self._pack)
+            return []
+        if answer is None:
+            self._send(task, self._pack)
+            return []
+        del self._futures[task], self._arguments[task]
+        return [(task, answer)]
+
+    def _error(self, task: int, error: BaseException) -> LabseqError:
+        if isinstance(error, LabseqError):
+            return error
+        if type(error).__name__ == "KilledWorker":
+            what = f"{self._what} {task} has ended several workers of the cluster"
+            return LabseqError(f"{what}; perhaps the memory was used up: see their logs")
+        return LabseqError(f"a worker of the cluster failed, perhaps without labseq: {format_error(error)}")
+
+    def close(self) -> None:
+        """Give up all tasks, and leave the cluster."""
+        for act in (
+            lambda: self._client.cancel(list(self._futures.values()), force=True),
+            self._client.close,
+        ):
+            try:
+                act()
+            except Exception as error:  # noqa: BLE001 - the scheduler may be gone
+                logging.getLogger(__name__).debug("%s", error)
+
+
+def check_address(address: str) -> None:
+    """Refuse addresses that are none, and those of other computers without encryption.
+
+    Raises:
+        ConfigError: It is one of them.
+    """
+    found = _ADDRESS.fullmatch(address)
+    if found is None:
+        raise _problem(address, "this is no address of a scheduler", "tls://HOST:PORT")
+    if found[1] == "tcp" and not _is_here(found[2].strip("[]")):
+        what = "without encryption, anybody on the network could have the workers run code"
+        raise _problem(address, what, "tls://HOST:PORT", "'labseq campaign keys' makes the certificates")
+
+
+def _is_here(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _problem(address: str, what: str, expected: str = "", hint: str = "") -> ConfigError:
+    return ConfigError(Problem(what, f"--scheduler {clean(address)}", expected=expected, hint=hint))
+
+
+def connect(address: str, keys: Path | None) -> Any:
+    """A client of the scheduler.
+
+    Raises:
+        ConfigError: The scheduler does not answer, a certificate is missing, or the extra is not installed.
+    """
+    try:
+        from distributed import Client, Security
+    except ModuleNotFoundError as error:
+        what = f"the Python package '{error.name}' is not installed"
+        raise _problem(address, what, hint=install_hint("campaign")) from error
+    security = None
+    if address.startswith("tls:"):
+        folder = _folder_of(address, keys)
+        client, ca = str(folder / CLIENT_FILE), str(folder / CA_FILE)
+        security = Security(
+            tls_ca_file=ca, tls_client_cert=client, tls_client_key=client, require_encryption=True
+        )
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported once, by labseq
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # other versions of packages that labseq does not use there
+            return Client(address, security=security, timeout=_ANSWER_S, set_as_default=False)
+    except Exception as error:
+        hint = "is it running, with the certificates of the same folder?" if security else "is it running?"
+        raise _problem(address, f"no scheduler answers: {error_text(error)}", hint=hint) from error
+
+
+def _folder_of(address: str, keys: Path | None) -> Path:
+    """The folder of the certificates of this computer."""
+    hint = "'labseq campaign keys FOLDER' makes them; name their folder with --keys or LABSEQ_CAMPAIGN_KEYS"
+    if keys is None:
+        raise _problem(address, "a tls address needs certificates", hint=hint)
+    for name in (CA_FILE, CLIENT_FILE):
+        if not (keys / name).is_file():
+            raise _problem(address, f"there is no {name} in {clean(str(keys))}", hint=hint)
+    return keys
+
+
+_lock: Final = threading.Lock()
+_prepared: Final[dict[str, Do]] = {}
+
+
+def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any:
+    """Carry out a task on a worker; one at a time, whatever the worker's number of threads.
+
+    Returns:
+        The result; None if the worker is not prepared and was not given the recipe.
+
+    Raises:
+        ConfigError: It has another version of labseq.
+    """
+    if version != __version__:
+        raise ConfigError(f"a worker has labseq {__version__}; expected {version}, as on this computer")
+    with _lock:
+        if run not in _prepared:
+            if pack is None:
+                return None
+            make, recipe = cast("tuple[Make, Any]", pickle.loads(pack))  # noqa: S301 - from the client
+            while len(_prepared) >= _MAX_PREPARED:
+                del _prepared[next(iter(_prepared))]
+            _prepared[run] = make(recipe)
+        return _prepared[run](argument)
