@@ -7,15 +7,11 @@ with :func:`warm` and :func:`warm_rendering`.
 import importlib
 
 from labseq.motion.axes import (
-    AffineCalibration,
-    Calibration,
     CombFit,
     Drive,
-    TableCalibration,
-    calibrated,
+    correct_overlay,
     drive,
     fit_comb,
-    standing_on_sites,
 )
 from labseq.motion.check import RULES, check_plan
 from labseq.motion.hold import all_on_program, cross_offsets_m, hold_program, hold_time_s
@@ -28,14 +24,12 @@ from labseq.motion.overlay import (
     group_counts,
     overlay_offset,
 )
-from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_chunks
+from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render
 from labseq.motion.survival import Survival, choose_plan, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
 
 __all__ = [
     "RULES",
-    "AffineCalibration",
-    "Calibration",
     "CombFit",
     "Drive",
     "FastOffset",
@@ -44,12 +38,11 @@ __all__ = [
     "Renderer",
     "Survival",
     "SurvivalShape",
-    "TableCalibration",
     "all_on_program",
-    "calibrated",
     "check_plan",
     "choose_plan",
     "comb_sample_rate",
+    "correct_overlay",
     "cross_offsets_m",
     "drive",
     "fast_offset",
@@ -62,8 +55,6 @@ __all__ = [
     "overlay_offset",
     "predict_survival",
     "render",
-    "render_chunks",
-    "standing_on_sites",
     "tone_program",
     "warm",
     "warm_rendering",

@@ -1,4 +1,4 @@
-"""From sites to tone frequencies: the nominal comb or calibrated tones.
+"""Tone frequencies of the sites: combs, offsets, amplitudes and limits.
 
 Positions are along the axis in the atom plane, from the grid's centre: along a1 for
 the columns' tones, along a2 for the rows'.
@@ -8,93 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.errors import LimitError
-from labseq.model import MotionSpec, RfSpec, SiteGrid, read_only
+from labseq.model import MotionSpec, RfSpec, SiteGrid
 
 Floats = NDArray[np.float64]
 
 ON_THE_COMB_HZ = 1e-6
 """Distance from the comb below which frequencies stay as they are, in Hz: rounding."""
-
-
-class Calibration(Protocol):
-    """Position <-> frequency along one axis; both ways, and beyond the grid too."""
-
-    def frequency_hz(self, position_m: ArrayLike) -> Floats:
-        """Frequencies of the tones for tweezers at the given positions."""
-        ...
-
-    def position_m(self, frequency_hz: ArrayLike) -> Floats:
-        """Positions of the tweezers of tones with the given frequencies."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class AffineCalibration:
-    """Frequency that changes evenly with the position.
-
-    Attributes:
-        centre_hz: Frequency of a tweezer at the grid's centre.
-        slope_hz_per_m: Change of the frequency with the position, not 0.
-
-    Example:
-        >>> axis = AffineCalibration(centre_hz=100e6, slope_hz_per_m=1.6e6 / 4.5e-6)
-        >>> axis.frequency_hz([0.0, 9e-6]).tolist()
-        [100000000.0, 103200000.0]
-    """
-
-    centre_hz: float
-    slope_hz_per_m: float
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.centre_hz) and np.isfinite(self.slope_hz_per_m) and self.slope_hz_per_m):
-            raise ValueError("a calibration has a finite centre and a finite slope other than 0")
-
-    def frequency_hz(self, position_m: ArrayLike) -> Floats:
-        """Frequencies of the tones for tweezers at the given positions."""
-        return self.centre_hz + self.slope_hz_per_m * np.asarray(position_m, np.float64)
-
-    def position_m(self, frequency_hz: ArrayLike) -> Floats:
-        """Positions of the tweezers of tones with the given frequencies."""
-        return (np.asarray(frequency_hz, np.float64) - self.centre_hz) / self.slope_hz_per_m
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TableCalibration:
-    """A frequency measured at each site; linear between sites and, by the outermost step, beyond.
-
-    Attributes:
-        site_m: float64 (n_sites,), positions of at least two sites, rising.
-        site_hz: float64 (n_sites,), their frequencies, all rising or all falling.
-    """
-
-    site_m: Floats
-    site_hz: Floats
-
-    def __post_init__(self) -> None:
-        site_m = read_only(self.site_m, np.float64, (-1,), "site_m")
-        site_hz = read_only(self.site_hz, np.float64, (len(site_m),), "site_hz")
-        steps = np.diff(site_hz)
-        if len(site_m) < 2 or not np.all(np.diff(site_m) > 0):
-            raise ValueError("a table needs at least two sites, with rising positions")
-        if not (np.all(steps > 0) or np.all(steps < 0)):
-            raise ValueError("the frequencies of a table all rise or all fall from site to site")
-        object.__setattr__(self, "site_m", site_m)
-        object.__setattr__(self, "site_hz", site_hz)
-
-    def frequency_hz(self, position_m: ArrayLike) -> Floats:
-        """Frequencies of the tones for tweezers at the given positions."""
-        return _along(np.asarray(position_m, np.float64), self.site_m, self.site_hz)
-
-    def position_m(self, frequency_hz: ArrayLike) -> Floats:
-        """Positions of the tweezers of tones with the given frequencies."""
-        rising = 1 if self.site_hz[-1] > self.site_hz[0] else -1
-        return _along(np.asarray(frequency_hz, np.float64), self.site_hz[::rising], self.site_m[::rising])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,25 +65,9 @@ def fit_comb(site_hz: Floats, spacing_m: float) -> CombFit:
     return CombFit(comb_hz, off_hz / step_hz * spacing_m)
 
 
-def calibrated(grid: SiteGrid, row: Calibration, column: Calibration) -> SiteGrid:
-    """The same grid, with the tones that calibrations give for its rows and columns.
+def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
+    """The same grid, with tones shifted so that the mobile tweezers are on the sites.
 
-    Raises:
-        LimitError: A tone is not above 0 Hz.
-    """
-    row_hz = row.frequency_hz(axis_positions_m(grid.n_rows, grid.spacing_m))
-    column_hz = column.frequency_hz(axis_positions_m(grid.n_cols, grid.spacing_m))
-    for name, hz in (("row", row_hz), ("column", column_hz)):
-        if not np.all(hz > 0):
-            raise LimitError(f"the lowest {name} frequency", f"{hz.min()} Hz", "above 0 Hz")
-    return replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
-
-
-def standing_on_sites(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
-    """The same grid, with the tones that bring displaced mobile tweezers back onto the sites.
-
-    A tweezer that its tone should put at a position stands ``offset_m`` beside it; so
-    the tone of the position that lies ``offset_m`` before the site puts it onto the site.
     An axis of one site takes the mean step of the other axis.
 
     Args:
@@ -171,19 +80,19 @@ def standing_on_sites(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
 
     Example:
         >>> grid = SiteGrid(3, 3, spacing_m=4e-6)
-        >>> (standing_on_sites(grid, [1e-6, 0.0]).column_frequency_hz - grid.column_frequency_hz).tolist()
+        >>> (correct_overlay(grid, [1e-6, 0.0]).column_frequency_hz - grid.column_frequency_hz).tolist()
         [-400000.0, -400000.0, -400000.0]
     """
     along_row_m, along_column_m = np.asarray(offset_m, np.float64)
     row_hz, column_hz = grid.row_frequency_hz, grid.column_frequency_hz
     return replace(
         grid,
-        row_frequency_hz=_moved_back("row", row_hz, column_hz, grid.spacing_m, along_column_m),
-        column_frequency_hz=_moved_back("column", column_hz, row_hz, grid.spacing_m, along_row_m),
+        row_frequency_hz=_shifted("row", row_hz, column_hz, grid.spacing_m, along_column_m),
+        column_frequency_hz=_shifted("column", column_hz, row_hz, grid.spacing_m, along_row_m),
     )
 
 
-def _moved_back(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
+def _shifted(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
     if offset_m == 0:
         return site_hz
     if len(site_hz) < 2 and len(other_hz) < 2:
@@ -192,7 +101,7 @@ def _moved_back(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, 
     if len(site_hz) < 2:
         moved_hz = site_hz - offset_m * np.diff(other_hz).mean() / spacing_m
     else:
-        moved_hz = TableCalibration(site_m, site_hz).frequency_hz(site_m - offset_m)
+        moved_hz = _along(site_m - offset_m, site_m, site_hz)
     if not np.all(moved_hz > 0):
         raise LimitError(f"the lowest {name} frequency", f"{moved_hz.min()} Hz", "above 0 Hz")
     return moved_hz

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import weakref
 from collections import deque
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
@@ -322,39 +321,6 @@ def _new_samples(size: int) -> NDArray[np.int16]:
     assert isinstance(all_views, memoryview)  # it lives as long as any part of these samples
     weakref.finalize(all_views, _FREE_SAMPLES.append, block).atexit = False
     return samples
-
-
-def render_chunks(
-    program: ToneProgram,
-    sample_rate_hz: float = 625e6,
-    chunk_samples: int = 1 << 20,
-    buffers: tuple[NDArray[np.int16], ...] = (),
-) -> Iterator[NDArray[np.int16]]:
-    """Render a tone program chunk by chunk, in the calling thread.
-
-    Chunks of a streaming driver are rendered in less time than it takes to wake another thread.
-
-    Args:
-        program: The tone program.
-        sample_rate_hz: Sample rate.
-        chunk_samples: Samples of a chunk, per channel; the last chunk ends in silence.
-        buffers: int16 (2, chunk_samples) each, C-contiguous, used in turn; two of its own by default.
-
-    Yields:
-        int16 (2, chunk_samples), one of the buffers.
-
-    Raises:
-        LimitError: The program is not playable, or chunks have no samples.
-    """
-    if chunk_samples < 1:
-        raise LimitError("the number of samples in a chunk", chunk_samples, "at least 1")
-    renderer = Renderer(program, sample_rate_hz)
-    shape = (N_CHANNELS, chunk_samples)
-    buffers = buffers or (np.empty(shape, np.int16), np.empty(shape, np.int16))
-    for n, start in enumerate(range(0, renderer.n_samples, chunk_samples)):
-        out = buffers[n % len(buffers)]
-        _write_channels(renderer, start, out)
-        yield out
 
 
 def _write_channels(renderer: Renderer, start: int, out: NDArray[np.int16]) -> None:

@@ -20,7 +20,7 @@ from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
 from labseq.plain import now_utc
-from labseq.roles import RunObserver, Step, StepContext, offers
+from labseq.roles import RunObserver, Step, offers
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of, open_device
 from labseq.sequencer.leader import Emit, LeaderAnswers
@@ -132,32 +132,27 @@ def _raise_first(outcome: Outcome) -> None:
         raise failure
 
 
-def plan_timelines(
-    lab: Lab, guard: Guard, steps: Sequence[tuple[str, Step]], context: StepContext | None = None
-) -> list[list[TimelineEntry]]:
+def plan_timelines(lab: Lab, guard: Guard, steps: Sequence[tuple[str, Step]]) -> list[list[TimelineEntry]]:
     """The timeline of each step.
 
     Args:
         lab: The devices.
         guard: Runs the calls.
         steps: The steps with their names.
-        context: The context for the timelines; by default that of the lab.
 
     Raises:
         LabseqError: A step fails; the error names it.
     """
-    planned = [plan_timeline(lab, guard, number, *step, context) for number, step in enumerate(steps)]
-    return with_waits(planned, context or lab.step_context)
+    planned = [plan_timeline(lab, guard, number, *step) for number, step in enumerate(steps)]
+    return with_waits(planned, lab.step_context)
 
 
-def plan_timeline(
-    lab: Lab, guard: Guard, number: int, name: str, step: Step, context: StepContext | None = None
-) -> list[TimelineEntry]:
+def plan_timeline(lab: Lab, guard: Guard, number: int, name: str, step: Step) -> list[TimelineEntry]:
     """The timeline of one step, see :func:`plan_timelines`; ``number`` is its index in the shot."""
 
     def entries() -> list[TimelineEntry]:
         with _named(number, name, step):
-            found = list(step.plan_timeline(context or lab.step_context))
+            found = list(step.plan_timeline(lab.step_context))
             if other := [one for one in found if not isinstance(one, TimelineEntry)]:  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(f"plan_timeline() gave {other[0]!r}; expected TimelineEntry objects")
             return found

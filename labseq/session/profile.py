@@ -23,7 +23,7 @@ from labseq.files import profile_dir
 from labseq.messages import clean, did_you_mean
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, MotionSpec, SiteGrid
 from labseq.model.lines import IDLE
-from labseq.motion import standing_on_sites
+from labseq.motion import correct_overlay
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Clock, Context
@@ -470,7 +470,7 @@ def _with_tones(document: Document, grid: SiteGrid, entries: Mapping[str, Calibr
         grid = replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
     if (overlay := entries.get("overlay")) is not None:
         try:
-            grid = standing_on_sites(grid, overlay.values["offset_m"])
+            grid = correct_overlay(grid, overlay.values["offset_m"])
         except LimitError as error:
             raise document.error(("calibrations",), f"calibration overlay {overlay.id}: {error}") from error
     return grid

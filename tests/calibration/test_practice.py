@@ -19,7 +19,7 @@ from labseq.config.profile import load_profile
 from labseq.detection.sites import known_sites, region_corners, spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import CalibrationEntry
-from labseq.motion import standing_on_sites
+from labseq.motion import correct_overlay
 from labseq.plugin import Context, DepthRamp, RandomStream, Run, TweezerAmplitudes
 
 Floats = NDArray[np.float64]
@@ -77,7 +77,7 @@ class Practice:
         if "frequencies" in self.found:
             tones = self.found["frequencies"].values
             grid = replace(grid, row_frequency_hz=tones["row_hz"], column_frequency_hz=tones["column_hz"])
-            grid = standing_on_sites(grid, self.found["overlay"].values["offset_m"])
+            grid = correct_overlay(grid, self.found["overlay"].values["offset_m"])
         row, col = (
             self.world._positions.actual(axis, hz) - np.arange(len(hz))
             for axis, hz in enumerate((grid.row_frequency_hz, grid.column_frequency_hz))

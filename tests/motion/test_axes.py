@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from numpy.typing import NDArray
+from scipy.interpolate import InterpolatedUnivariateSpline
 
 from labseq.errors import LimitError
 from labseq.model import MotionSpec, Plan, RfSpec, SiteGrid, ToneProgram
 from labseq.model.grid import centred_comb
 from labseq.motion import (
-    AffineCalibration,
-    Calibration,
-    TableCalibration,
-    calibrated,
+    correct_overlay,
     drive,
     fit_comb,
-    standing_on_sites,
     tone_program,
 )
 from labseq.motion.axes import axis_positions_m
@@ -35,62 +32,6 @@ def bent(worst_m: float) -> NDArray[np.float64]:
     sites = np.linspace(-1.0, 1.0, 20)
     off = sites**2 - (sites**2).mean()
     return COMB_HZ + SLOPE * worst_m * off / np.abs(off).max()
-
-
-CALIBRATIONS = pytest.mark.parametrize(
-    "calibration",
-    [
-        AffineCalibration(100e6, SLOPE),
-        AffineCalibration(100e6, -SLOPE),
-        TableCalibration(SITES_M, bent(0.5e-6)),
-        TableCalibration(SITES_M, bent(0.5e-6)[::-1]),
-    ],
-    ids=["affine", "affine falling", "table", "table falling"],
-)
-
-
-@CALIBRATIONS
-@given(position_m=st.floats(-100e-6, 100e-6))
-def test_there_and_back(calibration: Calibration, position_m: float) -> None:
-    hz = calibration.frequency_hz([position_m])
-    assert calibration.position_m(hz) == pytest.approx([position_m], abs=1e-13)
-
-
-def test_a_table_is_met_at_its_sites_and_goes_on_by_the_outermost_step() -> None:
-    hz = bent(0.5e-6)
-    table = TableCalibration(SITES_M, hz)
-    assert table.frequency_hz(SITES_M) == pytest.approx(hz, abs=1e-3)
-    outside = table.frequency_hz([SITES_M[0] - SPACING_M, SITES_M[-1] + 2 * SPACING_M])
-    assert outside == pytest.approx([2 * hz[0] - hz[1], 3 * hz[-1] - 2 * hz[-2]])
-    between = table.frequency_hz(0.5 * (SITES_M[3] + SITES_M[4]))
-    assert between == pytest.approx(0.5 * (hz[3] + hz[4]))
-
-
-def test_a_grid_with_calibrated_tones() -> None:
-    column = TableCalibration(SITES_M, bent(0.5e-6))
-    grid = calibrated(SiteGrid(), AffineCalibration(95e6, -SLOPE), column)
-    assert grid.row_frequency_hz == pytest.approx(centred_comb(20, 95e6, -1.6e6))
-    assert grid.column_frequency_hz == pytest.approx(column.site_hz)
-    with pytest.raises(LimitError, match="the lowest row frequency is "):
-        calibrated(grid, AffineCalibration(1e6, SLOPE), column)
-
-
-@pytest.mark.parametrize(
-    ("site_m", "site_hz", "message"),
-    [
-        ([0.0], [1e8], "at least two sites"),
-        ([1.0, 0.0], [1e8, 2e8], "with rising positions"),
-        ([0.0, 1.0, 2.0], [1e8, 3e8, 2e8], "all rise or all fall"),
-    ],
-)
-def test_tables_that_make_no_sense(site_m: Any, site_hz: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        TableCalibration(np.array(site_m), np.array(site_hz))
-
-
-def test_affine_calibrations_that_make_no_sense() -> None:
-    with pytest.raises(ValueError, match="a finite centre and a finite slope other than 0"):
-        AffineCalibration(1e8, 0.0)
 
 
 def test_tones_on_a_comb_are_left_as_they_are() -> None:
@@ -135,38 +76,39 @@ def test_tweezers_beside_the_sites_come_to_stand_on_them(
     """In truth each tone's tweezer stands by the offset beside where the calibration has it."""
     tones_hz = bent(bend_m)[:: -1 if falling else 1]
     grid = SiteGrid(20, 20, SPACING_M, row_frequency_hz=tones_hz, column_frequency_hz=tones_hz)
-    corrected = standing_on_sites(grid, offset_m)
-    believed = TableCalibration(SITES_M, tones_hz)
-    along_row_m = believed.position_m(corrected.column_frequency_hz) + offset_m[0]
-    from_row_to_row_m = believed.position_m(corrected.row_frequency_hz) + offset_m[1]
-    assert along_row_m == pytest.approx(SITES_M, abs=1e-12)
-    assert from_row_to_row_m == pytest.approx(SITES_M, abs=1e-12)
+    corrected = correct_overlay(grid, offset_m)
+    believed = InterpolatedUnivariateSpline(tones_hz if not falling else tones_hz[::-1], SITES_M, k=1)
+    for corrected_hz, beside_m in zip(
+        (corrected.column_frequency_hz, corrected.row_frequency_hz), offset_m, strict=True
+    ):
+        stands_m = (-1 if falling else 1) * np.asarray(believed(corrected_hz)) + beside_m
+        assert stands_m == pytest.approx(SITES_M, abs=1e-12)
     assert np.array_equal(corrected.positions_m, grid.positions_m)
 
 
 def test_without_an_offset_the_tones_stay_as_they_are() -> None:
     grid = SiteGrid(1, 4, SPACING_M)
-    assert standing_on_sites(grid, [0.0, 0.0]).row_frequency_hz is grid.row_frequency_hz
-    moved = standing_on_sites(grid, [1e-6, 0.0])
+    assert correct_overlay(grid, [0.0, 0.0]).row_frequency_hz is grid.row_frequency_hz
+    moved = correct_overlay(grid, [1e-6, 0.0])
     assert np.array_equal(moved.row_frequency_hz, grid.row_frequency_hz)
     assert np.all(moved.column_frequency_hz < grid.column_frequency_hz)
 
 
 def test_a_single_row_is_moved_by_the_step_of_the_columns() -> None:
     grid = SiteGrid(1, 4, SPACING_M)
-    (moved_hz,) = standing_on_sites(grid, [0.0, 1e-6]).row_frequency_hz - grid.row_frequency_hz
+    (moved_hz,) = correct_overlay(grid, [0.0, 1e-6]).row_frequency_hz - grid.row_frequency_hz
     assert moved_hz == pytest.approx(-1e-6 * np.diff(grid.column_frequency_hz).mean() / SPACING_M)
 
 
 def test_a_single_site_tells_no_slope_to_move_it_by() -> None:
     with pytest.raises(LimitError, match="the offset of a single row is 1e-06 m"):
-        standing_on_sites(SiteGrid(1, 1), [0.0, 1e-6])
+        correct_overlay(SiteGrid(1, 1), [0.0, 1e-6])
 
 
 def test_tones_are_not_moved_below_zero() -> None:
     grid = SiteGrid(3, 3, SPACING_M, column_frequency_hz=np.array([1e5, 2e6, 4e6]))
     with pytest.raises(LimitError, match="the lowest column frequency"):
-        standing_on_sites(grid, [2e-6, 0.0])
+        correct_overlay(grid, [2e-6, 0.0])
 
 
 GRID = SiteGrid(4, 6)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import DeviceError
 from labseq.model import SiteGrid
-from labseq.motion.axes import standing_on_sites
+from labseq.motion.axes import correct_overlay
 from labseq.motion.overlay import fit_overlay, overlay_offset
 
 GRIDS = {lattice: SiteGrid(20, 20, lattice=lattice) for lattice in ("triangular", "square")}  # type: ignore[arg-type]
@@ -58,7 +58,7 @@ def test_an_offset_that_was_found_is_undone(atoms: Any) -> None:
     hidden, in_use = np.array([0.21e-6, -0.16e-6]), np.zeros(2)
     offset = atoms.scan()
     for seed in (1, 2):
-        grid = standing_on_sites(GRID, in_use)
+        grid = correct_overlay(GRID, in_use)
         moved = np.array(
             [
                 grid.column_frequency_hz[0] - GRID.column_frequency_hz[0],

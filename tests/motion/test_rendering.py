@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import labseq
 from labseq.errors import LimitError
 from labseq.model import Batch, FrequencyCourse, MotionSpec, Plan, SiteGrid, ToneProgram
-from labseq.motion import Renderer, RenderPath, comb_sample_rate, render, render_chunks, tone_program
+from labseq.motion import Renderer, RenderPath, comb_sample_rate, render, tone_program
 from labseq.motion.render_reference import render_reference
 from labseq.motion.rendering import MAX_WORKSPACES
 
@@ -143,11 +143,13 @@ def test_any_program_is_rendered_right_in_chunks_of_any_size(
         made.append((duration_s, rows))
     program = program_of(*made, course=course, still=False)
     samples = check(program, sample_rate_hz)
-    chunks = [chunk.copy() for chunk in render_chunks(program, sample_rate_hz, chunk_samples)]
-    streamed = np.concatenate([np.zeros((2, 0), np.int16), *chunks], axis=1)
-    assert np.array_equal(streamed[:, : samples.shape[1]], samples)
-    assert not streamed[:, samples.shape[1] :].any()
-    assert streamed.shape[1] - samples.shape[1] < chunk_samples
+    renderer, n_samples = Renderer(program, sample_rate_hz), samples.shape[1]
+    streamed = np.ones((2, n_samples + chunk_samples), np.int16)
+    for start in range(0, n_samples + chunk_samples, chunk_samples):
+        for channel in (0, 1):
+            renderer.write(channel, start, streamed[channel, start : start + chunk_samples])
+    assert np.array_equal(streamed[:, :n_samples], samples)
+    assert not streamed[:, n_samples:].any()
 
 
 def test_segments_own_the_samples_from_the_rounded_start_on() -> None:
@@ -166,7 +168,6 @@ def test_what_is_silent_is_zero_and_the_empty_program_has_no_samples() -> None:
     assert path_of(program) == [SILENT, SILENT]
     assert not render(program, COMB_HZ).samples.any()
     assert render(program_of()).samples.shape == (2, 0)
-    assert list(render_chunks(program_of())) == []
 
 
 def test_row_tones_are_channel_0_and_column_tones_channel_1() -> None:
@@ -203,13 +204,6 @@ def test_only_the_memory_of_waveforms_that_are_gone_is_used_again() -> None:
     assert render(programs[1], COMB_HZ).samples.ctypes.data == gone
 
 
-def test_chunks_come_in_the_callers_buffers_in_turn() -> None:
-    buffers = tuple(np.empty((2, 2000), np.int16) for _ in range(3))
-    chunks = list(render_chunks(program_of(move(2, [1])), 200e6, 2000, buffers))
-    assert [any(chunk is buffer for buffer in buffers) for chunk in chunks] == [True] * 4
-    assert chunks[3] is buffers[0]
-
-
 @pytest.mark.parametrize(
     ("tone", "message"),
     [
@@ -243,8 +237,6 @@ def test_more_samples_than_can_be_counted_are_refused(durations_s: tuple[float, 
 
 
 @pytest.mark.parametrize("sample_rate_hz", [0.0, float("nan"), float("inf")])
-def test_wrong_sample_rates_and_chunks_are_refused(sample_rate_hz: float) -> None:
+def test_wrong_sample_rates_are_refused(sample_rate_hz: float) -> None:
     with pytest.raises(LimitError, match="sample rate"):
         render(program_of((1e-6, [])), sample_rate_hz)
-    with pytest.raises(LimitError, match="samples in a chunk is 0"):
-        next(render_chunks(program_of((1e-6, [])), chunk_samples=0))

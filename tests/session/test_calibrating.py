@@ -12,7 +12,7 @@ import labseq
 from labseq.calibration.store import Store, read_entry
 from labseq.errors import ConfigError
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid
-from labseq.motion import standing_on_sites
+from labseq.motion import correct_overlay
 from labseq.session.profile import open_store
 from labseq.testing.fakes import fake_calibration
 
@@ -76,7 +76,7 @@ def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(b
     frequencies = bench.use("frequencies", values={"column_hz": shifted_hz(GRID)})
     origin = {"calibrations": {"frequencies": frequencies.id}}
     bench.use("overlay", values={"offset_m": [1e-7, -2e-7]}, origin=origin)
-    expected = standing_on_sites(SiteGrid(6, 6, column_frequency_hz=shifted_hz(GRID)), [1e-7, -2e-7])
+    expected = correct_overlay(SiteGrid(6, 6, column_frequency_hz=shifted_hz(GRID)), [1e-7, -2e-7])
     grid = bench.session().assembly.hardware.grid
     assert np.array_equal(grid.column_frequency_hz, expected.column_frequency_hz)
     assert np.array_equal(grid.row_frequency_hz, expected.row_frequency_hz)
@@ -112,7 +112,7 @@ def test_the_ids_are_in_the_run_and_in_every_shot_and_the_entries_beside_it(benc
     assert [shot.calibrations for shot in run.shots] == [{"overlay": overlay.id}] * 2
     assert read_entry(run.path / "calibration_overlay.json").id == overlay.id
     table = run.record["resolved"]["profile"]["grid"]["column_frequency"]["table"]
-    moved = standing_on_sites(GRID, [1e-7, 0.0])
+    moved = correct_overlay(GRID, [1e-7, 0.0])
     assert table == moved.column_frequency_hz.tolist()
     assert run.record["resolved"]["profile"]["grid"]["row_frequency"]["table"] == []
 
