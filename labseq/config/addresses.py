@@ -115,8 +115,8 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
 def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] | None = None) -> Loc:
     """Convert an address to a location in a file; the last key of a mapping need not exist yet.
 
-    With ``may_add``, neither need mappings in the settings of a plugin, a step or the grid, and those that
-    it lists: "faults" of ``camera.faults.transient``.
+    With ``may_add``, missing mappings are created, too: at the top of the file only those that it lists,
+    below it anywhere but in ``devices``: "faults" of ``camera.faults.transient``.
 
     A list item with a ``name`` is addressed by it, and the address continues in its
     settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
@@ -133,18 +133,18 @@ def find(root: Node, address: str, name: str, source: str, may_add: Collection[s
             node = None
             loc = (*loc, part)
             continue
-        steps = _steps(node, part)
-        child = node.at(steps) if steps else None
+        keys = _keys_of_part(node, part)
+        child = node.at(keys) if keys else None
         new = i == len(parts) - 1 or (
             may_add is not None and (part in may_add if i == 0 else here not in NAMED)
         )
         if child is None and not (new and isinstance(node.value, dict)):
-            raise ConfigError(_lost(node, part, here, name, source))
-        loc, node = loc + (steps or (part,)), child
+            raise ConfigError(_missing_part(node, part, here, name, source))
+        loc, node = loc + (keys or (part,)), child
     return loc
 
 
-def _steps(node: Node, part: str) -> Loc:
+def _keys_of_part(node: Node, part: str) -> Loc:
     """The keys and indices of one part of an address; () if it does not exist."""
     if isinstance(node.value, dict):
         return (part,) if part in node.value else ()
@@ -159,7 +159,7 @@ def _steps(node: Node, part: str) -> Loc:
     return ()
 
 
-def _lost(node: Node, part: str, here: str, name: str, source: str) -> Problem:
+def _missing_part(node: Node, part: str, here: str, name: str, source: str) -> Problem:
     """Explain why an address does not exist."""
     where = f"'{here}'" if here else clean(name)
     if isinstance(node.value, dict):

@@ -74,9 +74,11 @@ class DeviceChoice(Choice):
     )
 
     @model_validator(mode="after")
-    def _has_light(self) -> Self:
+    def _check_blinding(self) -> Self:
         if self.role == "camera" and self.blinding is not None:
-            raise setting_error("a camera is blinding", "a device", at=("blinding",), key=True)
+            raise setting_error(
+                "`blinding` is set for a camera", "it for `role: device` only", at=("blinding",), key=True
+            )
         return self
 
 
@@ -110,21 +112,21 @@ class PowerMeterSettings(Settings):
     )
 
 
-def device_name(name: str, what: str) -> None:
+def check_name(name: str, what: str) -> None:
     """Raise for a name that cannot be used in an address or a file."""
     if not _DEVICE_NAME.fullmatch(name):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
         raise setting_error(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
 
 
-def named(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
+def check_devices(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
     """Raise for invalid device names, and add to each choice its place in the file."""
     for name in devices:
         if name in (*ROLES, "planner"):
             raise setting_error(
                 f"a device is called '{name}', like a role", "another name", at=(name,), key=True
             )
-        device_name(name, "a device")
+        check_name(name, "a device")
     return {name: choice.placed("devices", name) for name, choice in devices.items()}
 
 
@@ -178,7 +180,7 @@ class CalibrationSettings(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _may_be_one_word(cls, value: Any) -> Any:
+    def _accept_folder_or_off(cls, value: Any) -> Any:
         if value == OFF:
             return {"use": dict.fromkeys(CALIBRATION_KINDS, OFF)}
         return {"folder": value} if isinstance(value, str) else value
@@ -222,7 +224,7 @@ class ChannelSettings(Settings):
     )
 
     @model_validator(mode="after")
-    def _makes_sense(self) -> Self:
+    def _check_timing(self) -> Self:
         if self.turns_off and set(self.on) != {"release"}:
             raise setting_error(
                 "a line that turns the static tweezers off is on at other times",
@@ -252,16 +254,16 @@ class ChannelSettings(Settings):
     def spec(self, name: str) -> LineSpec:
         """Convert the settings to the core's type."""
         return LineSpec(
-            name,
-            self.channel,
-            frozenset(self.on),
-            self.lead,
-            self.lag,
-            self.pulse,
-            self.triggers,
-            self.blinding,
-            self.active_low,
-            self.turns_off,
+            name=name,
+            channel=self.channel,
+            on=frozenset(self.on),
+            lead_s=self.lead,
+            lag_s=self.lag,
+            pulse_s=self.pulse,
+            triggers=self.triggers,
+            blinding=self.blinding,
+            active_low=self.active_low,
+            turns_off=self.turns_off,
         )
 
 
@@ -275,7 +277,7 @@ def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings
             what = f"'{first}' and '{second}' both trigger the {a.triggers.replace('_', ' ')}"
             raise setting_error(what, "one line for that", at=(second, "triggers"))
     for name in channels:
-        device_name(name, "a line")
+        check_name(name, "a line")
     return channels
 
 
@@ -290,7 +292,7 @@ class LinesChoice(Choice):
     )
 
     @model_validator(mode="after")
-    def _never_together(self) -> Self:
+    def _check_exclusive_pairs(self) -> Self:
         for number, pair in enumerate(self.mutually_exclusive):
             for place, name in enumerate(pair):
                 if name not in self.channels:
@@ -611,7 +613,7 @@ class ProfileSpec(Settings):
     detector: Annotated[Choice, placed_by_field] = Field(
         description="the plugin that finds the atoms on an image"
     )
-    devices: Annotated[dict[str, DeviceChoice], empty_is({}), AfterValidator(named)] = Field(
+    devices: Annotated[dict[str, DeviceChoice], empty_is({}), AfterValidator(check_devices)] = Field(
         default={}, description="further instruments, by name"
     )
     lines: Annotated[LinesChoice, placed_by_field] | None = Field(
@@ -638,7 +640,7 @@ class ProfileSpec(Settings):
     )
 
     @model_validator(mode="after")
-    def _has_meter(self) -> Self:
+    def _check_meter(self) -> Self:
         named = self.equalise.device
         if "device" in self.equalise.model_fields_set and named not in (known := ["camera", *self.devices]):
             expected = ", ".join(f"'{one}'" for one in known)

@@ -222,7 +222,7 @@ class AdaptiveChoice(Choice):
     points: Points | None = Field(default=None, description="maximum number of points")
 
     @model_validator(mode="after")
-    def _has_one_aim(self) -> Self:
+    def _check_aim(self) -> Self:
         if self.maximise is None and self.minimise is None:
             raise setting_error(
                 "the scan has neither 'maximise' nor 'minimise'",

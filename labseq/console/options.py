@@ -220,8 +220,8 @@ FitModel = Annotated[
     typer.Option(
         "--fit",
         metavar="MODEL",
-        help="Fit the quantity against the scanned value: exponential, gaussian, lorentzian, linear or "
-        "release_recapture.",
+        help="Fit the quantity against the scanned value: exponential, gaussian, lorentzian, linear, "
+        "saturation, step, lowering or release_recapture.",
     ),
 ]
 FitSettings = Annotated[

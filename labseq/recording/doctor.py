@@ -122,7 +122,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
         report.in_progress.append(run_dir)
         return
     holders = _Check(run_dir, dry_run=dry_run)
-    holders.check_holders(run_dir)
+    holders.check_holders()
     check = _Check(run_dir, dry_run=True)
     check.check_run()
     if check.findings and not dry_run:
@@ -273,18 +273,18 @@ class _Check:
         except RecordingError as error:
             self.report_unreadable(error)
 
-    def check_holders(self, folder: Path) -> None:
+    def check_holders(self) -> None:
         """Check for notes on lock holders that were left by ended processes of this computer."""
         with suppress(RecordingError):  # of a folder that cannot be read, which other checks report
-            for name in names_in(folder):
+            for name in names_in(self.folder):
                 if not name.endswith(".lock.holder"):
                     continue
                 try:
-                    process = Process.from_plain(parse_object(read_file(folder / name)) or {})
+                    process = Process.from_plain(parse_object(read_file(self.folder / name)) or {})
                 except RecordingError:
                     continue  # the file is just being written or deleted
                 if process is not None and process.is_here and not process.is_running:
-                    self._quarantine("a lock whose holder is gone", folder / name, folder)
+                    self._quarantine("a lock whose holder is gone", self.folder / name)
 
     def check_data_folder(self, stale: list[Marker]) -> None:
         """Check for leftovers in a data folder next to its runs."""

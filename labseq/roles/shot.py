@@ -451,7 +451,7 @@ EVENTS: Final = {
     "compiled": "they are, with the time it took",
     "settling": "labseq waits for a device to settle, such as a camera that cools down",
     "run_started": "all devices are open",
-    "state": "the state of the run has changed: opening, idle, armed, playing, ...",
+    "state": "the state of the run has changed: opening, idle, shot, writing, recovering, ...",
     "shot_started": "an attempt at a shot begins",
     "stage": "a stage of a step has ended, with its duration and its budget",
     "image": "an image was taken, with the occupancy found on it",

@@ -44,7 +44,7 @@ from labseq.units import format_quantity
 
 
 class Events:
-    """Reports the events of shots.
+    """Reports the events of shots, and keeps this thread free of all that could delay it after a frame.
 
     From a frame to the start of the moves that follow from it they are kept, and Python collects no garbage:
     a slow disk or screen, or a search for garbage, would take longer than all the rest.

@@ -431,7 +431,10 @@ def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:
     return sites.astype(int).tolist()
 
 
-_OPTIONS = {"target": "--target", "planner": "--planner", "degree_of_parallelism": "--dop"} | {
+_OPTIONS = {
+    "target": "--target",
+    "planner": "--planner",
+    "degree_of_parallelism": "--dop",
     "seed": "--seed",
     "origin": "--origin",
 }

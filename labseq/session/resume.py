@@ -97,7 +97,9 @@ class ResumableRun:
         if read_state(folder)[0] == "running" and owner is not None:
             if owner.is_here:
                 raise _refused(folder, f"it is in progress (process {owner.pid} on {owner.host})")
-            changes.append(Change("its computer, where it may still be in progress", owner.host, "this one"))
+            changes.append(
+                Change("the computer", owner.host, "this one; the run may still be in progress there")
+            )
         LineLog(folder / INDEX_FILE)  # ends an unfinished last line: if it is whole, its shot counts
         run = open_run(folder)
         gone = [shot.index for shot in run.shots if not shot.file.is_file()]

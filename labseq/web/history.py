@@ -29,8 +29,8 @@ _LINE: Final = re.compile(
     rb'\{"shot": (\d{1,15}), "attempt": (\d{1,9}), "status": "(\w+)", "error": "(?:[^"\\]|\\.)*+", '
     rb'"t_start_utc": "([^"]{,40})", "t_end_utc": "[^"]{,40}", "success": (true|false|null), '
     rb'"filling_fraction": (null|[-+.\deE]{1,30}), "seen_defect_free_cycle": (-?\d{1,9}), "n_images": \d+, '
-    rb'"n_cycles": (\d{1,9}), "n_batches": (\d{1,9}), "n_atom_moves": (\d{1,15}), "n_missing_atoms": \d+, '
-    rb'"counts": (true|false), .*\}\n',
+    rb'"n_cycles": (\d{1,9}), "n_batches": (\d{1,9}), "n_atom_moves": (\d{1,15}), '
+    rb'(?:"\w{1,40}": [-+.\w]{1,30}, )*?"counts": (true|false), .*\}\n',
     re.DOTALL,
 )
 """A line as `labseq.recording` writes it, up to "counts"; matching takes a tenth of the time of JSON."""

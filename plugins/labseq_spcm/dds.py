@@ -207,7 +207,7 @@ class Dds:
         self._card = card
         self._cores = cores
         self._keep_warm = keep_warm
-        self._is_at_rest = False
+        self._is_idle = False
         self._commands = NO_COMMANDS
         self._continues = False
         self._n_sent = 0
@@ -236,9 +236,9 @@ class Dds:
         self._continues = continues
         self.render_s = time.perf_counter() - start_s
         self._n_sent = 0
-        if not (self._is_at_rest and self._card.running):
-            self.rest()
-        self._is_at_rest = False
+        if not (self._is_idle and self._card.running):
+            self.idle()
+        self._is_idle = False
         self._card.wait_until(self._feed_once, "the DDS takes no commands: its queue stays full")
         self._card.clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
         return program.total_duration_s
@@ -250,7 +250,7 @@ class Dds:
         self._feed()
         return program.total_duration_s
 
-    def rest(self) -> None:
+    def idle(self) -> None:
         """Stop, forget all commands, and start the keep-warm tones if there are any."""
         from labseq_spcm import kernels
 
@@ -273,7 +273,7 @@ class Dds:
         card.clock.sleep(ARRIVAL_S)
         self._start_triggered(spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER)
         card.command(spcm.M2CMD_CARD_DISABLETRIGGER, "disabling the trigger")
-        self._is_at_rest = True
+        self._is_idle = True
 
     def halt(self) -> None:
         """Nothing supplies the card beside the calls."""
@@ -312,8 +312,8 @@ class Dds:
         self._feed()
         n_events = card.read(spcm.SPC_DDS_TRG_COUNT) - self._n_events
         if not self._continues and n_events >= len(self._commands.ends) - (self._keep_warm is None):
-            self._is_at_rest = self._keep_warm is not None
-            command = spcm.M2CMD_CARD_DISABLETRIGGER if self._is_at_rest else spcm.M2CMD_CARD_STOP
+            self._is_idle = self._keep_warm is not None
+            command = spcm.M2CMD_CARD_DISABLETRIGGER if self._is_idle else spcm.M2CMD_CARD_STOP
             card.command(command, "end of the program")
             return True
         too_late = spcm.SPCM_DDS_STAT_QUEUE_UNDERRUN | spcm.SPCM_DDS_STAT_QUEUE_OVERRUN

@@ -54,7 +54,8 @@ class PlayMode(Protocol):
     """How a program gets to the outputs.
 
     Attributes:
-        max_wait_s: How long the card needs no attention while it plays; 0: none at all.
+        max_wait_s: Longest time between two calls of ``finished`` while a program plays, in seconds; 0:
+            call it again at once; inf: the card needs none until the end.
         render_s: Time for rendering in the last ``prepare``, on this computer's clock.
         beginning_s: Playing time after which a program can be cut; inf: only whole programs are played.
     """
@@ -88,7 +89,7 @@ class PlayMode(Protocol):
         """Whether the program has begun."""
         ...
 
-    def rest(self) -> None:
+    def idle(self) -> None:
         """Start what plays between programs, if anything does."""
         ...
 
@@ -229,12 +230,12 @@ class SpcmMobileTweezers(MobileTweezers):
         card, mode = self._opened()
         if close_relays(card):
             self._clock.sleep(limits.RELAY_S)
-        self._rest(card, mode)
+        self._play_idle(card, mode)
 
-    def _rest(self, card: AwgCard, mode: PlayMode) -> None:
+    def _play_idle(self, card: AwgCard, mode: PlayMode) -> None:
         """Have the keep-warm tones play, or the stream."""
         if (self._keep_warm is not None or self._settings.mode == "stream") and not card.running:
-            mode.rest()
+            mode.idle()
 
     def close(self) -> None:
         """Bring the outputs into the safe state and close the card; legal in any state."""
@@ -369,7 +370,7 @@ class SpcmMobileTweezers(MobileTweezers):
                 if self._due_s is None:
                     break
             if self._due_s is not None:
-                self._rest(card, mode)
+                self._play_idle(card, mode)
         except (DeviceError, TransientError):
             if self._due_s is not None:
                 self.safe_state()

@@ -93,7 +93,7 @@ class SampleMode:
         """Set up the mode of the programs; the card stands still."""
         raise NotImplementedError
 
-    def rest(self) -> None:
+    def idle(self) -> None:
         """Start the keep-warm tones if there are any; the card stands still."""
         if self._loop is not None:
             spcm = self._card.spcm

@@ -51,8 +51,9 @@ class SpcmSettings(Settings):
     sample_rate: Frequency = Field(
         default=625e6, description="samples per second; the card rounds it to 8 Hz"
     )
-    row_channel: Channel = Field(default=0, description="output that drives the row axis")
-    column_channel: Channel = Field(default=1, description="output that drives the column axis")
+    row_channel: Channel = Field(
+        default=0, description="output that drives the row axis; the other one drives the column axis"
+    )
     trigger: Literal["software", "external"] = Field(
         default="software",
         description="what starts a program: the driver, or an edge at the input Ext0, also from a line with "
@@ -116,9 +117,7 @@ class SpcmSettings(Settings):
         return () if self.card == "simulated" else (f"Spectrum {self.card}", *serial)
 
     @model_validator(mode="after")
-    def _check_channels_and_rate(self) -> Self:
-        if self.row_channel == self.column_channel:
-            raise ValueError(f"row_channel and column_channel are both {self.row_channel}; expected 0 and 1")
+    def _check_bus_rate(self) -> Self:
         if self.mode in ("fifo", "stream") and self.sample_rate > limits.FIFO_RATE_HZ:
             rate, most = _hz(self.sample_rate), _hz(limits.FIFO_RATE_HZ)
             raise ValueError(

@@ -30,9 +30,9 @@ FIRST: Final = 1 << 17
 """Samples of a program that are rendered before it starts: 0.21 ms at 625 MS/s, behind 0.25 ms of silence."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
-LOCKED_S: Final = 10e-6
+LOCK_RETRY_S: Final = 10e-6
 """After that time the thread tries again if a call of the driver is at work."""
-IN_MOTION_S: Final = 1e-3
+PLAYING_POLL_S: Final = 1e-3
 """Longest time between two looks at the ring while a program plays."""
 BUS_SAMPLES: Final = 1 << 22
 """Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
@@ -69,7 +69,7 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
 
 
 class Stream:
-    """Keeps the card supplied from ``rest`` to ``halt``. See ``PlayMode``.
+    """Keeps the card supplied from ``idle`` to ``halt``. See ``PlayMode``.
 
     Samples go into a ring in the computer, from there over the bus into the card's buffer and its
     output FIFO, and from there to the outputs. While no program plays, silence is handed over one
@@ -86,7 +86,7 @@ class Stream:
         DeviceError: The bus is too slow for the sample rate.
     """
 
-    max_wait_s = IN_MOTION_S
+    max_wait_s = PLAYING_POLL_S
     beginning_s = BEGINNING_S
     render_s = after_start_s = 0.0
 
@@ -112,13 +112,13 @@ class Stream:
         self._chunk = np.zeros((2, CHUNK), np.int16)
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._streams = self._fills = self._has_thread = False
+        self._is_on = self._is_filling = self._has_thread = False
         self._failure: LabseqError | None = None
         self._prepared: InterleavedRenderer | None = None
         self._program: InterleavedRenderer | None = None
-        self._rest: InterleavedRenderer | None = None
+        self._remainder: InterleavedRenderer | None = None
         self._n_rendered = 0
-        self._handed = self._n_fetched = self._start = self._end = self._clean_from = 0
+        self._n_written = self._n_fetched = self._start = self._end = self._silent_from = 0
         self.n_underruns = 0
         self._check_bus()
         self._set_mode(settings)
@@ -149,13 +149,13 @@ class Stream:
 
     # Calls of the driver: they read the status before they take the lock, so that virtual time catches up.
 
-    def rest(self) -> None:
+    def idle(self) -> None:
         """Start the stream; no effect if it is on."""
         with self._lock:
-            if self._streams:
+            if self._is_on:
                 return
             self._begin()
-            self._streams, self._stop = True, threading.Event()
+            self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._step)
         if self._has_thread:
             threading.Thread(target=self._run, args=(self._stop,), name="spcm stream", daemon=True).start()
@@ -165,8 +165,8 @@ class Stream:
         self._stop.set()
         self._card.library.call_in_virtual_time(None)
         with self._lock:
-            self._streams, self._failure = False, None
-            self._prepared = self._program = self._rest = None
+            self._is_on, self._failure = False, None
+            self._prepared = self._program = self._remainder = None
 
     def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
         """Render the first samples of a program; returns its playing time in seconds."""
@@ -185,12 +185,12 @@ class Stream:
         with self._lock:
             program, self._prepared = self._prepared, None
             if program is not None:  # else another thread has made the card safe
-                self._revive()
-                self._splice(program)
+                self._start_or_restart()
+                self._queue_program(program)
                 self._supply_until(self._start + self._n_rendered)
                 spliced_s = time.perf_counter()
                 # a beginning as a whole: this thread makes the rest next, and keeps others from Python
-                self._supply_until(min(self._end, self._handed + int(BEGINNING_S * self._rate_hz)))
+                self._supply_until(min(self._end, self._n_written + int(BEGINNING_S * self._rate_hz)))
                 self.after_start_s = time.perf_counter() - spliced_s
 
     def append(self, program: ToneProgram) -> float:
@@ -198,8 +198,8 @@ class Stream:
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel, self._chunk)
         self._check_failure()
         with self._lock:
-            self._rest = renderer
-            self._supply_until(self._handed + self._on_card)
+            self._remainder = renderer
+            self._supply_until(self._n_written + self._on_card)
         return renderer.n_samples / self._rate_hz
 
     def triggered(self) -> bool:
@@ -210,7 +210,7 @@ class Stream:
         """Whether the program has been played to its end."""
         self._check_failure()
         with self._lock:
-            if self._rest is None and self._handed - self._in_ring() >= self._end + self._on_card:
+            if self._remainder is None and self._n_written - self._in_ring() >= self._end + self._on_card:
                 self._program = None
             return self._program is None
 
@@ -234,31 +234,31 @@ class Stream:
     def _step(self) -> float | None:
         """Supply the card; returns after how many seconds that is due again, None if never."""
         if not self._lock.acquire(blocking=False):
-            return LOCKED_S
+            return LOCK_RETRY_S
         try:
-            if not self._streams:
+            if not self._is_on:
                 return None
             return self._supply()
         except LabseqError as failure:
-            self._streams, self._failure = False, failure
+            self._is_on, self._failure = False, failure
             return None
         finally:
             self._lock.release()
 
     def _supply_until(self, handed: int) -> None:
         """Hand over as many samples, or as there is room for."""
-        while self._handed < handed and self._supply() == 0.0:
+        while self._n_written < handed and self._supply() == 0.0:
             pass
 
     def _supply(self) -> float:
         """Hand over what there is room for; returns after how many seconds that is due again."""
-        in_ring = self._revive()
+        in_ring = self._start_or_restart()
         try:
             return self._fill(in_ring)
         except DeviceError:
             if self._card.running:
                 raise
-            self._recover(self._handed - self._in_ring())  # it ran dry just now
+            self._recover(self._n_written - self._in_ring())  # it ran dry just now
             return 0.0
 
     def _fill(self, in_ring: int) -> float:
@@ -267,31 +267,31 @@ class Stream:
         A part of a program is as long as what is ahead of the outputs: each part costs 0.1 ms for the tables
         of its tones, and a longer one takes less time than it plays.
         """
-        if self._rest is not None and self._handed >= self._end:
-            rest, self._rest, self._n_rendered = self._rest, None, 0
-            self._splice(rest)
-        if self._program is not None and self._handed < self._end:
-            room = min(len(self._ring) - in_ring, self._end - self._handed)
+        if self._remainder is not None and self._n_written >= self._end:
+            rest, self._remainder, self._n_rendered = self._remainder, None, 0
+            self._queue_program(rest)
+        if self._program is not None and self._n_written < self._end:
+            room = min(len(self._ring) - in_ring, self._end - self._n_written)
             if room:
                 ahead = (in_ring + self._on_card) // self._block * self._block
                 part = max(self._block, min(CHUNK, ahead))
                 self._hand_over_program(self._program, min(room, part))
                 return 0.0
-            return min(IN_MOTION_S, len(self._ring) / 8 / self._rate_hz)
+            return min(PLAYING_POLL_S, len(self._ring) / 8 / self._rate_hz)
         self._hand_over_silence(self._ahead - in_ring)
         return self._ahead / 2 / self._rate_hz
 
-    def _revive(self) -> int:
+    def _start_or_restart(self) -> int:
         """Start the card once it has samples, begin again if it ran dry; returns the samples in the ring."""
         card, spcm = self._card, self._card.spcm
         in_ring = self._in_ring()
-        fetched, before = self._handed - in_ring, self._n_fetched
+        fetched, before = self._n_written - in_ring, self._n_fetched
         self._n_fetched = fetched
-        if self._fills:
+        if self._is_filling:
             if fetched >= self._to_start:
                 start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
                 card.command(start, "start of the stream")
-                self._fills = False
+                self._is_filling = False
         elif (not in_ring or fetched == before) and not card.running:
             self._recover(fetched)
             return self._in_ring()
@@ -301,16 +301,16 @@ class Stream:
         """Fill the card with silence; it is started when it has some."""
         card, spcm = self._card, self._card.spcm
         card.stop()
-        self._handed, self._n_fetched, self._clean_from = 0, 0, len(self._ring)
+        self._n_written, self._n_fetched, self._silent_from = 0, 0, len(self._ring)
         card.define_transfer(self._ring, self._block * FRAME_BYTES)
         self._hand_over_silence(self._ahead + self._on_card)
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
-        self._fills = True
+        self._is_filling = True
 
-    def _splice(self, program: InterleavedRenderer | None) -> None:
+    def _queue_program(self, program: InterleavedRenderer | None) -> None:
         """Have a program follow what was handed over."""
-        self._program, self._start = program, self._handed
-        self._end = self._handed + (self._whole_blocks(program.n_samples) if program else 0)
+        self._program, self._start = program, self._n_written
+        self._end = self._n_written + (self._whole_blocks(program.n_samples) if program else 0)
 
     def _recover(self, fetched: int) -> None:
         """The card has run dry, or was stopped: begin again, with the program if it cannot have begun.
@@ -319,7 +319,7 @@ class Stream:
             TransientError: In the middle of a program.
         """
         # only whole blocks are reported as fetched: a part of the first one may have been played
-        may_have_begun = self._start <= fetched and self._start < self._handed
+        may_have_begun = self._start <= fetched and self._start < self._n_written
         if self._program is not None and may_have_begun and fetched < self._end:
             share = f"{(fetched - self._start) / (self._end - self._start):.0%} of the program was played"
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
@@ -327,7 +327,7 @@ class Stream:
         self.n_underruns += 1
         self._begin()
         if self._program is not None:
-            self._splice(None if fetched >= self._end else self._program)
+            self._queue_program(None if fetched >= self._end else self._program)
 
     def _in_ring(self) -> int:
         """Samples that were handed over and that the card has not reported as fetched."""
@@ -341,15 +341,15 @@ class Stream:
         n_samples = min(len(self._ring), n_samples // self._block * self._block)
         if n_samples <= 0:
             return
-        if self._handed < self._clean_from:
+        if self._n_written < self._silent_from:
             for n in range(0, n_samples, self._block):
-                at = (self._handed + n) % len(self._ring)
+                at = (self._n_written + n) % len(self._ring)
                 self._ring[at : at + self._block] = self._silence
         self._hand_over(n_samples)
 
     def _hand_over_program(self, program: InterleavedRenderer, n_samples: int) -> None:
         """Copy or render the next part of the program into the ring; behind its end there is silence."""
-        at, done = self._handed % len(self._ring), self._handed - self._start
+        at, done = self._n_written % len(self._ring), self._n_written - self._start
         part = self._ring[at : at + n_samples]
         if done < self._n_rendered:
             part = part[: self._n_rendered - done]
@@ -358,10 +358,10 @@ class Stream:
             start_s = time.perf_counter()
             program.write(done, part)
             self.render_s += time.perf_counter() - start_s
-        self._clean_from = self._end + len(self._ring)
+        self._silent_from = self._end + len(self._ring)
         self._hand_over(len(part))
 
     def _hand_over(self, n_samples: int) -> None:
         card = self._card
         card.write(card.spcm.SPC_DATA_AVAIL_CARD_LEN, n_samples * FRAME_BYTES, "handing samples over")
-        self._handed += n_samples
+        self._n_written += n_samples

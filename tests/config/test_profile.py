@@ -214,7 +214,7 @@ shutter: {use: virtual} => shutter: virtual
 shutter: {use: virtual} => shutter: {us: virtual}
   22:12: 'use' is missing from 'shutter' (the name of a plugin); did you write 'us' for it?
 shutter: {use: virtual} => shutter: {use: virtual, role: camera, blinding: {}}
-  22:41: a camera is blinding; expected a device
+  22:41: `blinding` is set for a camera; expected it for `role: device` only
 shutter: {use: virtual} => shutter: {use: virtual}⏎equalise: {device: shuter}
   23:20: there is no device 'shuter'; expected 'camera', 'shutter'
 {call: 3 s} => {call:3 s}

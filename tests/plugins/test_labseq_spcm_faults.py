@@ -412,7 +412,6 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         (f"card: simulated, mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream takes no"),
         ("card: simulated, mode: dds", 2, "set max_row_tones and max_column_tones to at most 16 and 5"),
         ("card: simulated, rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; the limit is the card's 80 mV"),
-        ("card: simulated, row_channel: 1", 2, "row_channel and column_channel are both 1; expected 0 and 1"),
     ],
 )
 def test_mistakes_are_reported_with_what_is_expected(

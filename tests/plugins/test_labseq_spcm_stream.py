@@ -52,7 +52,7 @@ def start_s(lab: Lab, program: ToneProgram, row_channel: int = 0) -> float:
 def test_programs_are_played_to_the_sample_within_the_look_ahead(
     driver: Any, row_channel: int, rate_hz: float, notify_size: int
 ) -> None:
-    outputs = {"row_channel": row_channel, "column_channel": 1 - row_channel}
+    outputs = {"row_channel": row_channel}
     with driver("stream", sample_rate=rate_hz, notify_size=notify_size, fill=3e-3, **outputs) as lab:
         lab.tweezers.settle()
         lab.clock.sleep(1e-3)
