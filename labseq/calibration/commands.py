@@ -39,6 +39,7 @@ Examples:
   labseq calibrate thresholds --profile lab --shots 400 --set shot.1.image.exposure="30 ms"
   labseq calibrate thresholds --profile lab --from data/2026-11-20/0012_calibrate-thresholds
   labseq calibrate sites --profile lab --from sites.csv
+  labseq calibrate sites --profile lab --centre 250,261
 """
 
 Profile = Annotated[str, profile_option("Hardware profile.")]
@@ -127,6 +128,15 @@ def calibrate(
             "a .npy or .csv file.",
         ),
     ] = None,
+    centre: Annotated[
+        str | None,
+        typer.Option(
+            "--centre",
+            metavar="Y,X",
+            help="For sites: the middle of the grid on the frames, in pixels, to less than half a spacing; "
+            "needed if the frames show more traps than the grid has.",
+        ),
+    ] = None,
     shots: Shots = None,
     seed: Seed = None,
     overrides: Overrides = None,
@@ -142,6 +152,6 @@ def calibrate(
 
     changes = tuple(overrides or ())
     request = CalibrationRequest(
-        profile, source, shots, seed, changes, output, dry_run_mode(dry_run), force=force
+        profile, source, shots, seed, changes, output, dry_run_mode(dry_run), force=force, centre=centre
     )
     calibrate_kind(kind, request, as_json=as_json)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,7 @@ class CalibrationRequest:
         output: Folder for the data of the run.
         dry_run: "off", "full" or "fast".
         force: Whether to use the result even if it is worse than the calibration in use.
+        centre: "Y,X", the middle of the sites' grid on the frames, in pixels; None if nothing else is lit.
     """
 
     profile: str
@@ -80,6 +82,7 @@ class CalibrationRequest:
     output: Path | None = None
     dry_run: DryRun = "off"
     force: bool = False
+    centre: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +122,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
             in use stays in use.
         LabseqError: Another error ended the run.
     """
+    _centre(method, request)
     document, spec = load_profile(request.profile, beside=Path(), overrides=_of_profile(request.overrides))
     ignoring = _ignoring(store_of(document, spec).folder, spec, method)
     hardware = resolve_profile(
@@ -170,7 +174,7 @@ def _analysed(
         else _open(source, request, hardware)
     )
     try:
-        return run, method.analyse(CalibrationData(run, hardware))
+        return run, method.analyse(CalibrationData(run, hardware, _centre(method, request)))
     except LabseqError:
         if observer is not None:
             again = f"analyse the run again with --from {run.path}"
@@ -229,6 +233,23 @@ def _open(source: Path, request: CalibrationRequest, hardware: ResolvedProfile) 
         hint = "calibrations of dry runs are made with --dry-run" if run.simulated else ""
         raise ConfigError(Problem(what, str(source), expected=expected, hint=hint))
     return run
+
+
+def _centre(method: Method, request: CalibrationRequest) -> tuple[float, float] | None:
+    if request.centre is None:
+        return None
+    if method.kind != "sites":
+        raise ConfigError(
+            Problem(f"a calibration of {method.kind} has no centre", "--centre", expected="sites")
+        )
+    try:
+        y, x = (float(part) for part in request.centre.split(","))
+    except ValueError:
+        y = x = math.nan
+    if not math.isfinite(y + x):
+        expected = "Y,X: two numbers of pixels, such as 250,261.5"
+        raise ConfigError(Problem(f"'{clean(request.centre)}'", "--centre", expected=expected))
+    return y, x
 
 
 def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:

@@ -58,10 +58,12 @@ class CalibrationData:
     Attributes:
         run: The run.
         hardware: The profile, with the calibrations that the analysis uses.
+        centre_px: (y, x) of the middle of the sites' grid on the frames, if the user gave it.
     """
 
     run: Run
     hardware: ResolvedProfile
+    centre_px: tuple[float, float] | None = None
 
     def frames(self) -> Iterator[Frame]:
         """The first frame of each shot: randomly loaded atoms, before any move.

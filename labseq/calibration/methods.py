@@ -43,16 +43,18 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     for frame in data.frames():
         total, n_frames = total + frame.image, n_frames + 1
     mean = total / n_frames
-    found = find_lattice(mean, data.hardware.grid)
-    quality = {
+    found = find_lattice(mean, data.hardware.grid, centre_px=data.centre_px)
+    spacings = [each for each in found.spacing_px if np.isfinite(each)]
+    figures = {
         "residual_px": found.residual_px,
         "n_sites_found": float(found.n_sites_found),
-        "spacing_px": sum(found.spacing_px) / 2,
+        "spacing_px": float(np.mean(spacings)) if spacings else np.nan,
         "angle_rad": found.angle_rad,
         "stretch": found.stretch,
         "spot_px": found.spot_px,
         "pixel_size_m": found.pixel_size_m,
     }
+    quality = {name: value for name, value in figures.items() if np.isfinite(value)}
     return AnalysisResult(
         {"positions_px": found.positions_px, "frame": found.frame},
         quality,
@@ -81,15 +83,16 @@ def read_site_file(path: Path, hardware: ResolvedProfile) -> AnalysisResult:
 
 
 def _summary_lines(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
-    along, down = found.spacing_px
-    angle, pixel = format_quantity(found.angle_rad, "angle"), format_quantity(found.pixel_size_m, "length")
     seen = f"{found.n_sites_found} of {found.found.size} sites found on the mean of {n_frames} frames"
-    size = f"spacing {along:.2f} px along rows, {down:.2f} px from row to row"
-    form = f"rotated by {angle}, stretched by {100 * (found.stretch - 1):.1f} %"
-    return (
-        f"{seen}, {found.residual_px:.3f} px r.m.s. from a smooth lattice",
-        f"{size}; {form}; a pixel is {pixel} wide if the grid's spacing is true",
-    )
+    first = f"{seen}, {found.residual_px:.3f} px r.m.s. from a smooth lattice"
+    ways = zip(found.spacing_px, ("along rows", "from row to row"), strict=True)
+    spacings = ", ".join(f"{px:.2f} px {way}" for px, way in ways if np.isfinite(px))
+    if not spacings:
+        return (first,)
+    angle, pixel = format_quantity(found.angle_rad, "angle"), format_quantity(found.pixel_size_m, "length")
+    form = f", stretched by {100 * (found.stretch - 1):.1f} %" if np.isfinite(found.stretch) else ""
+    size = f"a pixel is {pixel} wide if the grid's spacing is true"
+    return first, f"spacing {spacings}; rotated by {angle}{form}; {size}"
 
 
 def analyse_tweezers(data: CalibrationData) -> AnalysisResult:

@@ -196,13 +196,19 @@ def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
     """The reason why a calibration is worse than another of its kind and must not replace it; "" if it may.
 
     It is worse if its deciding figure is more than :data:`WORSE_FACTOR` times the other's and more
-    than good enough, if only the other has such a figure, or if it found fewer sites.
+    than good enough, if only the other has such a figure, or if it found fewer sites. Thresholds of which
+    more sites than before take a peak from their neighbours are refused even if none are in use.
 
     Args:
         new: The new calibration.
         old: The one in use, or None. One of another grid may always be replaced.
     """
-    if old is None or not same_grid(new.grid, old.grid):
+    old = old if old is not None and same_grid(new.grid, old.grid) else None
+    n_one_peak = new.quality.get("n_one_peak", 0.0)
+    if n_one_peak > (old.quality.get("n_one_peak", 0.0) if old is not None else 0.0):
+        sites = "1 site shows" if n_one_peak == 1 else f"{n_one_peak:.0f} sites show"
+        return f"{sites} one peak only, and would take the other from the neighbours"
+    if old is None:
         return ""
     deciding, now, before = DECIDING[new.kind], figure_of(new), figure_of(old)
     if math.isnan(now) and not math.isnan(before):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Centre: TypeAlias = tuple[float, float] | None
 
 SHORTEST_PX: Final = 3.5
 LONGEST_PX: Final = 55.0
@@ -67,7 +68,8 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
     Shifted by a vector of the lattice, the frame resembles itself, independent of
     its offset and of dark sites. The shortest such vector within 17 degrees of
     the image's x axis points along a row; the one nearest to the second axis of
-    ``grid`` points from row to row.
+    ``grid`` points from row to row. A single column has no rows to start from: there the shortest vector
+    within 17 degrees of the second axis counts. A single row or column takes the other vector from ``grid``.
 
     Args:
         flat: float64 (height, width), see :func:`labseq.detection.spots.flattened`.
@@ -87,16 +89,20 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
     if len(lags) == 0:
         return None
     lags = lags[heights >= ALIKE * heights.max()]
-    flat_enough = np.abs(np.arctan2(lags[:, 0], lags[:, 1])) < ROW_SLANT_RAD
-    if not flat_enough.any():
+    first = int(grid.n_cols == 1)  # the axis that the search begins with
+    x, y = grid.axes[first]
+    slant = np.arctan2(lags[:, 0] * x - lags[:, 1] * y, lags[:, 1] * x + lags[:, 0] * y)
+    likely = lags[np.abs(slant) < ROW_SLANT_RAD]
+    if len(likely) == 0:
         return None
-    row_lags = lags[flat_enough]
-    along = row_lags[np.argmin(np.hypot(*row_lags.T))]
-    expected = _turned(along, grid)
-    off = np.hypot(*(lags - expected).T)
-    if off.min() > 0.35 * np.hypot(*along):
-        return None
-    return Vectors(along, lags[np.argmin(off)], width)
+    found = likely[np.argmin(np.hypot(*likely.T))]
+    other = _turned(found, grid, first)
+    if 1 not in grid.shape:
+        off = np.hypot(*(lags - other).T)
+        if off.min() > 0.35 * np.hypot(*found):
+            return None
+        other = lags[np.argmin(off)]
+    return Vectors(other, found, width) if first else Vectors(found, other, width)
 
 
 def autocorrelation(flat: Floats) -> Floats:
@@ -127,11 +133,11 @@ def _peaks(likeness: Floats) -> tuple[Floats, Floats]:
     return peak_places(likeness, y, x) - middle, likeness[y, x]
 
 
-def _turned(along: Floats, grid: SiteGrid) -> Floats:
-    """The second axis of an undistorted grid whose first axis is ``along``."""
-    a1, a2 = grid.axes / grid.spacing_m
-    cos, sin = a1 @ a2, a1[0] * a2[1] - a1[1] * a2[0]
-    y, x = along
+def _turned(vector: Floats, grid: SiteGrid, axis: int) -> Floats:
+    """The other axis of an undistorted grid whose given axis is ``vector``."""
+    one, other = grid.axes[axis] / grid.spacing_m, grid.axes[1 - axis] / grid.spacing_m
+    cos, sin = one @ other, one[0] * other[1] - one[1] * other[0]
+    y, x = vector
     return np.array([cos * y + sin * x, cos * x - sin * y])
 
 
@@ -175,7 +181,8 @@ def fit_surface(
     are at least three points for each term.
 
     Args:
-        indices: (n, 2), row and column of each point; three points not on a line.
+        indices: (n, 2), row and column of each point. What does not differ in them is not fitted: along a
+            single row, places depend on the column only.
         places: float64 (n, 2), (y, x) of each.
         degree: Highest degree of a term.
         trust: float64 (n,), weight of each point; None is 1.
@@ -248,35 +255,44 @@ class Indexed:
     surface: Surface
 
 
-def index_spots(spots: Spots, vectors: Vectors, n_sites: int, reach: int) -> Indexed | None:
+def index_spots(
+    spots: Spots, vectors: Vectors, shape: tuple[int, int], centre_px: Centre = None
+) -> Indexed | None:
     """Assign a row and a column to each spot.
 
     It starts at a bright spot with neighbours at the expected places, and continues
     outwards a few sites at a time. The places are fitted again after each step, so
-    that distortions do not add up.
+    that distortions do not add up. A single row or column is followed along itself only; if its centre is
+    known, from the spot nearest to it.
 
     Returns:
-        None if no three spots are neighbours.
+        None if too few spots are neighbours: three, or both of a line of two.
     """
     from scipy.spatial import KDTree
 
+    n_sites, reach = shape[0] * shape[1], max(shape) + 2
     bright = spots.light > BRIGHT * usual_light(spots.light, n_sites)
     places = spots.places[bright]
-    if len(places) < 3:
+    fewest = min(3, n_sites)
+    if len(places) < fewest:
         return None
     tree, shortest = KDTree(places), vectors.shortest_px
-    origin = _best_place(places, tree, vectors, shortest)
+    if centre_px is not None and 1 in shape:
+        origin = places[tree.query(centre_px)[1]]
+    else:
+        origin = _best_place(places, tree, vectors, shortest)
     steps = np.array([vectors.down, vectors.along])
     surface = Surface(np.array([[0, 0], [1, 0], [0, 1]]), np.zeros(2), 1.0, np.vstack([origin, steps]))
     radius, taken, indices = 1.5, np.empty(0, np.int64), np.empty((0, 2), np.int64)
     while True:
-        span = np.arange(-int(radius), int(radius) + 1)
-        square = np.stack(np.meshgrid(span, span, indexing="ij"), axis=-1).reshape(-1, 2)
+        spans = [np.arange(-int(radius), int(radius) + 1) if n > 1 else np.zeros(1, np.int64) for n in shape]
+        square = np.stack(np.meshgrid(*spans, indexing="ij"), axis=-1).reshape(-1, 2)
         off, nearest = (np.asarray(answer) for answer in tree.query(surface.at(square)))
         near = off < NEAR * shortest
         near &= _in_full_lines(square, near)
         taken, indices = nearest[near], square[near]
-        if len(taken) < 3 or min(len(np.unique(values)) for values in indices.T) < 2:
+        n_lines = [len(np.unique(values)) for values in indices.T]
+        if len(taken) < fewest or any(n < min(2, wanted) for n, wanted in zip(n_lines, shape, strict=True)):
             return None
         surface, _ = fit_surface(indices, places[taken], 3 if radius >= 4 else 1)
         if radius >= reach:
@@ -295,9 +311,11 @@ def _in_full_lines(square: Ints, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def find_window(
-    spots: Spots, indexed: Indexed, shape: tuple[int, int]
+    spots: Spots, indexed: Indexed, shape: tuple[int, int], centre_px: Centre = None
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """Choose the rows and columns of the array, ``shape`` of the grid: those with the most light.
+
+    With its centre given, those that are nearest to it count, whatever else is lit.
 
     Returns:
         Row and column of site (0, 0), and the number of bright rows and columns of the array.
@@ -305,16 +323,23 @@ def find_window(
     from scipy.ndimage import map_coordinates
 
     usual = float(np.median(spots.light[indexed.spots]))
-    low = indexed.indices.min(axis=0) - np.array(shape)
-    high = indexed.indices.max(axis=0) + np.array(shape)
+    beyond = np.where(np.array(shape) > 1, shape, 0)
+    low, high = indexed.indices.min(axis=0) - beyond, indexed.indices.max(axis=0) + beyond
     rows, columns = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
     index = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+    n, m = shape
+    if centre_px is not None:
+        middles = indexed.surface.at(
+            index[: len(rows) - n + 1, : len(columns) - m + 1] + [(n - 1) / 2, (m - 1) / 2]
+        )
+        off = np.hypot(*np.moveaxis(middles - np.array(centre_px), -1, 0))
+        row, col = np.unravel_index(int(np.argmin(off)), off.shape)
+        return (int(rows[row]), int(columns[col])), shape
     close = np.all((index >= low + np.array(shape) - 2) & (index <= high - np.array(shape) + 2), axis=-1)
     places = indexed.surface.at(index)
     light = map_coordinates(spots.filtered, places.transpose(2, 0, 1), order=1, mode="constant")
     lit = np.where(close, np.clip(light / usual, 0, 1), 0.0)
     total = np.pad(lit.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    n, m = shape
     in_window = total[n:, m:] - total[:-n, m:] - total[n:, :-m] + total[:-n, :-m]
     row, col = np.unravel_index(int(np.argmax(in_window)), in_window.shape)
     seen_rows = _extent((lit[:, col : col + m] > LIT).mean(axis=1))
@@ -340,13 +365,16 @@ def _best_place(places: Floats, tree: KDTree, vectors: Vectors, shortest: float)
 MIN_FOUND: Final = 0.5
 """Minimum fraction of bright sites."""
 
+MAX_OTHERS: Final = 0.25
+"""Maximum number of bright spots beside a single row or column, relative to its sites."""
+
 MAX_RESIDUAL: Final = 0.08
 """Maximum r.m.s. distance of the spots from the smooth lattice, in spacings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLattice:
-    """The positions of the sites on the frame.
+    """The positions of the sites on the frame; nan for what a single line or site does not show.
 
     Attributes:
         positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site: a smooth lattice
@@ -384,7 +412,9 @@ class FoundLattice:
         return int(self.found.sum())
 
 
-def find_lattice(image: NDArray[Any], grid: SiteGrid, *, saturated: float = 65535.0) -> FoundLattice:
+def find_lattice(
+    image: NDArray[Any], grid: SiteGrid, *, centre_px: Centre = None, saturated: float = 65535.0
+) -> FoundLattice:
     """Find the positions of a grid's sites on an averaged frame.
 
     Rows run along the image's x axis within 15 degrees, from left to right;
@@ -392,13 +422,15 @@ def find_lattice(image: NDArray[Any], grid: SiteGrid, *, saturated: float = 6553
     leads downwards. So row 0 is at the top and column 0 at the left, and the
     six-fold symmetry of the triangular lattice causes no ambiguity. All sites must be
     on the frame; spacings of 5 to 40 pixels, spots of 0.5 to 4 pixels (1 sigma) with at
-    least 2.5 of their widths between them.
+    least 2.5 of their widths between them. A single column is within 15 degrees of the grid's second axis.
 
     The steps are described in ``docs/explanation/finding-sites.md``.
 
     Args:
         image: (height, width), mean of frames on which each site often holds an atom.
         grid: The grid of sites: its size, lattice and shear; its spacing is not used.
+        centre_px: (y, x) of the middle of the grid, to less than half a spacing, for frames that
+            show more of the lattice, or more lines or spots, than the grid has.
         saturated: Counts of a saturated pixel.
 
     Raises:
@@ -407,6 +439,10 @@ def find_lattice(image: NDArray[Any], grid: SiteGrid, *, saturated: float = 6553
     counts = _checked(image, grid, saturated)
     flat = flattened(counts, grid.n_rows * grid.n_cols)
     noise = pixel_noise(counts)
+    index = np.moveaxis(np.indices(grid.shape), 0, -1)
+    if grid.shape == (1, 1):
+        vectors, surface = _single(flat, noise, centre_px)
+        return _refined(flat, noise, vectors, surface, index, grid)
     vectors = find_vectors(flat, grid)
     if vectors is None:
         n_spots = len(find_spots(flat, 10.0, 1.2, 2 * noise).light)
@@ -415,20 +451,15 @@ def find_lattice(image: NDArray[Any], grid: SiteGrid, *, saturated: float = 6553
             f"{grid.lattice} lattice with rows within 15 degrees of the x axis; {_DARK}",
         )
     spots = find_spots(flat, vectors.shortest_px, vectors.width_px, noise)
-    surface, first = _indexed(spots, vectors, grid)
-    index = np.moveaxis(np.indices(grid.shape), 0, -1)
+    surface, first = _indexed(spots, vectors, grid, centre_px)
     return _refined(flat, noise, vectors, surface, index + np.array(first), grid)
 
 
 _DARK: Final = "check the exposure, the light, the loading, the focus, and `grid.lattice`"
+_MORE: Final = "if there are more traps than the grid has, give its centre with `--centre Y,X` in pixels"
 
 
 def _checked(image: NDArray[Any], grid: SiteGrid, saturated: float) -> Floats:
-    if min(grid.shape) < 2:
-        _fail(
-            f"a lattice has two directions, {grid.n_rows} x {grid.n_cols} sites do not; set `detector.sites` "
-            "to a file with their positions",
-        )
     counts = np.asarray(image, np.float64)
     if counts.ndim != 2 or min(counts.shape) < 16 or not np.isfinite(counts).all():
         _fail(
@@ -449,23 +480,44 @@ def _fail(message: str) -> NoReturn:
     raise DeviceError("camera", f"no lattice found: {message}")
 
 
-def _indexed(spots: Spots, vectors: Vectors, grid: SiteGrid) -> tuple[Surface, tuple[int, int]]:
+def _single(flat: Floats, noise: float, centre_px: Centre) -> tuple[Vectors, Surface]:
+    """The place of the only spot, or of that nearest to ``centre_px``; the vectors are made up."""
+    width = max(SCALES_PX, key=lambda scale: scale * float(filtered_by_width(flat, scale).max()))
+    spacing = 8 * width
+    spots = find_spots(flat, spacing, width, 2 * noise)
+    bright = spots.places[spots.light > BRIGHT * spots.light.max(initial=0.0)]
+    if len(bright) == 0 or (len(bright) > 1 and centre_px is None):
+        _fail(f"{len(bright)} spots found of 1 expected; {_DARK if len(bright) == 0 else _MORE}")
+    nearest = 0 if centre_px is None else int(np.argmin(np.hypot(*(bright - np.array(centre_px)).T)))
+    surface = Surface(np.zeros((1, 2), np.int64), np.zeros(2), 1.0, bright[nearest : nearest + 1])
+    return Vectors(np.array([0.0, spacing]), np.array([spacing, 0.0]), width), surface
+
+
+def _indexed(
+    spots: Spots, vectors: Vectors, grid: SiteGrid, centre_px: Centre
+) -> tuple[Surface, tuple[int, int]]:
     """The fitted places of all rows and columns, and the indices of row 0 and column 0."""
     n_sites = grid.n_rows * grid.n_cols
-    indexed = index_spots(spots, vectors, n_sites, max(grid.shape) + 2)
+    indexed = index_spots(spots, vectors, grid.shape, centre_px)
     bright = int(np.count_nonzero(spots.light > 0.3 * usual_light(spots.light, n_sites)))
     n_indexed = 0 if indexed is None else len(indexed.spots)
     if indexed is None or n_indexed < MIN_FOUND * min(bright, n_sites):
         _fail(
             f"of {bright} spots only {n_indexed} are on a lattice; {n_sites} are expected; {_DARK}",
         )
-    first, seen = find_window(spots, indexed, grid.shape)
+    n_others = bright - n_indexed
+    if 1 in grid.shape and centre_px is None and n_others > MAX_OTHERS * n_sites:
+        _fail(
+            f"the grid has {grid.n_rows} x {grid.n_cols} sites, and {n_others} spots are beside its line; "
+            f"{_MORE}"
+        )
+    first, seen = find_window(spots, indexed, grid.shape, centre_px)
     if seen != grid.shape:
         rows, cols = seen
         _fail(
             f"{rows} x {cols} rows and columns of sites are lit, the grid has {grid.n_rows} x {grid.n_cols}; "
             "a dark row or column at the edge is ambiguous: load it, or set the "
-            "size and `shear` of `grid` to those of the static tweezers",
+            f"size and `shear` of `grid` to those of the static tweezers; {_MORE}",
         )
     return indexed.surface, first
 
@@ -485,7 +537,7 @@ def _refined(
         fitted = fit_spots(flat, surface.at(sites), fitted.width_px, 0.3 * shortest, noise)
         off = np.hypot(*(fitted.places - surface.at(sites)).T)
         lit = (fitted.light > 0.25 * np.median(fitted.light)) & (off < 0.29 * shortest)
-        if lit.sum() < max(3, MIN_FOUND * len(sites)):
+        if lit.sum() < max(min(3, len(sites)), MIN_FOUND * len(sites)):
             _fail(f"{lit.sum()} spots found of {len(sites)} expected; {_DARK}")
         surface, _ = fit_surface(sites[lit], fitted.places[lit], 3, fitted.light[lit])
     positions = surface.at(sites)
@@ -513,19 +565,27 @@ def _described(
     grid: SiteGrid,
 ) -> FoundLattice:
     down, along = surface.axes(index.reshape(-1, 2).mean(axis=0))
+    if grid.n_rows == 1:
+        down = _turned(along, grid, 0)
+    elif grid.n_cols == 1:
+        along = _turned(down, grid, 1)
     seen = np.stack([along[::-1], down[::-1]], axis=1)  # (x, y) of each, as columns
     magnification = seen @ np.linalg.inv(grid.axes.T)  # pixels per metre
     left, strengths, right = np.linalg.svd(magnification)
     turned = left @ right
+    steps = [
+        float(np.hypot(*step)) if n > 1 else np.nan for step, n in ((along, grid.n_cols), (down, grid.n_rows))
+    ]
+    is_one = grid.shape == (1, 1)
     return FoundLattice(
         positions_px=positions.reshape(*grid.shape, 2),
         residuals_px=residuals.reshape(*grid.shape, 2),
         light=fitted.light.reshape(grid.shape),
         frame=(frame[0], frame[1]),
         spot_px=fitted.width_px,
-        spacing_px=(float(np.hypot(*along)), float(np.hypot(*down))),
-        angle_rad=float(np.arctan2(turned[1, 0], turned[0, 0])),
-        stretch=float(strengths[0] / strengths[1]),
-        pixel_size_m=float(1 / np.sqrt(strengths[0] * strengths[1])),
+        spacing_px=(steps[0], steps[1]),
+        angle_rad=np.nan if is_one else float(np.arctan2(turned[1, 0], turned[0, 0])),
+        stretch=np.nan if 1 in grid.shape else float(strengths[0] / strengths[1]),
+        pixel_size_m=np.nan if is_one else float(1 / np.sqrt(strengths[0] * strengths[1])),
         residual_px=residual,
     )

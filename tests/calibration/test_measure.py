@@ -44,7 +44,7 @@ def lab(tmp_path: Path, make_lab: Any) -> Any:
 def measured(tmp_path_factory: pytest.TempPathFactory, make_lab: Any) -> Any:
     """Such a lab after calibrations of sites and thresholds, for reading only."""
     lab = make_lab(tmp_path_factory.mktemp("measured") / "lab", PROFILE)
-    lab.sites, lab.thresholds = lab.calibrate("sites", shots=40), lab.calibrate("thresholds", shots=45)
+    lab.sites, lab.thresholds = lab.calibrate("sites", shots=40), lab.calibrate("thresholds", shots=60)
     return lab
 
 

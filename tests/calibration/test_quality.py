@@ -31,6 +31,13 @@ def test_fewer_sites_are_worse() -> None:
     assert not why_worse(entry("sites", 0.01), old)  # from a file: nothing was looked for
 
 
+def test_a_peak_taken_from_the_neighbours_is_the_users_choice() -> None:
+    good, lame = entry("thresholds", 1e-4, n_one_peak=0), entry("thresholds", 1e-4, n_one_peak=2)
+    for in_use in (None, good):
+        assert why_worse(lame, in_use).startswith("2 sites show one peak only")
+    assert not why_worse(lame, lame)
+
+
 def test_one_that_does_not_say_how_good_it_is_replaces_only_its_like() -> None:
     unknown = entry("overlay", math.nan)
     assert "it has no quality figure" in why_worse(unknown, entry("overlay", 1.0))

@@ -100,6 +100,26 @@ def test_atoms_lost_during_the_exposure_are_counted() -> None:
     assert found.lost == pytest.approx(0.012, abs=0.005)
 
 
+def test_a_site_with_one_peak_follows_its_neighbours_and_not_the_far_ones() -> None:
+    rng = np.random.default_rng(8)
+    step = np.linspace(20.0, 60.0, 12)[:, None] * np.ones(12)  # the light falls across the array
+    full = rng.random((200, 12, 12)) < 0.6
+    full[:, 2, 5] = full[:, 9, 5] = False
+    found = fit_thresholds(rng.normal(step * full, 1.0))
+    assert np.argwhere(found.never_loaded).tolist() == [[2, 5], [9, 5]]
+    for row in (2, 9):
+        assert found.thresholds[row, 5] == pytest.approx(found.thresholds[row, 4], rel=0.15)
+
+
+def test_one_site_is_enough() -> None:
+    rng = np.random.default_rng(9)
+    full = rng.random((200, 1, 1)) < 0.6
+    found = fit_thresholds(rng.normal(np.where(full, 9.0, 0.0), 1.0))
+    assert 3.0 < found.thresholds[0, 0] < 6.0
+    with pytest.raises(DeviceError, match="1 of 1 sites show one peak"):
+        fit_thresholds(rng.normal(0.0, 1.0, (200, 1, 1)))
+
+
 def test_sites_with_one_peak_are_listed_and_get_the_others_threshold() -> None:
     lab = Emccd(np.random.default_rng(5))
     signals = lab.draw(200, 0.6)

@@ -163,6 +163,30 @@ def test_spots_that_stand_on_no_lattice_are_refused(jitter: float) -> None:
         find_lattice(drawn(np.clip(sites, 2, 509), SHAPE, 1.2, rng), GRID)
 
 
-def test_one_row_is_no_lattice() -> None:
-    with pytest.raises(DeviceError, match=r"1 x 20 sites do not; set `detector.sites`"):
-        find_lattice(np.zeros((64, 64)), SiteGrid(1, 20))
+@pytest.mark.parametrize("shape", [(1, 12), (12, 1), (1, 2), (2, 1), (2, 2)])
+@pytest.mark.parametrize("shear", [1, -1])
+def test_a_line_is_found_along_its_axis(shape: tuple[int, int], shear: Literal[1, -1]) -> None:
+    grid = SiteGrid(*shape, shear=shear)
+    sites = seen_sites(grid, 11.0, 6.0, centre=(110.0, 120.0))
+    found = find_lattice(drawn(sites, (220, 240), 1.2, np.random.default_rng(7)), grid)
+    assert furthest(found, sites) < 0.25
+    assert np.rad2deg(found.angle_rad) == pytest.approx(6.0, abs=1.5)
+
+
+def test_further_traps_need_the_centre_of_the_grid() -> None:
+    everything = seen_sites(SiteGrid(12, 13), 11.0, 2.0, centre=(110.0, 120.0))
+    image = drawn(everything, (220, 240), 1.2, np.random.default_rng(8))
+    for rows, columns in ((2, 9), (3, 11)), ((4, 5), (2, 12)), ((1, 11), (6, 7)), ((5, 6), (6, 7)):
+        sites = everything[slice(*rows), slice(*columns)]
+        grid = SiteGrid(*sites.shape[:2])
+        with pytest.raises(
+            DeviceError, match="more traps than the grid has, give its centre with `--centre Y,X`"
+        ):
+            find_lattice(image, grid)
+        y, x = sites.mean(axis=(0, 1)) + np.array([3.0, -2.0])
+        assert furthest(find_lattice(image, grid, centre_px=(y, x)), sites) < 0.25
+
+
+def test_a_centre_where_there_is_nothing_is_refused() -> None:
+    with pytest.raises(DeviceError, match="no lattice found"):
+        find_lattice(small_frame(), SMALL, centre_px=(20.0, 500.0))
