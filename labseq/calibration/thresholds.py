@@ -375,7 +375,7 @@ def _cheapest(
 
 
 ENOUGH_SIGNALS: Final = 4000
-"""With fewer signals of all sites together, thresholds cost more than 1.3 times the best in one of 12 draws."""
+"""Signals of all sites together; with fewer, thresholds may cost more than 1.3 times the best."""
 
 MAX_NAMED: Final = 8
 """Maximum number of sites that a message lists; for more, it gives only their number."""
