@@ -22,7 +22,7 @@ Bools = NDArray[np.bool_]
 LANE: Final = 0.5
 """Distance of a lane from the lines of sites on both sides."""
 PARTS: Final = 8
-"""Knots per site of a tweezer's way along a lane that weaves."""
+"""Parts of a site of a tweezer's way along a lane that weaves; with 6 corners come at the trap frequency."""
 KNOTS_OF: Final = "float64[:, ::1]"
 
 
@@ -121,17 +121,20 @@ def add_travel(
     n_parts = max(PARTS * max(up, down), PARTS * min(up, down) + half if min(up, down) > 0 else 0)
     at = np.empty(len(to))
     for part in range(1, n_parts + 1):
+        turns = part == n_parts or part % half != 0  # or a tone starts or stops here
         swing = first * weave * math.sin(2.0 * math.pi * part / PARTS) if part % half else 0.0
         for i in range(len(to)):
             way = to[i] - start[i]
             went = part - (half if way * first < 0.0 else 0)
+            turns = turns or went == 0 or went == PARTS * abs(way)
             if went <= 0:
                 at[i] = start[i] + swing * shear
             elif went < PARTS * abs(way):
                 at[i] = start[i] + math.copysign(went / PARTS, way) - 0.5 * shear * swing
             else:
                 at[i] = to[i] + swing * shear
-        n_knots = add_knot(moving, crossing, n_knots, at, lanes + swing)
+        if turns:
+            n_knots = add_knot(moving, crossing, n_knots, at, lanes + swing)
     return n_knots
 
 

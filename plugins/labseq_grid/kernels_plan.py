@@ -38,9 +38,12 @@ from labseq_grid.kernels_rows import (
 UNWANTED: Final = 3
 """An atom on a site that must be empty; elsewhere an atom is SPARE or STAYS."""
 SCATTER: Final = 3.0
+"""Weight of the vacancies that are left, against one atom carried."""
 WAY: Final = 0.05
 """Weight of one site of an atom's way: on long ways tweezers pass many atoms."""
-"""Weight of the vacancies that are left, against one atom carried."""
+COMPARED_SITES: Final = 2000
+"""Number of sites up to which all candidates that are kept are compared; above, fewer."""
+LEAST_COMPARED: Final = 6
 GRID: Final = const("bool_", 2)
 LIMITS: Final = "UniTuple(int64, 3)"
 Limits = tuple[int, int, int]
@@ -282,6 +285,7 @@ def add_batches(
     source = np.empty_like(kind)
     kept = np.empty((N_KEPT, CANDIDATE), np.int64)
     n_unwanted = np.count_nonzero(kind == UNWANTED)
+    n_compared = max(LEAST_COMPARED, N_KEPT * COMPARED_SITES // kind.size)
     while n_left > 0:
         best = -1e300
         chosen = (0, 0, np.empty((2, 0), np.int64), np.empty((3, 0), np.int64))
@@ -290,7 +294,7 @@ def add_batches(
             n_kept = find_candidates(source, vacant, limits, slots, n_left, kept, n_beside)
             source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
             for i in range(n_kept):
-                if kept[i, ATOMS] < kept[0, ATOMS] - SLACK:
+                if kept[i, ATOMS] < kept[0, ATOMS] - SLACK or i >= n_compared:
                     break
                 swapped = kept[i, ORIENTATION]
                 n_lines = kind.shape[0 if swapped else 1] + 2 * (slots - n_beside) - 1

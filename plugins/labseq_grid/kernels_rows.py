@@ -35,6 +35,8 @@ GOAL_ROWS: Final = 22
 """Number of goal rows that are considered for three rows; for two rows three times as many."""
 TRIALS: Final = 100
 """Maximum number of pairs of choices that are tried for each number of rows."""
+WORK: Final = 4_000_000
+"""Fewer are tried of large grids: so many steps of the programmes for the columns, about."""
 N_KEPT: Final = 16
 """Number of candidates that are kept."""
 SLACK: Final = 2
@@ -203,7 +205,7 @@ def try_rows(
     spare = np.empty((n_froms, 1 << n, n_cols + 1), np.int64)
     end = np.empty((limit + 1, highest + 1), np.int64)
     has_spare = np.zeros(n_froms, np.bool_)
-    n_trials = 0
+    n_trials = work = 0
     for level in range(highest, 0, -1):
         for k in range(n_tos):
             if to_bounds[k] != level:
@@ -219,7 +221,8 @@ def try_rows(
                 if atoms >= worth_keeping(kept, n_kept):
                     n_kept = keep(kept, n_kept, atoms, orientation, froms[i], tos[k], n)
                 n_trials += 1
-                if n_trials == TRIALS or kept[0, ATOMS] == n_left:
+                work += n_cols * limit * most
+                if n_trials == TRIALS or work > WORK or kept[0, ATOMS] == n_left:
                     return n_kept
         if level <= worth_keeping(kept, n_kept):  # the next level is lower
             break
