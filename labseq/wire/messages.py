@@ -1,4 +1,4 @@
-"""A message: one part of msgpack for its structure, and a raw part for each array.
+"""A message: one part of msgpack for its structure, a raw one for all small arrays, and one for each other.
 
 Nothing that arrives is executed: it can become plain values, arrays of numbers, the types of :data:`TYPES`
 and the errors of :mod:`labseq.errors`, whose own constructors check their values.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence, Set as AbstractSet
 from enum import Enum
 from pathlib import PurePath
@@ -27,6 +28,10 @@ MAX_HEADER: Final = 1 << 20
 """Largest first part, in bytes."""
 MAX_PART: Final = 1 << 26
 """Largest part, in bytes; a frame of 4096 x 4096 pixels has half of that."""
+SMALL: Final = 1 << 14
+"""Arrays of at most so many bytes share a part."""
+ALIGNMENT: Final = 16
+"""Where arrays begin in it, in bytes."""
 MAX_PARTS: Final = 256
 MAX_DEPTH: Final = 16
 MAX_DIMENSIONS: Final = 4
@@ -74,10 +79,12 @@ def pack(value: Any) -> list[Part]:
     import msgpack
 
     arrays: list[Part] = []
+    small = bytearray()
 
     def substitute(one: Any) -> Any:
         if isinstance(one, np.ndarray):
-            return msgpack.ExtType(_ARRAY, inner(_described(one, arrays)))
+            place, dtype, shape, about = _described(one, arrays, small)
+            return msgpack.ExtType(_ARRAY, inner([place, dtype, list(shape), about]))
         if (fields := _FIELDS.get(type(one).__name__)) and type(one) is TYPES[type(one).__name__]:
             return msgpack.ExtType(_OBJECT, inner([type(one).__name__, [getattr(one, f) for f in fields]]))
         if isinstance(one, tuple):
@@ -93,7 +100,7 @@ def pack(value: Any) -> list[Part]:
         header = inner(value)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MessageError(f"it cannot be sent: {format_error(error)}") from error
-    parts: list[Part] = [header, *arrays]
+    parts: list[Part] = [header, bytes(small), *arrays] if small or arrays else [header]
     if (
         len(header) > MAX_HEADER
         or len(parts) > MAX_PARTS
@@ -103,16 +110,27 @@ def pack(value: Any) -> list[Part]:
     return parts
 
 
-def _described(array: NDArray[Any], arrays: list[Part]) -> list[Any]:
-    """Where an array is among the parts, its dtype and its shape; its bytes are appended to the parts."""
-    dtype = array.dtype.newbyteorder("<")
-    array = np.ascontiguousarray(array, dtype).reshape(array.shape)
-    arrays.append(array.reshape(-1).view(np.uint8).data if array.size else b"")
+def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> list[Any]:
+    """Where an array is, its dtype and its shape.
+
+    The place is an index among the parts, to which it is appended. Small arrays share the first of them, as
+    a part costs more than copying: their place is [where they begin].
+    """
+    dtype = array.dtype
+    if not dtype.isnative or sys.byteorder == "big":
+        dtype = dtype.newbyteorder("<")
+    if array.dtype is not dtype or not array.flags.c_contiguous:
+        array = np.ascontiguousarray(array, dtype).reshape(array.shape)
+    if array.nbytes <= SMALL:
+        place: Any = [len(small)]
+        small.extend(array.tobytes() + bytes(-array.nbytes % ALIGNMENT))
+    else:
+        arrays.append(array.reshape(-1).view(np.uint8).data)
+        place = len(arrays) + 1
     if dtype.names is None:
-        return [len(arrays), _dtype_text(dtype), list(array.shape), {}]
+        return [place, _dtype_text(dtype), array.shape, {}]
     columns = [[name, _dtype_text(dtype[name])] for name in dtype.names]
-    about = dict((array.dtype.metadata or {}).get("descriptions", {}))
-    return [len(arrays), columns, list(array.shape), about]
+    return [place, columns, array.shape, dict((array.dtype.metadata or {}).get("descriptions", {}))]
 
 
 def _dtype_text(dtype: np.dtype[Any]) -> str:
@@ -187,8 +205,10 @@ def unpack(parts: Sequence[Part]) -> Any:
 
 
 def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
-    index, dtype, shape, about = content
-    if type(index) is not int or not 1 <= index < len(parts):
+    place, dtype, shape, about = content
+    begin = cast("list[Any]", place)[0] if isinstance(place, list) and len(place) == 1 else 0
+    index = 1 if isinstance(place, list) else place
+    if type(index) is not int or not 1 <= index < len(parts) or type(begin) is not int or begin < 0:
         raise MessageError("an array is missing")
     if isinstance(dtype, list):
         columns = [(str(name), _known_dtype(one)) for name, one in cast("list[Any]", dtype)]
@@ -201,8 +221,10 @@ def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
         or any(type(n) is not int or not 0 <= n <= MAX_PART for n in cast("list[Any]", shape))
     ):
         raise MessageError("an array has a wrong shape")
-    data = memoryview(parts[index])
     wanted = math.prod(cast("list[int]", shape)) * kind.itemsize
+    data = memoryview(parts[index])
+    if isinstance(place, list):
+        data = data[begin : begin + wanted]
     if data.nbytes != wanted:
         raise MessageError(f"an array of shape {tuple(shape)} has {data.nbytes} bytes; expected {wanted}")
     array = np.frombuffer(data, kind).reshape(shape) if wanted else np.empty(shape, kind)

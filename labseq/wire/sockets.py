@@ -69,18 +69,20 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def client_socket(keys: Keys | None, server: bytes | None) -> zmq.Socket[Any]:
+def client_socket(keys: Keys | None, server: bytes | None, timeout_s: float = -1e-3) -> zmq.Socket[Any]:
     """A DEALER, not connected yet, that connects once: a connection that breaks stays broken.
 
     Args:
         keys: The keys of this computer; None on this computer only.
         server: The public key of the server; None likewise.
+        timeout_s: Longest time that receiving may take; without it, for ever.
     """
     import zmq
 
     socket = zmq.Context.instance().socket(zmq.DEALER)
     _limit(socket)
     socket.set(zmq.RECONNECT_IVL, -1)
+    socket.set(zmq.RCVTIMEO, round(1e3 * timeout_s))
     if keys is not None and server is not None:
         socket.curve_publickey, socket.curve_secretkey, socket.curve_serverkey = (
             keys.public,

@@ -66,7 +66,7 @@ class Connection:
         try:
             self.about = self._hello(settings, kind)
             self._token = self.about["session"]
-            self._calls = wire.client_socket(keys, server)
+            self._calls = wire.client_socket(keys, server, timeout_s=POLL_S)
             self._calls.connect(wire.endpoint(settings.host, int(self.about["port"])))
         except BaseException:
             self._control.close()
@@ -219,8 +219,12 @@ class Connection:
         try:
             self._calls.send_multipart(parts, copy=False)
             while not self._lost:
-                if self._calls.poll(int(1e3 * POLL_S)):
-                    reply = _read([part.buffer for part in self._calls.recv_multipart(copy=False)])
+                try:
+                    frames = self._calls.recv_multipart(copy=False)
+                except zmq.Again:  # after POLL_S
+                    frames = []
+                if frames:
+                    reply = _read([frame.buffer for frame in frames])
                     if reply.get("n") in (self._number, 0):
                         return reply
                     continue
