@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from labseq.bench import latency
 from labseq.bench.latency import (
     BETWEEN,
     HOST_STAGES,
@@ -23,6 +25,13 @@ SEQUENCE = str(SMALL.sequence)
 
 def measure(*overrides: str, **options: Any) -> LatencyReport:
     return measure_latency(replace(SMALL, overrides=overrides, **options))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_cold_loadings() -> Generator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(latency, "N_WARM", 1)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What each command does once for its process is not done a hundred times in this one."""
     monkeypatch.setattr("typer.main.get_command", get_command)
+    monkeypatch.setattr("labseq.bench.latency.N_WARM", 1)
     monkeypatch.setattr("labseq.calibration.measure.encode_figure", lambda *_, **__: b"")
     monkeypatch.setattr("labseq.pictures.figures.encode_figure", composed)
     monkeypatch.setenv("GIT_DIR", os.devnull)  # no digest of the code's changes for each run
