@@ -32,7 +32,7 @@ from labseq.plugin import (
     render,
 )
 from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
-from labseq_virtual.responses import AXES, REFERENCE, TABLES, Reference
+from labseq_virtual.responses import AXES, REFERENCE, TABLES, TRANSIT_S, Reference
 from labseq_virtual.rf_analysis import HOPS, RfPulse
 from labseq_virtual.settings import SimulationSettings
 
@@ -46,7 +46,6 @@ FADE_S: Final = 80e-6
 """Time in which the other tweezer is faded: five periods in the shallow one."""
 REST_S: Final = 20e-6
 """Time before and after the ramps and moves, for the sound to cross the beam."""
-TRANSIT_S: Final = 10e-6
 SOUND_S: Final = TRANSIT_S / 4
 """s.d. of the sound's weight across the beam, for a transit time of 10 us: its field and that of the beam."""
 KEYED_S: Final = 2e-6

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, format_quantity
+from labseq_virtual.rf_analysis import MAX_SITES, PEAK_SPEED
 from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
@@ -31,6 +32,8 @@ DEPTH_K: Final = 300e-6
 WAIST_M: Final = 0.98e-6
 SITE_M: Final = 4.49e-6
 """Depth and waist of the static tweezers that the tables belong to, and their distance."""
+TRANSIT_S: Final = 10e-6
+"""Transit time of the sound that the tables belong to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,11 @@ def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
             came, first, last = (format_quantity(each, dimension) for each in (value, low, high))
             what = f"profile.{name} is {came}; the virtual lab knows heat and loss from {first} to {last}"
             texts.append(f"{what} only, and takes the nearest end: its losses are not to be trusted")
+    clear_m_s = MAX_SITES * SITE_M / TRANSIT_S / PEAK_SPEED[motion.speed_profile] * time / length
+    if clear_m_s < motion.speed_m_s <= SPEEDS[-1] * time / length:
+        came, last = (format_quantity(each, "speed") for each in (motion.speed_m_s, clear_m_s))
+        what = f"profile.mobile_tweezers.speed is {came}; above {last} the sound's chirp blurs the tweezers"
+        texts.append(f"{what}: that more atoms are lost is right, how many is not to be trusted")
     return texts
 
 

@@ -12,7 +12,7 @@ from labseq.model import Batch, LossSpec, MotionSpec, Plan, SiteGrid, TargetPatt
 from labseq.motion import check_plan
 from labseq.motion.survival import Survival, predict_survival
 
-NO_LOSS = LossSpec(move=0.0, passing=0.0, spread=0.0, image=0.0, lifetime_s=math.inf)
+NO_LOSS = LossSpec(move=0.0, landing=0.0, passing=0.0, spread=0.0, image=0.0, lifetime_s=math.inf)
 GRID = SiteGrid(3, 4)
 ATOMS = np.array([[1, 0, 1, 0], [0, 0, 0, 0], [1, 0, 1, 1]], np.bool_)
 FILL = np.array([[0, 1, 0, 1], [0, 0, 0, 0], [1, 0, 1, 1]], np.bool_)

@@ -1,0 +1,36 @@
+"""What the virtual lab warns of."""
+
+from __future__ import annotations
+
+import pytest
+from labseq_virtual.responses import beyond
+from labseq_virtual.settings import SimulationSettings
+
+from labseq.model import MotionSpec
+
+PAPER = SimulationSettings()
+
+
+@pytest.mark.parametrize(
+    ("motion", "texts"),
+    [
+        (MotionSpec(), []),
+        (MotionSpec(speed_m_s=0.265), []),
+        (MotionSpec(speed_m_s=0.275), ["profile.mobile_tweezers.speed is 275 um/ms; above 269 um/ms"]),
+        (
+            MotionSpec(speed_m_s=0.15, speed_profile="minimum_jerk"),
+            ["profile.mobile_tweezers.speed is 150 um/ms; above 144 um/ms"],
+        ),
+        (MotionSpec(speed_m_s=4.0), ["speed is 4000 um/ms; the virtual lab knows heat and loss from 0 "]),
+        (MotionSpec(drop_off_s=1e-3), ["drop_off is 1 ms; the virtual lab knows"]),
+    ],
+)
+def test_moves_beyond_what_the_tables_were_derived_for(motion: MotionSpec, texts: list[str]) -> None:
+    found = beyond(motion, PAPER)
+    assert len(found) == len(texts)
+    assert all(text in one for text, one in zip(texts, found, strict=True))
+
+
+def test_a_deeper_static_tweezer_bears_more_speed() -> None:
+    deep = PAPER.model_copy(update={"static_depth": 4 * PAPER.static_depth})
+    assert not [text for text in beyond(MotionSpec(speed_m_s=0.4), deep) if "speed" in text]
