@@ -10,15 +10,10 @@ import typer
 campaign = typer.Typer(
     name="campaign",
     help="Clusters, and runs over many values.",
-    short_help="Make the certificates of a cluster.",
+    short_help="Runs over many values; certificates of a cluster.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-
-
-@campaign.callback()
-def _group() -> None:
-    """Keep the name of a single command."""
 
 
 @campaign.command(short_help="Make the certificates of a cluster.")

@@ -241,6 +241,27 @@ def run_queue(
     raise typer.Exit(run_entries(run_session, keep_going=keep_going, watch=watch))
 
 
+@campaign.command("run", short_help="Run a sequence at each point of a grid of values.")
+def run_campaign(
+    file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="The file.", show_default=False)],
+    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the campaign.", show_default=False)],
+    netcdf: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the means of all points here, as netCDF.")
+    ] = None,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
+    keys: Keys = None,
+    _plugins: Plugins = None,
+) -> None:
+    """Run a sequence at each point of a grid of values; continue a campaign that was stopped."""
+    from labseq.campaign.terminal import run_file
+    from labseq.cli.run import run_session
+    from labseq.session.options import Options
+
+    who = Options(workers=workers, scheduler=scheduler, keys=keys)
+    run_file(run_session, file, output, netcdf, who)
+
+
 @app.command(short_help="Check a sequence; print its timeline and limits.")
 def check(
     sequence: SequenceFile,

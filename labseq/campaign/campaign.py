@@ -1,0 +1,207 @@
+"""A campaign: a sequence run at each point of a grid of values, one run for each, in one folder."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from pydantic import Field
+
+from labseq.config.document import Document
+from labseq.errors import ConfigError, Problem
+from labseq.messages import visible
+from labseq.recording import Run, open_run
+from labseq.recording.folders import RUN_FILE
+from labseq.recording.tables import check_installed
+from labseq.roles import RunObserver
+from labseq.session.options import Options
+from labseq.session.session import Session
+from labseq.settings import Settings
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+MAX_POINTS: Final = 10_000
+FIGURES: Final = ("filling_fraction", "success", "n_defects", "n_batches", "n_atom_moves")
+"""Figures of shots, of which the combined file has the mean at each point."""
+
+RunSession = Callable[[Callable[[RunObserver | None], Session]], None]
+
+
+class CampaignSettings(Settings):
+    """A campaign file."""
+
+    labseq: Literal[1]
+    sequence: str = Field(description="the sequence file, beside this file, or the name of one")
+    profile: str | None = Field(default=None, description="hardware profile, instead of the sequence's own")
+    axes: Annotated[dict[str, list[Any]], Field(min_length=1)] = Field(
+        description="address, as for --set, and its values; every combination is a point"
+    )
+    repeats: int = Field(default=1, ge=1, description="shots at each point")
+    seed: int | None = Field(default=None, ge=0, description="seed of all runs; by default each has its own")
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """A campaign file.
+
+    Attributes:
+        document: The file.
+        settings: Its content.
+        axes: Address -> its values, as they were typed.
+    """
+
+    document: Document
+    settings: CampaignSettings
+    axes: dict[str, list[str]]
+
+    @classmethod
+    def read(cls, path: Path) -> Campaign:
+        """Read a campaign file.
+
+        Raises:
+            ConfigError: It has an error, with its place.
+        """
+        document = Document.read(path)
+        settings = document.validate(CampaignSettings, ())
+        axes: dict[str, list[str]] = {}
+        for address, values in settings.axes.items():
+            nodes = [document.root.at(("axes", address, i)) for i in range(len(values))]
+            axes[address] = [str(node.raw or node.plain()) for node in nodes if node is not None]
+            if not values or len({*axes[address]}) < len(values):
+                what = "a value occurs twice" if values else "there are no values"
+                raise document.error(("axes", address), what, "a list of different values")
+        if (n_points := math.prod(map(len, axes.values()))) > MAX_POINTS:
+            raise document.error(("axes",), f"there are {n_points} points", f"at most {MAX_POINTS}", key=True)
+        return cls(document, settings, axes)
+
+    @property
+    def sequence(self) -> Path:
+        """The sequence file, or the name of one."""
+        beside = self.document.path.parent / self.settings.sequence
+        return beside if beside.is_file() else Path(self.settings.sequence)
+
+    def points(self) -> Iterator[tuple[int, ...]]:
+        """The indices of the values of each point; the last axis changes fastest."""
+        yield from itertools.product(*(range(len(values)) for values in self.axes.values()))
+
+    def options(self, point: Sequence[int], output: Path | None = None) -> Options:
+        """The options of the run at a point."""
+        values = [(address, self.axes[address][i]) for address, i in zip(self.axes, point, strict=True)]
+        profile = self.settings.profile
+        if profile is not None and (beside := self.document.path.parent / profile).is_file():
+            profile = str(beside)
+        overrides = tuple(f"{address}={value}" for address, value in values)
+        return Options(profile, self.settings.repeats, self.settings.seed, overrides, output)
+
+    def check(self) -> None:
+        """Check the sequence at every point, before the first run.
+
+        Raises:
+            ConfigError: It has an error; at the place of the value in the campaign file, if that is wrong.
+        """
+        for point in self.points():
+            try:
+                Session.open(self.sequence, **asdict(self.options(point)))
+            except ConfigError as error:
+                raise ConfigError([self._placed(problem, point) for problem in error.problems]) from error
+
+    def _placed(self, problem: Problem, point: Sequence[int]) -> Problem:
+        for address, i in zip(self.axes, point, strict=True):
+            if problem.source.startswith(f"--set {address}="):
+                line, column = self.document.locate(("axes", address, i))
+                return replace(problem, source=self.document.name, line=line, column=column)
+        return problem
+
+
+def run_campaign(run_session: RunSession, campaign: Campaign, folder: Path, workers: Options) -> list[Run]:
+    """Take the runs of a campaign, or those that are missing.
+
+    Args:
+        run_session: Runs a session and shows it.
+        campaign: The campaign.
+        folder: Its folder, a data folder of its own.
+        workers: Who takes the shots: ``workers``, ``scheduler`` and ``keys`` of these options.
+
+    Returns:
+        The run of each point, in order.
+
+    Raises:
+        ConfigError: The campaign has an error, or the runs in the folder are not its own.
+        LabseqError: What ended a run; the campaign is continued by the same command.
+    """
+    campaign.check()
+    who: dict[str, Any] = {"workers": workers.workers, "scheduler": workers.scheduler, "keys": workers.keys}
+    found = _runs_of(campaign, folder)
+    for point in campaign.points():
+        earlier = found.get(point)
+        if earlier is not None and earlier.status == "complete":
+            continue
+
+        def start(observer: RunObserver | None, point: Any = point, earlier: Any = earlier) -> Session:
+            if earlier is not None:
+                return Session.resume(earlier.path, **who, observer=observer)
+            options = asdict(campaign.options(point, folder)) | who
+            return Session.open(campaign.sequence, **options, observer=observer)
+
+        run_session(start)
+    runs = _runs_of(campaign, folder)
+    return [runs[point] for point in campaign.points() if point in runs]
+
+
+def _runs_of(campaign: Campaign, folder: Path) -> dict[tuple[int, ...], Run]:
+    """The runs in a folder: point -> run.
+
+    Raises:
+        ConfigError: One of them belongs to no point.
+    """
+    points = {tuple(campaign.options(point).changes().items()): point for point in campaign.points()}
+    found: dict[tuple[int, ...], Run] = {}
+    for file in sorted(folder.glob(f"*/*/{RUN_FILE}")):
+        run = open_run(file.parent)
+        point = points.get(tuple(run.changes.items()))
+        if point is None:
+            what = "this run belongs to no point of the campaign, which may have been changed since"
+            raise ConfigError(Problem(what, visible(str(run.path)), expected="another folder"))
+        found[point] = run
+    return found
+
+
+def combined(campaign: Campaign, runs: Sequence[Run]) -> xr.Dataset:
+    """The results of a campaign: mean figures over the grid of its points.
+
+    Args:
+        campaign: The campaign.
+        runs: The run of each point, in order.
+
+    Returns:
+        A variable for each of :data:`FIGURES`, with a dimension for each axis, and ``n_shots``; nan where no
+        shot has the figure. Coordinates are the values in SI units.
+    """
+    check_installed("xarray", "h5netcdf")
+    import numpy as np
+    import xarray as xr
+
+    shape = tuple(map(len, campaign.axes.values()))
+    data = {name: np.full(shape, np.nan) for name in FIGURES}
+    n_shots, coordinates = np.zeros(shape, np.int64), dict[str, Any]()
+    for point, run in zip(campaign.points(), runs, strict=True):
+        n_shots[point] = len(run.shots)
+        for name, values in data.items():
+            known = [float(one) for shot in run.shots if (one := shot.row.get(name)) is not None]
+            if known:
+                values[point] = np.mean(known)
+        for address, i in zip(campaign.axes, point, strict=True):
+            change = run.record["overrides"][address]
+            coordinates.setdefault(address, ([None] * len(campaign.axes[address]), change["unit"]))
+            coordinates[address][0][i] = change["value"]
+    names = [*campaign.axes]
+    return xr.Dataset(
+        {name: (names, values) for name, values in {**data, "n_shots": n_shots}.items()},
+        {name: ((name,), values, {"units": unit}) for name, (values, unit) in coordinates.items()},
+        {"sequence": campaign.settings.sequence},
+    )

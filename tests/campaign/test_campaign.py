@@ -1,0 +1,84 @@
+"""Campaigns: a run for each point, continued after a stop; mistakes of the file with their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from labseq.campaign.campaign import Campaign, combined, run_campaign
+from labseq.errors import ConfigError, StopRequested
+from labseq.session.options import Options
+from labseq.session.session import Session
+from tests.session.small_runs import write
+
+FILE = """labseq: 1
+sequence: no_scan.yaml
+axes:
+  planner.degree_of_parallelism: [1, 4]
+  profile.simulation.loading: [60 %, 80 %]
+repeats: 2
+seed: 3
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    write(tmp_path)
+    path = tmp_path / "campaign.yaml"
+    path.write_text(FILE, encoding="utf-8")
+    return path
+
+
+def running(n_runs: int) -> Callable[[Any], None]:
+    """Runs sessions, and is stopped in the last of them."""
+    left = [n_runs]
+
+    def run_session(opening: Callable[[Any], Session]) -> None:
+        with opening(None) as session:
+            left[0] -= 1
+            if not left[0]:
+                session.stop_flag.request()
+            session.run()
+
+    return run_session
+
+
+def test_a_campaign_that_is_stopped_goes_on_and_its_results_are_combined(file: Path) -> None:
+    campaign, folder = Campaign.read(file), file.parent / "out"
+    with pytest.raises(StopRequested):
+        run_campaign(running(2), campaign, folder, Options())
+    runs = run_campaign(running(9), campaign, folder, Options())
+    assert [run.status for run in runs] == ["complete"] * 4
+    assert len([*folder.glob("*/*/run.json")]) == 4
+    results = combined(campaign, runs)
+    assert dict(results.sizes) == {"planner.degree_of_parallelism": 2, "profile.simulation.loading": 2}
+    assert results["profile.simulation.loading"].values.tolist() == [0.6, 0.8]
+    point = results.sel({"planner.degree_of_parallelism": 4, "profile.simulation.loading": 0.6})
+    [expected] = [
+        run
+        for run in runs
+        if (run.changes["planner.degree_of_parallelism"], run.changes["profile.simulation.loading"])
+        == ("4", "60 %")
+    ]
+    assert float(point["n_batches"]) == sum(shot.row["n_batches"] for shot in expected.shots) / 2
+    file.write_text(FILE.replace("seed: 3", "seed: 4"), encoding="utf-8")
+    with pytest.raises(ConfigError, match="this run belongs to no point of the campaign"):
+        run_campaign(running(9), Campaign.read(file), folder, Options())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("labseq: 1\nsequence: x\naxes: {}\n", r"campaign.yaml:3:7: .*axes"),
+        ("labseq: 1\nsequence: x\nrepeat: 2\naxes: {a: [1]}\n", r"campaign.yaml:3:1: .*'repeat'.*'repeats'"),
+        ("labseq: 1\nsequence: x\naxes: {a: [1, 1]}\n", r"campaign.yaml:3:11: a value occurs twice"),
+        (FILE.replace("[1, 4]", "[1, 0]"), r"campaign.yaml:4:38: degree_of_parallelism is 0"),
+    ],
+)
+def test_mistakes_have_their_place(file: Path, text: str, message: str) -> None:
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
+        run_campaign(running(9), Campaign.read(file), file.parent / "out", Options())
