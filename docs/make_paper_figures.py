@@ -1,20 +1,22 @@
 """Draw the paper's figures 4 and 5, from runs or from the simulated tables.
 
     python docs/make_paper_figures.py --figure 5 RUN [RUN2] --output figure5.png
-    python docs/make_paper_figures.py --shots-4 20000 --shots-5 10000
+    python docs/make_paper_figures.py --shots-4 10000 --shots-5 10000
 
 The first command draws a run of ``sequences/figure5_multicycle.yaml`` or ``figure4_dop_scan.yaml``, or two
 runs to compare. The second takes many shots of these sequences with labseq's sequencer, keeps their sums
-instead of files, and draws the figures of the documentation. Each point of figure 4 is appended to its table
-as soon as it is done, and skipped if it is there already: a long simulation can be stopped and continued.
+instead of files, draws the figures of the documentation, and writes the tables of its page, with the
+differences from the paper in standard errors. Seeds are fixed. Both figures continue from their tables, so
+a long simulation can be stopped; after a change of the code that matters, delete the tables first.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import io
 import math
-import secrets
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
@@ -29,7 +31,8 @@ from numpy.typing import NDArray
 
 from labseq import Run, Session, ShotRecord, open_run
 from labseq.analysis.statistics import Statistics, statistics_of
-from labseq.model.estimate import Rate
+from labseq.files import write_file
+from labseq.model.estimate import Estimate, Rate
 from labseq.recording.points import scan_points
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
@@ -37,6 +40,7 @@ from labseq.sequencer.run import Sequencer
 DOCS = Path(__file__).parent
 SEQUENCES = DOCS.parent / "sequences"
 FIGURES = DOCS / "_static" / "paper"
+PAGE = DOCS / "explanation" / "virtual-lab.md"
 
 FIGURE_4, FIGURE_5 = "figure4_dop_scan.yaml", "figure5_multicycle.yaml"
 DOP = "planner.degree_of_parallelism"
@@ -61,9 +65,17 @@ UNTUNED = (
     "profile.simulation.mobile_light.depth_drop_per_tone=0 %",
     "profile.simulation.mobile_light.adiabatic_depth=0 uK",
     "profile.simulation.imaging_loss=0.314 %",
-    "planner.repair_below=0",
 )
 """Overrides of the profile `paper`, after which only the loss of a moved atom is fitted."""
+SERIES_5: dict[str, tuple[str, tuple[str, ...]]] = {
+    "figure5": ("profile `paper`", ()),
+    "figure5_no_repair": ("the same, repair off", ("planner.repair_below=0",)),
+    "figure5_untuned": ("only the loss per atom fitted", UNTUNED),
+    "figure5_variant": ("`variant: paper`", ("planner.variant=paper",)),
+}
+"""Table of each series of figure 5 -> its name and its overrides."""
+DRAWN_5 = ("figure5", "figure5_untuned")
+SEED_5, PART_5 = 51, 250
 
 
 @dataclass
@@ -77,8 +89,8 @@ class Tally:
     def write_shot(self, shot: ShotRecord) -> None:
         images = [image for image in shot.images if image.cycle >= 0]
         self.defects.append([int(self.target.n_defects(image.occupancy)) for image in images])
-        played = [cycle.plan.batch_offsets[cycle.n_batches_played] for cycle in shot.cycles]
-        self.n_atom_moves.append([int(n) for n in played])
+        played = [list(cycle.plan.batches)[: cycle.n_batches_played] for cycle in shot.cycles]
+        self.n_atom_moves.append([sum(len(b) for b in batches if not b.linked) for batches in played])
         shot.images.clear()
 
 
@@ -89,7 +101,7 @@ class NoObserver:
         del name, values
 
 
-def take(sequence: str, n_shots: int, overrides: Sequence[str], seed: int) -> Tally:
+def take(sequence: str, shots: Sequence[int], overrides: Sequence[str], seed: int) -> Tally:
     """Take the shots of a sequence, and keep what the figures need."""
     session = Session.open(SEQUENCES / sequence, overrides=overrides, seed=seed)
     lab = session.build_lab()
@@ -108,7 +120,7 @@ def take(sequence: str, n_shots: int, overrides: Sequence[str], seed: int) -> Ta
     )
     try:
         sequencer.open()
-        sequencer.run(range(n_shots))
+        sequencer.run(shots)
     finally:
         sequencer.shut_down()
     return tally
@@ -121,7 +133,7 @@ def point(dop: int, window_ms: int, n_shots: int, seed: int) -> dict[str, Any]:
         f"repeats={n_shots}",
         f"shot.2.rearrange.window={window_ms} ms",
     ]
-    filling = 1 - np.array(take(FIGURE_4, n_shots, overrides, seed).defects)[:, 0] / 225
+    filling = 1 - np.array(take(FIGURE_4, range(n_shots), overrides, seed).defects)[:, 0] / 225
     error = filling.std(ddof=1) / math.sqrt(n_shots)
     return {
         "dop": dop,
@@ -156,34 +168,129 @@ def simulate_4(n_shots: int, n_processes: int, points: Iterable[tuple[int, int]]
     done = {(int(row["dop"]), int(row["window_ms"])) for row in rows_of(path)}
     with ProcessPoolExecutor(n_processes) as pool:
         left = [key for key in points if key not in done]
-        tasks = [pool.submit(point, *key, n_shots, secrets.randbits(63)) for key in left]
+        tasks = [pool.submit(point, *key, n_shots, 1000 * key[0] + key[1]) for key in left]
         for task in as_completed(tasks):
             append(path, task.result())
 
 
-def simulate_5(n_shots: int, n_processes: int) -> None:
-    """Take the shots of figure 5, fitted and untuned, and write its tables."""
-    parts = [n_shots // n_processes] * n_processes
-    for name, overrides in (("figure5", ()), ("figure5_untuned", UNTUNED)):
-        with ProcessPoolExecutor(n_processes) as pool:
-            tasks = [pool.submit(take, FIGURE_5, n, overrides, secrets.randbits(63)) for n in parts]
-            tallies = [task.result() for task in tasks]
-        defects = np.concatenate([tally.defects for tally in tallies])
-        moves = np.concatenate([tally.n_atom_moves for tally in tallies])
-        path = FIGURES / f"{name}.csv"
-        path.unlink(missing_ok=True)
-        for cycle in range(defects.shape[1]):
-            counts = np.bincount(np.minimum(defects[:, cycle], 9), minlength=10)
-            append(
-                path,
-                {
-                    "cycles": cycle + 1,
-                    "shots": len(defects),
-                    **{f"defects_{n}": int(counts[n]) for n in range(10)},
-                    "filling": f"{1 - defects[:, cycle].mean() / 225:.6f}",
-                    "atom_moves": f"{moves[:, cycle].mean():.3f}",
-                },
-            )
+def simulate_5(n_shots: int) -> None:
+    """Add shots to the series of figure 5 until all have so many, in parts."""
+    while True:
+        shots = {name: int(rows[0]["shots"]) if (rows := table_5(name)) else 0 for name in SERIES_5}
+        name = min(shots, key=lambda name: shots[name])
+        if shots[name] >= n_shots:
+            return
+        part = range(shots[name], min(shots[name] + PART_5, n_shots))
+        add_5(name, take(FIGURE_5, part, SERIES_5[name][1], SEED_5))
+
+
+def table_5(name: str) -> list[dict[str, str]]:
+    """The table of a series of figure 5, a row for each cycle."""
+    return rows_of(FIGURES / f"{name}.csv")
+
+
+def add_5(name: str, tally: Tally) -> None:
+    """Add shots to the table of a series of figure 5."""
+    defects, moves = np.array(tally.defects), np.array(tally.n_atom_moves)
+    before = table_5(name)
+    rows: list[dict[str, Any]] = []
+    for cycle in range(defects.shape[1]):
+        old = {key: float(value) for key, value in before[cycle].items()} if before else {}
+        counts = np.bincount(np.minimum(defects[:, cycle], 9), minlength=10)
+        n_old = int(old.get("shots", 0))
+        n = n_old + len(defects)
+        filling = n_old * old.get("filling", 0.0) + (1 - defects[:, cycle] / PAPER_ATOMS).sum()
+        n_moves = n_old * old.get("atom_moves", 0.0) + moves[:, cycle].sum()
+        squares = n_old * old.get("filling_squared", 0.0) + ((1 - defects[:, cycle] / PAPER_ATOMS) ** 2).sum()
+        rows.append(
+            {
+                "cycles": cycle + 1,
+                "shots": n,
+                **{f"defects_{k}": int(counts[k] + old.get(f"defects_{k}", 0)) for k in range(10)},
+                "filling": f"{filling / n:.9f}",
+                "filling_squared": f"{squares / n:.9f}",
+                "atom_moves": f"{n_moves / n:.6f}",
+            }
+        )
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_file(FIGURES / f"{name}.csv", text.getvalue().encode())
+
+
+def difference(value: float, error: float, paper: float, paper_error: float) -> str:
+    """A difference from the paper in standard errors of both: "+3.1"."""
+    return f"{(value - paper) / math.hypot(error, paper_error):+.1f}"
+
+
+def percent(value: float, error: float) -> str:
+    """A fraction with its error in per cent: "1.53(12) %"."""
+    return f"{Estimate(value, error).scaled(100)} %"
+
+
+def lines_5() -> list[str]:
+    """The table of figure 5 with its differences from the paper."""
+    header = (
+        "series",
+        "shots",
+        "after one cycle",
+        "after two",
+        "after ten",
+        "filling after one",
+        "atoms moved",
+    )
+    cells = [percent(p, e) for _, p, e in (*PAPER_DEFECT_FREE, *PAPER_FILLING)]
+    lines = [
+        "| " + " | ".join(row) + " |" for row in (header, ["---"] * 7, ["Tian et al.", "", *cells, "2.7"])
+    ]
+    for name, (label, _) in SERIES_5.items():
+        rows = table_5(name)
+        if not rows:
+            continue
+        n = int(rows[0]["shots"])
+        cells = [label, str(n)]
+        for cycle, paper, paper_error in PAPER_DEFECT_FREE:
+            p = int(rows[cycle - 1]["defects_0"]) / n
+            error = math.sqrt(p * (1 - p) / n)
+            cells.append(f"{percent(p, error)}, {difference(p, error, paper, paper_error)}")
+        filling, squared = (float(rows[0][key]) for key in ("filling", "filling_squared"))
+        error = math.sqrt(max(squared - filling**2, 0.0) / n)
+        cells.append(f"{percent(filling, error)}, {difference(filling, error, *PAPER_FILLING[0][1:])}")
+        later = np.mean([float(row["atom_moves"]) for row in rows[1:]])
+        cells.append(f"{later:.1f}")
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def lines_4() -> list[str]:
+    """The table of figure 4."""
+    rows = rows_of(FIGURES / "figure4.csv")
+    by_key = {(int(row["dop"]), int(row["window_ms"])): float(row["filling"]) for row in rows}
+    header = ["DOP", *map(str, range(2, 16))]
+    lines = ["| " + " | ".join(row) + " |" for row in (header, ["---"] * 15)]
+    for label, keys in (("window 200 ms", POINTS[:14]), ("own window, 60 to 94 ms", POINTS[14:])):
+        cells = [f"{100 * by_key[key]:.2f}" if key in by_key else "" for key in keys]
+        lines.append("| " + " | ".join([label, *cells]) + " |")
+    for row in rows:
+        if (row["dop"], row["window_ms"]) == ("7", "60"):
+            value, error = float(row["filling"]), float(row["error"])
+            away = difference(value, error, *PAPER_FILLING[0][1:])
+            lines += [
+                "",
+                f"At DOP 7: {percent(value, error)}, {away} standard errors from the paper's 97.66(4) %.",
+            ]
+    return lines
+
+
+def write_page(page: Path = PAGE) -> None:
+    """Replace the tables of the page."""
+    text = page.read_text(encoding="utf-8")
+    for name, lines in (("figure 4", lines_4()), ("figure 5", lines_5())):
+        part = re.compile(rf"(?<=<!-- measured: {name} -->\n).*?(?=<!-- end -->)", re.DOTALL)
+        body = "\n".join(["", *lines, "", ""])
+        text = part.sub(lambda _, body=body: body, text, count=1)
+    write_file(page, text.encode())
 
 
 class Points(NamedTuple):
@@ -557,8 +664,8 @@ def draw_5(path: Path) -> None:
     """Draw figure 5 from its tables."""
     series: list[Points] = []
     defects: list[NDArray[np.int64]] = []
-    for name, label in (("figure5", "profile paper"), ("figure5_untuned", "only the loss per atom fitted")):
-        rows = rows_of(FIGURES / f"{name}.csv")
+    for name in DRAWN_5:
+        rows, label = table_5(name), SERIES_5[name][0].replace("`", "")
         rates = [Rate(int(row["defects_0"]), int(row["shots"])) for row in rows]
         points = [(n, rate.value, *rate.interval) for n, rate in enumerate(rates, start=1)]
         series.append(Points.of(f"{label}, {rows[0]['shots']} shots", points))
@@ -577,7 +684,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--shots-4", type=int, default=0, help="shots of each point of figure 4; 0: draw only"
     )
     parser.add_argument("--shots-5", type=int, default=0, help="shots of figure 5; 0: draw only")
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--processes", type=int, default=1, help="of figure 4")
     given = parser.parse_args(arguments)
     if given.figure is not None:
         if not 1 <= len(given.runs) <= 2:
@@ -590,7 +697,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.shots_4:
         simulate_4(given.shots_4, given.processes, POINTS)
     if given.shots_5:
-        simulate_5(given.shots_5, given.processes)
+        simulate_5(given.shots_5)
+    write_page()
     draw_4(FIGURES / "figure4.png")
     draw_5(FIGURES / "figure5.png")
 

@@ -183,6 +183,7 @@ class Figure:
 
 PSCA: Final = PlannerEntry("psca")
 PSCA_OF_THE_PAPER: Final = PlannerEntry("psca", (("variant", "paper"),))
+ROWS_X_COLUMNS: Final = PlannerEntry("grid")
 
 EBADI: Final = (("speed", "75 um/ms"), ("pick_up", "15 us"), ("drop_off", "15 us"))
 """Transport speed and capture time of S. Ebadi et al., Nature 595, 227 (2021)."""
@@ -219,7 +220,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 title="compact targets, 75 % loading, degree of parallelism 15",
                 x="n_target_atoms",
                 y="n_batches",
-                planner_entries=(PSCA, PSCA_OF_THE_PAPER, PlannerEntry("lsap_squared")),
+                planner_entries=(PSCA, PSCA_OF_THE_PAPER, ROWS_X_COLUMNS, PlannerEntry("lsap_squared")),
                 conditions=_COMPACT,
                 fitted=True,
                 paper="PSCA 0.48(2), modified LSAP 1.16(1)",
@@ -229,7 +230,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 title="15 x 15 out of 20 x 20, 75 % loading",
                 x="degree_of_parallelism",
                 y="n_batches",
-                planner_entries=(PSCA, PSCA_OF_THE_PAPER),
+                planner_entries=(PSCA, PSCA_OF_THE_PAPER, ROWS_X_COLUMNS),
                 conditions=tuple(Condition((20, 20), "compact:15x15", 0.75, dop) for dop in range(2, 16)),
                 fitted=False,
                 paper="PSCA 160.0(2) batches at 2, 29.61(3) at 15",

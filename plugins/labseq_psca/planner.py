@@ -57,7 +57,7 @@ class PscaSettings(Settings):
     )
     variant: Literal["fewest", "paper"] = Field(
         default="fewest",
-        description="fewest: few batches; paper: each row sort helps one column, to compare with the paper",
+        description="fewest: few batches; paper: the paper's text taken literally, for comparison",
     )
     row_order: RowOrder = Field(
         default="half_filled",

@@ -35,25 +35,22 @@ def test_filling_declines_in_the_fixed_window_with_a_step_at_thirteen() -> None:
     assert max(steps, key=lambda dop: steps[dop]) == 13
 
 
-@pytest.mark.parametrize(
-    ("cycle", "paper", "within"), [(1, 0.015, 0.005), (2, 0.169, 0.04), (10, 0.33, 0.04)]
-)
-def test_figure_five_is_as_near_to_the_paper_as_the_page_says(
-    cycle: int, paper: float, within: float
-) -> None:
-    row = rows("figure5")[cycle - 1]
-    assert row["shots"] == 10_000
-    assert row["defects_0"] / row["shots"] == pytest.approx(paper, abs=within)
+def test_the_page_is_what_the_script_writes(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(PAGE, encoding="utf-8")
+    load_script("make_paper_figures").write_page(page)
+    assert page.read_text(encoding="utf-8") == PAGE
 
 
-def test_the_page_has_the_numbers_of_the_tables() -> None:
-    for values in (fillings(fixed=True), fillings(fixed=False)):
-        assert " | ".join(f"{100 * values[dop]:.2f}" for dop in sorted(values)) in PAGE
-    for name in ("figure5", "figure5_untuned"):
-        table = rows(name)
-        assert f"{100 * table[0]['filling']:.2f} %" in PAGE
-        for cycle in (2, 10):
-            assert f"{table[cycle - 1]['defects_0'] / 100:.1f}(" in PAGE
+def test_a_series_grows_by_the_shots_that_are_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = load_script("make_paper_figures")
+    monkeypatch.setattr(script, "FIGURES", tmp_path)
+    script.add_5("figure5", script.Tally([[5, 0], [9, 2]], [[100, 4], [90, 2]]))
+    script.add_5("figure5", script.Tally([[0, 0]], [[80, 3]]))
+    first, second = script.table_5("figure5")
+    assert (first["shots"], first["defects_0"], first["defects_9"]) == ("3", "1", "1")
+    assert float(first["atom_moves"]) == pytest.approx(90)
+    assert float(second["filling"]) == pytest.approx(1 - 2 / 3 / 225)
 
 
 def test_the_script_takes_a_point_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

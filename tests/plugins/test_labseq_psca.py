@@ -27,11 +27,19 @@ from .planning import COMPACT, loadings, plan_and_check, psca
 Bools = NDArray[np.bool_]
 
 
-@pytest.mark.parametrize(("dop", "paper"), [(15, 29.61), (2, 160.0)])
-def test_the_papers_variant_comes_near_its_numbers_of_batches(dop: int, paper: float) -> None:
-    planner = psca(variant="paper")(Context(), dop)
-    n_batches = [planner.plan(atoms, COMPACT).n_batches for atoms in loadings(40)]
-    assert np.mean(n_batches) == pytest.approx(paper, rel=0.12)
+def test_the_papers_variant_takes_fewest_batches_with_half_filled_rows_first() -> None:
+    """As the paper says; the text gives fewer batches than the paper's own program has (29.61)."""
+    n_batches = {
+        order: np.mean(
+            [
+                psca(variant="paper", row_order=order)(Context(), 15).plan(a, COMPACT).n_batches
+                for a in loadings(60)
+            ]
+        )
+        for order in ("half_filled", "fullest")
+    }
+    assert n_batches["half_filled"] == pytest.approx(20.6, abs=0.8)
+    assert n_batches["fullest"] > n_batches["half_filled"] + 1.0
 
 
 @pytest.mark.parametrize(("order", "row"), [("half_filled", 1), ("fullest", 0), ("emptiest", 2)])

@@ -251,25 +251,27 @@ def test_ejection_slots_are_used_from_the_outermost_atom_on(slots: int) -> None:
 
 
 class TestPaper:
-    """Row sorting for one column at a time."""
+    """Each row is sorted once, and helps the columns most in need."""
 
-    def test_the_most_distant_column_of_the_target_gives(self) -> None:
-        row, need = bools([1, 1, 0, 0, 1, 1]), ints([0, 1, 1, 1, 1, 0])
-        assert kernels_paper.partner(row, need, ints([2, 1, -1, 0, 1, 2]), 2) == 4
-        assert kernels_paper.partner(row, need, ints([2, 0, -1, 0, 0, 2]), 2) == 5
-        assert kernels_paper.partner(row, need, ints([0, 0, -1, 0, 0, 0]), 2) == -1
+    def test_rows_closest_to_half_filled_come_first(self) -> None:
+        atoms = bools([[1, 1, 1, 1], [1, 0, 0, 0], [0, 1, 1, 0], [0, 1, 1, 1]])
+        assert kernels_paper.order_of_rows(atoms, 0).tolist() == [2, 1, 3, 0]
+        assert kernels_paper.order_of_rows(atoms, -1).tolist() == [0, 3, 2, 1]
+        assert kernels_paper.order_of_rows(atoms, 1).tolist() == [1, 2, 3, 0]
 
-    def test_surplus_goes_to_the_nearest_column_with_room(self) -> None:
-        row, need = bools([0, 0, 1, 1, 0]), ints([0, 0, 1, 1, 0])
-        assert kernels_paper.partner(row, need, ints([-1, -1, 1, 0, -1]), 2) == 1
+    def test_columns_most_in_need_are_helped_by_those_with_most_to_spare(self) -> None:
+        change = np.empty(6, np.int64)
+        row, need = bools([1, 0, 0, 1, 1, 0]), ints([0, 3, 3, 0, 0, 3])
+        assert kernels_paper.exchange_for_need(row, need, ints([2, 1, 2, 3, 1, 0]), change) == 3
+        assert change.tolist() == [-1, 1, 1, -1, -1, 1]
+        assert kernels_paper.exchange_for_need(row, need, ints([0, 1, 2, 3, 1, 0]), change) == 2
+        assert change.tolist() == [0, 1, 0, -1, -1, 1]
 
-    def test_the_column_most_in_need_comes_first_and_surplus_last(self) -> None:
-        spare = np.zeros(4, np.int64)
-        room = ints([9, 9, 9, 9])
-        assert kernels_paper.column_in_need(ints([3, 4, 2, 0]), room, ints([2, 2, 5, 1]), spare) == 1
-        assert kernels_paper.column_in_need(ints([3, 4, 2, 0]), room, ints([3, 4, 5, 1]), spare) == 2
-        assert spare.tolist() == [0, 0, 3, -8]
-        assert kernels_paper.column_in_need(ints([3, 4, 2, 0]), room, ints([3, 4, 2, 1]), spare) == -1
+    def test_each_row_is_sorted_once_where_that_is_enough(self) -> None:
+        atoms, fill = bools([[1, 0, 1], [0, 0, 1], [0, 1, 1]]), bools([[1, 0, 0], [1, 0, 0], [1, 0, 0]])
+        moves, offsets = kernels_paper.plan_as_in_paper(atoms, fill, np.zeros_like(fill), 3, 3, 1, 0)
+        assert len(offsets) == 3
+        assert sorted(moves[:, 0].tolist()) == [1, 2, 2]
 
 
 class TestRepair:
