@@ -57,6 +57,14 @@ PICTURES: Final = {
         (f"{_KAGOME} --json plan.json", "labseq waveform plan.json --batches 1-3 --png waveform.png"),
         "waveform.png",
     ),
+    "grid_waveform.png": Picture(
+        "explanation/grid-planner.md",
+        (
+            "labseq plan random:20x20@0.75 --seed 1 --target compact:15x15 --planner grid --json plan.json",
+            "labseq waveform plan.json --batches 1 --png grid_waveform.png",
+        ),
+        "grid_waveform.png",
+    ),
     "scan_window.png": Picture(
         "tutorials/scan.md",
         ("labseq run window.yaml --seed 1", "labseq plot --what scan -o window.png"),
