@@ -377,6 +377,9 @@ def _cheapest(
 ENOUGH_SIGNALS: Final = 4000
 """Signals of all sites together; with fewer, thresholds may cost more than 1.3 times the best."""
 
+CHANCE: Final = 1e-3
+"""Probability that any site of an array counts as one that is never, or always, loaded only by chance."""
+
 MAX_NAMED: Final = 8
 """Maximum number of sites that a message lists; for more, it gives only their number."""
 
@@ -401,7 +404,7 @@ def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
         "false_negative": float(fitted.false_negative.mean()),
         "false_positive": float(fitted.false_positive.mean()),
         "loading": float(fitted.loading.mean()),
-        "n_one_peak": float((fitted.never_loaded | fitted.always_loaded).sum()),
+        "n_one_peak": float(_n_not_by_chance(fitted, len(signals))),
     }
     return AnalysisResult(
         {"thresholds": fitted.thresholds},
@@ -410,6 +413,16 @@ def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
         {"unit": unit, "detector": chosen.dump()},
         lambda: draw_thresholds(signals, fitted.thresholds, unit),
     )
+
+
+def _n_not_by_chance(fitted: FittedThresholds, n_frames: int) -> int:
+    """Number of sites with one peak whose loading differs from the others' by more than chance explains."""
+    from scipy.stats import binom
+
+    n_full, usual = np.rint(fitted.loading * n_frames), float(np.median(fitted.loading))
+    chance = np.minimum(binom.cdf(n_full, n_frames, usual), binom.sf(n_full - 1, n_frames, usual))
+    one_peak = fitted.never_loaded | fitted.always_loaded
+    return int(np.count_nonzero(one_peak & (chance < CHANCE / one_peak.size)))
 
 
 def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[str, ...]:
