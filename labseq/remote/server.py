@@ -178,9 +178,9 @@ class Server:
         self._runs: dict[tuple[str, bytes], Run] = {}
         self._ended = threading.Event()
         self._failure: BaseException | None = None
-        self._control = server_socket(self._zmq, host, port, keys)
         self.devices: dict[str, ServedDevice] = {}
         try:
+            self._control = server_socket(self._zmq, host, port, keys)
             for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
                 socket = server_socket(self._zmq, host, port + number, keys)
                 device = ServedDevice(name, chosen, socket, self.is_known, self._tell)

@@ -57,6 +57,7 @@ class Connection:
         self._controlling = threading.Lock()
         self._number = self._question = 0
         self._lost = ""
+        self._is_abandoned = False
         self._ended = threading.Event()
         self._heard_s = time.monotonic()
         self._beat: dict[str, Any] = {"number": 0, "running": False, "rescue": ""}
@@ -148,7 +149,12 @@ class Connection:
                 self._calls.close()
                 self._calling.release()
 
-    def ask(self, what: str, timeout_s: float = wire.LOST_S, **about: Any) -> Any:
+    def abandon(self) -> None:
+        """End the heartbeats of a driver that is no longer used; the collector of garbage may not wait."""
+        self._is_abandoned = True
+        self._ended.set()
+
+    def ask(self, what: str, timeout_s: float | None = None, **about: Any) -> Any:
         """Ask the control of the server; also while a call is out.
 
         Raises:
@@ -163,17 +169,19 @@ class Connection:
             about |= {"n": self._question, "op": what}
             if "session" not in about and what != "hello":
                 about["session"] = self._token
+            timeout_s = wire.LOST_S if timeout_s is None else timeout_s
             deadline_s = time.monotonic() + timeout_s
             try:
                 self._control.send_multipart(wire.pack(about))
-                while (left_s := deadline_s - time.monotonic()) > 0:
-                    if not self._control.poll(int(1e3 * left_s) + 1):
-                        break
+                # an answer that is there counts, even if this computer stood still meanwhile
+                while self._control.poll(int(1e3 * max(0.0, deadline_s - time.monotonic()))):
                     answer = _read(self._control.recv_multipart())
                     if answer.get("n") in (self._question, 0):
                         if "error" in answer:
                             raise wire.error_of(answer["error"], self._name, self.address)
                         return answer.get("value")
+            except zmq.Again:
+                pass  # it cannot be sent: the connection was refused or has ended
             except zmq.ZMQError as error:
                 raise self._failure(f"{error.strerror}") from error
         raise _NoAnswer(self._name, f"the server did not answer within {timeout_s:.3g} s (at {self.address})")
@@ -276,7 +284,10 @@ class Connection:
             except DeviceError as error:
                 text = str(error).removeprefix(f"{self._name}: ").removesuffix(f" (at {self.address})")
                 self._lose(text)
-                return
+                self._ended.wait()
+        if self._is_abandoned:
+            self._control.close()
+            self._calls.close()
 
     def _lose(self, why: str) -> None:
         if not self._ended.is_set():

@@ -60,7 +60,7 @@ class _Link:
             if isinstance(self._context.simulation, RemoteSimulation):  # its devices are constructed with it
                 self._context.simulation.connect()
             self._connection = made = Connection(self.settings, self._context, self._kind)
-            weakref.finalize(self, made.close)
+            weakref.finalize(self, made.abandon)
             self._about = made.about
             made.state = self._state = {**self._state, **made.state}
         return self._connection

@@ -15,6 +15,8 @@ pytest.importorskip("msgpack")
 
 from labseq_remote.settings import RemoteSettings
 
+import labseq.remote.server
+from labseq import wire
 from labseq.remote.server import Server, Serving, serving
 
 PROFILE = """\
@@ -82,6 +84,15 @@ def served(folder: Path, profile: str = PROFILE, *, plain: bool = True) -> Gener
             return
         except OSError:
             continue
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _patient() -> Generator[None]:
+    """Computers that run tests stand still for longer than those of a lab."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wire, "LOST_S", 2.0)
+        patch.setattr(labseq.remote.server, "LOST_S", 2.0)
+        yield
 
 
 @pytest.fixture(scope="session")

