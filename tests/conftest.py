@@ -6,6 +6,7 @@ import itertools
 import os
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import tomllib
@@ -63,6 +64,22 @@ def pytest_xdist_auto_num_workers() -> int:
     """Three processes for two cores: a third of the time, tests wait for processes and devices."""
     n_cores = os.cpu_count() or 1
     return n_cores + (n_cores + 1) // 2
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile all kernels before the whole suite begins: its processes would each compile the same ones."""
+    config = session.config
+    if hasattr(config, "workerinput") or config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        return
+    names = [
+        ".".join(path.relative_to(base).with_suffix("").parts)
+        for base, folder in ((_REPOSITORY, "labseq"), (_REPOSITORY / "plugins", "."))
+        for path in (base / folder).rglob("*kernels*.py")
+    ]
+    code = (
+        f"import importlib, labseq.kernel as k; [*map(importlib.import_module, {names!r})]; k.load_kernels()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.hookimpl(wrapper=True)
