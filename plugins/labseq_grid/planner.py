@@ -33,6 +33,11 @@ class GridSettings(Settings):
         description="maximum number of mobile tweezers on at once, those without an atom included; the "
         "profile's limits hold too",
     )
+    lanes: Literal["straight", "weaving"] = Field(
+        default="straight",
+        description="weaving: around the atoms of a triangular lattice, 2.2 um from them; a simulation that "
+        "takes each knot for a stop overrates the losses of such lanes",
+    )
     without_lanes: Literal["refuse", "psca"] = Field(
         default="refuse",
         description="what happens if the profile's clearance, band or tones leave no lane between the sites: "
@@ -141,7 +146,7 @@ class GridPlanner:
         self._slots = motion.eject_slots
         self._may_land = motion.empty_tweezers_may_land
         self._grid = context.grid
-        self._weave = lane_weave(context.grid, motion)
+        self._weave = lane_weave(context.grid, motion) if settings.lanes == "weaving" else 0.0
         self._kernel: Callable[..., Any] | None = None
 
     def warm(self) -> None:
