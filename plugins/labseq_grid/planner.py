@@ -35,8 +35,8 @@ class GridSettings(Settings):
     )
     lanes: Literal["straight", "weaving"] = Field(
         default="straight",
-        description="weaving: around the atoms of a triangular lattice, 2.2 um from them; a simulation that "
-        "takes each knot for a stop overrates the losses of such lanes",
+        description="weaving: around the atoms of a triangular lattice, 2.2 um from them, which loses fewer; "
+        "planning and checking take longer",
     )
     without_lanes: Literal["refuse", "psca"] = Field(
         default="refuse",
