@@ -24,7 +24,10 @@ def test_each_array_of_the_papers_figure_6_has_a_sequence() -> None:
 def test_it_is_accepted_without_a_warning_and_runs(sequence: Path, tmp_path: Path) -> None:
     dry_run = "full" if sequence.stem == "follow" else "off"  # it waits for another program
     with labseq.Session.open(sequence, shots=1, seed=1, output=tmp_path, dry_run=dry_run) as session:
-        assert not check(session).warnings
+        warnings = [one.what for one in check(session).warnings]
+        if sequence.stem == "climb_dop_speed":  # goes to speeds at which the tweezers fade
+            assert "above 269 um/ms" in warnings.pop()
+        assert not warnings
         run = session.run()
     assert run.status == "complete"
     if "rearrange" not in sequence.read_text("utf-8"):
