@@ -88,10 +88,13 @@ def served(folder: Path, profile: str = PROFILE, *, plain: bool = True) -> Gener
 
 @pytest.fixture(scope="session", autouse=True)
 def _patient() -> Generator[None]:
-    """Computers that run tests stand still for longer than those of a lab."""
+    """Computers that run tests stand still for longer than those of a lab, and drivers that are dropped stay
+    connected, because tests do not collect garbage.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wire, "LOST_S", 2.0)
         patch.setattr(labseq.remote.server, "LOST_S", 2.0)
+        patch.setattr(labseq.remote.server, "MAX_SESSIONS", 10_000)
         yield
 
 
