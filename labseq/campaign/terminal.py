@@ -11,7 +11,7 @@ from typing import Any
 from labseq.campaign.campaign import Campaign, combined, run_campaign
 from labseq.console.output import check_writable, say
 from labseq.console.text import columns, plural
-from labseq.files import explained
+from labseq.files import explained, whole_file
 from labseq.recording.tables import check_installed
 from labseq.session.options import Options
 
@@ -33,6 +33,6 @@ def run_file(
         rows.append((*values, str(len(run.shots)), filling, f"{run.path.parent.name}/{run.path.name}"))
     say("", *columns(rows), f"{plural(len(runs), 'run')} in {folder}")
     if netcdf is not None:
-        with explained(netcdf):
-            combined(campaign, runs).to_netcdf(netcdf, engine="h5netcdf")
+        with explained(netcdf), whole_file(netcdf) as written:
+            combined(campaign, runs).to_netcdf(Path(written.name), engine="h5netcdf")
         say(f"written: {netcdf}")
