@@ -1,4 +1,4 @@
-"""How planning, checking, tones, rendering and detection grow with the array: table and picture.
+"""How detection, planning, checking, tones, rendering and recording grow with the array: table and picture.
 
     python docs/make_scale.py [--loadings 5]
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -26,9 +27,22 @@ from labseq_scans.planners import Mta1Planner, Mta1Settings, TetrisPlanner, Tetr
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.geometry import pattern
+from labseq.model import CycleRecord, ImageRecord, PlanReport, RunRecord, ShotRecord
 from labseq.model.grid import centred_comb
-from labseq.motion import check_plan, render, tone_program
-from labseq.plugin import Context, Frame, MotionSpec, RfSpec, SiteGrid
+from labseq.motion import Renderer, check_plan, tone_program
+from labseq.plain import now_utc
+from labseq.plugin import (
+    Context,
+    Frame,
+    MotionSpec,
+    Occupancy,
+    Plan,
+    RfSpec,
+    SiteGrid,
+    TargetPattern,
+    ToneProgram,
+)
+from labseq.recording import RunWriter
 
 PAGE: Final = Path(__file__).parent / "explanation" / "scale.md"
 PICTURE: Final = Path(__file__).parent / "_static" / "planners" / "scale.png"
@@ -36,8 +50,8 @@ SIZES: Final = (20, 30, 45, 64, 100)
 LOADINGS: Final = (0.55, 0.85)
 BAND_HZ: Final = 35.4e6
 """All sites and an ejection slot at each end share it, as in the profile ``large``."""
-RENDERED: Final = 64
-"""Up to this size waveforms are rendered: longer ones need more memory than they tell."""
+CHUNK: Final = 1 << 18
+"""Samples that are rendered at a time, as by a card's driver."""
 PLANNERS: Final[dict[str, tuple[Any, Any]]] = {
     "psca": (PscaPlanner, PscaSettings),
     "grid": (GridPlanner, GridSettings),
@@ -51,6 +65,46 @@ def cpu_s(call: Callable[[], Any]) -> tuple[float, Any]:
     start_s = time.process_time()
     made = call()
     return time.process_time() - start_s, made
+
+
+def render_chunks(program: ToneProgram) -> None:
+    """Render both channels, into the same memory again and again."""
+    renderer, out = Renderer(program), np.empty(CHUNK, np.int16)
+    for start in range(0, renderer.n_samples, CHUNK):
+        for channel in (0, 1):
+            renderer.write(channel, start, out)
+
+
+def record(frame: Frame, atoms: Occupancy, target: TargetPattern, plan: Plan, report: PlanReport) -> float:
+    """Processor time of writing a shot with two frames and one cycle to the disk."""
+    now = now_utc()
+    run = RunRecord(
+        name="scale",
+        n_shots=1,
+        seed=1,
+        simulated=True,
+        t_start_utc=now,
+        target=target,
+        sequence_text="",
+        profile_text="",
+        sequence_path="",
+        profile_path="",
+        resolved={},
+        overrides={},
+        devices={},
+        plugins=(),
+        provenance={},
+        record_frames="all",
+        grid_spacing_m=4.49e-6,
+        lattice="triangular",
+    )
+    signal = np.ones(atoms.shape, np.float32)
+    images = [ImageRecord(frame, atoms, signal, 1, cycle, 0.0, 45e-3) for cycle in (-1, 0)]
+    cycle = CycleRecord(2, 0, plan, report, plan.n_batches, 0.06, 0.1, 0.03)
+    shot = ShotRecord(0, 0, 1, now, now, "complete", images=images, cycles=[cycle])
+    with tempfile.TemporaryDirectory() as folder:
+        writer = RunWriter.create(Path(folder), run)
+        return cpu_s(lambda: writer.write_shot(shot))[0]
 
 
 def measure(n: int, loading: float, n_loadings: int) -> dict[str, float]:
@@ -82,8 +136,9 @@ def measure(n: int, loading: float, n_loadings: int) -> dict[str, float]:
                 )
                 assert report.meets_target or atoms.sum() < target.n_atoms
                 took[f"tones, {name}"], program = cpu_s(lambda q=plan: tone_program(q, grid, motion))
-                if n <= RENDERED and k < 2:
-                    took[f"render, {name}"], _ = cpu_s(lambda p=program: render(p))
+                if k < 2:
+                    took[f"render, {name}"], _ = cpu_s(lambda p=program: render_chunks(p))
+                took[f"record, {name}"] = record(frame, atoms, target, plan, report)
             for what, value in took.items():
                 if k > 0:  # the first compiles
                     found[what].append(value)
@@ -116,7 +171,14 @@ def draw(results: dict[float, dict[int, dict[str, float]]]) -> None:
         if what.startswith("batches"):
             continue
         points = [(n * n, 1e3 * by_size[n][what]) for n in SIZES if what in by_size[n]]
-        style = {"plan": "o-", "check": "s--", "tones": "^:", "render": "d-.", "detect": "k+-"}
+        style = {
+            "plan": "o-",
+            "check": "s--",
+            "tones": "^:",
+            "render": "d-.",
+            "detect": "k+-",
+            "record": "x-",
+        }
         axes.loglog(*zip(*points, strict=True), style[what.partition(",")[0]], label=what, markersize=4)
     axes.set_xlabel("sites")
     axes.set_ylabel("processor time (ms)")

@@ -30,6 +30,19 @@ class TestContractWhereEmptyTweezersLand(PlannerContract):
         return lambda context: grid(context, 9)
 
 
+class TestContractOfLanesThatWeave(PlannerContract):
+    """A triangular lattice whose rows shift to the left on the way down, where all others shift to the right."""
+
+    n_examples: ClassVar[int] = 15
+
+    def context(self, shape: tuple[int, int]) -> Context:
+        return Context("planner", SiteGrid(*shape, shear=-1))
+
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], GridPlanner]:
+        return lambda context: GridPlanner(GridSettings(lanes="weaving"), context)
+
+
 @pytest.mark.parametrize(("dop", "most"), [(7, 12.6), (15, 8.0), (20, 7.7)])
 @pytest.mark.parametrize("may_land", [False, True])
 def test_mean_number_of_batches_of_the_papers_array(dop: int, most: float, may_land: bool) -> None:
