@@ -31,7 +31,7 @@ class TestContractWhereEmptyTweezersLand(PlannerContract):
 
 
 class TestContractOfLanesThatWeave(PlannerContract):
-    """A triangular lattice whose rows shift to the left on the way down, where all others shift to the right."""
+    """On a lattice whose rows shift to the left on the way down; everywhere else they shift to the right."""
 
     n_examples: ClassVar[int] = 15
 
