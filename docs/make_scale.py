@@ -166,6 +166,7 @@ def table(results: dict[float, dict[int, dict[str, float]]]) -> list[str]:
 def draw(results: dict[float, dict[int, dict[str, float]]]) -> None:
     """The growth at the higher loading."""
     figure, axes = plt.subplots(figsize=(6, 4.4), layout="constrained")
+    axes.set_prop_cycle(color=plt.get_cmap("tab20").colors)  # type: ignore[attr-defined]
     by_size = results[LOADINGS[-1]]
     for what in by_size[SIZES[0]]:
         if what.startswith("batches"):
@@ -182,7 +183,7 @@ def draw(results: dict[float, dict[int, dict[str, float]]]) -> None:
         axes.loglog(*zip(*points, strict=True), style[what.partition(",")[0]], label=what, markersize=4)
     axes.set_xlabel("sites")
     axes.set_ylabel("processor time (ms)")
-    axes.legend(frameon=False, fontsize=7, ncols=2)
+    figure.legend(loc="outside lower center", frameon=False, fontsize=7, ncols=4)
     figure.savefig(PICTURE, dpi=110)
 
 

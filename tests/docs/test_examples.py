@@ -51,7 +51,6 @@ NOT_RUN = {
     "docs/explanation/detection.md": [MEASURED],
     "docs/explanation/finding-sites.md": [MEASURED],
     "docs/explanation/grid-planner.md": [
-        "slow where `labseq plan` has chosen plain Python for its process",
         "takes a minute",
         "measured",
         "takes minutes",
