@@ -75,10 +75,9 @@ greatest depth in kelvin; the durations of the ramps at start and end; depth and
 came from; its temperature, as it would be in a static tweezer of nominal depth; the probability that it was
 lost so far; whether the pick-up is contained in both; the velocity, in sites per second."""
 N_COURSE = 11
-NEW_LEG = 0.2
-"""Change of the velocity, relative to the greater one, from which on a tweezer has started anew."""
-PERIOD_S = 7e-6
-"""Radial period in a mobile tweezer: 145 kHz at 2.1 mK. What turns more often than that moves in a curve."""
+NEW_LEG = 0.8
+"""Change of the velocity, relative to the greater one, from which on a tweezer has started anew; smaller ones
+are the bends of a curve, each with less than a third of the energy of a start and a stop."""
 RAMP = 0.7
 """Ratio of the powers at the two ends of a segment below which it is part of a ramp: tones that give depths
 that differ from site to site change less."""
@@ -329,10 +328,7 @@ def advance(
     course[HEAT] *= math.exp(min(duration_s * constants[NOISE_HZ] * ratio, 20.0))
     down_hz, right_hz = down / duration_s, right / duration_s
     change = math.hypot(down_hz - course[DOWN], right_hz - course[RIGHT])
-    before_hz = math.hypot(course[DOWN], course[RIGHT])
-    starts = change > NEW_LEG * max(math.hypot(down_hz, right_hz), before_hz)
-    if before_hz > 0.0 and duration_s < PERIOD_S:
-        starts = False  # part of a curve, which the atom follows
+    starts = change > NEW_LEG * max(math.hypot(down_hz, right_hz), math.hypot(course[DOWN], course[RIGHT]))
     course[DOWN], course[RIGHT] = down_hz, right_hz
     length_m = math.hypot(down, right) * constants[SPACING]
     if length_m == 0.0:

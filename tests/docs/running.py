@@ -12,7 +12,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-import numba  # noqa: F401 - else `labseq plan` would choose plain Python for all that follows in this process
+# else `labseq plan` would choose plain Python for all that follows in this process
+import numba  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
 from labseq.cli import main
 
