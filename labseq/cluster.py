@@ -7,7 +7,6 @@ carry out whatever code they are sent.
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import pickle
 import queue
@@ -22,6 +21,7 @@ from typing import Any, Final, cast
 from labseq import __version__
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, error_text, format_error, install_hint
+from labseq.processes import is_loopback
 from labseq.workers import Do, Make
 
 CA_FILE: Final = "ca.pem"
@@ -155,16 +155,9 @@ def check_address(address: str) -> None:
     found = _ADDRESS.fullmatch(address)
     if found is None:
         raise _problem(address, "this is no address of a scheduler", "tls://HOST:PORT")
-    if found[1] == "tcp" and not _is_here(found[2].strip("[]")):
+    if found[1] == "tcp" and not is_loopback(found[2].strip("[]")):
         what = "without encryption, anybody on the network could have the workers run code"
         raise _problem(address, what, "tls://HOST:PORT", "'labseq campaign keys' makes the certificates")
-
-
-def _is_here(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _problem(address: str, what: str, expected: str = "", hint: str = "") -> ConfigError:

@@ -260,3 +260,20 @@ def _local(time_utc: str) -> str:
         return f"{datetime.fromisoformat(time_utc).astimezone():%Y-%m-%d %H:%M:%S}"
     except ValueError:
         return time_utc
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach an address; a name of a host counts as reachable by others.
+
+    Example:
+        >>> is_loopback("127.0.0.1"), is_loopback("::1"), is_loopback("localhost"), is_loopback("0.0.0.0")
+        (True, True, True, False)
+        >>> is_loopback("camera-pc")
+        False
+    """
+    import ipaddress  # few commands need it
+
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -168,7 +168,7 @@ class ServedDevice:
         chosen: Its plugin.
         socket: A ROUTER; used in the device's thread only.
         is_known: Whether a client's key is still known.
-        tell: Receives what happens, for the operator.
+        report: Receives what happens, for the operator.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class ServedDevice:
         chosen: ChosenPlugin,
         socket: Any,
         is_known: Callable[[str], bool],
-        tell: Callable[[str], object],
+        report: Callable[[str], object],
     ) -> None:
         self.name = name
         self.kind = chosen.entry.kind
@@ -187,7 +187,7 @@ class ServedDevice:
         self._chosen = chosen
         self._socket = socket
         self._is_known = is_known
-        self._tell = tell
+        self._report = report
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name=f"labseq {name}", daemon=True)
 
@@ -241,7 +241,7 @@ class ServedDevice:
         thread.start()
         thread.join(RESCUE_S)
         session.rescue = outcome[0] or "safe"
-        self._tell(f"{self.name}: {session.call}() does not return; made safe beside it: {session.rescue}")
+        self._report(f"{self.name}: {session.call}() does not return; made safe beside it: {session.rescue}")
         if outcome[0] and session.watchdog is not None:
             session.watchdog.end()  # it switches off what it was not asked to forget
 
@@ -262,7 +262,7 @@ class ServedDevice:
                 except zmq.ZMQError:
                     pass  # the client is gone
                 except Exception as error:  # noqa: BLE001 - no message may end this thread
-                    self._tell(f"{self.name}: a message could not be answered: {format_error(error)}")
+                    self._report(f"{self.name}: a message could not be answered: {format_error(error)}")
             for session in [one for one in self.sessions.values() if one.ended]:
                 self._close(session)
             if self._ended.is_set() and not self.sessions:
@@ -410,7 +410,7 @@ class ServedDevice:
             assert self.owner is not None
             raise DeviceError(self.name, f"in use by {self.owner.who}; one at a time can use it")
         if self.owner is None:
-            self._tell(f"{self.name}: in use by {session.who}")
+            self._report(f"{self.name}: in use by {session.who}")
         self.owner, session.is_open = session, True
         with session.abort.held():
             session.device.open()
@@ -419,7 +419,7 @@ class ServedDevice:
             session.watchdog = Watchdog("labseq serve-devices")
             session.watchdog.add(self.name, 0, emergency.script, dict(emergency.arguments))
             for note in session.watchdog.notes():
-                self._tell(f"{self.name}: {note}")
+                self._report(f"{self.name}: {note}")
 
     def _close_device(self, session: Session) -> None:
         """Close it; the owner gives it up."""
@@ -457,7 +457,7 @@ class ServedDevice:
             return
         after_s = time.monotonic() - begun_s
         outcome = "; ".join(failures) or f"made safe in {1e3 * after_s:.0f} ms"
-        self._tell(f"{self.name}: the connection of {session.who} ended ({session.ended}); {outcome}")
+        self._report(f"{self.name}: the connection of {session.who} ended ({session.ended}); {outcome}")
         if failures and session.watchdog is not None:
             session.watchdog.end()
             session.watchdog = None

@@ -70,7 +70,7 @@ class Serving:
 
 
 def serve_devices(
-    profile: str, overrides: Sequence[str], how: Serving, tell: Callable[[str], object]
+    profile: str, overrides: Sequence[str], how: Serving, report: Callable[[str], object]
 ) -> None:
     """Serve devices until Ctrl-C or SIGTERM; then they are made safe.
 
@@ -83,18 +83,18 @@ def serve_devices(
     """
     require_packages()
     stop = StopFlag()
-    with stop_on_signals(stop), serving(profile, overrides, how, tell) as server:
+    with stop_on_signals(stop), serving(profile, overrides, how, report) as server:
         try:
             while True:
                 stop.wait(LOOK_S)
                 server.check()
         except StopRequested:
-            tell("ends; devices in use are made safe")
+            report("ends; devices in use are made safe")
 
 
 @contextmanager
 def serving(
-    profile: str, overrides: Sequence[str], how: Serving, tell: Callable[[str], object]
+    profile: str, overrides: Sequence[str], how: Serving, report: Callable[[str], object]
 ) -> Generator[Server]:
     """The same within a block."""
     try:
@@ -107,10 +107,10 @@ def serving(
     keys = None if how.plain else find_keys(keys_root(), how.key)
     hardware = _served(resolve_profile(profile, overrides=profile_overrides(overrides)), how.devices)
     with ExitStack() as stack:
-        stack.enter_context(lock_devices(hardware, "labseq serve-devices", tell))
-        tell(f"tests {', '.join(hardware.chosen)}")
-        _test(hardware, tell)
-        server = Server(hardware, host, port, keys, tell)
+        stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
+        report(f"tests {', '.join(hardware.chosen)}")
+        _test(hardware, report)
+        server = Server(hardware, host, port, keys, report)
         stack.callback(server.end)
         server.start()
         yield server
@@ -131,7 +131,7 @@ def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> ResolvedProfil
     return replace(hardware, chosen=chosen)
 
 
-def _test(hardware: ResolvedProfile, tell: Callable[[str], object]) -> None:
+def _test(hardware: ResolvedProfile, report: Callable[[str], object]) -> None:
     """Raise the first failure of a device, after all were tried."""
     is_virtual = hardware.virtual_time
     clock = VirtualClock(StopFlag()) if is_virtual else RealClock(StopFlag())
@@ -140,11 +140,11 @@ def _test(hardware: ResolvedProfile, tell: Callable[[str], object]) -> None:
     failures: list[LabseqError] = [*refused.values()]
     if simulation is not None or not is_virtual:
         for found in check_each_device(
-            made.items(), timeouts_of(hardware.profile), StopFlag(), simulation, tell
+            made.items(), timeouts_of(hardware.profile), StopFlag(), simulation, report
         ):
             failures += [one for one in (found.failure, found.unsafe, found.unclosed) if one is not None]
     for failure in failures[1:]:
-        tell(f"error: {failure}")
+        report(f"error: {failure}")
     if failures:
         raise failures[0]
 
@@ -157,7 +157,7 @@ class Server:
         host: Address to listen on.
         port: The control's port; the devices have the next ones.
         keys: Keys of this computer; None without keys.
-        tell: Receives what happens, for the operator.
+        report: Receives what happens, for the operator.
     """
 
     def __init__(
@@ -166,11 +166,11 @@ class Server:
         host: str,
         port: int,
         keys: Any,
-        tell: Callable[[str], object],
+        report: Callable[[str], object],
     ) -> None:
         import zmq
 
-        self._tell_to = tell
+        self._report_to = report
         self._keys = keys
         self._known: Mapping[bytes, str] = known_keys(keys_root()) if keys is not None else {}
         self._zmq = zmq.Context()
@@ -183,7 +183,7 @@ class Server:
             self._control = server_socket(self._zmq, host, port, keys)
             for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
                 socket = server_socket(self._zmq, host, port + number, keys)
-                device = ServedDevice(name, chosen, socket, self.is_known, self._tell)
+                device = ServedDevice(name, chosen, socket, self.is_known, self._report)
                 self.devices[name] = device
         except ConfigError:
             self._zmq.destroy(linger=0)
@@ -204,12 +204,12 @@ class Server:
             device.start()
         self._thread.start()
         places = ", ".join(f"{name} at {port}" for name, port in self._ports.items())
-        self._tell(f"serves {places}; control at tcp://{self._host}:{self._port}; Ctrl-C ends it")
+        self._report(f"serves {places}; control at tcp://{self._host}:{self._port}; Ctrl-C ends it")
         if self._keys is not None:
             names = (
                 ", ".join(sorted(self._known.values())) or f"none: put public keys into {keys_root()}/known"
             )
-            self._tell(f"known keys: {names}")
+            self._report(f"known keys: {names}")
 
     def end(self) -> None:
         """Make all devices safe, and end all threads."""
@@ -219,7 +219,7 @@ class Server:
         if self._auth is not None:
             self._auth.stop()
         for name in late:
-            self._tell(f"{name}: NOT SAFE: a call does not return")
+            self._report(f"{name}: NOT SAFE: a call does not return")
         if not late:
             self._zmq.destroy(linger=0)
 
@@ -236,8 +236,8 @@ class Server:
         """Whether a client's key is known, or none is needed."""
         return self._keys is None or peer.encode() in self._known
 
-    def _tell(self, text: str) -> None:
-        self._tell_to(f"{now().astimezone():%H:%M:%S} {text}")
+    def _report(self, text: str) -> None:
+        self._report_to(f"{now().astimezone():%H:%M:%S} {text}")
 
     def _serve(self) -> None:
         import zmq

@@ -38,7 +38,6 @@ from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import make_safe_after_crash
 from labseq.session.scan import Point
 from labseq.session.scan_run import OwnShots, scan_run_of
-from labseq.session.workers import WorkersShots, refuse_workers
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
@@ -219,7 +218,10 @@ class Session:
             warnings = [str(problem) for problem in check(self, runs=True).warnings]
             labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
             lab = next(labs)
-            refuse_workers(self.assembly, self.options, lab)
+            if self.options.has_workers:
+                from labseq.session.workers import refuse_workers  # most runs have none
+
+                refuse_workers(self.assembly, self.options, lab)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
             if gc.get_freeze_count():  # by an earlier run in this process
@@ -307,6 +309,8 @@ class Session:
         if not self.options.has_workers:
             self.scan_run.run(OwnShots(sequencer, first, changes, record.seed), hooks)
             return
+        from labseq.session.workers import WorkersShots
+
         shots = WorkersShots(self.scan_run, self.options, writer, self._observers, self.stop_flag)
         with closing(shots):
             self.scan_run.run(shots, hooks)

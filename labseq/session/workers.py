@@ -51,7 +51,7 @@ Place = int | Mapping[str, float]
 
 
 def refuse_workers(assembly: Assembly, options: Options, lab: Lab) -> None:
-    """Check that the shots of a run can be taken by several workers, if they are to be.
+    """Check that the shots of a run can be taken by several workers.
 
     Args:
         assembly: The run.
@@ -63,8 +63,6 @@ def refuse_workers(assembly: Assembly, options: Options, lab: Lab) -> None:
     """
     if options.workers < 1:
         raise ConfigError(Problem(f"workers is {options.workers}", expected="1 or more"))
-    if not options.has_workers:
-        return
     if options.scheduler is not None:
         check_address(options.scheduler)
         if options.workers != 1:

@@ -116,18 +116,6 @@ def own_names(extra: tuple[str, ...] = ()) -> frozenset[str]:
     )
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach an address.
-
-    Example:
-        >>> is_loopback("127.0.0.1"), is_loopback("::1"), is_loopback("localhost"), is_loopback("0.0.0.0")
-        (True, True, True, False)
-    """
-    with suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
-
-
 def find_token() -> str:
     """The token: that of LABSEQ_WEB_TOKEN, else that of this user, which is made when it is first needed.
 

@@ -20,8 +20,8 @@ from labseq.console.output import say
 from labseq.errors import ConfigError, Problem
 from labseq.files import data_root
 from labseq.messages import install_hint, visible
-from labseq.processes import Process
-from labseq.web.access import Access, find_token, is_loopback, own_names
+from labseq.processes import Process, is_loopback
+from labseq.web.access import Access, find_token, own_names
 
 HOST: Final = "127.0.0.1"
 PORT: Final = 8642

@@ -1,5 +1,6 @@
 """Messages between computers: values, keys and sockets, for drivers of remote devices and their server."""
 
+from labseq.processes import is_loopback
 from labseq.wire.keys import find_keys, keys_root, known_keys, new_keys, read_public
 from labseq.wire.messages import MessageError, error_of, pack, report_error, unpack
 from labseq.wire.sockets import (
@@ -8,7 +9,6 @@ from labseq.wire.sockets import (
     PROTOCOL,
     client_socket,
     endpoint,
-    is_loopback,
     parse_address,
     require_packages,
     server_socket,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
@@ -54,19 +53,6 @@ def parse_address(address: str) -> tuple[str, int]:
             f"'{clean(address)}' is no address; expected tcp://HOST:PORT, as tcp://camera-pc:5760"
         )
     return found[1].strip("[]"), int(found[2])
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach an address; a name of a host counts as reachable by others.
-
-    Example:
-        >>> is_loopback("127.0.0.1"), is_loopback("localhost"), is_loopback("camera-pc")
-        (True, True, False)
-    """
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def client_socket(keys: Keys | None, server: bytes | None, timeout_s: float = -1e-3) -> zmq.Socket[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
@@ -15,6 +14,7 @@ from labseq.plugin import (
     clean,
     port_identities,
     setting_error,
+    wire,
 )
 
 SIMULATED: Final = "simulated"
@@ -64,7 +64,7 @@ class TcpLeaderSettings(LeaderSettings):
 
     @model_validator(mode="after")
     def _check_host(self) -> Self:
-        if not self.allow_remote and not _is_loopback(self.host):
+        if not self.allow_remote and not wire.is_loopback(self.host):
             what = f"host is '{clean(self.host)}', which other computers can reach"
             hint = "or set 'allow_remote: true' in a network in which nobody listens"
             raise setting_error(
@@ -84,12 +84,3 @@ class SerialLeaderSettings(LeaderSettings):
     def identities(self) -> tuple[str, ...]:
         """What only one process can use of it."""
         return port_identities(self.port)
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -76,8 +76,8 @@ came from; its temperature, as it would be in a static tweezer of nominal depth;
 lost so far; whether the pick-up is contained in both; the velocity, in sites per second."""
 N_COURSE = 11
 NEW_LEG = 0.8
-"""Change of the velocity, relative to the greater one, from which on a tweezer has started anew; smaller ones
-are the bends of a curve, each with less than a third of the energy of a start and a stop."""
+"""Change of the velocity, relative to the greater one, from which on a tweezer has started again; smaller
+ones are the bends of a curve, each with less than a third of the energy of a start and a stop."""
 RAMP = 0.7
 """Ratio of the powers at the two ends of a segment below which it is part of a ramp: tones that give depths
 that differ from site to site change less."""
