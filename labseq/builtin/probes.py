@@ -10,17 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from labseq.builtin.overlay import FastOffset, SurvivalShape, fast_offset, group_counts
 from labseq.builtin.rearrange import play
 from labseq.detection.sites import measure_shift
-from labseq.motion import (
-    FastOffset,
-    SurvivalShape,
-    cross_offsets_m,
-    fast_offset,
-    group_counts,
-    hold_program,
-    hold_time_s,
-)
+from labseq.motion import cross_offsets_m, hold_program, hold_time_s
 from labseq.plugin import (
     ConfigError,
     DeviceError,

@@ -10,23 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.builtin.equalise import READINGS
-from labseq.calibration.method import AnalysisResult, CalibrationData, ProbeCounts, count_probed
-from labseq.calibration.pictures import draw_powers, draw_sites, draw_survival, draw_tone_offsets
-from labseq.detection.lattice import FoundLattice, find_lattice
-from labseq.detection.sites import read_sites
-from labseq.errors import ConfigError, DeviceError, Problem
-from labseq.model import MotionSpec, SiteGrid
-from labseq.motion import overlay_offset
-from labseq.motion.axes import drive
-from labseq.motion.overlay import (
+from labseq.builtin.overlay import (
     MIN_P,
     OverlayFit,
     SurvivalShape,
     checked_counts,
     distance_m,
     fit_overlay,
+    overlay_offset,
     unit_axes,
 )
+from labseq.calibration.method import AnalysisResult, CalibrationData, ProbeCounts, count_probed
+from labseq.calibration.pictures import draw_powers, draw_sites, draw_survival, draw_tone_offsets
+from labseq.detection.lattice import FoundLattice, find_lattice
+from labseq.detection.sites import read_sites
+from labseq.errors import ConfigError, DeviceError, Problem
+from labseq.model import MotionSpec, SiteGrid
+from labseq.motion.axes import drive
 from labseq.recording import Run
 from labseq.session.profile import ResolvedProfile
 from labseq.units import format_quantity
@@ -224,7 +224,7 @@ def fit_frequencies(
 ) -> FrequenciesFit:
     """Find the position of each row's and column's tweezers, and the tones that centre them on the sites.
 
-    All sites have the same survival peak (:func:`labseq.motion.fit_overlay`). Its centre on the
+    All sites have the same survival peak (:func:`fit_overlay`). Its centre on the
     site (i, j) is that of column j along a1 and of row i along a2; all are fitted together by maximum
     likelihood. Each is then shrunk towards a parabola through the others of its axis, as much as
     its error and the scatter of all about the parabola require: one with few atoms takes the value
@@ -240,7 +240,7 @@ def fit_frequencies(
         worst_error_m: Maximum allowed r.m.s. error of rows and columns, in metres.
 
     Raises:
-        DeviceError: As :func:`labseq.motion.fit_overlay`, or there are too few atoms for a fit by rows.
+        DeviceError: As :func:`fit_overlay`, or there are too few atoms for a fit by rows.
         ValueError: The shapes of the arrays do not match.
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)

@@ -15,15 +15,6 @@ from labseq.motion.axes import (
 )
 from labseq.motion.check import RULES, check_plan
 from labseq.motion.hold import all_on_program, cross_offsets_m, hold_program, hold_time_s
-from labseq.motion.overlay import (
-    FastOffset,
-    OverlayFit,
-    SurvivalShape,
-    fast_offset,
-    fit_overlay,
-    group_counts,
-    overlay_offset,
-)
 from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render
 from labseq.motion.survival import Survival, choose_plan, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
@@ -32,12 +23,9 @@ __all__ = [
     "RULES",
     "CombFit",
     "Drive",
-    "FastOffset",
-    "OverlayFit",
     "RenderPath",
     "Renderer",
     "Survival",
-    "SurvivalShape",
     "all_on_program",
     "check_plan",
     "choose_plan",
@@ -45,14 +33,10 @@ __all__ = [
     "correct_overlay",
     "cross_offsets_m",
     "drive",
-    "fast_offset",
     "fit_comb",
-    "fit_overlay",
     "fitting_batches",
-    "group_counts",
     "hold_program",
     "hold_time_s",
-    "overlay_offset",
     "predict_survival",
     "render",
     "tone_program",

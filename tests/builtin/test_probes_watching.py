@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from labseq.builtin.overlay import SurvivalShape
 from labseq.builtin.probes import CheckOverlaySettings, CheckOverlayStep, CheckSitesSettings, CheckSitesStep
 from labseq.builtin.steps import ImageSettings, ImageStep
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationEntry, Frame, SegmentKind, ShotRecord, SiteGrid
 from labseq.model.calibration import grid_facts
-from labseq.motion import SurvivalShape
 from labseq.roles import Context, Step
 from labseq.sequencer.run import Sequencer
 from labseq.testing.fakes import FakeLab, ListSink, RecordingObserver, fake_lab

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.builtin.overlay import fit_overlay, overlay_offset
 from labseq.errors import ConfigError
 from labseq.model import SiteGrid
-from labseq.motion import fit_overlay, overlay_offset
 from labseq.testing.fakes import RecordingObserver
 
 ROOT = Path(__file__).parents[2]

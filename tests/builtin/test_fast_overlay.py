@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from labseq.builtin.overlay import FastOffset, SurvivalShape, fast_offset, group_counts
 from labseq.model import SiteGrid
 from labseq.motion.hold import cross_offsets_m
-from labseq.motion.overlay import FastOffset, SurvivalShape, fast_offset, group_counts
 
 GRID = SiteGrid(20, 20)
 ALL = np.ones(GRID.shape, np.bool_)

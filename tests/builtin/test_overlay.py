@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
+from labseq.builtin.overlay import fit_overlay, overlay_offset
 from labseq.errors import DeviceError
 from labseq.model import SiteGrid
 from labseq.motion.axes import correct_overlay
-from labseq.motion.overlay import fit_overlay, overlay_offset
 
 GRIDS = {lattice: SiteGrid(20, 20, lattice=lattice) for lattice in ("triangular", "square")}  # type: ignore[arg-type]
 GRID = GRIDS["triangular"]
