@@ -42,22 +42,22 @@ def collect_tones(moves: Moves, start: int, stop: int, axis: int, n_sites: int, 
     return n
 
 
-@helper_kernel(f"int64({TONES}, int64, int64)")
-def next_arrival(tones: Ints, n_tones: int, travelled: int) -> int:
+@helper_kernel("int64(int64[:, :], int64)")
+def next_arrival(tones: Ints, travelled: int) -> int:
     """Distance, in sites, at which the next tones arrive; ``travelled`` if all have."""
     nearest = travelled
-    for k in range(n_tones):
+    for k in range(tones.shape[1]):
         distance = abs(tones[1, k] - tones[0, k])
         if distance > travelled and (nearest == travelled or distance < nearest):
             nearest = distance
     return nearest
 
 
-@helper_kernel(f"int64({TONES}, int64)")
-def last_arrival(tones: Ints, n_tones: int) -> int:
+@helper_kernel("int64(int64[:, :])")
+def last_arrival(tones: Ints) -> int:
     """Longest displacement of all tones, in sites."""
     longest = 0
-    for k in range(n_tones):
+    for k in range(tones.shape[1]):
         longest = max(longest, abs(tones[1, k] - tones[0, k]))
     return longest
 
@@ -135,7 +135,7 @@ SEGMENTS: Final = "Tuple((int8[:, ::1], int32[::1], float64[::1], int32[::1]))"
 
 
 @helper_kernel(
-    f"int64(float64[:, ::1], int64, {SITES_OF_AXIS}, {TONES}, int64, int64, int64, float64, float64, float64,"
+    f"int64(float64[:, ::1], int64, {SITES_OF_AXIS}, int64[:, :], int64, int64, float64, float64, float64,"
     " float64[::1])"
 )
 def add_tones(
@@ -143,7 +143,6 @@ def add_tones(
     n: int,
     sites: Sites,
     tones: Ints,
-    n_tones: int,
     travelled: int,
     arriving: int,
     on_start: float,
@@ -158,7 +157,6 @@ def add_tones(
         n: How many there are.
         sites: The sites of the axis.
         tones: The batch's tones.
-        n_tones: Number of tones.
         travelled: Sites travelled at the start; tones with a shorter way have arrived.
         arriving: Sites travelled at the end.
         on_start: 0 if the tones are off at the start, 1 if they are on.
@@ -167,6 +165,7 @@ def add_tones(
         phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
     """
     site_hz, step_hz, site_amplitude = sites
+    n_tones = tones.shape[1]
     for k in range(n_tones):
         site, goal = tones[0, k], tones[1, k]
         way = goal - site
@@ -196,19 +195,17 @@ def add_segment(
     return n + 1
 
 
-@helper_kernel(f"int64({TONES}, int64, {TONES}, int64, int64, int64, boolean)")
-def next_joint(
-    tones: Ints, n_tones: int, others: Ints, n_others: int, travelled: int, course: int, is_uneven: bool
-) -> int:
+@helper_kernel("int64(int64[:, :], int64[:, :], int64, int64, boolean)")
+def next_joint(tones: Ints, others: Ints, travelled: int, course: int, is_uneven: bool) -> int:
     """Distance, in sites, at which a transport is cut next; ``travelled`` if it is over.
 
     At constant speed that is where tones of either axis arrive, or at every site if amplitudes differ
     from site to site; otherwise all start and stop together.
     """
     if course != LINEAR:
-        return max(last_arrival(tones, n_tones), last_arrival(others, n_others))
-    arriving = next_arrival(tones, n_tones, travelled)
-    other = next_arrival(others, n_others, travelled)
+        return max(last_arrival(tones), last_arrival(others))
+    arriving = next_arrival(tones, travelled)
+    other = next_arrival(others, travelled)
     if is_uneven:
         return min(travelled + 1, max(arriving, other))
     if arriving == travelled or (travelled < other < arriving):
@@ -220,6 +217,62 @@ def next_joint(
 def level(keyed_s: float, ramp_s: float, is_ramped: bool) -> float:
     """Amplitude of an axis when the parked one is fully on: the depth changes evenly over the ramp."""
     return float(np.sqrt(keyed_s / ramp_s)) if is_ramped else 1.0
+
+
+@helper_kernel(
+    "UniTuple(int64, 2)(int64, int64, int64, int64, int64[:, :], int64[:, :], boolean, boolean,"
+    f" {SITES_OF_AXIS}, int64, boolean, {SITES}, {SEGMENTS}, float64[:, ::1], float64[::1])"
+)
+def add_line_batch(
+    m: int,
+    n: int,
+    batch: int,
+    axis: int,
+    tones: Ints,
+    others: Ints,
+    follows: bool,
+    leads: bool,
+    sites: Sites,
+    course: int,
+    is_uneven: bool,
+    times_s: Floats,
+    segments: Segments,
+    values: Floats,
+    phase: Floats,
+) -> tuple[int, int]:
+    """Add the segments of a batch along lines; return the numbers of segments and of tones.
+
+    ``tones`` are those of the axis, ``others`` those of the other one. A batch that ``follows`` is linked
+    to the one before and picks nothing up; one that ``leads`` has the next one linked to it and drops
+    nothing.
+    """
+    pause_s, pick_up_s, site_s, drop_off_s, keyed_up_s, keyed_down_s = times_s
+    ramped = last_arrival(tones) > 0 or (axis == 1 and last_arrival(others) == 0)
+    if not follows:
+        if pause_s > 0.0:
+            m = add_segment(segments, m, IDLE, LINEAR, batch, pause_s, n)
+        if pick_up_s > 0.0:
+            part, ramp_s = level(keyed_up_s, pick_up_s, ramped), pick_up_s - keyed_up_s
+            n = add_tones(values, n, sites, tones, 0, 0, 0.0, part, keyed_up_s, phase)
+            m = add_segment(segments, m, PICK_UP, LINEAR, batch, keyed_up_s, n)
+            n = add_tones(values, n, sites, tones, 0, 0, part, 1.0, ramp_s, phase)
+            m = add_segment(segments, m, PICK_UP, LINEAR, batch, ramp_s, n)
+    at = 0
+    while True:
+        goal = next_joint(tones, others, at, course, is_uneven)
+        if goal == at:
+            break
+        took_s = (goal - at) * site_s
+        n = add_tones(values, n, sites, tones, at, goal, 1.0, 1.0, took_s, phase)
+        m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)
+        at = goal
+    if drop_off_s > 0.0 and not leads:
+        part, ramp_s = level(keyed_down_s, drop_off_s, ramped), drop_off_s - keyed_down_s
+        n = add_tones(values, n, sites, tones, at, at, 1.0, part, ramp_s, phase)
+        m = add_segment(segments, m, DROP_OFF, LINEAR, batch, ramp_s, n)
+        n = add_tones(values, n, sites, tones, at, at, part, 0.0, keyed_down_s, phase)
+        m = add_segment(segments, m, DROP_OFF, LINEAR, batch, keyed_down_s, n)
+    return m, n
 
 
 Batch = tuple[Floats, NDArray[np.int32], Shape, int, int]
@@ -409,8 +462,6 @@ def build_axis(
     Returns:
         Number of segments and number of tones.
     """
-    pause_s, pick_up_s, site_s, drop_off_s = times_s[0], times_s[1], times_s[2], times_s[3]
-    keyed_up_s, keyed_down_s = times_s[4], times_s[5]
     n_sites = most = len(preassigned)
     for number in range(len(paths[0])):
         most = max(most, paths[0][number, 1 + axis])
@@ -432,33 +483,14 @@ def build_axis(
         start, stop = batch_offsets[batch], batch_offsets[batch + 1]
         n_tones = collect_tones(moves, start, stop, axis, n_sites, tones)
         n_others = collect_tones(moves, start, stop, 1 - axis, n_other_sites, others)
-        moving = last_arrival(tones, n_tones) > 0
-        ramped = moving or (axis == 1 and last_arrival(others, n_others) == 0)
-        if not linked[batch]:
+        follows = linked[batch]
+        leads = batch + 1 < n_batches and linked[batch + 1]
+        if not follows:
             first_phases(tones, n_tones, preassigned, low_crest, sites[2], phase)
-            if pause_s > 0.0:
-                m = add_segment(segments, m, IDLE, LINEAR, batch, pause_s, n)
-            if pick_up_s > 0.0:
-                keyed_s, part = keyed_up_s, level(keyed_up_s, pick_up_s, ramped)
-                n = add_tones(values, n, sites, tones, n_tones, 0, 0, 0.0, part, keyed_s, phase)
-                m = add_segment(segments, m, PICK_UP, LINEAR, batch, keyed_s, n)
-                n = add_tones(values, n, sites, tones, n_tones, 0, 0, part, 1.0, pick_up_s - keyed_s, phase)
-                m = add_segment(segments, m, PICK_UP, LINEAR, batch, pick_up_s - keyed_s, n)
-        at = 0
-        while True:
-            goal = next_joint(tones, n_tones, others, n_others, at, course, is_uneven)
-            if goal == at:
-                break
-            took_s = (goal - at) * site_s
-            n = add_tones(values, n, sites, tones, n_tones, at, goal, 1.0, 1.0, took_s, phase)
-            m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)
-            at = goal
-        if drop_off_s > 0.0 and not (batch + 1 < n_batches and linked[batch + 1]):
-            keyed_s, part = keyed_down_s, level(keyed_down_s, drop_off_s, ramped)
-            n = add_tones(values, n, sites, tones, n_tones, at, at, 1.0, part, drop_off_s - keyed_s, phase)
-            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, drop_off_s - keyed_s, n)
-            n = add_tones(values, n, sites, tones, n_tones, at, at, part, 0.0, keyed_s, phase)
-            m = add_segment(segments, m, DROP_OFF, LINEAR, batch, keyed_s, n)
+        m, n = add_line_batch(
+            m, n, batch, axis, tones[:, :n_tones], others[:, :n_others], follows, leads, sites, course,
+            is_uneven, times_s, segments, values, phase,
+        )  # fmt: skip
     return m, n
 
 
