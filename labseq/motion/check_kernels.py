@@ -321,6 +321,42 @@ def check_paths_of_batch(
     return fault if fault[0] != RIGHT else counted
 
 
+@helper_kernel(
+    f"{FAULT}({MOVES}, int64, {ATOMS}, {STAMPS}, {STAMPS}, int64[::1], int64[::1], int64, boolean, boolean,"
+    " int64, int64, int64, int64)"
+)
+def check_lines_of_batch(
+    batch: Moves,
+    n_before: int,
+    atoms: Bools,
+    lifted: Stamps,
+    goals: Stamps,
+    row_goal: Ints,
+    column_goal: Ints,
+    stamp: int,
+    follows: bool,
+    leads: bool,
+    max_tweezers: int,
+    max_row_tones: int,
+    max_column_tones: int,
+    slots: int,
+) -> Fault:
+    """Test a batch along lines; without a fault the last number is that of tweezers.
+
+    One that ``follows`` is linked to the batch before, one that ``leads`` has the next one linked to it.
+    """
+    fault = check_shapes(batch, atoms.shape[0], atoms.shape[1], slots, follows or leads)
+    if fault[0] == RIGHT:
+        fault = check_sites(batch, n_before, atoms, lifted, goals, stamp, follows)
+    if fault[0] != RIGHT:
+        return fault
+    counted = check_tones(batch, row_goal, column_goal, max_tweezers, max_row_tones, max_column_tones)
+    if counted[0] != RIGHT:
+        return counted
+    fault = check_paths(atoms, lifted, stamp, row_goal, column_goal)
+    return fault if fault[0] != RIGHT else counted
+
+
 @helper_kernel(f"UniTuple(float64, 2)({POSITIONS}, {KNOTS}, UniTuple(int64, 3), float64)")
 def path_lengths(positions: Floats, off: Stamps, shape: Shape, cosine: float) -> tuple[float, float]:
     """Sum of the longest ways of all legs, in sites, and the number of knots at which tones go off."""
@@ -404,27 +440,21 @@ def check(
                 batch, positions, off, shape, atoms, lifted, goals, dropped, stamp,
                 max_tweezers, max_row_tones, max_column_tones, slots, geometry,
             )  # fmt: skip
-            n_tweezers[number] = fault[3]
-            if fault[0] != RIGHT:
-                return fault[0], number, fault[1], fault[2], fault[3]
-            ejected = move_atoms(batch, atoms)
-            ways, drops = path_lengths(positions, off, shape, geometry[1])
-            time_s += times_s[1] + times_s[2] + ways * times_s[3] + drops * times_s[4]
-            end_s[number] = time_s
-            continue
-        fault = check_shapes(batch, atoms.shape[0], atoms.shape[1], slots, follows or leads)
-        if fault[0] == RIGHT:
-            fault = check_sites(batch, n_before, atoms, lifted, goals, stamp, follows)
-        if fault[0] == RIGHT:
-            fault = check_tones(batch, row_goal, column_goal, max_tweezers, max_row_tones, max_column_tones)
-            n_tweezers[number] = fault[3]
-        if fault[0] == RIGHT:
-            fault = check_paths(atoms, lifted, stamp, row_goal, column_goal)
+        else:
+            fault = check_lines_of_batch(
+                batch, n_before, atoms, lifted, goals, row_goal, column_goal, stamp, follows, leads,
+                max_tweezers, max_row_tones, max_column_tones, slots,
+            )  # fmt: skip
+        n_tweezers[number] = fault[3]
         if fault[0] != RIGHT:
             return fault[0], number, fault[1], fault[2], fault[3]
         ejected = move_atoms(batch, atoms)
         n_before = len(batch)
+        if had_paths:
+            ways, drops = path_lengths(positions, off, shape, geometry[1])
+        else:
+            ways, drops = float(longest_move(batch)), 0.0 if leads else 1.0
         time_s += 0.0 if follows else times_s[1] + times_s[2]
-        time_s += longest_move(batch) * times_s[3] + (0.0 if leads else times_s[4])
+        time_s += ways * times_s[3] + drops * times_s[4]
         end_s[number] = time_s
     return RIGHT, -1, -1, 0, 0

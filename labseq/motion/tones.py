@@ -146,15 +146,9 @@ def tone_program(
         [motion.overhead_per_batch_s, ramps_s[0], site_s, ramps_s[1], *map(keyed_time_s, ramps_s)]
     )
     course = SPEED_PROFILES.index(motion.speed_profile)
-    sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
     drives = [drive(grid, motion, axis) for axis in AXIS_INDICES]
     is_uneven = any(driven.is_uneven for driven in drives)
-    n_cuts = 2 * sizes  # a tone may arrive on either axis
-    if is_uneven:
-        n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)
-    shapes = plan.path_shapes[:n_batches].astype(np.int64)
-    n_path_segments = 2 * shapes[:, 0] + 4
-    n_segments = 5 * n_batches + int(n_cuts.sum() + n_path_segments.sum())
+    n_segments, n_values = _capacity(plan, n_batches, is_uneven)
     cosine = float(path_geometry(grid, motion)[1])
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
@@ -164,8 +158,7 @@ def tone_program(
     for axis in AXIS_INDICES:
         driven = drives[axis]
         offsets = np.empty(n_segments + 1, np.int32)
-        n_values = ((n_cuts + 4) * sizes).sum() + (n_path_segments * shapes[:, 1 + axis]).sum()
-        values = np.empty((N_FIELDS, int(n_values)), np.float64)
+        values = np.empty((N_FIELDS, n_values[axis]), np.float64)
         n, n_tones = build_axis(
             plan.moves,
             plan.batch_offsets,
@@ -196,6 +189,19 @@ def tone_program(
         array.flags.writeable = False
     kind, courses = labels[:, :n]
     return ToneProgram(axes[0], axes[1], duration_s[:n], kind, batch[:n], courses)
+
+
+def _capacity(plan: Plan, n_batches: int, is_uneven: bool) -> tuple[int, list[int]]:
+    """The most segments that a plan's batches can need, and the most tones in them on each axis."""
+    sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
+    n_cuts = 2 * sizes  # a tone may arrive on either axis
+    if is_uneven:
+        n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)
+    shapes = plan.path_shapes[:n_batches].astype(np.int64)
+    n_path_segments = 2 * shapes[:, 0] + 4
+    n_line_values = int(((n_cuts + 4) * sizes).sum())
+    n_values = [n_line_values + int((n_path_segments * shapes[:, 1 + axis]).sum()) for axis in AXIS_INDICES]
+    return 5 * n_batches + int(n_cuts.sum() + n_path_segments.sum()), n_values
 
 
 def _check_size(plan: Plan, grid: SiteGrid, n_batches: int) -> None:
