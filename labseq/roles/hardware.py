@@ -229,6 +229,10 @@ class MobileTweezers(Hardware):
         """
         return False
 
+    def warnings(self) -> Sequence[str]:
+        """What ``labseq check`` and a run warn of, such as motion that the device can only approximate."""
+        return ()
+
     def check_program(self, program: ToneProgram) -> None:
         """Refuse before the device is opened what ``prepare`` would refuse; nothing is sent.
 

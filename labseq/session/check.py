@@ -382,7 +382,7 @@ def _warnings(points: _Points, each: Mapping[int, Point]) -> list[Problem]:
     found: dict[Any, tuple[Problem, list[int]]] = {}
     is_adaptive = points.session.scan_run.is_adaptive
     judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings
-    for judge in (*judges, _device_warnings, _simulation_warnings):
+    for judge in (*judges, _device_warnings, _instance_warnings):
         for n, point in each.items():
             if n and is_adaptive and judge is _window_warnings:
                 continue  # the search is there to find out about the corners
@@ -534,12 +534,13 @@ def _deadline_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Pro
             yield number, point.document.problem(loc, what, hint=hint)
 
 
-def _simulation_warnings(points: _Points, point: Point) -> Iterator[tuple[str, Problem]]:
-    """What the simulation warns of."""
-    simulation = points.lab(point).simulation
-    if simulation is not None and offers(simulation, "warnings"):
-        for text in points.guard.call("simulation", WARM_S, simulation.warnings):
-            yield text, Problem(text)
+def _instance_warnings(points: _Points, point: Point) -> Iterator[tuple[str, Problem]]:
+    """What the simulation and the mobile tweezers themselves warn of."""
+    lab = points.lab(point)
+    for name, instance in (("simulation", lab.simulation), ("mobile_tweezers", lab.mobile_tweezers)):
+        if instance is not None and offers(instance, "warnings"):
+            for text in points.guard.call(name, WARM_S, instance.warnings):
+                yield text, Problem(text)
 
 
 def _device_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:  # noqa: ARG001

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Final
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 from labseq.plugin import (
     AxisTones,
     ConfigError,
+    FrequencyCourse,
     LimitError,
     MotionSpec,
+    SiteGrid,
     ToneProgram,
     TransientError,
 )
@@ -38,8 +41,6 @@ AMPLITUDE_STEPSIZE: Final = 64
 """Amplitude slopes become finer, 298 / 64 per second, with fewer and larger increments."""
 ARRIVAL_S: Final = 20e-6
 """Latency of commands sent by DMA (EDMSuite, on an M4i.9622)."""
-COMMANDS_PER_S: Final = 10e6
-"""Rate at which commands reach the card by DMA (likewise)."""
 PORTION: Final = 1000
 """Commands sent in one call, when the queue has room for them; no block has as many."""
 BEGINNING_S: Final = 1e-3
@@ -54,11 +55,13 @@ class Cores:
         row: int64 (n,), cores of the row axis.
         column: int64 (n,), cores of the column axis.
         masks: The cores of output 0 and of output 1, one bit each.
+        within_hz: float64 (2,), how closely a row tone and a column tone are to follow a curved course.
     """
 
     row: NDArray[np.int64]
     column: NDArray[np.int64]
     masks: tuple[int, int]
+    within_hz: NDArray[np.float64]
 
     def idle_state(self, tones: KeepWarm | None) -> NDArray[np.float64]:
         """Frequency, its slope, amplitude and its slope of each core between programs, float64 (4, n)."""
@@ -69,7 +72,39 @@ class Cores:
         return state
 
 
-def choose_cores(name: str, settings: SpcmSettings, motion: MotionSpec) -> Cores:
+def steps_hz(grid: SiteGrid) -> NDArray[np.float64]:
+    """Change of a tone's frequency per site, float64 (2,), in Hz: of row tones, of column tones.
+
+    An axis with a single site takes that of the other one.
+    """
+    row, column = (
+        float(np.abs(np.diff(hz)).mean()) if len(hz) > 1 else 0.0
+        for hz in (grid.row_frequency_hz, grid.column_frequency_hz)
+    )
+    return np.array([row or column, column or row])
+
+
+def worst_distance_m(grid: SiteGrid, motion: MotionSpec) -> float:
+    """Largest distance of a tweezer from its course, in metres, in moves of a whole number of sites.
+
+    At constant speed it is 0. Otherwise the course is played in straight steps: as many as bring the
+    distance to :data:`labseq_spcm.limits.FOLLOWS_M`, but no more than the rate of commands allows if all
+    tones of the motion move at once.
+    """
+    from labseq_spcm.kernels import BENDS
+
+    if motion.speed_profile == "constant":
+        return 0.0
+    bend = BENDS[FrequencyCourse[motion.speed_profile.upper()]]
+    n_commands = 2 * (motion.max_row_tones + motion.max_column_tones) + 2
+    n_sites = np.arange(1, max(grid.shape) + 1)
+    way_m = n_sites * grid.spacing_m
+    wanted = np.ceil(np.sqrt(bend * way_m / (8 * limits.FOLLOWS_M)))
+    by_rate = way_m / motion.speed_m_s * limits.DDS_COMMANDS_PER_S // n_commands
+    return float((bend * way_m / (8 * np.maximum(1, np.minimum(wanted, by_rate)) ** 2)).max())
+
+
+def choose_cores(name: str, settings: SpcmSettings, motion: MotionSpec, grid: SiteGrid) -> Cores:
     """Assign the cores to the outputs.
 
     Raises:
@@ -82,7 +117,8 @@ def choose_cores(name: str, settings: SpcmSettings, motion: MotionSpec) -> Cores
         if n_first <= len(first) and n_second <= len(second):
             cores = np.array(first), np.array(second)
             masks = sum(1 << core for core in first), sum(1 << core for core in second)
-            return Cores(cores[row], cores[1 - row], masks)
+            within_hz = steps_hz(grid) * limits.FOLLOWS_M / grid.spacing_m
+            return Cores(cores[row], cores[1 - row], masks, within_hz)
     names = ("max_row_tones", "max_column_tones")
     first_name, second_name = names if row == 0 else names[::-1]
     raise ConfigError(
@@ -137,12 +173,13 @@ def compile_commands(
     row, column = _tones(program.row), _tones(program.column)
     tones, both = np.hstack([row, column]), np.concatenate([cores.row, cores.column])
     offsets = np.stack([program.row.offsets, program.column.offsets + np.int32(row.shape[1])])
-    n_most = 5 * kernels.COURSE_STEPS * tones.shape[1] + 200 * (program.n_segments + 1)
+    n_steps = _most_steps(program, cores)
+    n_most = 5 * n_steps * tones.shape[1] + 200 * (program.n_segments + 1)
     registers, values = np.empty(n_most, np.int32), np.empty(n_most)
-    ends = np.empty(kernels.COURSE_STEPS * program.n_segments + 2, np.int64)
+    ends = np.empty(n_steps * program.n_segments + 2, np.int64)
     n_blocks = kernels.compile_program(
         program.duration_s, program.course, offsets, tones, both, len(cores.row),
-        cores.idle_state(keep_warm), registers, values, ends,
+        cores.idle_state(keep_warm), cores.within_hz, n_steps, registers, values, ends,
     )  # fmt: skip
     if n_blocks == kernels.TOO_MANY:
         raise _too_many_tones(name, program, cores, int(ends[0]))
@@ -160,6 +197,19 @@ def compile_commands(
     entries["type"] = np.where(whole, TYPE_INT64, TYPE_DOUBLE)
     entries["value"] = np.where(whole, values.astype(np.int64), values.view(np.int64))
     return Commands(entries, ends)
+
+
+def _most_steps(program: ToneProgram, cores: Cores) -> int:
+    """The most steps that a segment of a program needs."""
+    from labseq_spcm.kernels import BENDS, RAMP_STEPS
+
+    if not program.course.any():
+        return RAMP_STEPS
+    longest = max(
+        float(np.abs(axis.end_hz - axis.start_hz).max(initial=0.0)) / hz
+        for axis, hz in zip((program.row, program.column), cores.within_hz, strict=True)
+    )
+    return max(RAMP_STEPS, math.ceil(math.sqrt(max(BENDS) / 8 * longest)))
 
 
 def _tones(axis: AxisTones) -> NDArray[np.float64]:
@@ -240,7 +290,7 @@ class Dds:
             self.idle()
         self._is_idle = False
         self._card.wait_until(self._feed_once, "the DDS takes no commands: its queue stays full")
-        self._card.clock.sleep(ARRIVAL_S + self._n_sent / COMMANDS_PER_S)
+        self._card.clock.sleep(ARRIVAL_S + self._n_sent / limits.DDS_COMMANDS_PER_S)
         return program.total_duration_s
 
     def append(self, program: ToneProgram) -> float:

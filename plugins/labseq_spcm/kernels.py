@@ -2,19 +2,21 @@
 
 The DDS knows frequencies and amplitudes that change linearly. Each segment of a tone program is
 cut into steps in which that is close enough: a depth ramp where the amplitude has covered equal
-parts of its change, a transport with another speed profile at equal times. At the start of each
-step one block of commands takes effect.
+parts of its change, a transport with another speed profile at equal times, as often as the tweezers'
+distance from the course wants and the rate of commands allows. At the start of each step one block of
+commands takes effect.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
-from labseq_spcm.limits import DDS_AMPLITUDE_SLOPE, DDS_MIN_TICKS, DDS_TICK_S
+from labseq_spcm.limits import DDS_AMPLITUDE_SLOPE, DDS_COMMANDS_PER_S, DDS_MIN_TICKS, DDS_TICK_S
 
 Words = NDArray[np.uint16]
 Reals = NDArray[np.float64]
@@ -26,8 +28,9 @@ RAMP_STEPS: Final = 8
 """Steps of a depth ramp: within 1 / (4 n^2), 0.4 % of the full depth, of a linear ramp."""
 SHORT_STEPS: Final = 8
 """Duration of the first step of a ramp, at least, in shortest times of the DDS: one step in 2 us."""
-COURSE_STEPS: Final = 16
-"""Steps of a transport: the frequency is within 0.3 % of its change."""
+BENDS: Final = (0.0, 10 / math.sqrt(3), 6.0)
+"""Greatest second derivative of each course (:class:`labseq.plugin.FrequencyCourse`). With n straight steps
+of equal duration a tone is within bend / (8 n^2) of its way from the course."""
 SAME_HZ: Final = 1.0
 """A tone that starts within this of where another ended keeps that tone's core."""
 SAME_TURNS: Final = 1e-3
@@ -117,8 +120,38 @@ def widest_ramp(tones: Reals, first: int, last: int, widest: Reals) -> None:
             widest[0], widest[1] = start, end
 
 
-@helper_kernel("int64(float64[::1], int64, float64, float64[::1])")
-def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
+@helper_kernel(f"UniTuple(float64, 2)({TONES}, int64, int64, float64)")
+def longest_way(tones: Reals, first: int, last: int, hz: float) -> tuple[float, float]:
+    """Longest way of some tones, in units of ``hz``, and the commands that they need for each step."""
+    longest, n_commands = 0.0, 0.0
+    for tone in range(first, last):
+        way = abs(tones[END_HZ, tone] - tones[START_HZ, tone])
+        longest = max(longest, way / hz)
+        n_commands += 2.0 * (way > 0.0) + 2.0 * (tones[END, tone] != tones[START, tone])
+    return longest, n_commands
+
+
+@helper_kernel(f"int64({TONES}, int64[::1], int64, float64, {REALS}, float64[::1])")
+def cut_course(
+    tones: Reals, ends: Ints, course: int, duration_s: float, within_hz: Reals, knots: Reals
+) -> int:
+    """Cut a segment with a curved course into steps of equal duration; as :func:`cut`.
+
+    ``ends`` are the first and last row tone of the segment, and the first and last column tone.
+    """
+    rows, row_commands = longest_way(tones, ends[0], ends[1], within_hz[0])
+    columns, column_commands = longest_way(tones, ends[2], ends[3], within_hz[1])
+    wanted = np.ceil(np.sqrt(BENDS[course] / 8.0 * max(rows, columns)))
+    by_rate = duration_s * DDS_COMMANDS_PER_S / (row_commands + column_commands + 2.0)
+    by_timer = duration_s / ((DDS_MIN_TICKS + 1) * DDS_TICK_S)
+    n_steps = max(1, int(min(wanted, by_rate, by_timer, len(knots) - 1.0)))
+    for k in range(n_steps + 1):
+        knots[k] = k / n_steps
+    return n_steps
+
+
+@helper_kernel("int64(float64[::1], float64, float64[::1])")
+def cut(widest: Reals, duration_s: float, knots: Reals) -> int:
     """Cut a segment into steps: their ends as fractions of its duration; returns how many steps."""
     start, end = widest[0], widest[1]
     room = duration_s / ((DDS_MIN_TICKS + 1) * DDS_TICK_S)
@@ -128,10 +161,8 @@ def cut(widest: Reals, course: int, duration_s: float, knots: Reals) -> int:
             a = start + (end - start) * k / n_steps
             knots[k] = (a * a - start * start) / (end * end - start * start)
         return n_steps
-    n_steps = 1 if course == 0 else max(1, min(COURSE_STEPS, int(room)))
-    for k in range(n_steps + 1):
-        knots[k] = k / n_steps
-    return n_steps
+    knots[0], knots[1] = 0.0, 1.0
+    return 1
 
 
 @helper_kernel(
@@ -245,11 +276,12 @@ def drive_tones(
 
 @kernel(
     f"int64({const('float64', 1)}, {const('int8', 1)}, {const('int32', 2)}, {TONES}, {CORES}, int64, {TONES},"
-    " int32[::1], float64[::1], int64[::1])"
+    f" {REALS}, int64, int32[::1], float64[::1], int64[::1])"
 )
 def compile_program(
     duration_s: Reals, course: NDArray[np.int8], offsets: Shorts, tones: Reals, cores: Ints,
-    n_row_cores: int, idle: Reals, registers: Shorts, values: Reals, ends: Ints,
+    n_row_cores: int, idle: Reals, within_hz: Reals, most_steps: int, registers: Shorts, values: Reals,
+    ends: Ints,
 ) -> int:  # fmt: skip
     """Compile a tone program into blocks of commands.
 
@@ -264,6 +296,8 @@ def compile_program(
         cores: The cores of the row axis, then those of the column axis.
         n_row_cores: How many the row axis has.
         idle: float64 (4, n_cores): frequency, its slope, amplitude and its slope between programs; 0: silent.
+        within_hz: float64 (2,), by how much a row tone and a column tone may differ from a curved course.
+        most_steps: The most steps of a segment.
         registers: Result: register of each command.
         values: Result: its value.
         ends: Result: end of each block among the commands.
@@ -274,7 +308,7 @@ def compile_program(
     now, core_of = idle.copy(), np.zeros(tones.shape[1], np.int64)
     set_phase = np.ones(tones.shape[1], np.bool_)
     used, on = np.zeros(len(cores), np.bool_), np.zeros(len(cores), np.bool_)
-    widest, knots = np.zeros(2), np.zeros(COURSE_STEPS + 1)
+    widest, knots, tone_ends = np.zeros(2), np.zeros(most_steps + 1), np.zeros(4, np.int64)
     n = add_command(SOURCE, FROM_TIMER, registers, values, 0)
     n_blocks, joint_s, before_s = 0, 0.0, 0.0
     for i in range(len(duration_s)):
@@ -286,11 +320,15 @@ def compile_program(
                 ends[0] = i
                 return TOO_MANY
             on |= used
+            tone_ends[2 * axis : 2 * axis + 2] = offsets[axis, i : i + 2]
             widest_ramp(tones, offsets[axis, i], offsets[axis, i + 1], widest)
         before_s = duration_s[i]
         if before_s == 0.0:
             continue
-        n_steps = cut(widest, course[i], before_s, knots)
+        if course[i] == 0:
+            n_steps = cut(widest, before_s, knots)
+        else:
+            n_steps = cut_course(tones, tone_ends, course[i], before_s, within_hz, knots)
         for k in range(n_steps):
             tick = np.rint((joint_s + knots[k] * before_s) / DDS_TICK_S)
             n_ticks = np.rint((joint_s + knots[k + 1] * before_s) / DDS_TICK_S) - tick

@@ -52,6 +52,10 @@ DDS_FREQUENCY_SLOPE: Final = 1.9e14
 """Largest slope of a frequency, in Hz/s (EDMSuite)."""
 DDS_AMPLITUDE_SLOPE: Final = 3.05e5
 """Largest slope of an amplitude, in 1/s (EDMSuite)."""
+DDS_COMMANDS_PER_S: Final = 10e6
+"""Rate at which commands reach the DDS by DMA (EDMSuite)."""
+FOLLOWS_M: Final = 20e-9
+"""How closely a tweezer is to follow a curved course: a tenth of an atom's thermal spread (ours)."""
 DDS_DELAY_S: Final = 560e-9
 """From the trigger to the output (EDMSuite)."""
 

@@ -31,7 +31,7 @@ from labseq.plugin import (
 )
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
-from labseq_spcm.dds import Dds, choose_cores, compile_commands
+from labseq_spcm.dds import Dds, choose_cores, compile_commands, worst_distance_m
 from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.replay_fifo import Fifo, Replay
@@ -142,7 +142,7 @@ class SpcmMobileTweezers(MobileTweezers):
         self._amplitude_mv = limits.full_scale_mv(self._name, self._rf)
         self._cores = None
         if settings.mode == "dds":
-            self._cores = choose_cores(self._name, settings, context.motion)
+            self._cores = choose_cores(self._name, settings, context.motion, context.grid)
         else:
             limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
         warm = settings.keep_warm
@@ -172,6 +172,19 @@ class SpcmMobileTweezers(MobileTweezers):
         )
         dark = ", dark from upload to start" if self._settings.mode in ("replay", "fifo") else ""
         return f"keep-warm tones off the atoms: {' and '.join(each)}{dark}"
+
+    def warnings(self) -> list[str]:
+        """A curved course that the commands of the mode ``dds`` cannot follow closely enough."""
+        motion = self._context.motion
+        worst_m = 0.0 if self._cores is None else worst_distance_m(self._context.grid, motion)
+        if worst_m <= limits.FOLLOWS_M:
+            return []
+        worst, aim = (format_quantity(m, "length") for m in (worst_m, limits.FOLLOWS_M))
+        n_tones = f"{motion.max_row_tones} row and {motion.max_column_tones} column tones"
+        what = f"profile.{self._name}.speed_profile is {motion.speed_profile}; in the mode dds {n_tones}"
+        why = f"as the card takes {limits.DDS_COMMANDS_PER_S / 1e6:g} million commands per second"
+        remedy = "allow fewer tones, lower the speed, or use the mode replay"
+        return [f"{what} follow it within {worst} only, not {aim}, {why}; {remedy}"]
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.

@@ -99,7 +99,7 @@ def test_a_whole_program(benchmark: Any, dop: int) -> None:
 
 def test_commands_for_the_dds(benchmark: Any) -> None:
     program = Case(7, DDS_LIMITS).program()
-    cores = choose_cores("dds", SpcmSettings(mode="dds"), DDS_LIMITS)
+    cores = choose_cores("dds", SpcmSettings(mode="dds"), DDS_LIMITS, SiteGrid())
     commands = benchmark(compile_commands, "dds", program, cores)
     benchmark.extra_info["commands"] = len(commands.entries)
     assert len(commands.ends) >= program.n_segments

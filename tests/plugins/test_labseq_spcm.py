@@ -41,6 +41,7 @@ from labseq.plugin import (
     Plan,
     RfSpec,
     RfTones,
+    SiteGrid,
     TransientError,
 )
 from labseq.roles import offers
@@ -378,19 +379,31 @@ class TestTones:
                         assert abs(tone.amplitude**2 - amplitude**2) < 0.006 * most**2
                         assert _apart(tone.phase_rad, phase_rad) < 0.01
 
+    @pytest.mark.parametrize("n_sites", [1, 14])
     @pytest.mark.parametrize("course", ["minimum_jerk", "constant_jerk"])
-    def test_follow_other_courses_of_speed(self, driver: Any, course: Any) -> None:
-        with driver("dds", motion=replace(MOTION, speed_profile=course)) as lab:
-            program = lab.program(1)
+    def test_follow_other_courses_of_speed_within_20_nm(self, driver: Any, course: Any, n_sites: int) -> None:
+        motion = replace(MOTION, speed_profile=course)
+        plan = Plan.from_batches([([(0, col) for col in range(5)], [(0, col + n_sites) for col in range(5)])])
+        with driver("dds", motion=motion) as lab:
+            program = tone_program(plan, SiteGrid(), motion)
             lab.play(program)
             start_s = _start_s(lab)
             transport = int(np.flatnonzero(program.kind == 2)[0])
             spans = lab.card.played(1)
             first_s, last_s = program.joint_s[transport], program.joint_s[transport + 1]
-            for at_s in np.linspace(first_s, last_s, 101)[1:-1]:
+            for at_s in np.linspace(first_s, last_s, 1001)[1:-1]:
                 wanted = np.sort(program.tones_at(at_s).column.frequency_hz)
                 tones = np.sort([tone.frequency_hz for tone in _tones_at(spans, start_s + at_s)])
-                assert np.abs(tones - wanted).max() < 0.05 * 1.6e6
+                off_m = np.abs(tones - wanted).max() / 1.6e6 * SiteGrid().spacing_m
+                assert off_m < 20.5e-9
+
+    def test_that_cannot_follow_a_course_are_warned_of(self, driver: Any) -> None:
+        few = replace(MOTION, speed_profile="minimum_jerk", max_row_tones=7)
+        with driver("dds", motion=few) as lab:
+            assert not lab.tweezers.warnings()
+        with driver("dds", motion=replace(few, max_row_tones=16)) as lab:
+            (text,) = lab.tweezers.warnings()
+        assert "16 row and 5 column tones follow it within 66.1 nm only, not 20 nm" in text
 
     def test_of_a_program_larger_than_the_queue_are_sent_while_it_plays(self, driver: Any) -> None:
         with driver("dds") as lab:
