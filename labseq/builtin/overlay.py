@@ -234,7 +234,7 @@ def fit_overlay(
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     n, k = n.reshape(len(n), -1).sum(axis=1), k.reshape(len(k), -1).sum(axis=1)
     if n.sum() < MIN_ATOMS:
-        _refuse(f"only {int(n.sum())} atoms were probed; expected {MIN_ATOMS} at least: take more shots")
+        _refuse(f"only {int(n.sum())} atoms were probed; expected {MIN_ATOMS} at least: set more `repeats`")
     for axis, direction in enumerate(DIRECTIONS):
         if len(np.unique(offset[:, axis].round(9))) < 5:
             _refuse(
@@ -249,7 +249,8 @@ def fit_overlay(
     if worst > worst_error_m:
         more = math.ceil((worst / worst_error_m) ** 2)
         known, wanted = format_quantity(worst, "length"), format_quantity(worst_error_m, "length")
-        _refuse(f"too few atoms: the centre is known to {known} only; for {wanted} take {more} times as many")
+        remedy = f"for {wanted} take {more} times as many `repeats`"
+        _refuse(f"too few atoms: the centre is known to {known} only; {remedy}")
     return fit
 
 

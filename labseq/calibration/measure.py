@@ -29,7 +29,7 @@ from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.console.runs import existing_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean, install_hint
-from labseq.model import CALIBRATION_KINDS, CalibrationEntry, grid_facts, same_grid
+from labseq.model import CALIBRATION_KINDS, CalibrationEntry, SiteGrid, grid_facts, same_grid
 from labseq.pictures.figures import can_draw, encode_figure
 from labseq.plain import now_utc
 from labseq.recording import Run, open_run
@@ -40,6 +40,10 @@ from labseq.session.recorded import recorded_machine
 from labseq.session.session import Session
 
 PICTURE_DPI: Final = 110
+PROBED_PER_POINT: Final = {"overlay": 50, "frequencies": 100}
+"""Sites to probe at each point of the scan: with 75 % loading their centre is known to about 35 nm."""
+FEWEST_REPEATS: Final = 4
+"""Of the sequences of these calibrations; more are only needed on small grids."""
 VALUE_FILES: Final = (".npy", ".csv")
 """Suffixes of files of values; any other source is a run."""
 
@@ -190,7 +194,9 @@ def _measure(
     ignoring: str,
     observer: RunObserver | None,
 ) -> Run:
-    overrides = [*_meter(method, hardware.profile), *_target(method, hardware), *request.overrides, ignoring]
+    grid = hardware.grid
+    fitting = [*_meter(method, hardware.profile), *_target(method, grid), *_repeats(method, grid)]
+    overrides = [*fitting, *request.overrides, ignoring]
     if not method.uses_detector:  # its settings may be wrong before it is calibrated
         overrides = [one for one in overrides if not one.lstrip().startswith("profile.detector.")]
         overrides.append("profile.detector={use: blind}")
@@ -273,13 +279,22 @@ def _meter(method: Method, spec: ProfileSpec) -> list[str]:
     return [f"shot.0.equalise.{key}={json.dumps(text)}" for key, text in texts.items()]
 
 
-def _target(method: Method, hardware: ResolvedProfile) -> list[str]:
+def _target(method: Method, grid: SiteGrid) -> list[str]:
     """The overrides for a target as large as a reservoir allows, and without the time that is measured."""
     if method.kind != "timing":
         return []
-    sizes = zip(("rows", "cols"), hardware.grid.shape, strict=True)
+    if grid.shape == (1, 1):
+        what = "the grid has a single site, so that no atom can be moved"
+        raise ConfigError(Problem(what, "labseq calibrate timing", expected="a grid of at least two sites"))
+    sizes = zip(("rows", "cols"), grid.shape, strict=True)
     block = [f"target.{axis}={max(1, 3 * n // 4)}" for axis, n in sizes]
     return [*block, "profile.mobile_tweezers.overhead_per_cycle=0 s"]
+
+
+def _repeats(method: Method, grid: SiteGrid) -> list[str]:
+    """The override for more repeats on a small grid, so that enough atoms are probed."""
+    n_repeats = math.ceil(PROBED_PER_POINT.get(method.kind, 0) / (grid.n_rows * grid.n_cols))
+    return [f"repeats={n_repeats}"] if n_repeats > FEWEST_REPEATS else []
 
 
 def _of_profile(overrides: Sequence[str]) -> list[Override]:

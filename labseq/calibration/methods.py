@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -258,7 +259,9 @@ def fit_frequencies(
     ]
     fit = FrequenciesFit(hz[0], hz[1], -rows_m, -columns_m, row_error_m, column_error_m, overlay)
     if fit.error_m > worst_error_m:
-        text = f"rows and columns are known to {fit.error_m * 1e9:.0f} nm only"
+        known, wanted = (format_quantity(m, "length") for m in (fit.error_m, worst_error_m))
+        more = math.ceil((fit.error_m / worst_error_m) ** 2)
+        text = f"rows and columns are known to {known} only; for {wanted} take {more} times as many `repeats`"
         raise DeviceError("mobile_tweezers", f"no frequencies found: too few atoms: {text}")
     return fit
 

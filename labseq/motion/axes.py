@@ -68,15 +68,15 @@ def fit_comb(site_hz: Floats, spacing_m: float) -> CombFit:
 def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
     """The same grid, with tones shifted so that the mobile tweezers are on the sites.
 
-    An axis of one site takes the mean step of the other axis.
+    An axis of one site takes the mean step of the other axis, a grid of one site 1.6 MHz per spacing, by
+    which the offsets of a probe are made from tones too.
 
     Args:
         grid: The grid, with the tones that put the tweezers beside the sites.
         offset_m: float64 (2,), how far beside: along a1 (along a row) and a2 (from row to row), in metres.
 
     Raises:
-        LimitError: There is an offset on a grid of one site, whose tones cannot tell how
-            frequency and position belong together; or a tone is not above 0 Hz.
+        LimitError: A tone is not above 0 Hz.
 
     Example:
         >>> grid = SiteGrid(3, 3, spacing_m=4e-6)
@@ -95,11 +95,9 @@ def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
 def _shifted(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
     if offset_m == 0:
         return site_hz
-    if len(site_hz) < 2 and len(other_hz) < 2:
-        raise LimitError(f"the offset of a single {name}", f"{offset_m} m", "0 m: one tone tells no slope")
     site_m = axis_positions_m(len(site_hz), spacing_m)
     if len(site_hz) < 2:
-        moved_hz = site_hz - offset_m * np.diff(other_hz).mean() / spacing_m
+        moved_hz = site_hz - offset_m * _step_hz(site_hz, other_hz) / spacing_m
     else:
         moved_hz = _along(site_m - offset_m, site_m, site_hz)
     if not np.all(moved_hz > 0):
@@ -130,7 +128,7 @@ AxisIndex = Literal[0, 1]
 AXES: Final = ("row", "column")
 
 SINGLE_SITE_STEP_HZ: Final = 1.6e6
-"""Step from the only site of a 1 x 1 grid to an ejection slot, in Hz (the paper's step)."""
+"""Change of frequency by a move of one spacing on a 1 x 1 grid, in Hz (the paper's step)."""
 
 ROUNDING: Final = 1e-9
 """Relative excess over a limit that rounding of sums can cause."""

@@ -13,12 +13,7 @@ from scipy.interpolate import InterpolatedUnivariateSpline
 from labseq.errors import LimitError
 from labseq.model import MotionSpec, Plan, RfSpec, SiteGrid, ToneProgram
 from labseq.model.grid import centred_comb
-from labseq.motion import (
-    correct_overlay,
-    drive,
-    fit_comb,
-    tone_program,
-)
+from labseq.motion import correct_overlay, drive, fit_comb, hold_program, tone_program
 from labseq.motion.axes import axis_positions_m
 
 SPACING_M = 4.49e-6
@@ -100,9 +95,13 @@ def test_a_single_row_is_moved_by_the_step_of_the_columns() -> None:
     assert moved_hz == pytest.approx(-1e-6 * np.diff(grid.column_frequency_hz).mean() / SPACING_M)
 
 
-def test_a_single_site_tells_no_slope_to_move_it_by() -> None:
-    with pytest.raises(LimitError, match="the offset of a single row is 1e-06 m"):
-        correct_overlay(SiteGrid(1, 1), [0.0, 1e-6])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 3)])
+def test_a_correction_moves_tones_as_the_offset_of_a_probe_does(shape: tuple[int, int]) -> None:
+    grid, offset_m = SiteGrid(*shape, SPACING_M), np.array([0.3e-6, -0.2e-6])
+    corrected = correct_overlay(grid, -offset_m)
+    probe = hold_program(grid, MotionSpec(), np.ones(shape, bool), offset_m, 1e-4)
+    for axis, hz in ((probe.row, corrected.row_frequency_hz), (probe.column, corrected.column_frequency_hz)):
+        assert np.unique(axis.start_hz.round(3)) == pytest.approx(np.unique(hz.round(3)))
 
 
 def test_tones_are_not_moved_below_zero() -> None:
