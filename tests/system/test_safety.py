@@ -55,8 +55,14 @@ def test_a_signal_in_any_step_ends_safely(bench, step, number):
 
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGHUP", 143)])  # Ctrl-C, a lost terminal
 def test_a_signal_before_the_run_has_begun_ends_it(bench, name, code):
-    bench.environment["WATCHED_SIGNAL"] = f"static_tweezers.open:1:{int(getattr(signal, name))}:slow"
-    done = bench.run("run", "sequence.yaml", "--realtime", "--set", "profile.timeouts.call=2 h")
+    number = getattr(signal, name)
+    if (before := signal.getsignal(number)) is signal.SIG_IGN:  # the tests run under nohup
+        signal.signal(number, signal.SIG_DFL)
+    bench.environment["WATCHED_SIGNAL"] = f"static_tweezers.open:1:{int(number)}:slow"
+    try:
+        done = bench.run("run", "sequence.yaml", "--realtime", "--set", "profile.timeouts.call=2 h")
+    finally:
+        signal.signal(number, before)
     assert done.returncode == code, done.stderr
     assert safe_calls(bench.calls()) == SAFE_ORDER
 
