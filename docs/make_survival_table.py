@@ -63,14 +63,14 @@ SETTINGS: Final = (
     Setting("grid", 15, {"move": 0.005}),
     Setting("grid", 15, {"spread": 0.0}),
     Setting("grid", 15, {"tone": 0.002}),
-    Setting("grid", 15, {"lifetime_s": 15.0}, speed_m_s=0.050),
+    Setting("grid", 15, {"lifetime_s": 15.0}),
     Setting("psca", 15, {"move": 0.005}, loading=0.9),
 )
 
 
 def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimate]]:
     """Simulated and predicted, for atoms lost and shots without a defect."""
-    losses = replace(LossSpec(image=0.00314, passing=0.0), **setting.losses)
+    losses = replace(LossSpec(image=0.00314), **setting.losses)
     motion = MotionSpec(losses=losses, speed_m_s=setting.speed_m_s)
     settings = SimulationSettings.model_validate(
         {
@@ -87,9 +87,10 @@ def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimat
     simulation.open()
     simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     planner_class, settings_class = PLANNERS[setting.planner]
-    planner = planner_class(
-        settings_class(degree_of_parallelism=setting.parallel), Context(grid=GRID, motion=motion)
-    )
+    options: dict[str, Any] = {"degree_of_parallelism": setting.parallel}
+    if setting.planner == "grid":
+        options["lanes"] = "weaving"
+    planner = planner_class(settings_class.model_validate(options), Context(grid=GRID, motion=motion))
     found: list[tuple[float, ...]] = []
     for shot in range(n_shots):
         now_s = 100.0 * shot

@@ -285,7 +285,7 @@ def follow_atoms(
                     record_loss(state[j], plane, record[j], t_s[k + 1], 1.0)
 
 
-@kernel(f"void(float64[:, ::1], {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, float64, int64)")
+@kernel(f"void(float64[:, ::1], {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, float64, int64, float64)")
 def follow_in_row(
     state: Floats,
     static: Floats,
@@ -295,8 +295,9 @@ def follow_in_row(
     beams: Floats,
     frame_s: float,
     n_steps: int,
+    aside: float,
 ) -> None:
-    """Follow atoms, each alone, in a row of static tweezers along x and one mobile tweezer on that line.
+    """Follow atoms, each alone, in a row of static tweezers along x and one mobile tweezer that moves along.
 
     Args:
         state: The atoms, (n_atoms, 6); changed in place. Those that are far away stop.
@@ -307,8 +308,10 @@ def follow_in_row(
         beams: The beams.
         frame_s: Time from frame to frame.
         n_steps: Integration steps from frame to frame.
+        aside: Distance of the mobile tweezer from the row, along y.
     """
     site, tweezer = np.zeros(2), np.zeros(9)
+    tweezer[1] = aside
     for i in range(len(state)):
         for k in range(len(static) - 1):
             atom = state[i]

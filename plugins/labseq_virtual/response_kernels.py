@@ -1,6 +1,6 @@
 """Kernels that look up how atoms respond to the stages of a move (``responses.py``), and to time.
 
-``tables``: the tables of pick-up, drop-off and transport, one after the other, see
+``tables``: the tables of pick-up, drop-off, transport, landing and passing, one after the other, see
 :func:`labseq_virtual.responses.move_tables`.
 """
 
@@ -13,7 +13,20 @@ from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel
 from labseq_virtual.handover import COOLING_HZ, NOISE_HZ, STATIC_DEPTH, STATIC_WAIST, TEMPERATURE
-from labseq_virtual.responses import AWAY, DEPTH_K, RAMPS_S, RATIOS, SITE_M, SPEEDS, TEMPERATURES, WAIST_M
+from labseq_virtual.responses import (
+    AWAY,
+    BESIDE,
+    DEPTH_K,
+    LANDING_SPEEDS,
+    LEAST_LOSS,
+    PASSING_SPEEDS,
+    RAMPS_S,
+    RATIOS,
+    SITE_M,
+    SPEEDS,
+    TEMPERATURES,
+    WAIST_M,
+)
 
 Floats = NDArray[np.float64]
 
@@ -22,6 +35,9 @@ VECTOR = const("float64", 1)
 RAMP_AXIS, AWAY_AXIS, SPEED_AXIS = np.array(RAMPS_S), np.array(AWAY), np.array(SPEEDS)
 RATIO_AXIS, TEMPERATURE_AXIS = np.array(RATIOS), np.array(TEMPERATURES)
 N_RAMP = len(RAMPS_S) * len(AWAY) * len(RATIOS) * len(TEMPERATURES)
+LANDING_AXIS, PASSING_AXIS, BESIDE_AXIS = np.array(LANDING_SPEEDS), np.array(PASSING_SPEEDS), np.array(BESIDE)
+N_LANDING = len(LANDING_SPEEDS) * len(RAMPS_S) * len(RATIOS) * len(TEMPERATURES)
+N_PASSING = len(PASSING_SPEEDS) * len(BESIDE) * len(RATIOS) * len(TEMPERATURES)
 N_TRANSPORT = 3 * len(SPEEDS) * len(RATIOS) * len(TEMPERATURES)
 CURVED_SITES = 4.0
 """Length of the moves in the table of a curved course, in sites."""
@@ -141,6 +157,66 @@ def carry(
     return respond(
         tables, 4 * N_RAMP, N_TRANSPORT, float(course), speed, SPEED_AXIS, mobile / static, temperature, 3.0
     )
+
+
+@helper_kernel(f"UniTuple(float64, 2)(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+def land_on(
+    static: float,
+    mobile: float,
+    speed_m_s: float,
+    ramp_s: float,
+    heat: float,
+    constants: Floats,
+    tables: Floats,
+) -> tuple[float, float]:
+    """Loss and ratio of temperatures of an atom on which an empty tweezer lands and goes off.
+
+    Args:
+        static: Depth of its static tweezer, in kelvin.
+        mobile: Greatest depth of the mobile one.
+        speed_m_s: Speed at which this one came.
+        ramp_s: Duration of its ramp.
+        heat: Temperature of the atom in a static tweezer of the nominal depth.
+        constants: The constants.
+        tables: The tables.
+    """
+    if not static > 0.0:
+        return 1.0, 1.0
+    temperature = heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
+    faster = quicker(static, constants)
+    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / faster
+    i, part = locate(LANDING_AXIS, speed)
+    return respond(
+        tables, 4 * N_RAMP + 2 * N_TRANSPORT, N_LANDING, i + part, ramp_s * faster, RAMP_AXIS,
+        mobile / static, temperature, len(LANDING_AXIS),
+    )  # fmt: skip
+
+
+@helper_kernel(f"UniTuple(float64, 2)(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+def pass_by(
+    static: float,
+    mobile: float,
+    speed_m_s: float,
+    away_m: float,
+    heat: float,
+    constants: Floats,
+    tables: Floats,
+) -> tuple[float, float]:
+    """Loss and ratio of temperatures of an atom that a tweezer passes; ``away_m``: its nearest distance.
+
+    The other arguments are those of :func:`land_on`.
+    """
+    if not static > 0.0:
+        return 1.0, 1.0
+    temperature = heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
+    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
+    i, part = locate(PASSING_AXIS, speed)
+    log_loss, warmer = respond(
+        tables, 4 * N_RAMP + 2 * N_TRANSPORT + 2 * N_LANDING, N_PASSING, i + part,
+        away_m / constants[STATIC_WAIST], BESIDE_AXIS, mobile / static, temperature, len(PASSING_AXIS),
+    )  # fmt: skip
+    loss = math.exp(log_loss)
+    return (loss if loss > 2 * LEAST_LOSS else 0.0), warmer
 
 
 @helper_kernel(f"float64(float64, float64, {VECTOR})")

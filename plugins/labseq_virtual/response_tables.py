@@ -1,6 +1,6 @@
 """Makes the tables of ``responses.npz`` from atoms moved by Newton's equations: see ``responses.py``.
 
-    python -m labseq_virtual.response_tables
+    python -m labseq_virtual.response_tables [TABLE ...]
 
 Each stage of a move is simulated on its own, with the forces of ``flight_kernels.py``: atoms start from the
 thermal distribution of the tweezer that they are in. The sound smooths amplitudes and positions in the AOD as
@@ -10,8 +10,10 @@ faded in before, or out after it, slowly.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -67,7 +69,7 @@ def fly(state: Floats, static: Floats, mobile: Floats, place: Floats, at: Refere
     from labseq_virtual.flight_kernels import follow_in_row
 
     steps = max(1, round(FRAME_S / STEP_S))
-    follow_in_row(state, KELVIN * static, KELVIN * mobile, place, at.spacing, at.beams, FRAME_S, steps)
+    follow_in_row(state, KELVIN * static, KELVIN * mobile, place, at.spacing, at.beams, FRAME_S, steps, 0.0)
 
 
 def energy_k(state: Floats, depth: float, place: float, at: Reference, *, is_mobile: bool) -> Floats:
@@ -208,9 +210,39 @@ def transport(
         static = np.full(len(sites), KELVIN * at.depth)
         mobile = KELVIN * ratio * at.depth * light
         steps = round(frame_s / STEP_S)
-        follow_in_row(state, static, mobile, sites * at.spacing, at.spacing, at.beams, frame_s, steps)
+        follow_in_row(state, static, mobile, sites * at.spacing, at.spacing, at.beams, frame_s, steps, 0.0)
         after.append(_both(state, length * at.spacing, ratio, at))
     return outcome(np.concatenate(before), np.concatenate(after), whole, 1.0)
+
+
+def landing(
+    speed: float, ramp_s: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """An empty mobile tweezer comes from an empty neighbouring site and goes off on an atom."""
+    up, n = ramp(ramp_s)
+    n_way = math.ceil(at.spacing / speed / FRAME_S)
+    place = smoothed(np.concatenate([np.linspace(-at.spacing, 0.0, n_way + 1), np.zeros(n)]))
+    mobile = ratio * at.depth * np.concatenate([np.ones(n_way), up[::-1]])
+    state = draw(at.depth, temperature, at, 4, is_mobile=False)
+    before = energy_k(state, at.depth, 0.0, at, is_mobile=False)
+    fly(state, np.full(len(place), at.depth), mobile, place, at)
+    return outcome(before, energy_k(state, at.depth, 0.0, at, is_mobile=False), at.depth, 1.0)
+
+
+def passing(
+    speed: float, beside: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """A mobile tweezer passes beside an atom, from four waists before it to four behind."""
+    from labseq_virtual.flight_kernels import follow_in_row
+
+    far = 4 * at.waist
+    n = math.ceil(2 * far / speed / FRAME_S)
+    state = np.concatenate([draw(at.depth, temperature, at, seed, is_mobile=False) for seed in range(5)])
+    before = energy_k(state, at.depth, 0.0, at, is_mobile=False)
+    static, mobile = np.full(n + 1, KELVIN * at.depth), np.full(n + 1, KELVIN * ratio * at.depth)
+    place, steps = np.linspace(-far, far, n + 1), round(FRAME_S / STEP_S)
+    follow_in_row(state, static, mobile, place, 1.0, at.beams, FRAME_S, steps, beside * at.waist)
+    return outcome(before, energy_k(state, at.depth, 0.0, at, is_mobile=False), at.depth, 1.0)
 
 
 def _both(state: Floats, place: float, ratio: float, at: Reference) -> Floats:
@@ -235,6 +267,8 @@ STAGES: Final[dict[str, Any]] = {
     "pick_up": pick_up,
     "drop_off": drop_off,
     "transport": transport,
+    "landing": landing,
+    "passing": passing,
     "lowering": lowering,
 }
 
@@ -243,11 +277,11 @@ def _point(name: str, values: tuple[float, ...]) -> tuple[float, float]:
     return STAGES[name](*values, REFERENCE)
 
 
-def make_tables(processes: int = 2) -> dict[str, NDArray[np.float32]]:
+def make_tables(names: Iterable[str], processes: int = 2) -> dict[str, NDArray[np.float32]]:
     """Simulate all points: name -> float32 (2, ...), loss and ratio of temperatures on the axes."""
     made: dict[str, NDArray[np.float32]] = {}
     with ProcessPoolExecutor(processes) as pool:
-        for name in STAGES:
+        for name in names:
             start_s = time.monotonic()
             axes = AXES[name]
             points = list(product(*axes))
@@ -260,5 +294,7 @@ def make_tables(processes: int = 2) -> dict[str, NDArray[np.float32]]:
 
 
 if __name__ == "__main__":
-    np.savez_compressed(TABLES, **make_tables())  # pyright: ignore[reportArgumentType]
+    wanted = sys.argv[1:] or list(STAGES)
+    kept = dict(np.load(TABLES)) if TABLES.exists() else {}
+    np.savez_compressed(TABLES, **(kept | make_tables(wanted)))  # pyright: ignore[reportArgumentType]
     sys.stdout.write(f"{TABLES}: {TABLES.stat().st_size} bytes\n")

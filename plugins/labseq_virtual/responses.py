@@ -66,6 +66,9 @@ SPEEDS: Final = (
     0.02, 0.06, 0.1, 0.115, 0.13, 0.145, 0.16, 0.18, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3, 0.32, 0.34, 0.37, 0.4,
     0.45, 0.5, 0.6, 0.8, 1.1, 3.0,
 )  # fmt: skip
+LANDING_SPEEDS: Final = (0.013, 0.13, 0.26)
+PASSING_SPEEDS: Final = (0.03, 0.13, 0.4)
+BESIDE: Final = (1.2, 1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.7, 3.1)
 FRACTIONS: Final = (0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.35, 0.6, 1.0)
 DURATIONS_S: Final = (10e-6, 100e-6, 300e-6, 1e-3, 3e-3, 10e-3)
 
@@ -73,11 +76,14 @@ AXES: Final[dict[str, tuple[tuple[float, ...], ...]]] = {
     "pick_up": (RAMPS_S, AWAY, RATIOS, TEMPERATURES),
     "drop_off": (RAMPS_S, AWAY, RATIOS, TEMPERATURES),
     "transport": ((0, 1, 2), SPEEDS, RATIOS, TEMPERATURES),
+    "landing": (LANDING_SPEEDS, RAMPS_S, RATIOS, TEMPERATURES),
+    "passing": (PASSING_SPEEDS, BESIDE, RATIOS, TEMPERATURES),
     "lowering": (FRACTIONS, DURATIONS_S, TEMPERATURES),
 }
 """Axes of each table: duration of a ramp (s), distance from the site (waists), mobile over static depth,
 temperature (K); course of the motion (:class:`labseq.model.FrequencyCourse`), mean speed (m/s; of a curved
-course over four sites); depth after the ramp over that before."""
+course over four sites); speed of an empty tweezer that lands on an atom, and its ramp; speed of one that
+passes an atom, and its nearest distance (waists); depth after the ramp over that before."""
 
 
 def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
@@ -108,6 +114,10 @@ def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
     return texts
 
 
+LEAST_LOSS: Final = 1e-6
+"""Loss by passing that counts as none."""
+
+
 @cache
 def tables() -> dict[str, Floats]:
     """Name -> float64 (2, ...): loss, and ratio of the temperatures, on its :data:`AXES`."""
@@ -117,8 +127,11 @@ def tables() -> dict[str, Floats]:
 
 @cache
 def move_tables() -> Floats:
-    """The tables of pick-up, drop-off and transport as the kernels take them, float64 (n,)."""
-    flat = np.concatenate([tables()[name].ravel() for name in ("pick_up", "drop_off", "transport")])
+    """The tables of a move as the kernels take them, float64 (n,); of passing the logarithm of the loss."""
+    moves = {name: tables()[name] for name in ("pick_up", "drop_off", "transport", "landing", "passing")}
+    passing = moves["passing"].copy()
+    passing[0] = np.log(np.maximum(passing[0], LEAST_LOSS))  # falls by decades from distance to distance
+    flat = np.concatenate([one.ravel() for one in (moves | {"passing": passing}).values()])
     flat.flags.writeable = False
     return flat
 

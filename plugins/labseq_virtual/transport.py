@@ -15,7 +15,9 @@ Rules, in the order in which they act on a segment:
    lost.
 4. A crossing that moves over an atom on a site, or ends on one, knocks it out, if it is deeper than a static
    tweezer. The first to arrive loses its own atom too.
-5. A crossing that switches off drops its atom on the nearest site, with the losses of ``handover.py``; two
+5. A crossing that passes beside an atom may take it along, and lose its own; an empty one that goes off on an
+   atom may take that (``responses.py``).
+6. A crossing that switches off drops its atom on the nearest site, with the losses of ``handover.py``; two
    atoms on one site are both lost; outside the grid the atom is gone (ejected).
 
 Atoms still held when the program ends are lost. The velocity profile within a segment does not matter here:
@@ -128,11 +130,16 @@ class Transport:
             thermal = np.stack(
                 [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
             )
+        hazards = np.zeros(occupied.shape)
         lost = carry_atoms(
             occupied, thermal, start_s, depth * self._settings.static_depth, rows, offsets[0], cols,
             offsets[1], program.duration_s, program.course, n_segments, loss_factor, draws, self._constants,
-            self._merging, move_tables(),
+            self._merging, move_tables(), hazards,
         )  # fmt: skip
+        if hazards.any():
+            taken = occupied & (rng.random(occupied.shape) < -np.expm1(-hazards))
+            occupied &= ~taken
+            lost[COLLISION] += np.count_nonzero(taken)
         by_cause: Counter[str] = Counter(dict(zip(CAUSES, lost.tolist(), strict=True)))
         return +by_cause
 

@@ -44,10 +44,12 @@ from labseq_virtual.handover import (
     SPACING,
     START,
     STATIC_DEPTH,
+    STATIC_WAIST,
     TOLERANCE,
     TRANSPORT_LOSS,
 )
-from labseq_virtual.response_kernels import carry, hand_over, relaxed
+from labseq_virtual.response_kernels import carry, hand_over, land_on, pass_by, relaxed
+from labseq_virtual.responses import BESIDE
 from labseq_virtual.transport import COLLISION, EJECTED, FASTEST, HAND_OVER, PROGRAM, TRANSPORT
 
 Floats = NDArray[np.float64]
@@ -69,12 +71,14 @@ TABLE = const("float64", 2)
     IS_PICKED,
     DOWN,
     RIGHT,
-) = range(11)
+    SPEED,
+) = range(12)
 """Columns of a course: the probability that the atom fell out because the tweezer was too shallow; the
 greatest depth in kelvin; the durations of the ramps at start and end; depth and distance of the site that it
 came from; its temperature, as it would be in a static tweezer of nominal depth; the probability that it was
-lost so far; whether the pick-up is contained in both; the velocity, in sites per second."""
-N_COURSE = 11
+lost so far; whether the pick-up is contained in both; the velocity, in sites per second; the speed of the
+last motion, in m/s."""
+N_COURSE = 12
 NEW_LEG = 0.8
 """Change of the velocity, relative to the greater one, from which on a tweezer has started again; smaller
 ones are the bends of a curve, each with less than a third of the energy of a start and a stop."""
@@ -166,13 +170,14 @@ def span(paths: Floats, n: int, axis: int, n_sites: int, tolerance: float) -> tu
 
 @helper_kernel(f"int64({TABLE}, int64, int64, int64, float64)")
 def first_to_hit(paths: Floats, n: int, r: int, c: int, tolerance: float) -> int:
-    """Which of n paths passes over a site first; -1 if none does."""
+    """Which of n paths passes over a site first; -1 if none does. One that ends there lands or goes on."""
     first, soonest = -1, math.inf
     for k in range(n):
         to_r, to_c, down, right = r - paths[k, 0], c - paths[k, 1], paths[k, 2], paths[k, 3]
         when = min(max((to_r * down + to_c * right) / paths[k, 4], 0.0), 1.0)
         miss_r, miss_c = to_r - when * down, to_c - when * right
-        if miss_r * miss_r + miss_c * miss_c <= tolerance * tolerance and when < soonest:
+        ends_there = (to_r - down) ** 2 + (to_c - right) ** 2 <= tolerance * tolerance
+        if miss_r * miss_r + miss_c * miss_c <= tolerance * tolerance and when < soonest and not ends_there:
             first, soonest = k, when
     return first
 
@@ -216,6 +221,7 @@ def sweep(
 
 
 VECTOR = const("float64", 1)
+OUTPUT = "float64[:, ::1]"
 SITES = "boolean[:, ::1]"
 STATES = "int8[:, ::1]"
 NUMBERS = "int64[::1]"
@@ -282,7 +288,8 @@ def settle(course: Floats, constants: Floats, tables: Floats) -> None:
     loss, warmer = hand_over(
         0, course[SITE_DEPTH], course[PEAK], course[AWAY], course[RISE_S], course[HEAT], constants, tables
     )
-    course[LOST], course[HEAT] = loss, course[HEAT] * warmer
+    course[LOST] = 1.0 - (1.0 - course[LOST]) * (1.0 - loss)
+    course[HEAT] *= warmer
 
 
 @helper_kernel(
@@ -333,6 +340,7 @@ def advance(
     length_m = math.hypot(down, right) * constants[SPACING]
     if length_m == 0.0:
         return
+    course[SPEED] = length_m / duration_s
     risk = shallow(depth, length_m / duration_s * FASTEST[kind], n_further, constants)
     course[RISK] = max(course[RISK], risk)
     if is_held and starts:
@@ -402,7 +410,7 @@ def nearest_site(row: float, col: float, static: Floats, constants: Floats) -> t
 
 @helper_kernel(
     f"void({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {COURSES}, {VECTOR}, "
-    f"{TABLE})"
+    f"{TABLE}, {OUTPUT})"
 )
 def pick_up(
     occupied: Mask,
@@ -416,6 +424,7 @@ def pick_up(
     course: Floats,
     constants: Floats,
     merging: Floats,
+    hazards: Floats,
 ) -> None:
     """Rule 2: crossings that are ramped up take the atoms of the sites close to them, row by row."""
     for i in range(len(row)):
@@ -431,6 +440,103 @@ def pick_up(
                 course[i, j, SITE_DEPTH], course[i, j, AWAY] = static[r, c], away_m
                 course[i, j, HEAT] = relaxed(thermal[0, r, c], now_s - thermal[1, r, c], constants)
                 course[i, j, IS_PICKED] = 0.0
+                course[i, j, LOST], hazards[r, c] = -math.expm1(-hazards[r, c]), 0.0
+
+
+@helper_kernel(f"float64(float64, float64, float64, float64, {VECTOR})")
+def dot(down: float, right: float, to_down: float, to_right: float, constants: Floats) -> float:
+    """Scalar product of two displacements in sites, along columns and rows, in square metres."""
+    straight = (down * to_down + right * to_right) * constants[SPACING] * constants[SPACING]
+    return straight + 0.5 * constants[SKEW] * (down * to_right + right * to_down)
+
+
+@helper_kernel(f"float64(float64, float64, float64, float64, float64, float64, {VECTOR})")
+def nearest_pass(
+    to_down: float,
+    to_right: float,
+    down: float,
+    right: float,
+    was_down: float,
+    was_right: float,
+    constants: Floats,
+) -> float:
+    """Distance in metres at which a tweezer passes an atom in a segment; inf if it is nearest in another one.
+
+    Args:
+        to_down: From the tweezer at the start to the atom, in sites along the columns.
+        to_right: Along a row.
+        down: Displacement of the tweezer in the segment.
+        right: Along a row.
+        was_down: Its velocity before.
+        was_right: Along a row.
+        constants: The constants.
+    """
+    length2 = dot(down, right, down, right, constants)
+    ahead = dot(to_down, to_right, down, right, constants)
+    if length2 > 0.0 and ahead >= length2:
+        return math.inf  # it comes nearer still
+    if length2 > 0.0 and ahead > 0.0:
+        part = ahead / length2
+        to_down, to_right = to_down - part * down, to_right - part * right
+    else:
+        rested = was_down == 0.0 and was_right == 0.0
+        came_nearer = dot(to_down, to_right, was_down, was_right, constants) > 0.0
+        if not (came_nearer or (rested and length2 > 0.0)):
+            return math.inf
+    return math.sqrt(dot(to_down, to_right, to_down, to_right, constants))
+
+
+@helper_kernel(
+    f"void({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {TABLE}, {COURSES}, float64, "
+    f"{VECTOR}, {VECTOR}, {OUTPUT})"
+)
+def pass_atoms(
+    occupied: Mask,
+    thermal: Floats,
+    now_s: float,
+    static: Floats,
+    row: Floats,
+    col: Floats,
+    state: States,
+    depth: Floats,
+    course: Floats,
+    duration_s: float,
+    constants: Floats,
+    tables: Floats,
+    hazards: Floats,
+) -> None:
+    """Rule 5: tweezers that pass atoms on sites add to their hazards of being lost, and of their own atom."""
+    cosine = 0.5 * constants[SKEW] / (constants[SPACING] * constants[SPACING])
+    within_m = BESIDE[-1] * constants[STATIC_WAIST]
+    reach = within_m / constants[SPACING] / math.sqrt(1.0 - cosine * cosine)
+    for i in range(len(row)):
+        for j in range(len(col)):
+            down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
+            if state[i, j] == DARK:
+                continue
+            top = max(math.ceil(row[i, START] + min(down, 0.0) - reach), 0)
+            bottom = min(math.floor(row[i, START] + max(down, 0.0) + reach) + 1, occupied.shape[0])
+            left = max(math.ceil(col[j, START] + min(right, 0.0) - reach), 0)
+            last = min(math.floor(col[j, START] + max(right, 0.0) + reach) + 1, occupied.shape[1])
+            for r in range(top, bottom):
+                for c in range(left, last):
+                    if not occupied[r, c]:
+                        continue
+                    away_m = nearest_pass(
+                        r - row[i, START], c - col[j, START], down, right,
+                        course[i, j, DOWN], course[i, j, RIGHT], constants,
+                    )  # fmt: skip
+                    if not constants[TOLERANCE] * constants[SPACING] < away_m < within_m:
+                        continue
+                    speed_m_s = math.sqrt(dot(down, right, down, right, constants)) / duration_s
+                    heat = relaxed(thermal[0, r, c], now_s - thermal[1, r, c], constants)
+                    loss, warmer = pass_by(
+                        static[r, c], depth[i, j], speed_m_s, away_m, heat, constants, tables
+                    )
+                    thermal[0, r, c], thermal[1, r, c] = heat * warmer, now_s
+                    hazards[r, c] -= math.log1p(-min(loss, 1.0 - 1e-9))
+                    if state[i, j] == HELD:
+                        course[i, j, LOST] = 1.0 - (1.0 - course[i, j, LOST]) * (1.0 - loss)
 
 
 @helper_kernel("int64(boolean[:, ::1], int64[::1], int64)")
@@ -452,9 +558,30 @@ def land(occupied: Mask, sites: Ints, n: int) -> int:
     return n_lost
 
 
+@helper_kernel(f"void(int64, int64, {THERMAL}, float64, {TABLE}, float64[::1], {VECTOR}, {VECTOR}, {OUTPUT})")
+def land_empty(
+    r: int,
+    c: int,
+    thermal: Floats,
+    now_s: float,
+    static: Floats,
+    course: Floats,
+    constants: Floats,
+    tables: Floats,
+    hazards: Floats,
+) -> None:
+    """An empty tweezer that came from elsewhere goes off on an atom, which may be lost, or is heated."""
+    if course[SPEED] == 0.0:
+        return
+    heat = relaxed(thermal[0, r, c], now_s - thermal[1, r, c], constants)
+    loss, warmer = land_on(static[r, c], course[PEAK], course[SPEED], course[FALL_S], heat, constants, tables)
+    thermal[0, r, c], thermal[1, r, c] = heat * warmer, now_s
+    hazards[r, c] -= math.log1p(-min(loss, 1.0 - 1e-9))
+
+
 @helper_kernel(
     f"int64({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {COURSES}, int64, float64, "
-    f"{TABLE}, int64, {VECTOR}, {VECTOR}, {NUMBERS}, {NUMBERS})"
+    f"{TABLE}, int64, {VECTOR}, {VECTOR}, {NUMBERS}, {NUMBERS}, {OUTPUT})"
 )
 def set_down(
     occupied: Mask,
@@ -473,17 +600,22 @@ def set_down(
     tables: Floats,
     work: Ints,
     lost: Ints,
+    hazards: Floats,
 ) -> int:
-    """Rule 5: crossings that switch off drop their atoms; returns the number of draws used so far."""
+    """Rule 6: crossings that switch off drop their atoms; returns the number of draws used so far."""
     n = 0
     for i in range(len(row)):
         for j in range(len(col)):
             if row[i, ON_END] * col[j, ON_END] > 0.0:
                 continue
-            held, state[i, j] = state[i, j] == HELD, DARK
-            if not held:
+            before, state[i, j] = state[i, j], DARK
+            if before == DARK:
                 continue
             r, c, away_m, inside = nearest_site(row[i, END], col[j, END], static, constants)
+            if before != HELD:
+                if inside and occupied[r, c] and away_m <= constants[TOLERANCE] * constants[SPACING]:
+                    land_empty(r, c, thermal, now_s, static, course[i, j], constants, tables, hazards)
+                continue
             by_heat, by_hand_over, in_motion, heat = risks(
                 static[r, c], course[i, j], away_m, n_further, factor, constants, tables
             )
@@ -498,6 +630,7 @@ def set_down(
             else:
                 work[n] = r * static.shape[1] + c
                 thermal[0, r, c], thermal[1, r, c] = heat, now_s
+                hazards[r, c] = 0.0
                 n += 1
     lost[COLLISION] += land(occupied, work, n)
     return n_drawn
@@ -507,7 +640,6 @@ Offsets = NDArray[np.int32]
 
 OFFSETS = const("int32", 1)
 KINDS = const("int8", 1)
-OUTPUT = "float64[:, ::1]"
 
 INSTANT_S = 1e-12
 """Duration assumed for a segment of duration 0, in seconds."""
@@ -632,7 +764,7 @@ def max_tones(offsets: Offsets, n_segments: int) -> int:
 
 @helper_kernel(
     f"int64({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {TABLE}, {STATES}, {OUTPUT}, {COURSES}, float64, "
-    f"int64, float64, {TABLE}, int64, {VECTOR}, {TABLE}, {VECTOR}, {OUTPUT}, {NUMBERS}, {NUMBERS})"
+    f"int64, float64, {TABLE}, int64, {VECTOR}, {TABLE}, {VECTOR}, {OUTPUT}, {NUMBERS}, {NUMBERS}, {OUTPUT})"
 )
 def play(
     occupied: Mask,
@@ -655,19 +787,24 @@ def play(
     paths: Floats,
     work: Ints,
     lost: Ints,
+    hazards: Floats,
 ) -> int:
-    """Rules 2 to 5 for a segment; returns the number of draws used so far."""
+    """Rules 2 to 6 for a segment; returns the number of draws used so far."""
     n_further = count_lit(row) + count_lit(col) - 2
     for i in range(len(row)):
         for j in range(len(col)):
             start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
             depth[i, j] = mobile_depth(max(start, end), n_further, constants)
-    pick_up(occupied, thermal, now_s, static, row, col, state, depth, course, constants, merging)
+    pick_up(occupied, thermal, now_s, static, row, col, state, depth, course, constants, merging, hazards)
     lost[COLLISION] += mix(row, col, state)
     if moves(row) or moves(col):
         lost[COLLISION] += sweep(
             occupied, row, col, state, depth, constants[STATIC_DEPTH], constants[TOLERANCE], paths, work
         )
+    pass_atoms(
+        occupied, thermal, now_s, static, row, col, state, depth, course, max(duration_s, INSTANT_S),
+        constants, tables, hazards,
+    )  # fmt: skip
     for i in range(len(row)):
         for j in range(len(col)):
             start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
@@ -679,13 +816,13 @@ def play(
                 )  # fmt: skip
     return set_down(
         occupied, thermal, now_s + duration_s, static, row, col, state, course, n_further, factor, draws,
-        n_drawn, constants, tables, work, lost,
+        n_drawn, constants, tables, work, lost, hazards,
     )  # fmt: skip
 
 
 @kernel(
     f"{NUMBERS}({SITES}, {THERMAL}, float64, {TABLE}, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {VECTOR}, "
-    f"{KINDS}, int64, float64, {TABLE}, {VECTOR}, {TABLE}, {VECTOR})"
+    f"{KINDS}, int64, float64, {TABLE}, {VECTOR}, {TABLE}, {VECTOR}, {OUTPUT})"
 )
 def carry_atoms(
     occupied: Mask,
@@ -704,6 +841,7 @@ def carry_atoms(
     constants: Floats,
     merging: Floats,
     tables: Floats,
+    hazards: Floats,
 ) -> Ints:
     """Carry atoms by the first segments of a program.
 
@@ -725,9 +863,10 @@ def carry_atoms(
         constants: The constants.
         merging: The merging distances.
         tables: The tables of ``response_kernels.py``.
+        hazards: Result, hazard of the atom on each site by tweezers that passed it (n_rows, n_cols), from 0.
 
     Returns:
-        Number of atoms lost by each cause (5,).
+        Number of atoms lost by each cause (5,), without those that the hazards will cost.
     """
     shape = max_tones(row_offsets, n_segments), max_tones(col_offsets, n_segments)
     old_state, state = np.zeros(shape, np.int8), np.zeros(shape, np.int8)
@@ -747,7 +886,7 @@ def carry_atoms(
             lost[PROGRAM] -= count_held(state, row, col)
             n_drawn = play(
                 occupied, thermal, now_s, static, row, col, state, depth, course, duration_s[k], kinds[k],
-                factor, draws, n_drawn, constants, merging, tables, paths, work, lost,
+                factor, draws, n_drawn, constants, merging, tables, paths, work, lost, hazards,
             )  # fmt: skip
             old_row, old_col, old_state, state = row, col, state, old_state
             old_course, course = course, old_course

@@ -24,8 +24,8 @@ from labseq_virtual.handover import (
     constants,
     merging_distance,
 )
-from labseq_virtual.response_kernels import carry, hand_over
-from labseq_virtual.response_tables import drop_off, pick_up, transport
+from labseq_virtual.response_kernels import carry, hand_over, land_on, pass_by
+from labseq_virtual.response_tables import drop_off, landing, passing, pick_up, transport
 from labseq_virtual.responses import REFERENCE, move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
@@ -79,6 +79,7 @@ class NaiveTransport:
         self.constants, self.reach = transport._constants, transport._merging
         self.tables = move_tables()
         self.thermal = np.stack([np.full(GRID.shape, settings.temperature), np.zeros(GRID.shape)])
+        self.hazards = np.zeros(GRID.shape)
         self.now_s, self.n_drawn = 0.0, 0
         self.lost: Counter[str] = Counter()
 
@@ -92,6 +93,14 @@ class NaiveTransport:
             before = self._segment(before, row, col, float(program.duration_s[k]), int(program.course[k]))
             self.now_s += float(program.duration_s[k])
         self.lost["program"] += 0 if before is None else count(before.loaded)
+        if self.hazards.any():
+            offsets = program.row.offsets, program.column.offsets
+            tones = self.transport._tones(program, 0), self.transport._tones(program, 1)
+            first = 3 * max_drop_offs(tones[0], offsets[0], tones[1], offsets[1], n_segments)
+            draws = self.draws.ravel()[first : first + occupied.size].reshape(occupied.shape)
+            taken = occupied & (draws < 1 - np.exp(-self.hazards))
+            self.lost["collision"] += count(taken)
+            occupied &= ~taken
         return +self.lost
 
     def _segments(self, program: ToneProgram, axis: int) -> list[Floats]:
@@ -125,11 +134,13 @@ class NaiveTransport:
         down, right = (row[:, END] - row[:, START])[:, None], (col[:, END] - col[:, START])[None, :]
         if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
             self._sweep(lit & (depth > self.settings.static_depth), loaded, row, col)
+        self._pass(lit, loaded, course, depth, row, col, duration_s)
         for i, j in np.argwhere(lit):
             kernels.advance(
                 course[i, j], bool(loaded[i, j]), start[i, j], end[i, j], depth[i, j], float(down[i, 0]),
                 float(right[0, j]), duration_s, kind, further, self.constants, self.tables,
             )  # fmt: skip
+        self._land(lit & ~loaded & ~lit_end, course, row, col, duration_s)
         self._set_down(loaded & ~lit_end, course, row, col, further, duration_s)
         return Before(row, col, lit_end, loaded & lit_end, fresh, course)
 
@@ -169,7 +180,37 @@ class NaiveTransport:
                 heat = kernels.relaxed(self.thermal[0][site], waited_s, self.constants)
                 course[i, j, kernels.SITE_DEPTH : kernels.HEAT + 1] = static, away_m[i, j], heat
                 course[i, j, kernels.IS_PICKED] = 0.0
+                course[i, j, kernels.LOST] = 1 - np.exp(-self.hazards[site])
+                self.hazards[site] = 0.0
         return taken
+
+    def _pass(
+        self, lit: Mask, loaded: Mask, course: Floats, depth: Any, row: Floats, col: Floats, duration_s: float
+    ) -> None:
+        """Tweezers pass atoms where they are nearest to them: on the way, or where they stop or turn away."""
+        a1, a2 = GRID.axes
+        for i, j in np.argwhere(lit):
+            start, end = (row[i, at] * a2 + col[j, at] * a1 for at in (START, END))
+            was = course[i, j, kernels.DOWN] * a2 + course[i, j, kernels.RIGHT] * a1
+            way = end - start
+            for r, c in np.argwhere(self.occupied):
+                to = r * a2 + c * a1 - start
+                part = float(to @ way / (way @ way)) if way.any() else 0.0
+                if part >= 1 or (part <= 0 and not (to @ was > 0 or (way.any() and not was.any()))):
+                    continue
+                away_m = float(np.linalg.norm(to - max(part, 0.0) * way))
+                if not self.settings.site_tolerance * GRID.spacing_m < away_m < 3.1 * WAIST_M:
+                    continue
+                waited_s = self.now_s - self.thermal[1, r, c]
+                heat = kernels.relaxed(self.thermal[0, r, c], waited_s, self.constants)
+                speed = float(np.linalg.norm(way)) / duration_s
+                loss, warmer = pass_by(
+                    float(self.depth[r, c]), depth[i, j], speed, away_m, heat, self.constants, self.tables
+                )
+                self.thermal[:, r, c] = heat * warmer, self.now_s
+                self.hazards[r, c] -= np.log1p(-min(loss, 1 - 1e-9))
+                if loaded[i, j]:
+                    course[i, j, kernels.LOST] = 1 - (1 - course[i, j, kernels.LOST]) * (1 - loss)
 
     def _mixed(self, tones: Floats) -> Any:
         on = (tones[:, ON_START] + tones[:, ON_END]) > 0
@@ -189,11 +230,27 @@ class NaiveTransport:
         when = np.clip((to_r * down + to_c * right) / (down**2 + right**2), 0.0, 1.0)
         miss = (to_r - when * down) ** 2 + (to_c - when * right) ** 2
         hit: Any = miss <= self.settings.site_tolerance**2
+        hit &= (to_r - down) ** 2 + (to_c - right) ** 2 > self.settings.site_tolerance**2
         struck = hit.any(axis=0)
         first = np.unique(np.where(hit, when, np.inf).argmin(axis=0)[struck])
         self.lost["collision"] += count(struck) + count(loaded[i[first], j[first]])
         loaded[i[first], j[first]] = False
         self.occupied[r[struck], c[struck]] = False
+
+    def _land(self, empty: Mask, course: Floats, row: Floats, col: Floats, duration_s: float) -> None:
+        now_s = self.now_s + duration_s
+        for i, j in np.argwhere(empty):
+            r, c, away_m, inside = (each[()] for each in self._nearest(row[i, END], col[j, END]))
+            if not (inside and self.occupied[r, c] and course[i, j, kernels.SPEED] > 0):
+                continue
+            if away_m > self.settings.site_tolerance * GRID.spacing_m:
+                continue
+            peak, speed, fall_s = course[i, j, [kernels.PEAK, kernels.SPEED, kernels.FALL_S]]
+            heat = kernels.relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c], self.constants)
+            static = float(self.depth[r, c])
+            loss, warmer = land_on(static, peak, speed, fall_s, heat, self.constants, self.tables)
+            self.thermal[:, r, c] = heat * warmer, now_s
+            self.hazards[r, c] -= np.log1p(-min(loss, 1 - 1e-9))
 
     def _set_down(
         self,
@@ -217,6 +274,7 @@ class NaiveTransport:
         stays = inside & ~fallen & ~dropped
         self.thermal[0, r[stays], c[stays]] = heat[stays]
         self.thermal[1, r[stays], c[stays]] = self.now_s + duration_s
+        self.hazards[r[stays], c[stays]] = 0.0
         n_atoms = self.occupied.astype(int)
         np.add.at(n_atoms, (r[stays], c[stays]), 1)
         self.lost.update(
@@ -368,7 +426,7 @@ def test_a_static_tweezer_that_is_off_holds_nothing_back() -> None:
     assert risks(course_of(), static=0.0)[0] == 1.0
 
 
-PICK_UP, DROP_OFF, TRANSPORT = range(3)
+PICK_UP, DROP_OFF, TRANSPORT, LANDING, PASSING = range(5)
 BETWEEN = [
     (PICK_UP, (30e-6, 0.7, 6.0, 17e-6)),
     (PICK_UP, (6e-6, 1.1, 9.0, 23e-6)),
@@ -379,22 +437,29 @@ BETWEEN = [
     (TRANSPORT, (0, 0.33, 6.0, 17e-6)),
     (TRANSPORT, (0, 0.39, 7.0, 17e-6)),
     (TRANSPORT, (1, 0.12, 6.0, 23e-6)),
+    (LANDING, (0.2, 40e-6, 3.0, 23e-6)),
+    (PASSING, (0.13, 1.65, 6.5, 33e-6)),
+    (PASSING, (0.2, 1.5, 3.5, 28e-6)),
 ]
 """Arguments of the simulated stages, between the points of the tables."""
 
 
 @pytest.mark.parametrize(("stage", "args"), BETWEEN)
 def test_between_the_points_of_the_tables_atoms_fare_as_newtons_equations_say(stage: int, args: Any) -> None:
-    stages: tuple[Any, ...] = pick_up, drop_off, transport
+    stages: tuple[Any, ...] = pick_up, drop_off, transport, landing, passing
     lost, warmer = stages[stage](*args, REFERENCE)
     first, other, ratio, heat = args
-    physics, depth_k = constants_of(static_waist=WAIST_M), 300e-6
+    physics, depth_k, tables = constants_of(static_waist=WAIST_M), 300e-6, move_tables()
+    mobile_k = ratio * depth_k
     if stage == TRANSPORT:
-        length_m = 4 * 4.49e-6
-        found = carry(first, other, length_m, ratio * depth_k, heat, physics, move_tables())
+        found = carry(first, other, 4 * 4.49e-6, mobile_k, heat, physics, tables)
+    elif stage == LANDING:
+        found = land_on(depth_k, mobile_k, first, other, heat, physics, tables)
+    elif stage == PASSING:
+        found = pass_by(depth_k, mobile_k, first, other * WAIST_M, heat, physics, tables)
+        assert 0.01 < found[0] < 2 * lost < 4 * found[0]
     else:
-        away_m = other * WAIST_M
-        found = hand_over(stage, depth_k, ratio * depth_k, away_m, first, heat, physics, move_tables())
+        found = hand_over(stage, depth_k, mobile_k, other * WAIST_M, first, heat, physics, tables)
         assert found[1] == pytest.approx(warmer, rel=0.25)
     assert found[0] == pytest.approx(lost, abs=0.2 if stage == TRANSPORT else 0.08)
 
