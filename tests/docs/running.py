@@ -27,6 +27,7 @@ FEW: Final = {
     "bench planners": "--loadings 2 --workers 1",
     "bench latency": "--loadings 2",
     "bench waveform": "--repeats 1",
+    "calibrate amplitudes": "",
     "calibrate tweezers": "",
     "calibrate sites": "--shots 8 --seed 1",
     "calibrate": "--shots 30 --seed 1",
