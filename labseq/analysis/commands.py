@@ -153,7 +153,10 @@ def plot(
     fit_set: FitSettings = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file of --output.")] = False,
 ) -> None:
-    """Draw a run, finished or not: an overview, one part of it, the points of a scan, or a shot."""
+    """Draw a run, finished or not: an overview, one part of it, the points of a scan, or a shot.
+
+    Of a campaign's folder, draw filling and defect-free fraction at its points.
+    """
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import PlotRequest, plot_run
 

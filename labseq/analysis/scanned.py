@@ -110,7 +110,7 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     for i in varied:
         leader = next((k for k in together if _follows(columns, numbers, i, k)), i)
         together.setdefault(leader, []).append(addresses[i])
-    axes = tuple(_axis(" with ".join(names), columns[i], values[i]) for i, names in together.items())
+    axes = tuple(make_axis(" with ".join(names), columns[i], values[i]) for i, names in together.items())
     written = [tuple(map(clean, point.written.values())) for point in points]
     places = tuple(
         tuple(axis.words.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
@@ -118,7 +118,8 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     return Scanned(axes, places, tuple(points))
 
 
-def _axis(address: str, words: Sequence[str], values: Sequence[Any]) -> Axis:
+def make_axis(address: str, words: Sequence[str], values: Sequence[Any]) -> Axis:
+    """An axis from the words and values, SI, of its points, of which some may be equal."""
     of_word = dict(zip(words, values, strict=True))
     return Axis(address, tuple(of_word), _numbers([*of_word.values()], [*of_word]))
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from labseq.analysis.campaigns import campaign_in, campaign_picture
 from labseq.analysis.overview import overview, picture_of, scan_picture
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.scanned import ScanRequest, scan_report
@@ -335,15 +336,23 @@ class PlotRequest:
 
 
 def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, replace: bool = False) -> None:
-    """Draw a run; a file is replaced only on request."""
+    """Draw a run or a campaign; a file is replaced only on request."""
     request.check()
-    path = _free_name(request.name) if output is None else output
+    folder = campaign_in(run)
+    if folder is not None and request != PlotRequest():
+        what = "a campaign has one picture; these options are for one of its runs"
+        raise ConfigError(Problem(what, visible(str(folder)), expected="no option but --output and --force"))
+    path = _free_name(request.name if folder is None else "campaign") if output is None else output
     check_place(path)
     if path.exists() and not replace:
         hint = "--force replaces it"
         raise ConfigError(
             Problem("this file exists already", visible(str(path)), expected="a new name", hint=hint)
         )
+    if folder is not None:
+        campaign_picture(folder).save(path)
+        say(f"written: {path}")
+        return
     chosen = chosen_run(run)
     if request.shot is not None:
         save_shot(path, shot_picture(chosen, request.shot, request.cycle))

@@ -8,18 +8,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from labseq.campaign.campaign import Campaign, combined, run_campaign
 from labseq.console.output import check_writable, say
 from labseq.console.text import columns, plural
-from labseq.files import explained, whole_file
 from labseq.recording.tables import check_installed
+from labseq.session.campaign import Campaign, run_campaign
 from labseq.session.options import Options
 
 
 def run_file(
     run_session: Callable[..., None], file: Path, folder: Path, netcdf: Path | None, workers: Options
 ) -> None:
-    """Run a campaign file; print a table, and write the combined file if it is asked for."""
+    """Run a campaign file; print a table; check first that the combined file can be written."""
     if netcdf is not None:
         check_installed("xarray", "h5netcdf")
         check_writable(netcdf)
@@ -32,7 +31,3 @@ def run_file(
         filling = f"{100 * sum(known) / len(known):.2f} %" if known else "-"
         rows.append((*values, str(len(run.shots)), filling, f"{run.path.parent.name}/{run.path.name}"))
     say("", *columns(rows), f"{plural(len(runs), 'run')} in {folder}")
-    if netcdf is not None:
-        with explained(netcdf), whole_file(netcdf) as written:
-            combined(campaign, runs).to_netcdf(Path(written.name), engine="h5netcdf")
-        say(f"written: {netcdf}")

@@ -246,7 +246,8 @@ def run_campaign(
     file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="The file.", show_default=False)],
     output: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the campaign.", show_default=False)],
     netcdf: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the means of all points here, as netCDF.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the results of all points here, as labseq export does."),
     ] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
@@ -254,12 +255,15 @@ def run_campaign(
     _plugins: Plugins = None,
 ) -> None:
     """Run a sequence at each point of a grid of values; continue a campaign that was stopped."""
+    from labseq.analysis.campaigns import export_campaign
     from labseq.campaign.terminal import run_file
     from labseq.cli.run import run_session
     from labseq.session.options import Options
 
     who = Options(workers=workers, scheduler=scheduler, keys=keys)
     run_file(run_session, file, output, netcdf, who)
+    if netcdf is not None:
+        export_campaign(output.expanduser(), netcdf)
 
 
 @app.command(short_help="Check a sequence; print its timeline and limits.")
@@ -354,14 +358,15 @@ app.command(epilog=ANALYSE_EXAMPLES, short_help="Analyse the shots of a run.")(a
 def export(
     run: RunFolder = None,
     to: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--to",
             metavar="csv|parquet|netcdf|archive",
-            help="Kind of file: a table of the shots (csv, parquet), a table with occupancies on the axes of "
-            "the scan (netcdf), or everything in one HDF5 file (archive).",
+            help="Kind of file: a table of the shots (csv, parquet), a table with occupancies on the axes "
+            "of the scan (netcdf), or everything in one HDF5 file (archive). Default: csv, or netcdf for "
+            "a campaign.",
         ),
-    ] = "csv",
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -376,7 +381,7 @@ def export(
     where: Where = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
 ) -> None:
-    """Export a run to one file that other programs can read.
+    """Export a run, or all runs of a campaign's folder, to one file that other programs can read.
 
     With --scan a row for each point of the scan, csv only: scanned values, shots, means and their intervals.
     """
@@ -385,7 +390,7 @@ def export(
 
     wanted = scan_request(scan, where)
     if wanted is not None:
-        export_points(run, to, output, wanted, replace=force)
+        export_points(run, to or "csv", output, wanted, replace=force)
         return
     raise typer.Exit(export_to(run, to, output, frames=frames, replace=force))
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.analysis.campaigns import campaign_in, export_campaign
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.console.output import as_line, say
 from labseq.console.runs import chosen_run, existing_run
@@ -90,12 +91,22 @@ def _as_values(report: Report) -> dict[str, Any]:
     }
 
 
-def export_to(run: Path | None, kind: str, output: Path | None, *, frames: bool, replace: bool) -> int:
-    """Export a run, and print the names of the files.
+def export_to(run: Path | None, kind: str | None, output: Path | None, *, frames: bool, replace: bool) -> int:
+    """Export a run or a campaign, and print the names of the files.
 
     Returns:
         The exit code: 1 if shots are missing in the file.
     """
+    folder = campaign_in(run)
+    if folder is not None:
+        if kind not in (None, "netcdf"):
+            what = f"a campaign cannot be exported as '{visible(kind)}'"
+            raise ConfigError(Problem(what, "--to", expected="netcdf"))
+        path = output or Path(f"{folder.resolve().name}.nc")
+        check_export("netcdf", path, frames=frames, replace=replace)
+        export_campaign(folder, path)
+        return 0
+    kind = kind or "csv"
     if output is not None:
         check_export(kind, output, frames=frames, replace=replace)
     opened = chosen_run(run)

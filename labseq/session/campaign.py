@@ -7,27 +7,24 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
 from labseq.config.document import Document
 from labseq.errors import ConfigError, Problem
+from labseq.files import explained, write_file
 from labseq.messages import visible
 from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
-from labseq.recording.tables import check_installed
 from labseq.roles import RunObserver
 from labseq.session.options import Options
 from labseq.session.session import Session
 from labseq.settings import Settings
 
-if TYPE_CHECKING:
-    import xarray as xr
-
 MAX_POINTS: Final = 10_000
-FIGURES: Final = ("filling_fraction", "success", "n_defects", "n_batches", "n_atom_moves")
-"""Figures of shots, of which the combined file has the mean at each point."""
+CAMPAIGN_FILE: Final = "campaign.yaml"
+"""The copy of the campaign file in the campaign's folder."""
 
 RunSession = Callable[[Callable[[RunObserver | None], Session]], None]
 
@@ -137,6 +134,7 @@ def run_campaign(run_session: RunSession, campaign: Campaign, folder: Path, work
     campaign.check()
     who: dict[str, Any] = {"workers": workers.workers, "scheduler": workers.scheduler, "keys": workers.keys}
     found = _runs_of(campaign, folder)
+    _keep(campaign, folder, is_new=not found)
     for point in campaign.points():
         earlier = found.get(point)
         if earlier is not None and earlier.status == "complete":
@@ -151,6 +149,19 @@ def run_campaign(run_session: RunSession, campaign: Campaign, folder: Path, work
         run_session(start)
     runs = _runs_of(campaign, folder)
     return [runs[point] for point in campaign.points() if point in runs]
+
+
+def _keep(campaign: Campaign, folder: Path, *, is_new: bool) -> None:
+    """Copy the campaign file to the folder, so that its results can be read without the original."""
+    kept, text = folder / CAMPAIGN_FILE, campaign.document.text
+    if kept.is_file() and Document.read(kept).text == text:
+        return
+    if is_new and kept.exists():
+        what, hint = "this file is of another campaign", "delete it if that campaign has ended"
+        raise ConfigError(Problem(what, visible(str(kept)), expected="another folder", hint=hint))
+    with explained(kept):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_file(kept, text.encode())
 
 
 def _runs_of(campaign: Campaign, folder: Path) -> dict[tuple[int, ...], Run]:
@@ -171,37 +182,24 @@ def _runs_of(campaign: Campaign, folder: Path) -> dict[tuple[int, ...], Run]:
     return found
 
 
-def combined(campaign: Campaign, runs: Sequence[Run]) -> xr.Dataset:
-    """The results of a campaign: mean figures over the grid of its points.
+def recorded_runs(folder: Path) -> tuple[Campaign, dict[tuple[int, ...], Run]]:
+    """The campaign of a folder, and the runs that it has so far: point -> run.
 
-    Args:
-        campaign: The campaign.
-        runs: The run of each point, in order.
-
-    Returns:
-        A variable for each of :data:`FIGURES`, with a dimension for each axis, and ``n_shots``; nan where no
-        shot has the figure. Coordinates are the values in SI units.
+    Raises:
+        ConfigError: A run has values of no point, or there are no runs.
+        RecordingError: A run is damaged.
     """
-    check_installed("xarray", "h5netcdf")
-    import numpy as np
-    import xarray as xr
-
-    shape = tuple(map(len, campaign.axes.values()))
-    data = {name: np.full(shape, np.nan) for name in FIGURES}
-    n_shots, coordinates = np.zeros(shape, np.int64), dict[str, Any]()
-    for point, run in zip(campaign.points(), runs, strict=True):
-        n_shots[point] = len(run.shots)
-        for name, values in data.items():
-            known = [float(one) for shot in run.shots if (one := shot.row.get(name)) is not None]
-            if known:
-                values[point] = np.mean(known)
-        for address, i in zip(campaign.axes, point, strict=True):
-            change = run.record["overrides"][address]
-            coordinates.setdefault(address, ([None] * len(campaign.axes[address]), change["unit"]))
-            coordinates[address][0][i] = change["value"]
-    names = [*campaign.axes]
-    return xr.Dataset(
-        {name: (names, values) for name, values in {**data, "n_shots": n_shots}.items()},
-        {name: ((name,), values, {"units": unit}) for name, (values, unit) in coordinates.items()},
-        {"sequence": campaign.settings.sequence},
-    )
+    campaign = Campaign.read(folder / CAMPAIGN_FILE)
+    words = [*campaign.axes.values()]
+    points = {tuple(of[i] for of, i in zip(words, at, strict=True)): at for at in campaign.points()}
+    found: dict[tuple[int, ...], Run] = {}
+    for file in sorted(folder.glob(f"*/*/{RUN_FILE}")):
+        run = open_run(file.parent)
+        point = points.get(tuple(run.changes.get(address, "") for address in campaign.axes))
+        if point is None:
+            what = f"this run belongs to no point of {CAMPAIGN_FILE}, which may have been changed since"
+            raise ConfigError(Problem(what, visible(str(run.path))))
+        found[point] = run
+    if not found:
+        raise ConfigError(Problem("the campaign has no runs yet", visible(str(folder))))
+    return campaign, found

@@ -1,0 +1,171 @@
+"""The runs of a campaign together: one file, one picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from labseq.analysis.overview import RunPicture, scan_panels
+from labseq.analysis.scanned import DEFAULT, WITHOUT_TARGET, Scanned, make_axis
+from labseq.console.output import say
+from labseq.console.text import plural
+from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.files import explained, whole_file
+from labseq.messages import clean, visible
+from labseq.recording import Run, Shot
+from labseq.recording.folders import RUN_FILE, find_run
+from labseq.recording.points import ScanPoint
+from labseq.recording.quantities import Quantity, description_of
+from labseq.recording.tables import check_installed
+from labseq.session.campaign import CAMPAIGN_FILE, Campaign, recorded_runs
+from labseq.units import parse_any, si_unit_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Runs = Mapping[tuple[int, ...], Run]
+
+OF_SHOTS: Final = ("filling_fraction", "success", "n_defects", "n_batches", "n_atom_moves")
+"""Columns of the shots that the combined file has for each shot."""
+REPEAT: Final = "repeat"
+
+
+def campaign_in(path: Path | None) -> Path | None:
+    """The folder of the campaign that a command is given; None for a run.
+
+    Raises:
+        ConfigError: This folder is neither.
+    """
+    folder = None if path is None else path.expanduser()
+    if folder is None or not folder.is_dir():
+        return None
+    if (folder / CAMPAIGN_FILE).is_file() and not (folder / RUN_FILE).is_file():
+        return folder
+    try:
+        find_run(folder)
+    except RecordingError as error:
+        raise ConfigError(f"{error}, or a campaign's folder, which has a {CAMPAIGN_FILE}") from error
+    return None
+
+
+def export_campaign(folder: Path, path: Path) -> None:
+    """Write the results of a campaign to a netCDF file, and print its name.
+
+    Raises:
+        ConfigError: The campaign has no runs.
+        RecordingError: A run is damaged, or the file cannot be written.
+    """
+    campaign, runs = recorded_runs(folder)
+    results = combined(campaign, runs)
+    with explained(path), whole_file(path) as file:
+        results.to_netcdf(Path(file.name), engine="h5netcdf")
+    say(*_missing(campaign, runs), f"written: {path}")
+
+
+def _missing(campaign: Campaign, runs: Runs) -> list[str]:
+    """A line about the points whose runs are not complete; none if all are."""
+    n_points = math.prod(map(len, campaign.axes.values()))
+    n_complete = sum(run.status == "complete" for run in runs.values())
+    if n_complete == n_points:
+        return []
+    n_without = n_points - sum(bool(run.shots) for run in runs.values())
+    return [f"{n_complete} of {plural(n_points, 'point')} are complete; {n_without} without shots are nan"]
+
+
+def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
+    """The results of a campaign on the grid of its points.
+
+    Returns:
+        With a dimension for each axis: ``n_shots``, and mean filling and defect-free fraction with the ends
+        of their 1 sigma intervals, ``filling_low`` and ``filling_high``. With the dimension ``repeat`` as
+        well, if points have several shots: :data:`OF_SHOTS`. nan without a value. Coordinates are SI.
+    """
+    check_installed("xarray", "h5netcdf")
+    import numpy as np
+    import xarray as xr
+
+    shape, names = tuple(map(len, campaign.axes.values())), tuple(campaign.axes)
+    n_repeats = max(campaign.settings.repeats, *(len(run.shots) for run in runs.values()))
+    means = {f"{name}{end}": np.full(shape, np.nan) for name in DEFAULT for end in ("", "_low", "_high")}
+    of_shots = {name: np.full((*shape, n_repeats), np.nan) for name in OF_SHOTS}
+    n_shots = np.zeros(shape, np.int64)
+    for point, run in runs.items():
+        n_shots[point] = len(run.shots)
+        for name in DEFAULT:
+            one = run.quantity(name).over(run.shots)
+            for end, value in zip(("", "_low", "_high"), (one.value, *one.interval), strict=True):
+                means[name + end][point] = value
+        for name, values in of_shots.items():
+            known = [shot.row.get(name) for shot in run.shots]
+            values[point][: len(known)] = [math.nan if value is None else value for value in known]
+    dims, of_shot = (*names, REPEAT), slice(None)
+    if n_repeats == 1:
+        dims, of_shot = names, 0
+    data: dict[str, Any] = {name: (names, of, {"long_name": _about(name)}) for name, of in means.items()}
+    data |= {name: (dims, of[..., of_shot], {"long_name": _about(name)}) for name, of in of_shots.items()}
+    data["n_shots"] = (names, n_shots, {"long_name": "shots at the point"})
+    coordinates = {
+        address: ((address,), _values(campaign, address, runs), {"units": si_unit_of(words[0])})
+        for address, words in campaign.axes.items()
+    }
+    return xr.Dataset(data, coordinates, {"sequence": campaign.settings.sequence})
+
+
+def _about(name: str) -> str:
+    bare = name.removesuffix("_low").removesuffix("_high")
+    if bare == name:
+        return description_of(name) if name in OF_SHOTS else f"mean over the shots of: {description_of(name)}"
+    return f"{'lower' if name.endswith('low') else 'upper'} end of the 1 sigma interval of {bare}"
+
+
+def _values(campaign: Campaign, address: str, runs: Runs) -> list[Any]:
+    """The values of an axis, SI; all as written if one of them is no number."""
+    words, axis = campaign.axes[address], [*campaign.axes].index(address)
+    values: list[Any] = [*words]
+    for i, word in enumerate(words):
+        with suppress(ValueError):
+            values[i] = parse_any(word)[0]
+    for point, run in runs.items():  # as the run read it, which knows the setting's type
+        values[point[axis]] = run.record["overrides"][address]["value"]
+    return values if all(type(value) in (int, float) for value in values) else [*words]
+
+
+def campaign_picture(folder: Path) -> RunPicture:
+    """Filling and defect-free fraction at the points of a campaign: points with errors, or maps for two axes.
+
+    Raises:
+        ConfigError: It has no shots yet.
+        RecordingError: A run is damaged.
+    """
+    campaign, runs = recorded_runs(folder)
+    varied = [i for i, words in enumerate(campaign.axes.values()) if len(words) > 1] or [0]
+    addresses = [[*campaign.axes][i] for i in varied]
+    axes = tuple(
+        make_axis(clean(one), [*map(clean, campaign.axes[one])], _values(campaign, one, runs))
+        for one in addresses
+    )
+    points = [*campaign.points()]
+    shots = [tuple(runs[point].shots) if point in runs else () for point in points]
+    places = tuple(tuple(point[i] for i in varied) for point in points)
+    found = Scanned(axes, places, tuple(ScanPoint({}, {}, of) for of in shots))
+    some = next(iter(runs.values()))
+    names = WITHOUT_TARGET if some.target.is_none else DEFAULT
+    rows = tuple(row for name in names if (row := scan_panels(found, _over_runs(runs, name))))
+    if not rows:
+        raise ConfigError(Problem("the campaign has no shots to draw yet", visible(str(folder))))
+    note = "; ".join([plural(sum(map(len, shots)), "shot"), *_missing(campaign, runs)])
+    return RunPicture(f"campaign {clean(folder.resolve().name)}", note, rows)
+
+
+def _over_runs(runs: Runs, name: str) -> Quantity:
+    """A quantity of the shots of several runs, each with the target of its own run."""
+    of_run = {run.shots[0].file.parent: run.quantity(name) for run in runs.values() if run.shots}
+
+    def events_of(shot: Shot) -> tuple[float, float]:
+        return of_run[shot.file.parent].events_of(shot)
+
+    return replace(next(iter(runs.values())).quantity(name), events_of=events_of)
