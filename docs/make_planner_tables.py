@@ -34,7 +34,7 @@ from labseq.bench.comparison import (
     PlannerEntry,
     read_comparison,
 )
-from labseq.bench.planners import compare
+from labseq.bench.planners import Where, compare
 from labseq.bench.report import Report, Row, draw_histogram
 from labseq.model.estimate import Estimate
 from labseq.units import format_quantity
@@ -55,7 +55,7 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def planners(n_loadings: int) -> list[str]:
     """All planners side by side, one after the other so that times are true."""
     comparison = read_comparison(planners=PLANNERS, dop="15", loadings=n_loadings)
-    report = compare(comparison, 1)
+    report = compare(comparison, Where(1))
     header = (
         "planner",
         "batches",
@@ -92,7 +92,7 @@ def sizes(n_loadings: int) -> list[str]:
     for grid, side in SIZES:
         target = f"compact:{side}x{side}"
         comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop="15", loadings=n_loadings)
-        (row,) = compare(comparison, 1).rows
+        (row,) = compare(comparison, Where(1)).rows
         times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
         rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])
     command = "labseq bench planners --dop 15 --grid 64x64 --target compact:48x48"
@@ -389,7 +389,8 @@ def measure_figure(
     """
     conditions = tuple(replace(one, motion=(*one.motion, *motion)) for one in figure.conditions)
     called = f"figure {figure.name}"
-    return compare(Comparison(figure.planner_entries, conditions, n_loadings, 1, (), called), n_workers)
+    comparison = Comparison(figure.planner_entries, conditions, n_loadings, 1, (), called)
+    return compare(comparison, Where(n_workers))
 
 
 def figure_lines(figure: Figure, report: Report, n_loadings: int) -> list[str]:

@@ -22,7 +22,7 @@ from labseq import __version__
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, error_text, format_error, install_hint
 from labseq.processes import is_loopback
-from labseq.workers import Do, Make
+from labseq.workers import Do, Make, ProcessWorkers, Workers
 
 CA_FILE: Final = "ca.pem"
 CLIENT_FILE: Final = "client.pem"
@@ -144,6 +144,34 @@ class ClusterWorkers:
                 act()
             except Exception as error:  # noqa: BLE001 - the scheduler may be gone
                 logging.getLogger(__name__).debug("%s", error)
+
+
+def open_workers(
+    n_workers: int, scheduler: str | None, keys: Path | None, make: Make, recipe: Any, what: str
+) -> Workers:
+    """Workers of a cluster, or, without a scheduler, so many processes on this computer.
+
+    Raises:
+        ConfigError: As :class:`ClusterWorkers`.
+    """
+    if scheduler is None:
+        return ProcessWorkers(n_workers, make, recipe, what)
+    return ClusterWorkers(scheduler, keys, make, recipe, what)
+
+
+def check_workers(n_workers: int | None, scheduler: str | None) -> None:
+    """Refuse a number of processes beside a cluster, and an address as :func:`check_address` does.
+
+    Raises:
+        ConfigError: It is refused.
+    """
+    if n_workers is not None and n_workers < 1:
+        raise ConfigError(Problem(f"workers is {n_workers}", expected="1 or more"))
+    if scheduler is not None:
+        check_address(scheduler)
+        if n_workers is not None:
+            what = "the work goes to processes here or to a cluster"
+            raise ConfigError(Problem(what, expected="either --workers or --scheduler"))
 
 
 def check_address(address: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from labseq.console.options import JsonFile, Plugins, profile_names
+from labseq.console.options import JsonFile, Keys, Plugins, Scheduler, profile_names
 
 if TYPE_CHECKING:
     from labseq.bench.report import Report
@@ -111,6 +111,8 @@ def planners(
         int | None,
         typer.Option(metavar="N", min=1, help="Number of processes. Default: one per core."),
     ] = None,
+    scheduler: Scheduler = None,
+    keys: Keys = None,
     json: JsonFile = None,
     csv: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the table as CSV, in SI units.")
@@ -123,11 +125,13 @@ def planners(
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
     from labseq.bench.comparison import read_comparison
-    from labseq.bench.planners import compare
+    from labseq.bench.planners import Where, compare
     from labseq.bench.report import notes, table
+    from labseq.cluster import check_workers
     from labseq.console import output
     from labseq.pictures.plans import check_picture
 
+    check_workers(workers, scheduler)
     comparison = read_comparison(planners, grid, target, loading, dop, loadings, seed, overrides or ())
     output.check_different(json, csv, png)
     if png is not None:
@@ -136,7 +140,8 @@ def planners(
         output.check_writable(path)
     write = output.json_writer(json)
     with progress_of("loadings") as progress:
-        report = compare(comparison, workers, announce=output.report_compiling, progress=progress)
+        where = Where(workers, scheduler, keys)
+        report = compare(comparison, where, announce=output.report_compiling, progress=progress)
     output.say(*table(report), *notes(report))
     if report.rows:
         _write_files(report, csv, png, json)

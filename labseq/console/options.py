@@ -180,7 +180,7 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Scheduler of a dask cluster that takes the shots of a simulated run, tls://HOST:PORT "
+        help="Scheduler of a dask cluster whose workers do the work instead, tls://HOST:PORT "
         "(extra labseq[campaign]).",
     ),
 ]

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.cluster import ClusterWorkers, check_address
+from labseq.cluster import check_workers, open_workers
 from labseq.config.document import StoredText
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.guard import StopFlag
@@ -38,7 +38,7 @@ from labseq.session.provenance import run_record
 from labseq.session.resume import changes_between, plain_record
 from labseq.session.scan import Point
 from labseq.session.scan_run import OwnShots, ScanRun
-from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Workers, portable
+from labseq.workers import POLL_S, QUEUED, portable
 
 _AHEAD: Final = 1
 """Shots per worker that may wait to be recorded, besides those that are handed out."""
@@ -61,13 +61,7 @@ def refuse_workers(assembly: Assembly, options: Options, lab: Lab) -> None:
     Raises:
         ConfigError: They cannot, and why.
     """
-    if options.workers < 1:
-        raise ConfigError(Problem(f"workers is {options.workers}", expected="1 or more"))
-    if options.scheduler is not None:
-        check_address(options.scheduler)
-        if options.workers != 1:
-            what = "the shots go to workers here or to a cluster"
-            raise ConfigError(Problem(what, expected="either --workers or --scheduler"))
+    check_workers(None if options.workers == 1 else options.workers, options.scheduler)
     problem = _problem_of(assembly, options, lab)
     if problem is not None:
         raise ConfigError(replace(problem, what=f"workers cannot take the shots: {problem.what}"))
@@ -272,11 +266,9 @@ class WorkersShots:
         needs, folder = observers.need_frames, writer.run_dir if options.scheduler is None else None
         for_worker = replace(options, output=None, keys=None)
         recipe = Recipe(writer.run, run_id_of(writer.run_dir), for_worker, folder, needs)
-        self._workers: Workers
-        if options.scheduler is None:
-            self._workers = ProcessWorkers(options.workers, ShotWorker, recipe, "shot")
-        else:
-            self._workers = ClusterWorkers(options.scheduler, options.keys, ShotWorker, recipe, "shot")
+        self._workers = open_workers(
+            options.workers, options.scheduler, options.keys, ShotWorker, recipe, "shot"
+        )
 
     def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
         """Wait for a shot, and record it; see :class:`labseq.session.scan_run.ShotTaker`."""

@@ -12,7 +12,7 @@ import pytest
 
 from labseq.bench import planners as bench
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry, read_comparison
-from labseq.bench.planners import compare
+from labseq.bench.planners import Where, compare
 from labseq.bench.report import Report
 from labseq.bench.work import draw, set_up
 from labseq.errors import ConfigError, PlanError
@@ -53,6 +53,8 @@ def labseq_register(registry):
     registry.planner("cold", Cold)
 """
 
+ALONE = Where(1)
+
 
 @pytest.fixture
 def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,7 +64,7 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def report() -> Report:
-    return compare(replace(SMALL, planner_entries=TWICE), 1)
+    return compare(replace(SMALL, planner_entries=TWICE), ALONE)
 
 
 def without_times(values: Any) -> Any:
@@ -79,7 +81,7 @@ def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) 
     entries = (PlannerEntry("moody"), PlannerEntry("psca"))
     conditions = (*SMALL.conditions, Condition((6, 7), "compact:3x3", 0.5))
     comparison = replace(SMALL, planner_entries=entries, conditions=conditions)
-    alone, together = compare(comparison, 1), compare(comparison)
+    alone, together = compare(comparison, ALONE), compare(comparison)
     assert alone.ended_by is together.ended_by is None
     assert without_times(alone.as_dict()) == without_times(together.as_dict())
     assert all(np.array_equal(a.counts, b.counts) for a, b in zip(alone.rows, together.rows, strict=True))
@@ -90,6 +92,16 @@ def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) 
         assert moody.first_failure is not None
         assert moody.first_failure.loading == in_the_corner[0]
         assert "there is an atom in the corner" in moody.first_failure.message
+
+
+def test_a_cluster_finds_what_one_process_finds(report: Report) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, protocol="tcp", processes=False, dashboard_address=":0"
+    ) as cluster:
+        where = Where(scheduler=cluster.scheduler_address)
+        found = compare(replace(SMALL, planner_entries=TWICE), where)
+    assert without_times(found.as_dict()) == without_times(report.as_dict())
 
 
 def test_a_row_sums_up_what_the_planner_did(report: Report) -> None:
@@ -109,7 +121,7 @@ def test_losses_are_predicted_by_those_of_the_profile(report: Report) -> None:
     losses = {"move": "1 %", "spread": "0", "image": "0", "lifetime": "700 h"}
     overrides = [f"profile.mobile_tweezers.losses.{key}={value}" for key, value in losses.items()]
     asked = read_comparison("psca", "8x8", "compact:4x4", "75 %", "2,4", 20, 1, overrides)
-    two, four = compare(asked, 1).rows
+    two, four = compare(asked, ALONE).rows
     assert (two["degree_of_parallelism"], four["degree_of_parallelism"]) == (2, 4)
     for row in (two, four):
         assert row["n_lost"].value == pytest.approx(0.01 * row["n_atoms_moved"].value, rel=0.03)
@@ -128,14 +140,14 @@ def test_csv_and_json_hold_the_same(report: Report) -> None:
 
 def test_overheads_count_only_where_they_are_set(report: Report) -> None:
     motion = (("overhead_per_batch", "1 ms"), ("overhead_per_cycle", "0"))
-    loaded = compare(replace(SMALL, conditions=(replace(SMALL.conditions[0], motion=motion),)), 1).rows[0]
+    loaded = compare(replace(SMALL, conditions=(replace(SMALL.conditions[0], motion=motion),)), ALONE).rows[0]
     more_s = loaded["motion_s"].value - report.rows[0]["motion_s"].value
     assert more_s == pytest.approx(1e-3 * loaded["n_batches"].value)
     assert loaded["moving_s"].value == pytest.approx(report.rows[0]["motion_s"].value)
 
 
 def test_too_few_atoms_show_in_the_filling() -> None:
-    row = compare(replace(SMALL, conditions=(Condition((8, 8), "compact:8x8", 0.5, 4),)), 1).rows[0]
+    row = compare(replace(SMALL, conditions=(Condition((8, 8), "compact:8x8", 0.5, 4),)), ALONE).rows[0]
     assert row["n_short"] == row["n_loadings"] == 60
     assert row["n_failed"] == 0
     assert row["target_met"].value == 0.0
@@ -145,7 +157,8 @@ def test_too_few_atoms_show_in_the_filling() -> None:
 
 def test_empty_and_full_loadings() -> None:
     for loading in (0.0, 1.0):
-        row = compare(replace(SMALL, conditions=(Condition((5, 5), "compact:3x3", loading, 4),)), 1).rows[0]
+        conditions = (Condition((5, 5), "compact:3x3", loading, 4),)
+        row = compare(replace(SMALL, conditions=conditions), ALONE).rows[0]
         assert row["n_failed"] == 0
         assert row["n_batches"].value == 0.0
         assert row["filling_fraction"].value == loading
@@ -153,7 +166,7 @@ def test_empty_and_full_loadings() -> None:
 
 @pytest.mark.usefixtures("plugins")
 def test_a_planner_that_cannot_be_warmed_is_named() -> None:
-    report = compare(replace(SMALL, planner_entries=(PlannerEntry("cold"),)), 1)
+    report = compare(replace(SMALL, planner_entries=(PlannerEntry("cold"),)), ALONE)
     assert isinstance(report.ended_by, PlanError)
     assert str(report.ended_by) == "planner 'cold': warm() raised RuntimeError: no kernels"
     assert report.rows == ()
@@ -180,7 +193,7 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
 )
 def test_wrong_requests_are_refused(request_: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        compare(read_comparison(**request_), 1)
+        compare(read_comparison(**request_), ALONE)
 
 
 def test_the_tweezers_speed_can_be_set() -> None:

@@ -125,12 +125,11 @@ def test_what_is_done_is_kept_without_other_processes(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
-def test_a_process_that_dies_ends_the_comparison_with_what_is_done() -> None:
+def test_others_do_the_work_of_processes_that_die() -> None:
     with start() as child:
-        pids = {int(pid) for pid in Path("pids").read_text().split()} - {child.pid}
-        os.kill(min(pids), signal.SIGKILL)
+        for pid in {int(pid) for pid in Path("pids").read_text().split()} - {child.pid}:
+            os.kill(pid, signal.SIGKILL)
         out, err = child.communicate(timeout=60)
-    assert child.returncode == 1
-    assert "INCOMPLETE: 100 of 200 loadings" in out
-    assert "error: a process of the comparison died (exit code -9)" in err
-    assert "Traceback" not in err
+    assert child.returncode == 0, err
+    assert "200" in out
+    assert "INCOMPLETE" not in out
