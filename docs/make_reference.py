@@ -208,7 +208,7 @@ PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
     "exit-codes": reference.exit_codes,
     "plan-rules": reference.plan_rules,
     "events": reference.events,
-    "figures": reference.figures,
+    "quantities": reference.quantities,
     "datasets": reference.datasets,
     "columns": reference.columns,
     "attributes": reference.attributes,

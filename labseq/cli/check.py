@@ -238,7 +238,7 @@ def _chosen(search: Search) -> list[str]:
         lines.append(f"{axis.address} from {_ends(axis)}{steps}")
     repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
     what = f"points chosen during the run by {search.chosen.entry.name}, at most {adaptive.n_points}{repeats}"
-    aim = f"{'highest' if adaptive.maximise else 'lowest'} {clean(adaptive.figure)}"
+    aim = f"{'highest' if adaptive.maximise else 'lowest'} {clean(adaptive.quantity)}"
     return [*lines, f"{what}, for the {aim}; everything else here is for the values in the files"]
 
 

@@ -1,7 +1,7 @@
 """Scans in a sequence: lists of values, ranges, and adaptive scans, whose points a scanner chooses.
 
 Only the form of a scan is checked here. Whether plugins accept the values is checked where the plugins
-are known, in ``labseq.session.scan``; the scanner and its figure in ``labseq.session.assembly``.
+are known, in ``labseq.session.scan``; the scanner and its quantity in ``labseq.session.assembly``.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ class AdaptiveChoice(Choice):
         if self.maximise is None and self.minimise is None:
             raise setting_error(
                 "the scan has neither 'maximise' nor 'minimise'",
-                "'maximise' or 'minimise' with the name of a figure",
+                "'maximise' or 'minimise' with the name of a quantity",
             )
         if self.maximise is not None and self.minimise is not None:
             what = "'maximise' and 'minimise' are both given"
@@ -268,25 +268,25 @@ class Ends:
 
 @dataclass(frozen=True, slots=True)
 class Adaptive:
-    """The scanner of a scan, the ranges, and the figure to optimise.
+    """The scanner of a scan, the ranges, and the quantity to optimise.
 
     Attributes:
         choice: The scanner's name and place.
         ends: The range of each axis.
         n_points: Maximum number of points.
-        figure: The figure to maximise or minimise.
-        maximise: Whether the figure is maximised.
+        quantity: The quantity to maximise or minimise.
+        maximise: Whether the quantity is maximised.
     """
 
     choice: Choice
     ends: tuple[Ends, ...]
     n_points: int
-    figure: str
+    quantity: str
     maximise: bool
 
     @property
     def aim(self) -> Loc:
-        """Location of the name of the figure."""
+        """Location of the name of the quantity."""
         return (*self.choice.loc, "maximise" if self.maximise else "minimise")
 
 
@@ -449,8 +449,8 @@ def _read_adaptive(
     found.raise_any()
     if not groups:
         raise document.error(("scan", "over"), "nothing is left to choose: options set every address")
-    figure = choice.maximise or choice.minimise or ""
-    adaptive = Adaptive(choice, tuple(ends), n_points, figure, choice.maximise is not None)
+    quantity = choice.maximise or choice.minimise or ""
+    adaptive = Adaptive(choice, tuple(ends), n_points, quantity, choice.maximise is not None)
     return Scan(document.name, tuple(groups), repeats, "sequential", tuple(notes), adaptive)
 
 

@@ -58,7 +58,7 @@ class StepPolicySettings(Settings):
 
 
 class CheckSettings(Settings):
-    """A check of a figure of the last shots, between two shots."""
+    """A check of a quantity of the last shots, between two shots."""
 
     value: Text = Field(
         description="name of a quantity: `filling_fraction`, `survival:before,after`, `stage.plan_s`, "
@@ -216,7 +216,7 @@ class SequenceSpec(Settings):
     )
     policy: Annotated[PolicySettings, empty_is({})] = Field(
         default=PolicySettings(),
-        description="reactions to failures, exceeded budgets and figures out of range",
+        description="reactions to failures, exceeded budgets and quantities out of range",
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     scan: dict[str, Any] | list[dict[str, Any]] | None = Field(

@@ -1,7 +1,7 @@
 """Recorded runs: writes and reads a folder per run with one HDF5 file per shot."""
 
 from labseq.files import data_root
-from labseq.recording.columns import figures_in
+from labseq.recording.columns import quantities_in
 from labseq.recording.markers import (
     clear_active,
     find_dead_run,
@@ -19,10 +19,10 @@ __all__ = [
     "Shot",
     "clear_active",
     "data_root",
-    "figures_in",
     "find_dead_run",
     "lock_file",
     "mark_active",
     "open_run",
+    "quantities_in",
     "runs_in_progress",
 ]

@@ -50,7 +50,7 @@ class BestPoint:
 
 
 def best_point(run: Run) -> BestPoint | None:
-    """The best point of a run's adaptive scan; None without one, or if no shot has the figure.
+    """The best point of a run's adaptive scan; None without one, or if no shot has its quantity.
 
     Raises:
         RecordingError: The scan's record in run.json is damaged.

@@ -46,7 +46,7 @@ DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
 """Column of every run -> its description."""
 _TEXTS: Final = frozenset({"file", *(field.name for field in _FIELDS if field.dtype == "text")})
 
-FIGURES: Final = tuple(name for name in DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
+QUANTITIES: Final = tuple(name for name in DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
 """Columns of every run that are numerical results of a shot."""
 FRACTIONS: Final = frozenset({"success", "filling_fraction"})
 """Those of them that are shown in per cent."""
@@ -136,8 +136,8 @@ def _description(prefix: str, name: str, *, scanned: bool) -> str:
     return f"{'scanned' if scanned else 'set for the run'}, SI"
 
 
-def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
-    """The figures (numerical results) of a shot.
+def quantities_in(row: Mapping[str, Any]) -> dict[str, float]:
+    """The quantities (numerical results) of a shot, from its line in the index.
 
     Args:
         row: The shot's line in the index.
@@ -146,7 +146,7 @@ def figures_in(row: Mapping[str, Any]) -> dict[str, float]:
         Name -> value, as :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction",
         "stage.plan_s", "reading.laser.power_w"; without those that are nan.
     """
-    found = {name: value for name, value in _fixed(row).items() if name in FIGURES}
+    found = {name: value for name, value in _fixed(row).items() if name in QUANTITIES}
     for prefix in ("stage.", "reading."):
         found |= {_column_name(prefix, name): value for name, value in _GROUPS[prefix](row).items()}
     return {

@@ -18,7 +18,7 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
 from labseq.model import ImageRecord, TargetPattern, follow_atoms
 from labseq.model.estimate import Estimated, Rate, mean
-from labseq.recording.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, figures_in
+from labseq.recording.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, quantities_in
 from labseq.recording.results import PREFIX, result_columns
 from labseq.recording.schema import unit_of
 from labseq.recording.shot import Shot
@@ -180,7 +180,7 @@ def make_quantity(
     is_rate = name == "success" or (of_shots is not None and {*map(type, of_shots.values())} == {bool})
 
     def events_of(shot: Shot) -> tuple[float, float]:
-        found = figures_in(shot.row).get(name) if of_shots is None else of_shots.get(shot.index)
+        found = quantities_in(shot.row).get(name) if of_shots is None else of_shots.get(shot.index)
         return NOTHING if found is None else (float(found), 1)
 
     return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
@@ -240,7 +240,7 @@ def image_names(run: Run) -> list[str]:
 
 def column_names(run: Run) -> list[str]:
     """The names of the quantities of a run that need no image."""
-    names = dict.fromkeys(name for shot in run.shots[:MAX_LOOKED_AT] for name in figures_in(shot.row))
+    names = dict.fromkeys(name for shot in run.shots[:MAX_LOOKED_AT] for name in quantities_in(shot.row))
     return [*names, *_numbers(run)]
 
 

@@ -113,7 +113,7 @@ def explain(
     ] = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Explain a key of a file, a step, a plugin, a command, a figure, an error or a unit.
+    """Explain a key of a file, a step, a plugin, a command, a quantity, an error or a unit.
 
     It is the text of the reference pages, with the installed plugins and those of --plugins.
     """

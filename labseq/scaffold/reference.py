@@ -413,12 +413,12 @@ def index_keys() -> list[Block]:
     return [Table(("key", "type", "description"), rows)]
 
 
-def figures() -> list[Block]:
-    """A row per figure of a shot, which a scan can optimise and a policy can watch."""
-    from labseq.recording.columns import DESCRIPTIONS, FIGURES, GROUPS
+def quantities() -> list[Block]:
+    """A row per quantity of a shot, which a scan can optimise and a policy can watch."""
+    from labseq.recording.columns import DESCRIPTIONS, GROUPS, QUANTITIES
 
-    rows = {name: DESCRIPTIONS[name] for name in FIGURES}
-    return [_named("figure", rows | {f"{prefix}NAME": about for prefix, about in GROUPS.items()})]
+    rows = {name: DESCRIPTIONS[name] for name in QUANTITIES}
+    return [_named("quantity", rows | {f"{prefix}NAME": about for prefix, about in GROUPS.items()})]
 
 
 # Commands
@@ -486,7 +486,7 @@ MAX_WIDTH: Final = 110
 """Widest line of an explanation."""
 _TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
     "unit": ("quantities and their units", units),
-    "figure": ("numbers of each shot: to plot, to optimise in a scan, to watch in a policy", figures),
+    "quantity": ("numbers of each shot: to plot, to optimise in a scan, to watch in a policy", quantities),
     "field": ("what a shot's HDF5 file has, /entry left out", datasets),
     "column": ("columns of the tables in a shot's HDF5 file", columns),
     "index": ("what a line of index.jsonl has", index_keys),

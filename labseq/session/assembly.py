@@ -35,7 +35,7 @@ from labseq.session.chosen import (
     validate,
 )
 from labseq.session.options import Options
-from labseq.session.policies import check_figure, make_policy, with_policies
+from labseq.session.policies import check_quantity, make_policy, with_policies
 from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile, with_tones
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
 from labseq.settings import si_unit_at
@@ -383,7 +383,7 @@ def _grid_note(hardware: ResolvedProfile) -> str:
 
 
 CLIMBED: Final = "to optimise"
-"""The purpose of the figure, for messages."""
+"""The purpose of the quantity, for messages."""
 
 
 Steps = Sequence[tuple[str, Step]]
@@ -444,7 +444,7 @@ class Search:
             "written_units": self.units,
             "ranges": [asdict(one) for one in self.ranges],
             SCANNER: self.chosen.dump(),
-            "figure": self.adaptive.figure,
+            "figure": self.adaptive.quantity,
             "maximise": self.adaptive.maximise,
             "n_points": self.adaptive.n_points,
             "repeats": self.scanned.scan.repeats,
@@ -461,7 +461,7 @@ def make_search(
     Args:
         scanned: The scan, its ends checked.
         steps: Name and step, in order.
-        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_figure`.
+        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_quantity`.
         found: Receives the problems.
     """
     adaptive = scanned.scan.adaptive
@@ -469,7 +469,7 @@ def make_search(
         return None
     n_before, document = len(found.problems), scanned.document
     with found:
-        check_figure(document, adaptive.aim, adaptive.figure, CLIMBED, steps, results)
+        check_quantity(document, adaptive.aim, adaptive.quantity, CLIMBED, steps, results)
     chosen: ChosenPlugin | None = None
     with found:
         chosen = resolve(scanned.hardware.host, document, "scanner", adaptive.choice)

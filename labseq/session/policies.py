@@ -17,7 +17,7 @@ from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettin
 from labseq.errors import CheckFailedError, Loc, ProblemCollector, StopRequested
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model.records import unique_names
-from labseq.recording.columns import FIGURES, figures_in
+from labseq.recording.columns import QUANTITIES, quantities_in
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.recording.results import PREFIX
@@ -28,15 +28,15 @@ from labseq.sequencer.policies import RunPolicy, StepPolicy
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
 )
-"""Figures (results of a shot) that only shots with an image have."""
+"""Quantities (results of a shot) that only shots with an image have."""
 _UNFORESEEN: Final = ("reading.", "stage.")
-"""Prefixes of figures that depend on the shot."""
+"""Prefixes of quantities that depend on the shot."""
 
 
-def check_figure(
+def check_quantity(
     document: Document,
     place: Loc,
-    figure: str,
+    name: str,
     purpose: str,
     steps: Sequence[tuple[str, Step]] | None,
     results: Collection[str],
@@ -46,7 +46,7 @@ def check_figure(
     Args:
         document: The sequence.
         place: Place of its name in the file.
-        figure: Its name.
+        name: Its name.
         purpose: Its use: "to optimise".
         steps: The steps of a shot, or None if some have errors.
         results: Names of the results of its analyses, "analysis.NAME.KEY"; "analysis.NAME." if its keys are
@@ -57,36 +57,36 @@ def check_figure(
     """
     names = unique_names([name for name, _ in steps or ()])
     images = [name for name, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
-    known = [*FIGURES, *(name for name in results if not name.endswith("."))]
+    known = [*QUANTITIES, *(name for name in results if not name.endswith("."))]
     unforeseen = (*_UNFORESEEN, *(name for name in results if name.endswith(".")))
-    problem = quantity_problem(figure, known, images, unforeseen)
+    problem = quantity_problem(name, known, images, unforeseen)
     if problem is not None:
         what, expected, hint = problem
-        name = figure.removeprefix(PREFIX).split(".")[0]
-        if figure.startswith(PREFIX) and not any(one.startswith(f"{PREFIX}{name}.") for one in results):
-            hint = f"the sequence must list the analysis: 'analysis: [{{use: {clean(name)}}}]'"
+        analysis = name.removeprefix(PREFIX).split(".")[0]
+        if name.startswith(PREFIX) and not any(one.startswith(f"{PREFIX}{analysis}.") for one in results):
+            hint = f"the sequence must list the analysis: 'analysis: [{{use: {clean(analysis)}}}]'"
         raise document.error(place, f"{what} {purpose}", expected, hint)
     if (
-        (figure in _JUDGED or split_name(figure)[0] in OF_IMAGES)
+        (name in _JUDGED or split_name(name)[0] in OF_IMAGES)
         and steps is not None
         and not any(step.takes_image for _, step in steps)
     ):
-        what = f"no shot has a {figure}: it takes no image"
-        raise document.error(place, what, "an 'image' step in the shot, or another figure")
+        what = f"no shot has a {name}: it takes no image"
+        raise document.error(place, what, "an 'image' step in the shot, or another quantity")
 
 
-def missing_figure(shot: int, figure: str, purpose: str, figures: Iterable[str]) -> str:
-    """The warning that a shot lacks a figure.
+def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[str]) -> str:
+    """The warning that a shot lacks a quantity.
 
     Args:
         shot: Its index.
-        figure: Name of the figure.
+        name: Name of the quantity.
         purpose: Its use: "to optimise".
-        figures: Names of the figures that it has.
+        quantities: Names of the quantities that it has.
     """
-    known = list(figures)
-    hint = did_you_mean(figure, known) or f"it has {listing(known)}"
-    return f"shot {shot} has no '{clean(figure)}' {purpose} ({hint})"
+    known = list(quantities)
+    hint = did_you_mean(name, known) or f"it has {listing(known)}"
+    return f"shot {shot} has no '{clean(name)}' {purpose} ({hint})"
 
 
 _CHECKED: Final = "to check"
@@ -105,7 +105,7 @@ def make_policy(
         document: The sequence's file.
         sequence: Its content.
         steps: The steps without errors.
-        results: Names of the results of its analyses, see :func:`check_figure`.
+        results: Names of the results of its analyses, see :func:`check_quantity`.
         found: Receives the problems.
     """
     own = sequence.policy
@@ -124,7 +124,7 @@ def make_policy(
         place = "policy", "checks", number
         with found:
             checked = steps if is_whole else None
-            check_figure(document, (*place, "value"), check.value, _CHECKED, checked, results)
+            check_quantity(document, (*place, "value"), check.value, _CHECKED, checked, results)
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
             found.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
@@ -169,7 +169,7 @@ def _is_repeatable(step: Step) -> bool:
 
 
 class Checks:
-    """Checks the figures of the most recent shots against their limits, between two shots.
+    """Checks the quantities of the most recent shots against their limits, between two shots.
 
     Args:
         checks: The checks of the sequence.
@@ -227,7 +227,7 @@ class Checks:
         for (check, values), value in zip(self._checks, of_shot, strict=True):
             if math.isnan(value) and check.value in self._unseen:  # its name may be misspelt
                 self._unseen.discard(check.value)
-                self._warn(missing_figure(row["shot"], check.value, _CHECKED, figures_in(row)))
+                self._warn(missing_quantity(row["shot"], check.value, _CHECKED, quantities_in(row)))
             values.append(value)
             if message := _failure(check, values):
                 broken.append((check, message))

@@ -17,7 +17,7 @@ from labseq.messages import clean
 from labseq.model import ScanRange, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
-from labseq.recording.columns import figures_in
+from labseq.recording.columns import quantities_in
 from labseq.recording.quantities import Quantity, make_quantity
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
@@ -27,7 +27,7 @@ from labseq.session.assembly import CLIMBED, Assembly, Search
 from labseq.session.awaited import AwaitedResults
 from labseq.session.chosen import construct_one
 from labseq.session.lab import rebuild_lab
-from labseq.session.policies import ShotHooks, missing_figure
+from labseq.session.policies import ShotHooks, missing_quantity
 from labseq.session.scan import Point
 from labseq.units import written
 
@@ -268,7 +268,7 @@ class AdaptiveScanRun(ScanRun):
         self._results = Results(
             search,
             {} if run is None else {shot.index: shot for shot in run.shots},
-            make_quantity(search.adaptive.figure, assembly.target, awaited.values if awaited else None),
+            make_quantity(search.adaptive.quantity, assembly.target, awaited.values if awaited else None),
             awaited,
         )
         for attempt in () if run is None else run.attempts:
@@ -336,7 +336,7 @@ class AdaptiveScanRun(ScanRun):
             self._results.add_skipped(shot, row["parameters"])
             return
         self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), self._load))
-        if warning := self._results.missing_figure(shot):
+        if warning := self._results.missing_quantity(shot):
             self._log_event("warning", {"text": warning})
 
     def _report_point(self, shot: int, skipped: Collection[int]) -> None:
@@ -454,13 +454,13 @@ class Results:
         """The results of all points before the given one, as the scanner receives them."""
         return [one for one in map(self._visit, range(visit)) if one.values]
 
-    def missing_figure(self, shot: int) -> str:
-        """A warning, given once, that a shot lacks the figure that the scan optimises; else ""."""
+    def missing_quantity(self, shot: int) -> str:
+        """A warning, given once, that a shot lacks the quantity that the scan optimises; else ""."""
         name = self.quantity.name
         if self._warned or name.startswith(PREFIX) or not math.isnan(self.quantity.of_shot(self.shots[shot])):
             return ""
         self._warned = True
-        return missing_figure(shot, name, CLIMBED, figures_in(self.shots[shot].row))
+        return missing_quantity(shot, name, CLIMBED, quantities_in(self.shots[shot].row))
 
     def progress(self, visit: int) -> dict[str, Any]:
         """The score of a point and the best one so far, JSON-ready, for the run's events."""
@@ -476,7 +476,7 @@ class Results:
         known = [one for one in self._point_scores.values() if one.n_scores]
         best = max(known, key=lambda one: (one.mean, -one.first), default=None)
         return {
-            "figure": self.search.adaptive.figure,
+            "figure": self.search.adaptive.quantity,
             **plain(visit, own.values, own.score),
             "best": None if best is None else plain(best.first, best.values, best.mean),
         }
@@ -505,9 +505,9 @@ class Results:
         shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
         if self.awaited is not None:
             self.awaited.await_shots(self.quantity.name, [shot.index for shot in shots])
-        figures = [MappingProxyType(figures_in(shot.row) | self._value(shot)) for shot in shots]
+        quantities = [MappingProxyType(quantities_in(shot.row) | self._value(shot)) for shot in shots]
         score = sign * self.quantity.over(shots).value
-        return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(figures))
+        return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(quantities))
 
     def _value(self, shot: Shot) -> dict[str, float]:
         value = self.quantity.of_shot(shot)

@@ -321,7 +321,7 @@ class Session:
         needed = {check.value: "" for check in checks}
         needed |= {check.value: "for a check that stops it" for check in checks if check.then == "stop"}
         if search is not None:
-            needed[search.adaptive.figure] = "to choose the next point"
+            needed[search.adaptive.quantity] = "to choose the next point"
         analyses = self.assembly.resolved["analysis"]
         return AwaitedResults(needed, analyses, self._observers, self.stop_flag, run)
 

@@ -97,7 +97,7 @@ def test_every_model_of_a_file_is_on_a_page() -> None:
 
 def test_every_topic_can_be_explained() -> None:
     found = reference.topics(SCRIPT.registry(), SCRIPT.PROGRAM)
-    assert {*KINDS, *FILES, "unit", "command", "figure", "event", "role", "error"} <= found.keys()
+    assert {*KINDS, *FILES, "unit", "command", "quantity", "event", "role", "error"} <= found.keys()
     for name, topic in found.items():
         assert topic.about, name
         lines = reference.plain(topic.blocks(), 80)

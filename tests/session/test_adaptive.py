@@ -144,7 +144,7 @@ def test_a_shot_that_is_gone_is_taken_again_at_its_point(tmp_path: Path) -> None
     assert [shot.occupancies.tobytes() for shot in again.shots] == before
 
 
-def test_a_missing_figure_is_one_warning_and_no_score(tmp_path: Path) -> None:
+def test_a_missing_quantity_is_one_warning_and_no_score(tmp_path: Path) -> None:
     seen = RecordingObserver()
     over = OVER.replace("filling_fraction", "reading.laser.power_w")
     run(tmp_path, f"use: scripted, dops: [3, 5], {over}, points: 2", observer=seen)
