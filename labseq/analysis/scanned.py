@@ -11,11 +11,10 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.analysis.fits import Fit, fit_points
-from labseq.analysis.statistics import as_mapping
 from labseq.console.text import columns, count_of
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
-from labseq.model.estimate import Estimate, Estimated, Rate
+from labseq.model.estimate import Estimate, Estimated, Rate, as_mapping
 from labseq.recording import Run
 from labseq.recording.columns import Column, make_column
 from labseq.recording.points import ScanPoint, scan_points

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from labseq.errors import RecordingError
 from labseq.model import TargetPattern
-from labseq.model.estimate import Estimate, Rate, mean
+from labseq.model.estimate import Estimate, Rate, as_mapping, mean
 from labseq.plain import to_plain
 from labseq.recording.run_file import ShotSummary
 from labseq.recording.shot import Shot
@@ -196,25 +196,3 @@ def _losses(summaries: Sequence[ShotSummary]) -> dict[str, Estimate]:
         name.removeprefix(LOST): mean([of.simulation[name] for of in summaries if name in of.simulation])
         for name in causes
     }
-
-
-def as_mapping(value: Any) -> Any:
-    """Convert dataclasses to mappings: a rate with its interval, an estimate as "mean" and "error"."""
-    match value:
-        case Rate():
-            return {
-                "n": value.n,
-                "n_trials": value.n_trials,
-                "rate": value.value,
-                "interval": [*value.interval],
-            }
-        case Estimate():
-            return {"mean": value.value, "error": value.error}
-        case Mapping():
-            return {name: as_mapping(one) for name, one in value.items()}
-        case tuple():
-            return [as_mapping(one) for one in value]
-        case _ if is_dataclass(value):
-            return {field.name: as_mapping(getattr(value, field.name)) for field in fields(value)}
-        case _:
-            return value

@@ -17,7 +17,6 @@ from labseq.analysis.overview import overview, picture_of, scan_picture
 from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.analysis.shot import save_shot, shot_picture
-from labseq.analysis.statistics import as_mapping
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document
 from labseq.console.output import as_line, json_writer, report_compiling, say, stdout_to_stderr
@@ -25,7 +24,7 @@ from labseq.console.runs import chosen_run
 from labseq.console.text import columns, count_of, percent, plural, settings_text
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
-from labseq.model.estimate import Estimate, mean
+from labseq.model.estimate import Estimate, as_mapping, mean
 from labseq.pictures.figures import check_place
 from labseq.plain import to_plain
 from labseq.recording import Run

@@ -18,8 +18,9 @@ from labseq.bench.comparison import BARE_MOTION, Comparison, Condition, PlannerE
 from labseq.bench.work import Done, Failure, PreparedCondition, loading_seed
 from labseq.console.text import columns, percent, plural
 from labseq.errors import LabseqError
-from labseq.model.estimate import Estimate, mean
+from labseq.model.estimate import Estimate, as_mapping, mean
 from labseq.pictures.figures import make_figure, save_figure
+from labseq.plain import to_plain
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ class Report:
             "seed": self.comparison.seed,
             "n_loadings": self.comparison.n_loadings,
             "duration_s": self.duration_s,
-            "rows": [_known(row.values) for row in self.rows],
+            "rows": [to_plain(as_mapping(row.values)) for row in self.rows],
         }
 
     def as_csv(self) -> str:
@@ -149,15 +150,6 @@ class Report:
         writer.writeheader()
         writer.writerows(flat)
         return text.getvalue()
-
-
-def _known(value: Any) -> Any:
-    """JSON-ready; None for what is not known."""
-    if isinstance(value, Estimate):
-        return _known({"mean": value.value, "error": value.error})
-    if isinstance(value, Mapping):
-        return {name: _known(inner) for name, inner in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -128,3 +129,25 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
     low = float(betaincinv(a, b, tail)) if n else 0.0
     high = float(betaincinv(a, b, 1.0 - tail)) if n < n_trials else 1.0
     return low, high
+
+
+def as_mapping(value: Any) -> Any:
+    """Convert dataclasses to mappings: a rate with its interval, an estimate as "mean" and "error"."""
+    match value:
+        case Rate():
+            return {
+                "n": value.n,
+                "n_trials": value.n_trials,
+                "rate": value.value,
+                "interval": [*value.interval],
+            }
+        case Estimate():
+            return {"mean": value.value, "error": value.error}
+        case Mapping():
+            return {name: as_mapping(one) for name, one in value.items()}
+        case tuple():
+            return [as_mapping(one) for one in value]
+        case _ if is_dataclass(value):
+            return {field.name: as_mapping(getattr(value, field.name)) for field in fields(value)}
+        case _:
+            return value

@@ -26,7 +26,7 @@ _MAX_ATTRIBUTE: Final = 60_000
 def text_array(texts: str | Sequence[str], max_bytes: int = 1 << 31) -> NDArray[Any]:
     """Texts as an array of bytes of one length, UTF-8; those longer than ``max_bytes`` are cut.
 
-    Texts of variable length would be in a part of the file that HDF5 reads for ever if it is damaged.
+    Texts of variable length would be in a part of the file that HDF5 reads without an end if it is damaged.
     """
     several = [texts] if isinstance(texts, str) else texts
     data = [plain_text(text).encode() for text in several]

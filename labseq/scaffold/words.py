@@ -1,4 +1,4 @@
-"""Types, limits and defaults of settings in the words of somebody who writes YAML; docstrings as Markdown."""
+"""Types, limits and defaults of settings as one writes them in YAML; docstrings as Markdown."""
 
 from __future__ import annotations
 
