@@ -186,11 +186,13 @@ def _failure_lines(found: Replay) -> list[str]:
     lines = [f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure]
     lines += [f"shot {s}, image {i}: {text}" for (s, i), text in found.images.failures.items()]
     lines += [f"shot {shot} is left out: {text}" for shot, text in found.unreadable.items()]
-    more = len(lines) - MAX_REPORTED
-    return [
-        *lines[:MAX_REPORTED],
-        *([f"and {more} more; all of them with --output FILE"] if more > 0 else []),
-    ]
+    return _first(lines, "more; all of them with --output FILE")
+
+
+def _first(failures: Sequence[str], rest: str) -> list[str]:
+    """The failures that are printed one by one, and how many there are besides."""
+    n_more = len(failures) - MAX_REPORTED
+    return [*failures[:MAX_REPORTED], *([f"and {n_more} {rest}"] if n_more > 0 else [])]
 
 
 def as_values(found: Replay) -> dict[str, Any]:
@@ -287,8 +289,7 @@ def _report(done: AnalysisOutcome) -> None:
     before = f", {done.n_before} had a result already" if done.n_before else ""
     say(f"{done.name}: {plural(done.n_done, 'shot')} analysed{before}; see {done.path}")
     failed = [f"{done.name}: shot {shot} failed: {text}" for shot, text in done.failures.items()]
-    more = len(failed) - MAX_REPORTED
-    say(*failed[:MAX_REPORTED], *([f"and {more} more shots failed"] if more > 0 else []), stream=sys.stderr)
+    say(*_first(failed, "more shots failed"), stream=sys.stderr)
 
 
 @dataclass(frozen=True, slots=True)

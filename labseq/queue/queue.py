@@ -145,7 +145,8 @@ class Queue:
         """
         for one in [self._find(number) for number in ids]:
             if one.status == "running" and not one.is_interrupted and not one.is_complete:
-                hint = f"'labseq stop {one.run_dir or ''}' ends it first".replace(" '", "'")
+                command = "labseq stop" if one.run_dir is None else f"labseq stop {one.run_dir}"
+                hint = f"'{command}' ends it first"
                 raise ConfigError(Problem(f"entry {one.id} is running", hint=hint))
         for number in ids:
             self.drop(number)

@@ -48,9 +48,8 @@ def open_run(path: str | Path) -> Run:
     rows, damaged = read_lines(folder / folders.INDEX_FILE)
     usable = [row for row in rows if is_index_row(row)]
     load = caching_loader()
-    counted = {
-        row["shot"]: row for row in usable if row["counts"]
-    }  # the last line counts if a shot was written twice
+    # of a shot that was written twice, the last line counts
+    counted = {row["shot"]: row for row in usable if row["counts"]}
     return Run(
         path=folder,
         record=record,

@@ -79,7 +79,7 @@ class RunWriter:
             for name, content in {**texts, **(extra_files or {})}.items():
                 write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
             writer = cls(run_dir, run)
-            write_file(run_dir / folders.RUN_FILE, encode_run(run, run_id_of(run_dir)))
+            writer._write_run_file()
             with explained(run_dir):
                 sync_folder(run_dir)
         except BaseException:
@@ -104,7 +104,7 @@ class RunWriter:
             kept = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
         writer = cls(run_dir, run)
         writer.n_written, writer._before, writer._kept = n_written, before, kept
-        write_file(run_dir / folders.RUN_FILE, dumps(before, indent=1).encode() + b"\n")
+        writer._write_run_file()
         write_file(run_dir / folders.STATE_FILE, encode_state("running"))
         return writer
 
@@ -116,11 +116,19 @@ class RunWriter:
         """
         self.run = replace(self.run, devices=devices)
         self._encoder = self._make_encoder()
+        if self._before is not None:
+            if self._before.get("devices"):
+                return
+            self._before["devices"] = devices  # the run ended before they were open
+        self._write_run_file()
+
+    def _write_run_file(self) -> None:
+        """Write run.json; for a resumed run, as the first process wrote it."""
         if self._before is None:
-            write_file(self.run_dir / folders.RUN_FILE, encode_run(self.run, run_id_of(self.run_dir)))
-        elif not self._before.get("devices"):  # it ended before its devices were open
-            self._before["devices"] = devices
-            write_file(self.run_dir / folders.RUN_FILE, dumps(self._before, indent=1).encode() + b"\n")
+            data = encode_run(self.run, run_id_of(self.run_dir))
+        else:
+            data = dumps(self._before, indent=1).encode() + b"\n"
+        write_file(self.run_dir / folders.RUN_FILE, data)
 
     def _make_encoder(self) -> ShotEncoder:
         from labseq.recording.shot_file import ShotEncoder  # h5py takes 0.1 s to import
