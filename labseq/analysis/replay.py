@@ -364,15 +364,15 @@ class _Replayer:
     grid: SiteGrid
     calibrations: dict[str, CalibrationEntry]
     changes: dict[str, list[Override]]
-    _crews: dict[tuple[int, int], _Pipeline] = field(default_factory=dict[tuple[int, int], _Pipeline])
+    _pipelines: dict[tuple[int, int], _Pipeline] = field(default_factory=dict[tuple[int, int], _Pipeline])
     _points: list[Point] = field(default_factory=list[Point])  # kept alive, so that no id is used twice
 
     def at(self, point: Point) -> _Pipeline:
         key = id(point.planner), id(point.hardware)
-        if key not in self._crews:
+        if key not in self._pipelines:
             self._points.append(point)
-            self._crews[key] = self._make(point)
-        return self._crews[key]
+            self._pipelines[key] = self._make(point)
+        return self._pipelines[key]
 
     def _make(self, point: Point) -> _Pipeline:
         own = {"planner": point.planner, "detector": point.hardware.chosen["detector"]}
@@ -434,15 +434,15 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
     with announcing(announce):
         chosen = replayer.at(assembly.first_point).chosen
         for shot in wanted:
-            crew = replayer.at(point_of(assembly, shot, scan_run))
-            for stream in crew.streams:
+            pipeline = replayer.at(point_of(assembly, shot, scan_run))
+            for stream in pipeline.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:
-                if crew.detector is not None:
-                    images.add(shot, crew.detector)
-                if crew.planner is not None:
-                    name, dop = crew.planner_name, crew.degree_of_parallelism
-                    plans += replay_plans(shot, crew.planner, name, dop, replayer.grid, crew.motion)
+                if pipeline.detector is not None:
+                    images.add(shot, pipeline.detector)
+                if pipeline.planner is not None:
+                    name, dop = pipeline.planner_name, pipeline.degree_of_parallelism
+                    plans += replay_plans(shot, pipeline.planner, name, dop, replayer.grid, pipeline.motion)
             except RecordingError as error:
                 unreadable[shot.index] = str(error)
     return Replay(

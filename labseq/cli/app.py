@@ -1,5 +1,6 @@
 """The command line: all commands and their options; the code of a command is imported when it runs."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -238,7 +239,8 @@ def run_queue(
     from labseq.cli.run import run_session
     from labseq.queue.terminal import run_entries
 
-    raise typer.Exit(run_entries(run_session, keep_going=keep_going, watch=watch))
+    run = partial(run_session, as_json=False)
+    raise typer.Exit(run_entries(run, keep_going=keep_going, watch=watch))
 
 
 @campaign.command("run", short_help="Run a sequence at each point of a grid of values.")

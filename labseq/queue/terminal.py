@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from labseq.console.errors import exit_code_of, report, warning_lines
 from labseq.console.output import say
@@ -51,23 +52,16 @@ def pause_queue(is_paused: bool) -> None:
     say(paused if is_paused else "the queue continues")
 
 
-class RunSession(Protocol):
-    """Opens a session, runs it and prints the result."""
-
-    def __call__(self, opening: Opening, *, as_json: bool) -> None: ...  # noqa: D102
-
-
-def run_entries(run_session: RunSession, *, keep_going: bool, watch: bool) -> int:
+def run_entries(run_session: Callable[[Opening], None], *, keep_going: bool, watch: bool) -> int:
     """Run the entries of the queue.
+
+    Args:
+        run_session: Runs the session that its argument opens, and prints the result.
 
     Returns:
         The exit code: that of the first entry that failed, or 0.
     """
-
-    def take(opening: Opening) -> None:
-        run_session(opening, as_json=False)
-
-    runs = QueueRun(Queue(data_root()), take, _report, report, keep_going=keep_going)
+    runs = QueueRun(Queue(data_root()), run_session, _report, report, keep_going=keep_going)
     runs.run(watch=watch)
     return 0 if runs.first_error is None else exit_code_of(runs.first_error)
 
