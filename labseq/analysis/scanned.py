@@ -316,8 +316,8 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
 
 def _aim(run: Run) -> tuple[str, ...]:
     """What an adaptive scan optimises, unless it is shown anyway."""
-    figure = str(run.scan.get("figure") or "")
-    return (figure,) if figure and figure not in {*DEFAULT, "filling_fraction", "success"} else ()
+    name = str(run.scan.get("figure") or "")
+    return (name,) if name and name not in {*DEFAULT, "filling_fraction", "success"} else ()
 
 
 def _fit(

@@ -193,7 +193,7 @@ def point_text(values: Mapping[str, Any]) -> str:
     """A line about a point of an adaptive scan, and the best one so far."""
     best = values["best"]
     at = ", ".join(f"{address} {text}" for address, text in values["written"].items())
-    this = f"point {values['point']} ({at}): {values['figure']} {_figure(values['value'])}"
+    this = f"point {values['point']} ({at}): {values['figure']} {_number(values['value'])}"
     if best is None:
         return this
     return f"{this}; best so far " + ("this" if best["point"] == values["point"] else best_text(values))
@@ -204,8 +204,8 @@ def best_text(values: Mapping[str, Any]) -> str:
     best = values["best"]
     if best is None:
         return ""
-    return f"{_figure(best['value'])}, point {best['point']} ({', '.join(best['written'].values())})"
+    return f"{_number(best['value'])}, point {best['point']} ({', '.join(best['written'].values())})"
 
 
-def _figure(value: float | None) -> str:
+def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.5g}"
