@@ -34,11 +34,11 @@ from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.roles import Context, Detector, NeedsWarmUp, Planner
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.chosen import ChosenPlugin, resolve
+from labseq.session.chosen import ChosenPlugin, changed_settings, resolve
 from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import image_before
 from labseq.session.options import Options
-from labseq.session.planning import call_planner, changed_settings
+from labseq.session.planning import call_planner
 from labseq.session.profile import RecordedSetup
 from labseq.session.recorded import calibrations_of, machine_of, stored_text
 from labseq.session.scan import Point

@@ -12,19 +12,18 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from labseq.config.document import Document
-from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, one_of
+from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, ProblemCollector, one_of
 from labseq.guard import Guard
 from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
 from labseq.motion import tone_program
-from labseq.roles import Detector, Step, StepContext, find_leader, offers
+from labseq.roles import Detector, Step, find_leader, offers
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
 from labseq.session.camera_trigger import unsuitable_exposures
+from labseq.session.chosen import changed_settings
 from labseq.session.lab import WARM_S
-from labseq.session.planning import changed_settings
 from labseq.session.rehearsal import Rehearsal, rehearse, windows_of
 from labseq.session.scan import Point
 from labseq.units import format_quantity
@@ -48,160 +47,165 @@ Timeline: TypeAlias = Sequence[tuple[str, Sequence[TimelineEntry]]]
 """Name and bars of each step."""
 
 
-@dataclass(slots=True)
-class _Points:
-    """What devices and steps say of the points of a run; each combination of settings is asked for once."""
+class _Checks:
+    """The checks of a run; points with the same settings are checked once."""
 
-    session: Session
-    guard: Guard
-    problems: dict[str, Problem] = field(default_factory=dict[str, Problem])
-    warnings: dict[str, Problem] = field(default_factory=dict[str, Problem])
-    rehearsals: dict[tuple[object, ...], list[Rehearsal]] = field(default_factory=dict[Any, Any])
-    _labs: dict[tuple[int, int], tuple[Point, Lab]] = field(default_factory=dict[Any, Any])
-    _timelines: dict[tuple[int, ...], tuple[Point, Timeline]] = field(default_factory=dict[Any, Any])
-    _detectors: list[Detector] = field(default_factory=list[Detector])
+    def __init__(self, session: Session, guard: Guard) -> None:
+        self.session = session
+        self.guard = guard
+        self.found = ProblemCollector()
+        self.rehearsals: dict[tuple[object, ...], list[Rehearsal]] = {}
+        self.detectors: list[Detector] = []
+        self._labs: dict[tuple[int, int], Lab] = {}
+        self._points: dict[tuple[int, ...], _PointCheck] = {}
 
-    def lab(self, point: Point) -> Lab:
-        """The devices of a point; none is open."""
-        key = id(point.planner), id(point.hardware)
-        if key not in self._labs:
-            self._labs[key] = point, self.session.build_lab(point)
-        return self._labs[key][1]
-
-    def rehearsal_key(self, point: Point) -> tuple[object, ...]:
-        """Points with the same key have the same moves: the last windows do not change what is planned."""
-        return id(self.lab(point)), *[*windows_of(point.steps).values()][:-1]
-
-    def rehearsed(self, point: Point) -> dict[int, Rehearsal]:
-        """Step number -> the planner's results for each rearrangement of a point."""
-        return dict(zip(windows_of(point.steps), self.rehearsals[self.rehearsal_key(point)], strict=True))
-
-    def timeline(self, point: Point) -> Timeline:
-        """Name and bars of each step."""
-        lab = self.lab(point)
-        key = (id(lab), *(id(step) for _, step in point.steps))
-        if key not in self._timelines:
-            named: list[tuple[str, list[TimelineEntry]]] = []
-            for number, (name, step) in enumerate(point.steps):
-                try:
-                    named.append((name, plan_timeline(lab, self.guard, number, name, step)))
-                except LimitError as error:
-                    self.add(point.document, self.session.assembly.sequence.shot[number].loc, str(error))
-            self.raise_problems()
-            bars = with_waits([own for _, own in named], lab.step_context)
-            self._timelines[key] = point, [(name, own) for (name, _), own in zip(named, bars, strict=True)]
-        return self._timelines[key][1]
-
-    def add(self, document: Document, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
-        """Add a problem, unless it is known."""
-        problem = document.problem(loc, what, expected, hint)
-        self.problems.setdefault(str(problem), problem)
+    def of(self, point: Point) -> _PointCheck:
+        """The checks of a point."""
+        parts = id(point.planner), id(point.hardware)
+        key = (*parts, *(id(step) for _, step in point.steps))
+        if key not in self._points:
+            if parts not in self._labs:
+                self._labs[parts] = self.session.build_lab(point)
+            self._points[key] = _PointCheck(self, point, self._labs[parts])
+        return self._points[key]
 
     def raise_problems(self) -> None:
-        """Raise what was found.
+        """Raise what was found."""
+        try:
+            self.found.raise_any()
+        except ConfigError as error:
+            scanned = self.session.assembly.scanned
+            raise error if scanned is None else scanned.scan.explained(error) from None
 
-        Raises:
-            ConfigError: There is a problem.
-        """
-        if self.problems:
-            error, scanned = ConfigError([*self.problems.values()]), self.session.assembly.scanned
-            raise error if scanned is None else scanned.scan.explained(error)
 
-    def ask_steps(self, point: Point) -> None:
+class _PointCheck:
+    """What devices and steps say of the settings of a point; no device is open."""
+
+    def __init__(self, checks: _Checks, point: Point, lab: Lab) -> None:
+        self.checks = checks
+        self.point = point
+        self.lab = lab
+        self.timeline: Timeline = ()
+        self.windows = windows_of(point.steps)
+        # what is planned; the last windows do not change it
+        self.rehearsal_key: tuple[object, ...] = (id(lab), *[*self.windows.values()][:-1])
+        self._shot = checks.session.assembly.sequence.shot
+        self._guard = checks.guard
+
+    @property
+    def rehearsed(self) -> dict[int, Rehearsal]:
+        """Step number -> the planner's results for each rearrangement."""
+        return dict(zip(self.windows, self.checks.rehearsals[self.rehearsal_key], strict=True))
+
+    @property
+    def longest_exposure_s(self) -> float:
+        """The longest exposure of a shot, in seconds; 0 without images."""
+        return max((bar.exposure_s for _, bars in self.timeline for bar in bars), default=0.0)
+
+    def _add(self, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
+        self.checks.found.add(self.point.document.error(loc, what, expected, hint))
+
+    def _add_to_profile(self, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
+        self.checks.found.add(self.point.hardware.document.error(loc, what, expected, hint))
+
+    def ask_steps(self) -> None:
         """Have every step check its settings against the devices."""
-        lab, shot = self.lab(point), self.session.assembly.sequence.shot
-        for spec, (name, step) in zip(shot, point.steps, strict=True):
+        for spec, (name, step) in zip(self._shot, self.point.steps, strict=True):
             if offers(step, "check_devices"):
-                for setting, one in _wrong_settings(self.guard, lab, name, step).items():
+                for setting, one in _wrong_settings(self._guard, self.lab, name, step).items():
                     loc = (*spec.loc, setting) if setting else spec.loc
-                    self.add(point.document, loc, one.what, one.expected, one.hint)
+                    self._add(loc, one.what, one.expected, one.hint)
 
-    def ask_timing(self, point: Point) -> None:
-        """Refuse durations that the computer cannot keep; one that it keeps roughly is a warning."""
-        context, shot = self.lab(point).step_context, self.session.assembly.sequence.shot
-        for number, one, is_refused in _badly_timed([bars for _, bars in self.timeline(point)], context):
-            loc = (*shot[number].loc, "duration")
+    def ask_timeline(self) -> None:
+        """Have every step lay out its timeline."""
+        named: list[tuple[str, list[TimelineEntry]]] = []
+        for number, (name, step) in enumerate(self.point.steps):
+            try:
+                named.append((name, plan_timeline(self.lab, self._guard, number, name, step)))
+            except LimitError as error:
+                self._add(self._shot[number].loc, str(error))
+        bars = with_waits([own for _, own in named], self.lab.step_context)
+        self.timeline = [(name, own) for (name, _), own in zip(named, bars, strict=True)]
+
+    def ask_timing(self) -> None:
+        """Refuse durations that the computer cannot keep."""
+        for number, one, is_refused in _badly_timed(self):
             if is_refused:
-                self.add(point.document, loc, one.what, one.expected, one.hint)
-            else:
-                warning = point.document.problem(loc, one.what)
-                self.warnings.setdefault(f"{warning.source}:{warning.line}:{warning.column}", warning)
+                self._add((*self._shot[number].loc, "duration"), one.what, one.expected, one.hint)
 
-    def ask_devices(self, point: Point) -> None:
+    def ask_devices(self) -> None:
         """Have camera and lines check what each step of a shot would ask of them."""
-        lab, shot = self.lab(point), self.session.assembly.sequence.shot
-        for spec, (_, bars) in zip(shot, self.timeline(point), strict=True):
+        for spec, (_, bars) in zip(self._shot, self.timeline, strict=True):
             for bar in bars:
-                key = "exposure" if bar.exposure_s else "duration"
                 try:
                     if bar.exposure_s:
-                        lab.step_context.camera.check_exposure(bar.exposure_s)
+                        self.lab.step_context.camera.check_exposure(bar.exposure_s)
                     if bar.kind and bar.kind != "rearrange":  # its length follows from the plan
-                        self._ask_lines(lab, bar.kind, own_duration_s(lab.line_specs, bar))
+                        self._ask_lines(bar.kind, own_duration_s(self.lab.line_specs, bar))
                 except LabseqError as error:
-                    self.add(point.document, (*spec.loc, key), str(error))
-        if any(bar.exposure_s for _, bars in self.timeline(point) for bar in bars):
-            self._ask_line_trigger(point, lab)
-            self._ask_images(point, lab)
-            self._ask_timeouts(point, lab)
+                    self._add((*spec.loc, "exposure" if bar.exposure_s else "duration"), str(error))
+        if self.longest_exposure_s:
+            self._ask_line_trigger()
+            self._ask_images()
+            self._ask_timeouts()
 
-    def _ask_images(self, point: Point, lab: Lab) -> None:
+    def _ask_images(self) -> None:
         """The camera must have what triggers it, and the detector must take its frames."""
-        document, facts = point.hardware.document, lab.step_context.camera
+        lab, facts = self.lab, self.lab.step_context.camera
         if "software" not in facts.triggers and trigger_line(lab.line_specs, "camera") is None:
             what = (
                 f"the camera has no software trigger, only {one_of(facts.triggers)}, and no line triggers it"
             )
-            self.add(document, ("camera", "use"), what, "a line with `triggers: camera`")
-        if facts.frame_shape is None or lab.detector in self._detectors:
+            self._add_to_profile(("camera", "use"), what, "a line with `triggers: camera`")
+        if facts.frame_shape is None or lab.detector in self.checks.detectors:
             return
-        self._detectors.append(lab.detector)
+        self.checks.detectors.append(lab.detector)
         image = np.random.default_rng(0).integers(100, 1000, facts.frame_shape, np.uint16)
         try:
-            self.guard.call("detector", WARM_S, lab.detector.detect, Frame(image, 1.0, 0.0))
+            self._guard.call("detector", WARM_S, lab.detector.detect, Frame(image, 1.0, 0.0))
         except LabseqError as error:
             if error.__cause__ is None:  # it refuses the frame; a failure may be due to the noise on it
-                self.add(document, ("detector", "use"), str(error))
+                self._add_to_profile(("detector", "use"), str(error))
 
-    def _ask_line_trigger(self, point: Point, lab: Lab) -> None:
+    def _ask_line_trigger(self) -> None:
         """Exposures must suit what the line that triggers the camera does."""
-        context, shot = lab.step_context, self.session.assembly.sequence.shot
-        if trigger_line(lab.line_specs, "camera") is None:
+        context = self.lab.step_context
+        if trigger_line(self.lab.line_specs, "camera") is None:
             return
-        bars = [(shot[n].loc, bar) for n, (_, own) in enumerate(self.timeline(point)) for bar in own]
+        bars = [(self._shot[n].loc, bar) for n, (_, own) in enumerate(self.timeline) for bar in own]
         for loc, one in unsuitable_exposures(context.camera, context.lines_facts, bars):
-            document = point.hardware.document if loc[0] == "camera" else point.document
-            self.add(document, loc, one.what, one.expected, one.hint)
+            add = self._add_to_profile if loc[0] == "camera" else self._add
+            add(loc, one.what, one.expected, one.hint)
 
-    def _ask_lines(self, lab: Lab, kind: str, duration_s: float) -> None:
+    def _ask_lines(self, kind: str, duration_s: float) -> None:
+        lab = self.lab
         if lab.lines is not None and offers(lab.lines, "check_program"):
             program = line_program(lab.line_specs, kind, duration_s)
-            self.guard.call("lines", lab.timeouts.call_s, lab.lines.check_program, program)
+            self._guard.call("lines", lab.timeouts.call_s, lab.lines.check_program, program)
 
-    def _ask_timeouts(self, point: Point, lab: Lab) -> None:
+    def _ask_timeouts(self) -> None:
         """A timeout that is written in the profile must be longer than the exposures."""
-        document, loc = point.hardware.document, ("timeouts", "call")
-        longest_s = max((bar.exposure_s for _, bars in self.timeline(point) for bar in bars), default=0.0)
-        if document.get(loc) is not None and lab.timeouts.call_s < longest_s:
-            call, exposure = (format_quantity(s, "time") for s in (lab.timeouts.call_s, longest_s))
+        loc, call_s = ("timeouts", "call"), self.lab.timeouts.call_s
+        if self.point.hardware.document.get(loc) is not None and call_s < self.longest_exposure_s:
+            call, exposure = (format_quantity(s, "time") for s in (call_s, self.longest_exposure_s))
             what = f"device calls time out after {call}, but an exposure takes {exposure}"
-            self.add(document, loc, what, f"more than {exposure}")
+            self._add_to_profile(loc, what, f"more than {exposure}")
 
-    def ask_tweezers(self, point: Point, lab: Lab, plans: Iterable[Plan]) -> None:
+    def ask_tweezers(self, plans: Iterable[Plan]) -> None:
         """Turn plans into tones, and have the devices check them."""
-        document = point.hardware.document
+        lab, loc = self.lab, ("mobile_tweezers", "use")
         for plan in plans:
             try:
                 program = tone_program(plan, grid=lab.grid, motion=lab.motion)
                 if offers(lab.mobile_tweezers, "check_program"):
                     check_program = lab.mobile_tweezers.check_program
-                    self.guard.call("mobile_tweezers", WARM_S, check_program, program)
-                self._ask_lines(lab, "rearrange", program.total_duration_s)
+                    self._guard.call("mobile_tweezers", WARM_S, check_program, program)
+                self._ask_lines("rearrange", program.total_duration_s)
             except LimitError as error:
-                self.add(document, error.setting or ("mobile_tweezers", "use"), f"moving atoms: {error}")
+                self._add_to_profile(error.setting or loc, f"moving atoms: {error}")
                 return
             except LabseqError as error:
-                self.add(document, ("mobile_tweezers", "use"), str(error))
+                self._add_to_profile(loc, str(error))
                 return
 
 
@@ -209,11 +213,9 @@ ROUGH: Final = 0.1
 """Part of a duration by which the computer may be late without a warning."""
 
 
-def _badly_timed(
-    bars: Sequence[Sequence[TimelineEntry]], context: StepContext
-) -> Iterator[tuple[int, Problem, bool]]:
+def _badly_timed(one: _PointCheck) -> Iterator[tuple[int, Problem, bool]]:
     """Steps of fixed length that the computer cannot keep, or only roughly: index, what, if refused."""
-    least = format_quantity(COMPUTER.accuracy_s, "time")
+    bars, least = [own for _, own in one.timeline], format_quantity(COMPUTER.accuracy_s, "time")
     for number, own in enumerate(bars):
         own_s = sum(bar.duration_s for bar in own)
         last = own[-1] if own else None
@@ -224,7 +226,7 @@ def _badly_timed(
         wanted, late = (format_quantity(t, "time") for t in (own_s, late_s))
         if own_s < COMPUTER.accuracy_s:
             what = f"the computer cannot keep {wanted}: it is typically 0.4 ms late, now and then several ms"
-            by = context.release_by
+            by = one.lab.step_context.release_by
             hint = "to free the atoms, use the step `release`"
             hint += f", which '{by.name}' times" if by else ""
             hint += "; to pulse a light, use a line that is on in `wait` alone"
@@ -249,10 +251,18 @@ def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, 
         return {"": Problem(f"check_devices() of step '{name}' returned no mapping")}
 
 
-def _timeout_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
+def _timing_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+    """Warnings about durations that the computer keeps roughly."""
+    shot = one.checks.session.assembly.sequence.shot
+    for number, found, is_refused in _badly_timed(one):
+        if not is_refused:
+            yield number, one.point.document.problem((*shot[number].loc, "duration"), found.what)
+
+
+def _timeout_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """Warnings about steps that may take longer than the timeout of their policy."""
-    assembly = points.session.assembly
-    each = zip(assembly.sequence.shot, assembly.policy.steps, points.timeline(point), strict=True)
+    assembly = one.checks.session.assembly
+    each = zip(assembly.sequence.shot, assembly.policy.steps, one.timeline, strict=True)
     for number, (spec, policy, (_, bars)) in enumerate(each):
         longest_s = sum(bar.duration_s for bar in bars)
         if longest_s > policy.timeout_s:
@@ -260,7 +270,7 @@ def _timeout_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Prob
             what = f"the step takes up to {longest}, longer than its timeout of "
             what += format_quantity(policy.timeout_s, "time")
             place = (*spec.policy_loc, "timeout")
-            yield number, point.document.problem(place, what, f"more than {longest}")
+            yield number, one.point.document.problem(place, what, f"more than {longest}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,49 +331,52 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
         ConfigError: What a device or plugin would refuse in the first shot at some point of the run.
     """
     assembly, guard = session.assembly, Guard(session.stop_flag)
-    points = _Points(session, guard)
+    checks = _Checks(session, guard)
     try:
-        first = assembly.first_point
-        lab = points.lab(first)
-        each = _numbered(session)
-        for ask in (points.ask_steps, points.ask_timing, points.ask_devices):
-            for point in each.values():
-                ask(point)
-            points.raise_problems()
-        _rehearse_all(points, each.values(), runs)
-        points.raise_problems()
-        run_s = _run_s(session, points)
-        timeline, rehearsals = points.timeline(first), points.rehearsed(first)
+        first = checks.of(assembly.first_point)
+        numbers: dict[_PointCheck, list[int]] = {}
+        for number, point in _numbered(session).items():
+            numbers.setdefault(checks.of(point), []).append(number)
+        asks = (
+            _PointCheck.ask_steps,
+            _PointCheck.ask_timeline,
+            _PointCheck.ask_timing,
+            _PointCheck.ask_devices,
+        )
+        for ask in asks:
+            for one in numbers:
+                ask(one)
+            checks.raise_problems()
+        _rehearse_all(checks, numbers, runs)
+        checks.raise_problems()
+        run_s = _run_s(checks)
+        warnings = _warnings(checks, numbers)
     finally:
         guard.end()
-    warnings = _warnings(points, each) + _judgement_warnings(session, [*rehearsals])
-    warnings += [*points.warnings.values(), *_light_warnings(session, lab)]
+    rehearsals, bars = first.rehearsed, [bar for _, own in first.timeline for bar in own]
+    warnings += _judgement_warnings(session, [*rehearsals])
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
-        timeline,
+        first.timeline,
         assembly.sequence.shots,
         None if assembly.scanned is None else session.scan_run.n_points,
         run_s,
-        (*notes, *warnings),
+        (*notes, *warnings, *_light_warnings(session, first.lab)),
         next(iter(rehearsals.values()), None),
-        _shot_bytes(session, lab, timeline),
-        spans_on(lab.line_specs, (bar for _, bars in timeline for bar in bars)),
-        {name: text for name, one in lab.hardware() if (text := getattr(one, "idle_output", ""))},
+        _shot_bytes(session, first.lab, bars),
+        spans_on(first.lab.line_specs, bars),
+        {name: text for name, one in first.lab.hardware() if (text := getattr(one, "idle_output", ""))},
     )
 
 
-def _run_s(session: Session, points: _Points) -> tuple[float, float]:
+def _run_s(checks: _Checks) -> tuple[float, float]:
     """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
-    min_duration_s, most_s = list[float](), list[float]()
-    for point, n in session.scan_run.counted():
-        bars = [bar for _, bars in points.timeline(point) for bar in bars]
-        min_duration_s.append(n * sum(bar.min_duration_s for bar in bars))
+    run, least_s, most_s = checks.session.scan_run, list[float](), list[float]()
+    for point, n in run.counted():
+        bars = [bar for _, bars in checks.of(point).timeline for bar in bars]
+        least_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
-    return (
-        (min(min_duration_s), max(most_s))
-        if session.scan_run.is_adaptive
-        else (sum(min_duration_s), sum(most_s))
-    )
+    return (min(least_s), max(most_s)) if run.is_adaptive else (sum(least_s), sum(most_s))
 
 
 def _numbered(session: Session) -> dict[int, Point]:
@@ -377,62 +390,52 @@ def _numbered(session: Session) -> dict[int, Point]:
     }
 
 
-def _warnings(points: _Points, each: Mapping[int, Point]) -> list[Problem]:
+def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Sequence[int]]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
     found: dict[Any, tuple[Problem, list[int]]] = {}
-    is_adaptive = points.session.scan_run.is_adaptive
+    is_adaptive, n_points = checks.session.scan_run.is_adaptive, sum(map(len, numbers.values()))
     judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings
-    for judge in (*judges, _device_warnings, _instance_warnings):
-        for n, point in each.items():
-            if n and is_adaptive and judge is _window_warnings:
+    for judge in (*judges, _timing_warnings, _device_warnings, _instance_warnings):
+        for one, own in numbers.items():
+            if 0 not in own and is_adaptive and judge is _window_warnings:
                 continue  # the search is there to find out about the corners
-            for key, problem in judge(points, point):
-                found.setdefault((judge, key), (problem, []))[1].append(n)
+            for key, problem in judge(one):
+                found.setdefault((judge, key), (problem, []))[1].extend(own)
     texts: list[Problem] = []
-    for problem, numbers in found.values():
-        if len(numbers) < len(each) and not is_adaptive:
-            at = f"at {_listed(numbers)} of the scan"
+    for problem, own in found.values():
+        if len(own) < n_points and not is_adaptive:
+            others = f", and {len(own) - 1} others" if len(own) > 1 else ""
+            at = f"at point {min(own)} of the scan{others}"
             problem = replace(problem, hint=f"{problem.hint}; {at}" if problem.hint else at)
         texts.append(problem)
     return texts
 
 
-def _listed(numbers: Iterable[int]) -> str:
-    """For example "points 0 to 2, 4" for 0, 1, 2 and 4."""
-    runs: list[list[int]] = []
-    for n in sorted(numbers):
-        if runs and n == runs[-1][-1] + 1:
-            runs[-1].append(n)
-        else:
-            runs.append([n])
-    parts = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
-    return ("points " if len(runs) > 1 or len(runs[0]) > 1 else "point ") + ", ".join(parts)
-
-
-def _rehearse_all(points: _Points, each: Iterable[Point], runs: bool) -> None:
+def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) -> None:
     """Rehearse the moves at every point that differs from those before it."""
-    session = points.session
-    distinct: dict[tuple[object, ...], Point] = {}
-    for point in each:
-        distinct.setdefault(points.rehearsal_key(point), point)
+    session = checks.session
+    distinct: dict[tuple[object, ...], _PointCheck] = {}
+    for one in points:
+        distinct.setdefault(one.rehearsal_key, one)
     wait_s, asked = MAX_WAIT_S / max(1, len(distinct) - 1), set[int]()
-    for n, (key, point) in enumerate(distinct.items()):
-        windows, lab = windows_of(point.steps), points.lab(point)
-        points.rehearsals[key] = []
-        if not windows:
+    for n, (key, one) in enumerate(distinct.items()):
+        checks.rehearsals[key] = []
+        if not one.windows:
             continue
-        if id(lab) not in asked:
-            session.warm(lab, devices=runs and n == 0)
+        is_new = id(one.lab) not in asked
+        if is_new:
+            session.warm(one.lab, devices=runs and n == 0)
         deadline = time.monotonic() + (wait_s if n else MAX_WAIT_S)
-        n_loadings = N_LOADINGS_ELSEWHERE if n else N_LOADINGS
-        found, plans, failure = rehearse(points.guard, lab, [*windows.values()], n_loadings, deadline)
-        points.rehearsals[key] = found
-        if id(lab) not in asked:
-            points.ask_tweezers(point, lab, plans if n == 0 else plans[:1])
-            asked.add(id(lab))
+        n_loadings, windows = N_LOADINGS_ELSEWHERE if n else N_LOADINGS, [*one.windows.values()]
+        found, plans, failure = rehearse(checks.guard, one.lab, windows, n_loadings, deadline)
+        checks.rehearsals[key] = found
+        if is_new:
+            one.ask_tweezers(plans if n == 0 else plans[:1])
+            asked.add(id(one.lab))
         if failure is not None:
-            what, hint = failure.what, failure.hint and f"{failure.hint} {_plan_options(session, point)}"
-            points.add(point.document, (*session.assembly.sequence.planner.loc, "use"), what, hint=hint)
+            what, hint = failure.what, failure.hint and f"{failure.hint} {_plan_options(session, one.point)}"
+            loc = (*session.assembly.sequence.planner.loc, "use")
+            checks.found.add(one.point.document.error(loc, what, hint=hint))
 
 
 def _plan_options(session: Session, point: Point) -> str:
@@ -445,10 +448,10 @@ def _plan_options(session: Session, point: Point) -> str:
     return shlex.join(options)
 
 
-def _window_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
-    document, shot = point.document, points.session.assembly.sequence.shot
-    windows, rehearsals = windows_of(point.steps), points.rehearsed(point)
-    if min((one.n_loadings for one in rehearsals.values()), default=0) < N_LOADINGS_ELSEWHERE // 4:
+def _window_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+    document, shot = one.point.document, one.checks.session.assembly.sequence.shot
+    windows, rehearsals = one.windows, one.rehearsed
+    if min((found.n_loadings for found in rehearsals.values()), default=0) < N_LOADINGS_ELSEWHERE // 4:
         return
     for number, rehearsal in rehearsals.items():
         loc = (*shot[number].loc, "window")
@@ -503,18 +506,19 @@ def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list
     return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
 
 
-def _parallelism_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
+def _parallelism_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+    point = one.point
     asked = getattr(point.planner.settings, "degree_of_parallelism", None)
     limit = point.hardware.profile.motion.max_tweezers
     if isinstance(asked, int) and asked > limit:
-        loc = (*points.session.assembly.sequence.planner.loc, "degree_of_parallelism")
+        loc = (*one.checks.session.assembly.sequence.planner.loc, "degree_of_parallelism")
         what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
         yield 0, point.document.problem(loc, f"{what}; at most {limit} are used")
 
 
-def _deadline_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:
+def _deadline_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
-    timeline, lab = points.timeline(point), points.lab(point)
+    timeline, lab, point = one.timeline, one.lab, one.point
     waits = [bool(getattr(step, "signal", "")) for _, step in point.steps]
     for number, (_, step) in enumerate(point.steps):
         if not waits[number]:
@@ -529,24 +533,24 @@ def _deadline_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Pro
             longest = format_quantity(longest_s, "time")
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
-            loc = (*points.session.assembly.sequence.shot[number].loc, "for")
+            loc = (*one.checks.session.assembly.sequence.shot[number].loc, "for")
             hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
             yield number, point.document.problem(loc, what, hint=hint)
 
 
-def _instance_warnings(points: _Points, point: Point) -> Iterator[tuple[str, Problem]]:
+def _instance_warnings(one: _PointCheck) -> Iterator[tuple[str, Problem]]:
     """What the simulation and the mobile tweezers themselves warn of."""
-    lab = points.lab(point)
+    lab = one.lab
     for name, instance in (("simulation", lab.simulation), ("mobile_tweezers", lab.mobile_tweezers)):
         if instance is not None and offers(instance, "warnings"):
-            for text in points.guard.call(name, WARM_S, instance.warnings):
+            for text in one.checks.guard.call(name, WARM_S, instance.warnings):
                 yield text, Problem(text)
 
 
-def _device_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Problem]]:  # noqa: ARG001
+def _device_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """What the settings of the devices themselves warn of."""
     n_found = 0
-    for chosen in point.hardware.chosen.values():
+    for chosen in one.point.hardware.chosen.values():
         if chosen.settings is None or chosen.document is None:
             continue
         for loc, what, expected in chosen.settings.warnings():
@@ -554,9 +558,9 @@ def _device_warnings(points: _Points, point: Point) -> Iterator[tuple[int, Probl
             n_found += 1
 
 
-def _shot_bytes(session: Session, lab: Lab, timeline: Timeline) -> int | None:
+def _shot_bytes(session: Session, lab: Lab, bars: Sequence[TimelineEntry]) -> int | None:
     shape = lab.step_context.camera.frame_shape
-    n_images = sum(bar.n_images for _, bars in timeline for bar in bars)
+    n_images = sum(bar.n_images for bar in bars)
     kept = {"all": n_images, "last": min(1, n_images), "none": 0}[session.assembly.sequence.record_frames]
     if shape is None and kept:
         return None

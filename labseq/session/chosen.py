@@ -253,6 +253,11 @@ def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
     return call_plugin(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True))
 
 
+def changed_settings(settings: Settings | None) -> dict[str, Any]:
+    """The settings that differ from the defaults, SI, JSON-ready."""
+    return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
+
+
 def _defaults(entry: Entry) -> Settings | None:
     return entry.settings_model() if entry.settings_model is not None else None
 

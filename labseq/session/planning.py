@@ -26,12 +26,18 @@ from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
 from labseq.roles import Context, Planner
-from labseq.session.chosen import ChosenPlugin, construct_target, load_plugins, resolve
+from labseq.session.chosen import (
+    ChosenPlugin,
+    changed_settings,
+    construct_target,
+    load_plugins,
+    resolve,
+)
 from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import Source, read_source
 from labseq.session.profile import calibrated_machine
 from labseq.session.recorded import Machine, recorded_machine
-from labseq.settings import Choice, PatternChoice, Settings
+from labseq.settings import Choice, PatternChoice
 from labseq.text_files import YAML_SUFFIXES
 
 _TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
@@ -407,11 +413,6 @@ def call_planner(
     raise PlanError(
         f"plan() raised {format_error(error)}" + (f" ({place})" if place else ""), name
     ) from error
-
-
-def changed_settings(settings: Settings | None) -> dict[str, Any]:
-    """The settings that differ from the defaults, SI, JSON-ready."""
-    return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
 
 
 def _batch(batch: Batch) -> dict[str, Any]:

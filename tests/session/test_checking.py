@@ -115,7 +115,7 @@ def test_a_run_gives_the_warnings_of_the_check_once(tmp_path: Path):
     [
         (
             "shot.2.rearrange.window: [60 ms, 10 ms, 12 ms, 70 ms, 1 ms]",
-            "; at points 1, 2, 4 of the scan",
+            "; at point 1 of the scan, and 2 others",
             "scan:",
         ),
         (
