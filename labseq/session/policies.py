@@ -21,7 +21,6 @@ from labseq.recording.columns import QUANTITIES, quantities_in
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.recording.results import PREFIX
-from labseq.recording.writer import RunWriter
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
 
@@ -248,65 +247,6 @@ def _failure(check: CheckSettings, values: deque[float]) -> str:
     if check.at_most is not None and mean > check.at_most:
         return f"{check.value} is {mean:.6g}{of}; it should be at most {check.at_most:g}"
     return ""
-
-
-class ShotHooks:
-    """Called before and after each shot: obeys stop requests, checks results, records skipped shots.
-
-    Args:
-        writer: The run's folder.
-        checks: The checks of the sequence.
-        emit: Receives every event: name and values.
-    """
-
-    def __init__(
-        self, writer: RunWriter, checks: Checks, emit: Callable[[str, Mapping[str, Any]], None]
-    ) -> None:
-        self._writer = writer
-        self._checks = checks
-        self._emit = emit
-
-    @property
-    def left_open(self) -> tuple[int, str]:
-        """The last shot of an interrupted run, and why the remaining shots of its point are skipped, or "".
-
-        The skip may have been recorded before the interruption, or not.
-        """
-        return self._checks.left_open
-
-    def before(self) -> None:
-        """Check for a stop request before a shot.
-
-        Raises:
-            StopRequested: The run was asked to end.
-        """
-        check_stop_file(self._writer.run_dir)
-
-    def after(self, failed: Sequence[str]) -> str:
-        """Check the results after a shot.
-
-        Args:
-            failed: Why the shot failed for good, if it did.
-
-        Returns:
-            Why the other shots of its point are to be skipped, or "".
-
-        Raises:
-            CheckFailedError: A value is outside the limits of a check that stops the run.
-        """
-        return failed[0] if failed else self._checks.after(self._writer.last_row)
-
-    def skip(self, shots: Sequence[int], why: str) -> None:
-        """Record that shots will not be taken.
-
-        Raises:
-            RecordingError: The disk is full.
-        """
-        if shots:
-            self._writer.skip(shots, why)
-            which = f"shot {shots[0]} is" if len(shots) == 1 else f"{len(shots)} shots are"
-            self._emit("warning", {"text": f"{which} skipped: {why}"})
-            self._emit("shots_skipped", {"shots": list(shots), "why": why})
 
 
 def check_stop_file(run_dir: Path) -> None:

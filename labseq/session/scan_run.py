@@ -21,13 +21,14 @@ from labseq.recording.columns import quantities_in
 from labseq.recording.quantities import Quantity, make_quantity
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
-from labseq.roles import RunObserver, Scanner
+from labseq.roles import Scanner
+from labseq.sequencer.leader import Emit
 from labseq.sequencer.run import Sequencer
 from labseq.session.assembly import CLIMBED, Assembly, Search
 from labseq.session.awaited import AwaitedResults
 from labseq.session.chosen import construct_one
 from labseq.session.lab import rebuild_lab
-from labseq.session.policies import ShotHooks, missing_quantity
+from labseq.session.policies import Checks, check_stop_file, missing_quantity
 from labseq.session.scan import Point
 from labseq.units import written
 
@@ -91,6 +92,7 @@ class ScanRun:
     """
 
     is_adaptive = False
+    scanner_name = ""
 
     def __init__(self, assembly: Assembly, seed: int, done: Collection[int] = ()) -> None:
         self.assembly = assembly
@@ -139,32 +141,49 @@ class ScanRun:
         """Each point of the run, with the number of its shots."""
         return [(self.assembly.at(point), n) for point, n in Counter(self.points).items()]
 
-    def follow(self, writer: RunWriter, observer: RunObserver) -> None:
-        """Connect the recorded results and the observer of events; called before :meth:`run`."""
-
-    def run(self, taker: ShotTaker, shot_hooks: ShotHooks) -> None:
+    def run(self, taker: ShotTaker, writer: RunWriter, checks: Checks, emit: Emit) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
 
         Args:
             taker: Takes each of them.
-            shot_hooks: Called between two shots; their exceptions end the run.
+            writer: The run's folder.
+            checks: Checks each result; may end the run, or skip the other shots of a point.
+            emit: Receives every event: name and values.
 
         Raises:
-            LabseqError: The error that ended the run before its last shot.
+            StopRequested: Another process asked the run to end.
+            CheckFailedError: A value is outside the limits of a check that stops the run.
+            LabseqError: Another error that ended the run before its last shot.
         """
-        skipped = set(self._skip_before(shot_hooks))
+        skipped = set[int]()
+
+        def skip(shots: Sequence[int], why: str) -> None:
+            if shots:
+                writer.skip(shots, why)
+                which = f"shot {shots[0]} is" if len(shots) == 1 else f"{len(shots)} shots are"
+                emit("warning", {"text": f"{which} skipped: {why}"})
+                emit("shots_skipped", {"shots": [*shots], "why": why})
+                skipped.update(shots)
+
+        last, why = checks.left_open
+        if why:  # an earlier process may have died before it could record what it skips
+            skip(self._later_at_its_point(last), why)
         for shot in self.shots:
             if shot in skipped:
                 continue
-            shot_hooks.before()
+            check_stop_file(writer.run_dir)
             point = self._point_of(shot)
             if point is None:
-                self._scanner_ended(shot)
+                emit("scan_ended", {"scanner": self.scanner_name, "n_shots": shot})
                 return
             given_up = taker.take(shot, point, skipped)
-            self._add_result(shot)
-            skipped.update(self._skip(shot, given_up, shot_hooks))
-            self._report_point(shot, skipped)
+            if warning := self._add_result(writer):
+                emit("warning", {"text": warning})
+            why = next(iter(given_up.values()), "") or checks.after(writer.last_row)
+            if why:
+                skip([*given_up, *self._later_at_its_point(shot)], why)
+            if self.is_adaptive and skipped.issuperset(self._later_at_its_point(shot)):
+                emit("scan_point", self._progress(shot))
 
     def record(self) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; empty without one.
@@ -210,28 +229,13 @@ class ScanRun:
         place = self.place_of(shot)
         return [later for later in self.shots if later > shot and self.place_of(later) == place]
 
-    def _skip_before(self, shot_hooks: ShotHooks) -> list[int]:
-        """Record the shots to skip if an earlier process died before it could record them."""
-        shot, why = shot_hooks.left_open
-        left = self._later_at_its_point(shot) if why else []
-        shot_hooks.skip(left, why)
-        return left
+    def _add_result(self, writer: RunWriter) -> str:  # noqa: ARG002
+        """Read the result of the last shot, if the next points depend on it; returns a warning, or ""."""
+        return ""
 
-    def _skip(self, shot: int, given_up: Mapping[int, str], shot_hooks: ShotHooks) -> list[int]:
-        """Record the shots to skip after a shot."""
-        why = shot_hooks.after([*given_up.values()])
-        left = [*given_up, *self._later_at_its_point(shot)] if why else []
-        shot_hooks.skip(left, why)
-        return left
-
-    def _scanner_ended(self, shot: int) -> None:
-        """Report that the scanner has finished; adaptive scans only."""
-
-    def _add_result(self, shot: int) -> None:
-        """Read the result of a shot; adaptive scans only."""
-
-    def _report_point(self, shot: int, skipped: Collection[int]) -> None:
-        """Report the result of a point after its last shot; adaptive scans only."""
+    def _progress(self, shot: int) -> dict[str, Any]:  # noqa: ARG002
+        """The result of the point of a shot, for the run's events; of an adaptive scan."""
+        return {}
 
 
 class AdaptiveScanRun(ScanRun):
@@ -263,6 +267,7 @@ class AdaptiveScanRun(ScanRun):
         awaited: AwaitedResults | None = None,
     ) -> None:
         self._search = search
+        self.scanner_name = search.name
         super().__init__(assembly, seed, done)
         self._scanner = ScannerCall(search, seed, stop)
         self._results = Results(
@@ -275,8 +280,6 @@ class AdaptiveScanRun(ScanRun):
             if run is not None and attempt.index in run.skipped:
                 self._results.add_skipped(attempt.index, attempt.row["parameters"])
         self._load = caching_loader()
-        self._writer: RunWriter | None = None
-        self._observer: RunObserver | None = None
 
     def _points_of_shots(self) -> list[int]:
         repeats = self._search.scanned.scan.repeats
@@ -312,10 +315,6 @@ class AdaptiveScanRun(ScanRun):
         n_corners = math.prod(self._search.scanned.scan.shape)
         return [(self.assembly.at(corner), self.assembly.sequence.shots) for corner in range(n_corners)]
 
-    def follow(self, writer: RunWriter, observer: RunObserver) -> None:
-        """Connect the recorded results and the observer of events."""
-        self._writer, self._observer = writer, observer
-
     def record(self) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; see :meth:`Search.record`."""
         return self._search.record()
@@ -326,26 +325,17 @@ class AdaptiveScanRun(ScanRun):
             values = self._scanner.choose(self._results.before(place))
         return None if values is None else self._search.at(values)
 
-    def _scanner_ended(self, shot: int) -> None:
-        self._log_event("scan_ended", {"scanner": self._search.name, "n_shots": shot})
-
-    def _add_result(self, shot: int) -> None:
-        assert self._writer is not None
-        row = self._writer.last_row
+    def _add_result(self, writer: RunWriter) -> str:
+        row = writer.last_row
         if not row["counts"]:
-            self._results.add_skipped(shot, row["parameters"])
-            return
-        self._results.add(Shot(self._writer.run_dir / row["file"], json.loads(dumps(row)), self._load))
-        if warning := self._results.missing_quantity(shot):
-            self._log_event("warning", {"text": warning})
+            self._results.add_skipped(row["shot"], row["parameters"])
+            return ""
+        shot = Shot(writer.run_dir / row["file"], json.loads(dumps(row)), self._load)
+        self._results.shots[shot.index] = shot
+        return self._results.missing_quantity(shot.index)
 
-    def _report_point(self, shot: int, skipped: Collection[int]) -> None:
-        if set(skipped).issuperset(self._later_at_its_point(shot)):
-            self._log_event("scan_point", self._results.progress(self.place_of(shot)))
-
-    def _log_event(self, name: str, values: Mapping[str, Any]) -> None:
-        if self._observer is not None:
-            self._observer.event(name, values)
+    def _progress(self, shot: int) -> dict[str, Any]:
+        return self._results.progress(self.place_of(shot))
 
 
 def scan_run_of(
@@ -385,28 +375,6 @@ def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
     return assembly.search.at(values)
 
 
-@dataclass(slots=True)
-class PointScore:
-    """The scores of a point, over all its visits.
-
-    Attributes:
-        first: Its first visit.
-        values: Address -> value, SI.
-        total: Sum of the scores of its visits.
-        n_scores: Number of visits that have a score.
-    """
-
-    first: int
-    values: Mapping[str, Any]
-    total: float = 0.0
-    n_scores: int = 0
-
-    @property
-    def mean(self) -> float:
-        """Its mean score."""
-        return self.total / self.n_scores
-
-
 @dataclass(slots=True, eq=False)
 class Results:
     """The results of the points of an adaptive scan.
@@ -424,7 +392,7 @@ class Results:
     awaited: AwaitedResults | None = None
     _visited: dict[int, VisitedPoint] = field(default_factory=dict[int, VisitedPoint])
     _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
-    _point_scores: dict[str, PointScore] = field(default_factory=dict[str, PointScore])
+    _scores: dict[str, tuple[int, list[float]]] = field(default_factory=dict[str, tuple[int, list[float]]])
     _n_counted: int = 0
     _warned: bool = False
 
@@ -432,10 +400,6 @@ class Results:
     def is_empty(self) -> bool:
         """Whether no shot has been taken."""
         return not (self.shots or self._skipped)
-
-    def add(self, shot: Shot) -> None:
-        """Add a shot."""
-        self.shots[shot.index] = shot
 
     def add_skipped(self, shot: int, parameters: Mapping[str, Any]) -> None:
         """Remember the point of a skipped shot: the scanner receives the point without a score."""
@@ -471,24 +435,18 @@ class Results:
             value = None if math.isnan(score) else sign * score
             return {"point": number, "written": self.search.written(values), "value": value}
 
-        while self._n_counted <= visit:
-            self._count(self._n_counted)
-        known = [one for one in self._point_scores.values() if one.n_scores]
-        best = max(known, key=lambda one: (one.mean, -one.first), default=None)
+        for number in range(self._n_counted, visit + 1):  # a point that is visited again has the mean score
+            one = self._visit(number)
+            _, scores = self._scores.setdefault(dumps(dict(one.values)), (number, []))
+            scores += [] if math.isnan(one.score) else [one.score]
+        self._n_counted = max(self._n_counted, visit + 1)
+        means = [(sum(scores) / len(scores), -first) for first, scores in self._scores.values() if scores]
+        mean, first = max(means, default=(math.nan, 0))
         return {
             "figure": self.search.adaptive.quantity,
             **plain(visit, own.values, own.score),
-            "best": None if best is None else plain(best.first, best.values, best.mean),
+            "best": plain(-first, self._visit(-first).values, mean) if means else None,
         }
-
-    def _count(self, visit: int) -> None:
-        """Add a visit to its point; the score of a point is the mean over all its visits."""
-        one = self._visit(visit)
-        point = self._point_scores.setdefault(dumps(dict(one.values)), PointScore(visit, one.values))
-        if not math.isnan(one.score):
-            point.total += one.score
-            point.n_scores += 1
-        self._n_counted += 1
 
     def _shots_of(self, visit: int) -> list[Shot]:
         repeats = self.search.scanned.scan.repeats

@@ -33,7 +33,7 @@ from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.locks import lock_devices
 from labseq.session.observers import Observers
 from labseq.session.options import Options, path_of
-from labseq.session.policies import Checks, ShotHooks
+from labseq.session.policies import Checks
 from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import make_safe_after_crash
 from labseq.session.scan import Point
@@ -304,16 +304,16 @@ class Session:
             return [quantity.of_shot(shot) for quantity in quantities]
 
         checks = Checks(settings, before, self._warn, values_of)
-        self.scan_run.follow(writer, self._observers)
-        hooks = ShotHooks(writer, checks, self._observers.event)
+        emit = self._observers.event
         if not self.options.has_workers:
-            self.scan_run.run(OwnShots(sequencer, first, changes, record.seed), hooks)
+            own = OwnShots(sequencer, first, changes, record.seed)
+            self.scan_run.run(own, writer, checks, emit)
             return
         from labseq.session.workers import WorkersShots
 
         shots = WorkersShots(self.scan_run, self.options, writer, self._observers, self.stop_flag)
         with closing(shots):
-            self.scan_run.run(shots, hooks)
+            self.scan_run.run(shots, writer, checks, emit)
 
     def _awaited_results(self, run: Run | None) -> AwaitedResults:
         """The results of analyses without which the run cannot be continued, or a check cannot be made."""
