@@ -68,10 +68,6 @@ class Document:
     def read(cls, path: Path, kept: StoredText | None = None) -> Document:
         """Read a file.
 
-        Args:
-            path: The file.
-            kept: The text to use in place of the file's, which need not exist then.
-
         Raises:
             ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
         """
@@ -140,9 +136,6 @@ class Document:
     def with_values(self, values: Iterable[tuple[Loc, Node, Mark | None]]) -> Document:
         """A copy with other values at some locations, and its expressions computed again.
 
-        Args:
-            values: Location, value and place of its key, as for :meth:`Node.replaced`.
-
         Raises:
             ConfigError: An expression can no longer be computed.
         """
@@ -177,11 +170,6 @@ class Document:
         found: ProblemCollector | None = None,
     ) -> Document:
         """A copy with several values replaced, in order; see :meth:`override`.
-
-        Args:
-            overrides: Address and value of each.
-            may_add: Addresses of mappings that are added if the file has none.
-            found: Receives the problems; without it they are raised.
 
         Raises:
             ConfigError: All the overrides that cannot be applied.
@@ -305,13 +293,6 @@ def load_checked(
     document: Document, model: type[M], called: str, fallbacks: FallbackValues, found: ProblemCollector | None
 ) -> tuple[Document, M]:
     """Validate a whole file; if problems are collected, continue with fallbacks for wrong values.
-
-    Args:
-        document: The file.
-        model: The settings model of the whole file.
-        called: Its name in messages.
-        fallbacks: Values that replace invalid ones.
-        found: Receives the problems; without it they are raised.
 
     Raises:
         ConfigError: The file has errors, and its other values cannot be checked.

@@ -373,11 +373,6 @@ def is_expression(node: Node) -> bool:
 def evaluate(root: Node, name: str, text: str) -> Expressions:
     """Compute all expressions of a file.
 
-    Args:
-        root: The file.
-        name: Its name in messages.
-        text: Its text, for places within expressions.
-
     Raises:
         ConfigError: All errors in them.
     """

@@ -702,15 +702,6 @@ def load_profile(
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
 
-    Args:
-        name_or_path: See :func:`find_profile`.
-        beside: Folder of the file that names the profile.
-        overrides: Values that replace those in the file, addresses without "profile.".
-        named_in: The sequence whose key ``profile`` names it, for messages.
-        scan: The sequence's scan; the profile receives the values of its first point.
-        kept: The file's text when the run began, if it is resumed.
-        found: Receives the problems of a readable file; without it they are raised.
-
     Returns:
         The document, overrides included, and its content, with fallbacks for wrong values.
 

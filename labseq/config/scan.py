@@ -138,9 +138,6 @@ class Scan:
     def bound(self, document: Document) -> Scan:
         """A copy in which the axes of the profile have their locations in the profile.
 
-        Args:
-            document: The profile's file.
-
         Raises:
             ConfigError: Addresses that do not exist in it, or whose settings a scan cannot change.
         """
@@ -292,11 +289,6 @@ class Adaptive:
 
 def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None:
     """Read ``scan``, ``repeats`` and ``order`` of a sequence.
-
-    Args:
-        document: The sequence, overrides included.
-        fixed: The overrides, those of the profile with their "profile."; an axis that one of
-            them sets is left out, since ``--set`` takes precedence.
 
     Returns:
         The scan, its profile axes not yet bound; None if the sequence has none.
@@ -470,12 +462,6 @@ def _range_of(document: Document, address: str, n_steps: int) -> tuple[Axis, End
 
 def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Document) -> Axis:
     """An axis with its location in the sequence; an axis of the profile is located later.
-
-    Args:
-        address: The address.
-        key: Its place in the file.
-        values: Its values.
-        document: The sequence.
 
     Raises:
         ConfigError: The address does not exist, or a scan cannot change its setting.

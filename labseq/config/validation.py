@@ -83,12 +83,6 @@ class ValidationContext:
 def validate(model: type[M], node: Node, context: ValidationContext, file: str) -> M:
     """Validate a mapping with a settings model; an empty value counts as {}.
 
-    Args:
-        model: The settings model.
-        node: The mapping.
-        context: Its names in messages.
-        file: Name of the file for the messages.
-
     Raises:
         ConfigError: All errors in the mapping, in file order.
     """
@@ -356,14 +350,7 @@ _LENGTHS: Final[Mapping[str, tuple[str, str, str, str]]] = {
 
 
 def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Problem:
-    """Translate an error of pydantic for a physicist.
-
-    Args:
-        error: One of ``ValidationError.errors()``, neither "missing" nor "extra_forbidden".
-        name: Name of the setting.
-        value: Its value in the file.
-        raw: Its value as it is written, or "".
-    """
+    """Translate an error of pydantic for a physicist."""
     kind, details = str(error["type"]), error.get("ctx", {})
     what = f"{name} is {shown(value, raw)}" if name else f"this is {shown(value, raw)}"
     if kind == "setting_error":

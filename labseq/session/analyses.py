@@ -69,10 +69,6 @@ def analyses_of(run: Run) -> list[dict[str, Any]]:
 def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:
     """Construct an analysis for the shots of a run.
 
-    Args:
-        run: The run.
-        settings: "use" and its settings.
-
     Raises:
         UnknownPluginError: No plugin offers this analysis.
         PluginLoadError: Its plugin failed to load, or its constructor failed.
@@ -104,11 +100,6 @@ def results_of(
 
     If the settings of the analysis have changed, all shots are analysed again, so that results never mix.
 
-    Args:
-        run_dir: The run's folder.
-        prepared: The analysis.
-        again: Whether to analyse all shots again even if the settings are unchanged.
-
     Yields:
         The file of the results, and the shots that already have one.
 
@@ -131,12 +122,6 @@ def analyse(
 ) -> int:
     """Analyse shots; a failure is recorded and reported, and the next shot follows.
 
-    Args:
-        prepared: The analysis.
-        shots: The shots.
-        log: The file of the results.
-        failed: Receives the index of a failed shot, and the error.
-
     Returns:
         Number of shots that now have a result.
 
@@ -158,11 +143,6 @@ def analyse(
 
 def analyse_missing(run: Run, settings: Mapping[str, Any], *, again: bool = False) -> AnalysisOutcome:
     """Analyse the shots of a run that have no result yet.
-
-    Args:
-        run: The run.
-        settings: "use" and its settings.
-        again: Whether to analyse all shots again.
 
     Raises:
         ConfigError: A setting is invalid, or another process writes the same results.

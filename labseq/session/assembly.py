@@ -323,14 +323,7 @@ def make_target(
 def make_steps(
     hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
 ) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
-    """Name and step, in order, and the settings of each for the record.
-
-    Args:
-        hardware: The profile.
-        document: The sequence's file.
-        sequence: Its content.
-        found: Receives the problems.
-    """
+    """Name and step, in order, and the settings of each for the record."""
     steps: list[tuple[str, Step]] = []
     dumps: list[dict[str, Any]] = []
     image_seen = False
@@ -357,12 +350,6 @@ def make_analyses(
     """The settings of each analysis of the sequence, for the record, and the names of its results.
 
     Each is constructed once, to check that it can be; during the run they have their own processes.
-
-    Args:
-        hardware: The profile.
-        document: The sequence's file.
-        sequence: Its content.
-        found: Receives the problems.
     """
     dumps: list[dict[str, Any]] = []
     results: list[str] = []
@@ -457,12 +444,6 @@ def make_search(
     """Make and check the scanner of a scan; None if the scan is not adaptive, or if there is a problem.
 
     The scanner is constructed once, to check that its constructor accepts the settings.
-
-    Args:
-        scanned: The scan, its ends checked.
-        steps: Name and step, in order.
-        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_quantity`.
-        found: Receives the problems.
     """
     adaptive = scanned.scan.adaptive
     if adaptive is None:

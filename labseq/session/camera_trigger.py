@@ -41,11 +41,6 @@ def unsuitable_exposures(
 ) -> Iterator[tuple[Loc, Problem]]:
     """Exposures of a shot that a line cannot make, or that a camera cannot time by itself.
 
-    Args:
-        camera: The camera, triggered by a line.
-        lines: The timing box.
-        bars: The timeline of the shot, each with the place of its step in the sequence.
-
     Returns:
         What is wrong, with its place in the sequence, or in the profile for ("camera", ...).
     """

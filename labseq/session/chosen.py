@@ -104,12 +104,6 @@ class ChosenPlugin:
 def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
     """Find the plugin named in a file, and validate its settings.
 
-    Args:
-        host: The plugins.
-        document: The file.
-        kind: Kind of plugin.
-        choice: Name, and place in the file.
-
     Raises:
         ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
             and column.
@@ -142,14 +136,6 @@ def named(
     host: PluginHost, document: Document, kind: str, name: str, loc: Loc, *, key: bool = False
 ) -> Entry:
     """Find the registry entry of a plugin named in a file.
-
-    Args:
-        host: The plugins.
-        document: The file.
-        kind: Kind of plugin.
-        name: Its name.
-        loc: Location of the name in the file.
-        key: Whether the name is the key there.
 
     Raises:
         ConfigError: No plugin offers it, or the one that does failed to load.

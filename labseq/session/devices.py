@@ -90,11 +90,6 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     One that fails or hangs never keeps the others from being tried. After Ctrl-C the
     current device is made safe and closed, and no other is opened.
 
-    Args:
-        profile: Name or path of the profile.
-        overrides: ``"profile.address=value"`` strings, as given to ``--set``.
-        dry_run: "off", "full" or "fast".
-
     Raises:
         ConfigError: The profile has an error; no device was touched.
         DeviceError: Another process uses the same real devices; none was touched.
@@ -138,13 +133,6 @@ def check_each_device(
     """Open, identify, test, make safe and close one device after the other.
 
     The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
-
-    Args:
-        devices: Name and device, in the order of opening.
-        timeouts: How long each call may take.
-        stop: The request to stop: the current device is made safe and closed, the others are not opened.
-        simulation: The simulation that virtual devices act on: opened before them, closed after them.
-        warn: Receives what goes wrong with the watchdog.
 
     Returns:
         Those that were tried, the simulation first.

@@ -31,13 +31,7 @@ DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "e
 
 
 def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
-    """The clock of a run.
-
-    Args:
-        stop: The request to stop.
-        virtual: Whether time passes only in waits.
-        paced: Whether virtual time passes at the speed of real time.
-    """
+    """The clock of a run."""
     if not virtual:
         return RealClock(stop)
     return PacedClock(stop) if paced else VirtualClock(stop)
@@ -91,15 +85,6 @@ def construct(
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
 
-    Args:
-        chosen: Role -> its plugin.
-        context: Their common context; name and random numbers are added for each, and the simulation if it
-            is among the chosen.
-        seed: The run's seed.
-        truth: Grid and motion without calibrations, for the simulation, in which they are measured; None
-            without calibrations.
-        refused: Receives the errors, role -> error; without it they are raised.
-
     Returns:
         Role -> object, and the random streams that the objects received.
 
@@ -139,12 +124,6 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     tweezers stay open if the motion differs only in what each program contains. A
     simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
     on to the simulation, and that to the motion.
-
-    Args:
-        lab: The lab at the previous point.
-        before: The point that the lab is at.
-        after: The next point.
-        seed: The run's seed.
 
     Returns:
         The lab, and the names of the devices that must be reopened, "simulation" among them.
@@ -205,12 +184,7 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
 
 
 def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
-    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger it.
-
-    Args:
-        document: The profile's file.
-        lab: Its devices; none is open.
-    """
+    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger it."""
     problems: list[Problem] = []
     camera = lab.step_context.camera
     if lab.lines is not None and offers(lab.lines, "lines_facts"):

@@ -148,13 +148,7 @@ Warn = Callable[[str], None]
 
 
 class AnalysisProcesses:
-    """The processes of a run's analyses, one each; they neither stop nor slow the run.
-
-    Args:
-        run_dir: The run's folder.
-        analyses: "use" and "finish_within" of each.
-        warn: Receives warnings.
-    """
+    """The processes of a run's analyses, one each; they neither stop nor slow the run."""
 
     def __init__(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]], warn: Warn) -> None:
         self._run_dir = run_dir
@@ -273,12 +267,7 @@ class _AnalysisProcess:
             self._process.stdin.close()
 
     def wait(self, end_s: float, warn: Warn) -> None:
-        """Wait until the process has ended, and kill it if its time is up.
-
-        Args:
-            end_s: When the run ended, on this computer's monotonic clock.
-            warn: Receives warnings.
-        """
+        """Wait until the process has ended, and kill it if its time is up."""
         left_s = end_s + self._finish_within_s + GRACE_S - time.monotonic()
         try:
             self._process.wait(max(0.0, left_s))

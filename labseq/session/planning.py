@@ -89,10 +89,6 @@ class PlanInputs:
 def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
     """Read and validate all files and settings that a request names.
 
-    Args:
-        request: The request.
-        source: Its occupancy.
-
     Raises:
         ConfigError: An argument is invalid; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
@@ -328,12 +324,6 @@ def plan_moves(
 ) -> PlannedMoves:
     """Plan once, and check the plan as a run does.
 
-    Args:
-        request: The arguments.
-        source: Its occupancy, if it has been read already.
-        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
-        keep_refused: Whether a plan that breaks a rule in one of its batches is returned, too.
-
     Raises:
         ConfigError: The request has an error; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
@@ -381,13 +371,6 @@ def call_planner(
     planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern, guard: Guard | None = None
 ) -> Plan:
     """Call a planner with a copy of the occupancy, in case the planner changes its input.
-
-    Args:
-        planner: The planner.
-        name: Its name.
-        occupancy: bool (n_rows, n_cols).
-        target: The target pattern.
-        guard: Calls it; without one, a new one.
 
     Raises:
         PlanError: The planner raised, or did not return in time; names the planner.
@@ -446,13 +429,6 @@ def read_plan(
     data: bytes, name: str, request: PlanRequest, *, announce: Callable[[float], None] = lambda _: None
 ) -> PlannedMoves:
     """Read the JSON of a plan, and check the plan as a run does.
-
-    Args:
-        data: UTF-8, what ``labseq plan --json`` writes.
-        name: Its name in messages.
-        request: Names the profile with grid and motion; without one the grid is that of
-            the file, and the motion the paper's. Nothing is planned.
-        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
         ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request

@@ -42,15 +42,6 @@ def check_quantity(
 ) -> None:
     """Check that the shots of a sequence can have a quantity.
 
-    Args:
-        document: The sequence.
-        place: Place of its name in the file.
-        name: Its name.
-        purpose: Its use: "to optimise".
-        steps: The steps of a shot, or None if some have errors.
-        results: Names of the results of its analyses, "analysis.NAME.KEY"; "analysis.NAME." if its keys are
-            not known.
-
     Raises:
         ConfigError: No shot can have it.
     """
@@ -75,14 +66,7 @@ def check_quantity(
 
 
 def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[str]) -> str:
-    """The warning that a shot lacks a quantity.
-
-    Args:
-        shot: Its index.
-        name: Name of the quantity.
-        purpose: Its use: "to optimise".
-        quantities: Names of the quantities that it has.
-    """
+    """The warning that a shot lacks a quantity."""
     known = list(quantities)
     hint = did_you_mean(name, known) or f"it has {listing(known)}"
     return f"shot {shot} has no '{clean(name)}' {purpose} ({hint})"
@@ -98,15 +82,7 @@ def make_policy(
     results: Collection[str],
     found: ProblemCollector,
 ) -> RunPolicy:
-    """The policies of a run and its steps.
-
-    Args:
-        document: The sequence's file.
-        sequence: Its content.
-        steps: The steps without errors.
-        results: Names of the results of its analyses, see :func:`check_quantity`.
-        found: Receives the problems.
-    """
+    """The policies of a run and its steps."""
     own = sequence.policy
     otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
     policies = [StepPolicy()] * len(sequence.shot)
@@ -169,12 +145,6 @@ def _is_repeatable(step: Step) -> bool:
 
 class Checks:
     """Checks the quantities of the most recent shots against their limits, between two shots.
-
-    Args:
-        checks: The checks of the sequence.
-        rows: The index's lines of earlier shots of a resumed run, in order.
-        warn: Receives the warnings.
-        values_of: A line of the index -> the value of each check for its shot; nan if it has none.
 
     Attributes:
         left_open: The last of the earlier shots, and why a check would skip the rest of its point, or "".

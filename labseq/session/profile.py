@@ -98,14 +98,7 @@ class ResolvedProfile:
 
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
-    """Find lines that are on during unknown steps.
-
-    Args:
-        document: The profile's file.
-        spec: Its content.
-        host: The plugins.
-        found: Receives the problems.
-    """
+    """Find lines that are on during unknown steps."""
     if spec.lines is None:
         return
     steps = [name for name in host.registry.names("step") if _takes_time(host, name)]
@@ -159,17 +152,6 @@ def resolve_profile(
 ) -> ResolvedProfile:
     """Read a profile, load the plugins and choose the plugin of each role.
 
-    Args:
-        profile: Name or path of the profile.
-        beside: Folder of the file that names it.
-        overrides: Values that replace those in the file.
-        dry_run: "off", "full" or "fast".
-        named_in: The sequence that names the profile, for messages.
-        plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
-        scan: The sequence's scan; the profile receives the values of its first point.
-        found: Receives the problems of a readable profile; without it they are raised.
-        again: The profile's text and calibrations, if a run is resumed.
-
     Raises:
         ConfigError: The profile has an error.
         PluginLoadError: A plugin that it names failed to load.
@@ -201,16 +183,7 @@ def choose_plugins(
     found: ProblemCollector,
     calibrations: Mapping[str, str] | None = None,
 ) -> ResolvedProfile:
-    """Choose the plugin of each role of a profile.
-
-    Args:
-        document: The profile's file.
-        spec: Its content, with fallbacks for wrong values.
-        host: The plugins.
-        dry_run: "off", "full" or "fast".
-        found: Receives the problems.
-        calibrations: Kind -> id of the active ones; None for those chosen by profile and store.
-    """
+    """Choose the plugin of each role of a profile."""
     repaired = bool(found.problems)
     chosen: dict[str, ChosenPlugin] = {}
     warnings: list[str] = []
@@ -279,14 +252,7 @@ class ActiveCalibrations:
 def store_of(
     document: Document, profile: ProfileSpec, dry_run: Literal["off", "full", "fast"] = "off"
 ) -> Store:
-    """The folder of calibrations of a profile.
-
-    Args:
-        document: The profile's file.
-        profile: Content of the file.
-        dry_run: "off", "full" or "fast"; a profile with only virtual devices uses
-            the same store in a dry run.
-    """
+    """The folder of calibrations of a profile."""
     folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
     is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
@@ -295,10 +261,6 @@ def store_of(
 
 def open_store(profile: str, dry_run: Literal["off", "full", "fast"] = "off") -> tuple[Store, ProfileSpec]:
     """The folder of calibrations of a profile, and the content of the profile.
-
-    Args:
-        profile: Name or path of the profile.
-        dry_run: "off", "full" or "fast".
 
     Raises:
         ConfigError: The profile has an error, or does not exist.
@@ -315,16 +277,7 @@ def calibrated(
     detector: Mapping[str, Any] | None = None,
     pins: Mapping[str, str] | None = None,
 ) -> ActiveCalibrations:
-    """Read the calibrations that a profile uses, and apply those of the tones.
-
-    Args:
-        document: The profile's file.
-        profile: Content of the file.
-        found: Receives the problems; a calibration that has one is not used.
-        dry_run: "off", "full" or "fast".
-        detector: Settings of the detector in use, for the record; None if they do not matter.
-        pins: Kind -> id of the only calibrations to use; None for those of profile and store.
-    """
+    """Read the calibrations that a profile uses, and apply those of the tones."""
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
     entries: dict[str, CalibrationEntry] = {}
     if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
@@ -414,12 +367,7 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
 
 
 def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
-    """The reason why runs ignore a calibration although it is in use; "" if they do not.
-
-    Args:
-        entry: The calibration.
-        entries: Kind -> the other calibrations in use.
-    """
+    """The reason why runs ignore a calibration although it is in use; "" if they do not."""
     if entry.kind != "overlay" or _has_basis(entry, entries):
         return ""
     return "it was measured with other frequencies of the mobile tweezers"

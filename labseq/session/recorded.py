@@ -38,10 +38,6 @@ def resolved_of(run: Run) -> dict[str, Any]:
 def stored_text(path: Path, sha256: str) -> StoredText:
     """The text of a file in a run's folder.
 
-    Args:
-        path: The file.
-        sha256: Its SHA-256 when the run was begun.
-
     Raises:
         RecordingError: It is missing or has been changed.
     """
@@ -97,10 +93,6 @@ class Machine:
 def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
     """Grid and motion of a recorded run, with calibrated tones.
 
-    Args:
-        machine: The profile recorded in the run.
-        called: Name of the profile in messages.
-
     Raises:
         ConfigError: The recorded profile is invalid.
     """
@@ -124,10 +116,6 @@ def machine_of(run: Run) -> Machine:
 
 def context_of(run: Run, name: str) -> Context:
     """The context of a plugin that evaluates a recorded run.
-
-    Args:
-        run: The run.
-        name: The plugin's role or name.
 
     Raises:
         ConfigError: The recorded settings are invalid, or a calibration is missing.

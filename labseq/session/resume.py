@@ -63,9 +63,6 @@ class ResumableRun:
     def open(cls, path: Path) -> Self:
         """Open a run for resuming, and lock it.
 
-        Args:
-            path: The run's folder or any file in it.
-
         Raises:
             ConfigError: It is complete or in progress, or another process resumes it.
             RecordingError: It is no run, is damaged, has another format, or cannot be written to.
@@ -159,11 +156,6 @@ class ResumableRun:
     def compare(self, assembly: Assembly, options: Options, *, accept: bool) -> None:
         """Compare the run as it began with the run as it would continue today.
 
-        Args:
-            assembly: The run, assembled today.
-            options: Its options.
-            accept: Whether differences are accepted.
-
         Raises:
             ConfigError: A change is not accepted, or the remaining shots would be different ones.
         """
@@ -233,11 +225,6 @@ def _numbers(shots: list[int]) -> str:
 def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assembly, Options, ResumableRun]:
     """Read a run back so that it can be continued.
 
-    Args:
-        path: The run's folder or any file in it.
-        accept_changes: Whether to continue although something has changed.
-        realtime: Let virtual time pass as real time.
-
     Raises:
         ConfigError: The run cannot be resumed, or something has changed.
         RecordingError: It is no run, is damaged, has another format, or cannot be written to.
@@ -273,12 +260,7 @@ class Change(NamedTuple):
 
 
 def changes_between(then: Mapping[str, Any], today: RunRecord) -> list[Change]:
-    """The changes in code, plugins, calibrations and settings between two records of a run.
-
-    Args:
-        then: The run's run.json.
-        today: The same run, assembled today.
-    """
+    """The changes in code, plugins, calibrations and settings between two records of a run."""
     folder, now = then["provenance"].get("folder"), plain_record(today)
     return [
         *_differences(_made_with(then), _made_with(now), folder),

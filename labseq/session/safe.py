@@ -64,12 +64,6 @@ def make_each_safe(
 
     The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
 
-    Args:
-        devices: Name and device, in the order of the safe state.
-        timeouts: How long each call may take.
-        simulation: The simulation that virtual devices act on.
-        observer: Receives each device's outcome.
-
     Returns:
         Device name -> why it is not safe, or None. A device that is safe but
         cannot be closed is only reported to the observer, as at the end of a run.
@@ -119,10 +113,6 @@ def construct_hardware(
 ) -> tuple[dict[str, Any], dict[str, LabseqError]]:
     """Construct the devices of a profile, and the simulation if there is one; nothing is opened.
 
-    Args:
-        hardware: The profile.
-        clock: The clock that they use.
-
     Returns:
         Role or device name -> object; and name -> why it could not be constructed, with its place.
     """
@@ -139,11 +129,6 @@ def make_profile_devices_safe(
     """Construct each device of a profile, open it, make it safe and close it.
 
     A device that cannot be constructed does not affect the others; it is reported at the end.
-
-    Args:
-        hardware: The profile.
-        stop: The request to stop; not obeyed here.
-        observer: Receives each device's outcome.
     """
     clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
     made, failures = construct_hardware(hardware, clock)
@@ -161,12 +146,6 @@ def make_safe_after_crash(hardware: ResolvedProfile, key: str, stop: StopFlag, o
     """Make the devices of a profile safe if the process of their last run died, because they may still be on.
 
     This comes first, because constructing and compiling may fail.
-
-    Args:
-        hardware: The profile.
-        key: The profile's name in the markers of runs.
-        stop: The request to stop; obeyed once every device has been tried.
-        observer: Receives each device's outcome, and warnings.
 
     Raises:
         LabseqError: The first device that is not safe.
@@ -201,12 +180,6 @@ def make_profile_safe(
     It does so even while another process uses them, with a warning that names it: a run in progress fails,
     or switches its devices on again. A process that hangs is ended first. Ctrl-C is obeyed once every device
     has been tried. If all devices are safe, the next run need not make them safe, however the last one ended.
-
-    Args:
-        profile: Name or path of the profile.
-        overrides: ``"profile.address=value"`` strings, as given to ``--set``.
-        observer: Receives each device's outcome, and warnings.
-        end: Whether to end any other process that uses the devices first.
 
     Raises:
         ConfigError: The profile cannot be read, or does not exist; no device was touched.

@@ -39,11 +39,6 @@ class ShotTaker(Protocol):
     def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
         """Take and record a shot.
 
-        Args:
-            shot: Its index.
-            point: Its settings.
-            skipped: Shots that will not be taken.
-
         Returns:
             The shot and why, if it failed for good.
 
@@ -54,14 +49,7 @@ class ShotTaker(Protocol):
 
 
 class OwnShots:
-    """Takes the shots in this process.
-
-    Args:
-        sequencer: Open, at the point of the first shot.
-        point: That point.
-        changes: Address -> value of what differs from the files in every shot.
-        seed: The run's seed.
-    """
+    """Takes the shots in this process."""
 
     def __init__(self, sequencer: Sequencer, point: Point, changes: Mapping[str, Any], seed: int) -> None:
         self._sequencer = sequencer
@@ -80,11 +68,6 @@ class OwnShots:
 
 class ScanRun:
     """The shots of a run whose points are known in advance; without a scan, all shots are at one point.
-
-    Args:
-        assembly: The run.
-        seed: The run's seed.
-        done: Shots that were taken before.
 
     Attributes:
         points: The point of each shot of the run.
@@ -143,12 +126,6 @@ class ScanRun:
 
     def run(self, taker: ShotTaker, writer: RunWriter, checks: Checks, emit: Emit) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
-
-        Args:
-            taker: Takes each of them.
-            writer: The run's folder.
-            checks: Checks each result; may end the run, or skip the other shots of a point.
-            emit: Receives every event: name and values.
 
         Raises:
             StopRequested: Another process asked the run to end.
@@ -243,15 +220,6 @@ class AdaptiveScanRun(ScanRun):
 
     The scanner's choice depends only on the shots on disk, their lines in the index: a resumed
     run continues as the original would have, and a shot that is repeated is taken at its old point.
-
-    Args:
-        assembly: The run.
-        search: The scanner and its ranges.
-        seed: The run's seed.
-        stop: The request to stop.
-        run: The run so far, if it is resumed.
-        done: Shots that were taken before.
-        awaited: The results of analyses that the scan needs.
     """
 
     is_adaptive = True
@@ -346,29 +314,14 @@ def scan_run_of(
     done: Collection[int] = (),
     awaited: AwaitedResults | None = None,
 ) -> ScanRun:
-    """The shots of a run and their points.
-
-    Args:
-        assembly: The run.
-        seed: Its seed.
-        stop: The request to stop.
-        run: The run so far, if it is resumed.
-        done: Shots that need not be taken.
-        awaited: The results of analyses that the run needs.
-    """
+    """The shots of a run and their points."""
     if assembly.search is None:
         return ScanRun(assembly, seed, done)
     return AdaptiveScanRun(assembly, assembly.search, seed, stop, run, done, awaited)
 
 
 def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
-    """The settings that a recorded shot was taken with.
-
-    Args:
-        assembly: The run, assembled from its own recorded files.
-        shot: The shot.
-        scan_run: The run's shots and points.
-    """
+    """The settings that a recorded shot was taken with."""
     if assembly.search is None:
         return assembly.at(scan_run.points[shot.index])
     values = {one.address: shot.row["parameters"][one.address] for one in assembly.search.ranges}
@@ -474,11 +427,6 @@ class Results:
 
 class ScannerCall:
     """Calls a scanner, with a timeout, and checks its answers.
-
-    Args:
-        search: The scanner and its ranges.
-        seed: The run's seed.
-        stop: The request to stop.
 
     Raises:
         ConfigError: The scanner refuses its settings; with their place.

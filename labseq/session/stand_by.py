@@ -38,12 +38,6 @@ def stand_by(
 
     The locks of the devices say which process that is; devices that other processes use are left alone.
 
-    Args:
-        profile: Name or path of the profile.
-        overrides: ``"profile.address=value"`` strings, as given to ``--set``.
-        observer: Receives each device's outcome, and warnings.
-        tell: Receives the devices at the beginning, then each process that died or hangs.
-
     Raises:
         ConfigError: The profile has an error, or names no device that is locked while it is in use.
     """
