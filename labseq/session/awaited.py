@@ -92,27 +92,21 @@ class AwaitedResults:
     def _value(self, name: str, shot: int, row: Mapping[str, Any] | None) -> float | None:
         """The value in a row of the results; None, with a warning, if it has none."""
         analysis = self._analysis[name]
-        use = str(analysis[USE])
-        if row is None:
-            limit = format_quantity(analysis[FINISH_WITHIN], "time")
-            return self._warn(name, shot, "late", f"the analysis gave no result within {limit}")
-        if ERROR in row:
-            return self._warn(name, shot, "failed", f"the analysis failed: {row[ERROR]}")
-        key = name.removeprefix(f"{PREFIX}{use}.")
-        value = row.get(key)
+        prefix = f"{PREFIX}{analysis[USE]}."
+        value = None if row is None else row.get(name.removeprefix(prefix))
         if isinstance(value, bool | int | float) and math.isfinite(value):
             return value
-        if key in row:
-            return None if value is None else self._warn(name, shot, "kind", "the result is no number")
-        others = [f"{PREFIX}{use}.{other}" for other in row if other != SHOT]
-        hint = did_you_mean(name, others) or f"the analysis gave {listing(others)}"
-        return self._warn(name, shot, "name", hint)
-
-    def _warn(self, name: str, shot: int, kind: str, why: str) -> None:
-        """Warn of the first shot that has no value for this kind of reason."""
-        if (name, kind) not in self._warned:
-            self._warned.add((name, kind))
+        if row is None:
+            why = f"the analysis gave no result within {format_quantity(analysis[FINISH_WITHIN], 'time')}"
+        elif ERROR in row:
+            why = f"the analysis failed: {row[ERROR]}"
+        else:
+            others = [f"{prefix}{other}" for other in row if other != SHOT]
+            why = did_you_mean(name, others) or f"as a number; the analysis gave {listing(others)}"
+        if (kind := (name, why.partition(":")[0])) not in self._warned:
+            self._warned.add(kind)
             self._observers.warn(f"shot {shot} has no '{clean(name)}': {why}")
+        return None
 
     def _ended(self, name: str) -> DeviceError:
         use = self._analysis[name][USE]

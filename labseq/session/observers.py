@@ -142,7 +142,7 @@ LOOK_S: Final = 0.02
 """Interval between two readings of results that the run waits for, in seconds."""
 MAX_READ: Final = 1 << 16
 """Number of bytes that are read from the end of a log."""
-_MODULE: Final = "labseq.session.analysis_process"
+_MODULE: Final = "labseq.session.analyses"
 
 Warn = Callable[[str], None]
 
