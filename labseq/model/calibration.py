@@ -7,7 +7,7 @@ import json
 import math
 import string
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
@@ -15,7 +15,8 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.model.grid import SiteGrid, read_only
+from labseq.errors import LimitError
+from labseq.model.grid import Floats, SiteGrid, axis_positions_m, mean_step_hz, read_only
 
 CalibrationKind = Literal["sites", "thresholds", "tweezers", "amplitudes", "frequencies", "overlay", "timing"]
 CALIBRATION_KINDS: Final[tuple[CalibrationKind, ...]] = get_args(CalibrationKind)
@@ -188,3 +189,50 @@ def _content_id(entry: CalibrationEntry) -> str:
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     digest = hashlib.sha256(text.encode()).hexdigest()
     return digest.lstrip(string.digits)[:ID_DIGITS]
+
+
+def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
+    """The same grid, with tones shifted so that the mobile tweezers are on the sites.
+
+    An axis of one site takes the mean step of the other axis, a grid of one site 1.6 MHz per spacing, by
+    which the offsets of a probe are made from tones too.
+
+    Args:
+        grid: The grid, with the tones that put the tweezers beside the sites.
+        offset_m: float64 (2,), how far beside: along a1 (along a row) and a2 (from row to row), in metres.
+
+    Raises:
+        LimitError: A tone is not above 0 Hz.
+
+    Example:
+        >>> grid = SiteGrid(3, 3, spacing_m=4e-6)
+        >>> (correct_overlay(grid, [1e-6, 0.0]).column_frequency_hz - grid.column_frequency_hz).tolist()
+        [-400000.0, -400000.0, -400000.0]
+    """
+    along_row_m, along_column_m = np.asarray(offset_m, np.float64)
+    row_hz, column_hz = grid.row_frequency_hz, grid.column_frequency_hz
+    return replace(
+        grid,
+        row_frequency_hz=_shifted("row", row_hz, column_hz, grid.spacing_m, along_column_m),
+        column_frequency_hz=_shifted("column", column_hz, row_hz, grid.spacing_m, along_row_m),
+    )
+
+
+def _shifted(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
+    if offset_m == 0:
+        return site_hz
+    site_m = axis_positions_m(len(site_hz), spacing_m)
+    if len(site_hz) < 2:
+        moved_hz = site_hz - offset_m * mean_step_hz(site_hz, other_hz) / spacing_m
+    else:
+        moved_hz = _along(site_m - offset_m, site_m, site_hz)
+    if not np.all(moved_hz > 0):
+        raise LimitError(f"the lowest {name} frequency", f"{moved_hz.min()} Hz", "above 0 Hz")
+    return moved_hz
+
+
+def _along(x: Floats, knots: Floats, values: Floats) -> Floats:
+    """Interpolate linearly; extrapolate beyond the ends with the outermost step. ``knots`` rise."""
+    i = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+    slope = np.diff(values) / np.diff(knots)
+    return values[i] + slope[i] * (x - knots[i])

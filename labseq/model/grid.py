@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
 
 Occupancy: TypeAlias = NDArray[np.bool_]
 """bool (n_rows, n_cols), C-contiguous, indexed [row, col], row 0 at the top of the image."""
@@ -93,6 +95,29 @@ def centred_comb(n_sites: int, centre_hz: float = 100e6, step_hz: float = 1.6e6)
     """
     sites = np.arange(n_sites, dtype=np.float64)
     return centre_hz + step_hz * (sites - (n_sites - 1) / 2)
+
+
+def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:
+    """Positions of the sites along an axis from the grid's centre, float64 (n_sites,).
+
+    Example:
+        >>> axis_positions_m(3, 4e-6).tolist()
+        [-4e-06, 0.0, 4e-06]
+    """
+    sites = np.arange(n_sites, dtype=np.float64)
+    return (sites - (n_sites - 1) / 2) * spacing_m
+
+
+SINGLE_SITE_STEP_HZ: Final = 1.6e6
+"""Change of frequency by a move of one spacing on a 1 x 1 grid, in Hz (the paper's step)."""
+
+
+def mean_step_hz(site_hz: Floats, other_hz: Floats) -> float:
+    """Mean step from tone to tone of an axis, in Hz; of a single tone that of the other axis."""
+    for values in (site_hz, other_hz):
+        if len(values) > 1:
+            return float(values[-1] - values[0]) / (len(values) - 1)
+    return SINGLE_SITE_STEP_HZ
 
 
 @dataclass(frozen=True, slots=True, eq=False)

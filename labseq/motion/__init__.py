@@ -6,10 +6,10 @@ with :func:`warm` and :func:`warm_rendering`.
 
 import importlib
 
+from labseq.model.calibration import correct_overlay
 from labseq.motion.axes import (
     CombFit,
     Drive,
-    correct_overlay,
     drive,
     fit_comb,
 )

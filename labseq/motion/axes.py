@@ -6,15 +6,16 @@ the columns' tones, along a2 for the rows'.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from labseq.errors import LimitError
 from labseq.model import MotionSpec, RfSpec, SiteGrid
+from labseq.model.grid import mean_step_hz
 
 Floats = NDArray[np.float64]
 
@@ -65,70 +66,9 @@ def fit_comb(site_hz: Floats, spacing_m: float) -> CombFit:
     return CombFit(comb_hz, off_hz / step_hz * spacing_m)
 
 
-def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
-    """The same grid, with tones shifted so that the mobile tweezers are on the sites.
-
-    An axis of one site takes the mean step of the other axis, a grid of one site 1.6 MHz per spacing, by
-    which the offsets of a probe are made from tones too.
-
-    Args:
-        grid: The grid, with the tones that put the tweezers beside the sites.
-        offset_m: float64 (2,), how far beside: along a1 (along a row) and a2 (from row to row), in metres.
-
-    Raises:
-        LimitError: A tone is not above 0 Hz.
-
-    Example:
-        >>> grid = SiteGrid(3, 3, spacing_m=4e-6)
-        >>> (correct_overlay(grid, [1e-6, 0.0]).column_frequency_hz - grid.column_frequency_hz).tolist()
-        [-400000.0, -400000.0, -400000.0]
-    """
-    along_row_m, along_column_m = np.asarray(offset_m, np.float64)
-    row_hz, column_hz = grid.row_frequency_hz, grid.column_frequency_hz
-    return replace(
-        grid,
-        row_frequency_hz=_shifted("row", row_hz, column_hz, grid.spacing_m, along_column_m),
-        column_frequency_hz=_shifted("column", column_hz, row_hz, grid.spacing_m, along_row_m),
-    )
-
-
-def _shifted(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, offset_m: float) -> Floats:
-    if offset_m == 0:
-        return site_hz
-    site_m = axis_positions_m(len(site_hz), spacing_m)
-    if len(site_hz) < 2:
-        moved_hz = site_hz - offset_m * _step_hz(site_hz, other_hz) / spacing_m
-    else:
-        moved_hz = _along(site_m - offset_m, site_m, site_hz)
-    if not np.all(moved_hz > 0):
-        raise LimitError(f"the lowest {name} frequency", f"{moved_hz.min()} Hz", "above 0 Hz")
-    return moved_hz
-
-
-def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:
-    """Positions of the sites along an axis from the grid's centre, float64 (n_sites,).
-
-    Example:
-        >>> axis_positions_m(3, 4e-6).tolist()
-        [-4e-06, 0.0, 4e-06]
-    """
-    sites = np.arange(n_sites, dtype=np.float64)
-    return (sites - (n_sites - 1) / 2) * spacing_m
-
-
-def _along(x: Floats, knots: Floats, values: Floats) -> Floats:
-    """Interpolate linearly; extrapolate beyond the ends with the outermost step. ``knots`` rise."""
-    i = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
-    slope = np.diff(values) / np.diff(knots)
-    return values[i] + slope[i] * (x - knots[i])
-
-
 AxisIndex = Literal[0, 1]
 
 AXES: Final = ("row", "column")
-
-SINGLE_SITE_STEP_HZ: Final = 1.6e6
-"""Change of frequency by a move of one spacing on a 1 x 1 grid, in Hz (the paper's step)."""
 
 ROUNDING: Final = 1e-9
 """Relative excess over a limit that rounding of sums can cause."""
@@ -174,7 +114,7 @@ def drive(grid: SiteGrid, motion: MotionSpec, axis: AxisIndex) -> Drive:
     """
     rf = motion.rf
     all_hz = (grid.row_frequency_hz, grid.column_frequency_hz)
-    step_hz = _step_hz(all_hz[axis], all_hz[1 - axis])
+    step_hz = mean_step_hz(all_hz[axis], all_hz[1 - axis])
     comb = fit_comb(all_hz[axis], grid.spacing_m)
     snapped = comb.worst_m <= rf.snap_within_m
     site_hz = np.array(comb.frequency_hz if snapped else all_hz[axis])
@@ -233,10 +173,3 @@ def _limits(rf: RfSpec, axis: AxisIndex, direction: float) -> Floats:
             squares * above,
         ]
     )
-
-
-def _step_hz(site_hz: Floats, other_hz: Floats) -> float:
-    for values in (site_hz, other_hz):
-        if len(values) > 1:
-            return float(values[-1] - values[0]) / (len(values) - 1)
-    return SINGLE_SITE_STEP_HZ

@@ -22,8 +22,8 @@ from labseq.errors import (
 from labseq.files import profile_dir
 from labseq.messages import clean, did_you_mean
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, MotionSpec, SiteGrid
+from labseq.model.calibration import correct_overlay
 from labseq.model.lines import IDLE
-from labseq.motion import correct_overlay
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Clock, Context

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from labseq.builtin.overlay import fit_overlay, overlay_offset
 from labseq.errors import DeviceError
 from labseq.model import SiteGrid
-from labseq.motion.axes import correct_overlay
+from labseq.motion import correct_overlay
 
 GRIDS = {lattice: SiteGrid(20, 20, lattice=lattice) for lattice in ("triangular", "square")}  # type: ignore[arg-type]
 GRID = GRIDS["triangular"]
