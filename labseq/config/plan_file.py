@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, NoReturn, Self, TypeAlias, cast
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from pydantic import ConfigDict, Field, model_validator
 from labseq.config.profile import Sites
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
-from labseq.messages import shown
 from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern, TonePaths
 from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
@@ -109,8 +108,8 @@ class BatchFile(Settings):
         return Batch(from_sites, to_sites, self.linked, self.tones and self.tones.model())
 
 
-class _Header(Settings):
-    """The keys of a plan's file without its batches; derived values in it are ignored."""
+class _File(Settings):
+    """The keys of a plan's file; derived values in it are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -122,6 +121,7 @@ class _Header(Settings):
     )
     occupancy: Rows = Field(description="before the plan, rows of 0 and 1")
     target: TargetFile = Field(description="the pattern of atoms to reach")
+    batches: tuple[BatchFile, ...] = Field(description="the batches")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,66 +155,27 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
     """
     if len(data) > MAX_BYTES:
         raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_EXPECTED))
-    document = _parse_json(decode(data, name), name)
-    if not isinstance(document, dict) or "batches" not in document:
-        raise ConfigError(Problem("this is not a plan", name, expected=_EXPECTED))
-    values = cast("Mapping[str, Any]", document)
-    header = validate_values(_Header, values, name)
-    batches = values["batches"]
-    if not isinstance(batches, list):
-        raise ConfigError(Problem("'batches' is not a list", name, expected=_EXPECTED))
-    grid = header.grid.model()
-    return PlanFile(
-        planner=header.planner,
-        degree_of_parallelism=header.degree_of_parallelism,
-        seed=header.seed,
-        grid=grid,
-        occupancy=_bits(header.occupancy, "occupancy", grid.shape, name),
-        target=_target(header.target, grid.shape, name),
-        plan=Plan.from_batches(_batches(cast("list[object]", batches), name)),
-    )
-
-
-def _batches(batches: list[object], name: str) -> list[Batch]:
-    made: list[Batch] = []
-    for i, batch in enumerate(batches):
-        where = f"{name}, batch {i}"
-        if not isinstance(batch, dict):
-            raise ConfigError(Problem("this is not a batch", where, expected='{"from": [...], "to": [...]}'))
-        made.append(validate_values(BatchFile, cast("Mapping[str, Any]", batch), where).model())
-    return made
-
-
-def _parse_json(text: str, name: str) -> object:
+    text = decode(data, name)
     try:
-        return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats)
+        values: Any = json.loads(text)
     except json.JSONDecodeError as error:
         what = f"this is not JSON: {error.msg[:1].lower()}{error.msg[1:]}"
         raise ConfigError(Problem(what, name, error.lineno, error.colno, _EXPECTED)) from error
-    except _NoPlanError as error:
-        what = f"this is not a plan: {error}"
-    except RecursionError:
-        what = "this is not a plan: it is nested too deeply"
-    except ValueError:  # Python refuses numbers with thousands of digits
-        what = "this is not a plan: a number in it has too many digits"
-    raise ConfigError(Problem(what, name, expected=_EXPECTED))
-
-
-class _NoPlanError(Exception):
-    """The JSON is not that of a plan."""
-
-
-def _refuse_constant(constant: str) -> NoReturn:
-    raise _NoPlanError(f"it contains {constant}")
-
-
-def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    values = dict(pairs)
-    if len(values) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise _NoPlanError(f"{shown(twice)} occurs in it twice")
-    return values
+    except (RecursionError, ValueError) as error:  # nested too deeply, or a number of thousands of digits
+        raise ConfigError(Problem(f"this is not a plan: {error}", name, expected=_EXPECTED)) from error
+    if not isinstance(values, dict):
+        raise ConfigError(Problem("this is not a plan", name, expected=_EXPECTED))
+    file = validate_values(_File, cast("Mapping[str, Any]", values), name)
+    grid = file.grid.model()
+    return PlanFile(
+        planner=file.planner,
+        degree_of_parallelism=file.degree_of_parallelism,
+        seed=file.seed,
+        grid=grid,
+        occupancy=_bits(file.occupancy, "occupancy", grid.shape, name),
+        target=_target(file.target, grid.shape, name),
+        plan=Plan.from_batches([batch.model() for batch in file.batches]),
+    )
 
 
 def _target(target: TargetFile, shape: tuple[int, int], name: str) -> TargetPattern:
