@@ -394,92 +394,29 @@ def _check_characters(text: str, name: str, origin: str) -> None:
 _QUOTE_IT: Final = "put text with special characters in quotes"
 
 
-_NO_TAGS: Final = "YAML tags ('!') are not allowed"
-
-
 _MISALIGNED: Final = "the indentation of this line fits no line above"
 
 
 _CLOSER: Final = {"[": "]", "{": "}"}
 
 
-class _Rule(NamedTuple):
-    """The message if PyYAML's problem and context match; ``{0}`` is the first group of ``problem``."""
-
-    problem: str
-    what: str
-    expected: str = ""
-    hint: str = ""
-    context: str = ""
-    at_context: bool = False
-
-
 _RULES: Final = (
-    _Rule(
-        r"found character (.+) that cannot start any token", "a value cannot begin with {0}", "", _QUOTE_IT
-    ),
-    _Rule(
-        "sequence entries are not allowed",
-        "a list item ('- ') cannot begin here",
-        "it on a line of its own",
-    ),
-    _Rule("mapping keys are not allowed here", "a '?' is not allowed here", "", _QUOTE_IT),
-    _Rule(
-        "found unexpected (?:end of stream|document separator)",
-        "the quotation mark that opens here is never closed",
-        context="quoted scalar",
-        at_context=True,
-    ),
-    _Rule(
+    ("found character (.+) that cannot start any token", "a value cannot begin with {0}", "", _QUOTE_IT),
+    (
         "found unknown escape character (.+)",
         "a backslash and {0} mean nothing in double quotes",
-        hint=r"use single quotes, or write '\\' for a backslash",
-    ),
-    _Rule(
-        "expected escape sequence of (.+) hexadecimal numbers",
-        "this escape in double quotes needs {0} hexadecimal digits",
-        hint="use single quotes",
-    ),
-    _Rule(
-        "expected alphabetic or numeric character",
-        "'&' and '*' begin anchors and aliases, and a name must follow",
-        hint=_QUOTE_IT,
-        context="while scanning an",
-        at_context=True,
-    ),
-    _Rule("", _NO_TAGS, "plain values", _QUOTE_IT, context="a tag"),
-    _Rule("tag handle", _NO_TAGS, "plain values", _QUOTE_IT),
-    _Rule(
         "",
-        "'|' and '>' begin a block of text on the lines below",
-        "nothing else on their line",
-        context="a block scalar",
+        r"use single quotes, or write '\\' for a backslash",
     ),
-    _Rule("expected the node content, but found (.+)", "a value is missing before {0}"),
-    _Rule(
+    ("expected the node content", "a value is missing here", "", ""),
+    (
         "but found another document",
         "a second document begins here",
         "one document in a file",
         "remove '---'",
     ),
-    _Rule(
-        "expected '<document start>', but found",
-        "this follows after the end of the file's mapping",
-        "one mapping and nothing after it",
-    ),
-    _Rule("YAML d(?:irective|ocument)", "this is not a version of YAML that labseq reads", "YAML 1.2"),
-    _Rule("", "this is not a YAML directive", hint=_QUOTE_IT, context="a directive"),
 )
-
-
-_TOKENS: Final = {
-    "'<stream end>'": "the end of the file",
-    "'<document end>'": "the end of the document",
-    "'<document start>'": "'---'",
-    "'<block end>'": "the end of the block",
-    "'<block mapping start>'": "the next key",
-    "'<block sequence start>'": "'- '",
-}
+"""PyYAML's problem -> what, expected and hint of the message; ``{0}`` is the first group."""
 
 
 def explain_syntax_error(
@@ -512,12 +449,11 @@ def explain_syntax_error(
         return _wrong_in_brackets(flow[1], since, at)
     if block := re.match(r"expected <block end>, but found '(.+)'", problem):
         return _late_quote(last, at) or _out_of_place(block[1], context, text, since, at)
-    for rule in _RULES:
-        match = re.search(rule.problem, problem)
-        if match and rule.context in context:
-            found = match[1] if match.re.groups else ""
-            what = rule.what.format(_TOKENS.get(found, clean(found)))
-            return _at(since if rule.at_context else at, what, rule.expected, rule.hint)
+    if "quoted scalar" in context and "unexpected" in problem:
+        return _at(since, "the quotation mark that opens here is never closed")
+    for pattern, what, expected, hint in _RULES:
+        if match := re.search(pattern, problem):
+            return _at(at, what.format(*map(clean, match.groups())), expected, hint)
     return _at(at, f"this is not valid YAML: {clean(problem)}", "", _QUOTE_IT)
 
 
