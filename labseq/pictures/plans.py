@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise, product
+from itertools import pairwise, product
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -342,29 +342,14 @@ class Panel:
 
 
 def make_panels(batches: Sequence[Lines], max_panels: int = MAX_PANELS) -> list[Panel]:
-    """Distribute batches among panels, in order.
-
-    Each batch has its own panel if there are enough. If not, successive batches along
-    the same lines share one, then successive batches along the same axis, evenly, and
-    if the axis changes too often, any successive batches.
-
-    Args:
-        batches: The lines of each batch, from :func:`batch_lines`.
-        max_panels: Maximum number of panels, at least 1.
+    """Distribute batches among panels, in order and evenly; each has its own if there are enough.
 
     Example:
         >>> [(panel.first, panel.last) for panel in make_panels([("row", (i // 2,)) for i in range(8)], 4)]
         [(0, 1), (2, 3), (4, 5), (6, 7)]
     """
-    groups = [[i] for i in range(len(batches))]
-    if len(groups) > max_panels:
-        groups = _runs(batches)
-    if len(groups) > max_panels:
-        phases = _runs([axis for axis, _ in batches])
-        if len(phases) > max_panels:
-            phases = [list(range(len(batches)))]
-        groups = _evenly(phases, max_panels)
-    return [_panel(batches, group) for group in groups]
+    n, n_panels = len(batches), min(len(batches), max_panels)
+    return [_panel(batches, range(n * i // n_panels, n * (i + 1) // n_panels)) for i in range(n_panels)]
 
 
 def _words(axis: Axis, lines: tuple[int, ...]) -> str:
@@ -372,25 +357,7 @@ def _words(axis: Axis, lines: tuple[int, ...]) -> str:
     return words if len(words) <= MAX_WORDS else f"{len(lines)} {axis}s"
 
 
-def _runs(values: Sequence[object]) -> list[list[int]]:
-    """Indices of equal values that follow one another."""
-    return [list(run) for _, run in groupby(range(len(values)), values.__getitem__)]
-
-
-def _evenly(phases: list[list[int]], max_panels: int) -> list[list[int]]:
-    """Cut phases into pieces of about the same length, the shortest that are few enough."""
-    size = 1
-    while sum(-(-len(phase) // size) for phase in phases) > max_panels:
-        size += 1
-    pieces: list[list[int]] = []
-    for phase in phases:
-        n = -(-len(phase) // size)
-        cuts = [round(i * len(phase) / n) for i in range(n + 1)]
-        pieces += [phase[a:b] for a, b in pairwise(cuts)]
-    return pieces
-
-
-def _panel(batches: Sequence[Lines], group: list[int]) -> Panel:
+def _panel(batches: Sequence[Lines], group: range) -> Panel:
     found: dict[Axis, set[int]] = {}
     for axis, lines in (batches[i] for i in group):
         found.setdefault(axis, set()).update(lines)

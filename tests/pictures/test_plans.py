@@ -111,16 +111,6 @@ def test_a_batch_is_alone_while_there_is_room(batches: list[Lines]) -> None:
     assert len(make_panels(batches)) <= MAX_PANELS
 
 
-def test_axes_are_kept_apart_while_there_is_room() -> None:
-    panels = make_panels([*(("row", (i,)) for i in range(9)), *(("column", (i,)) for i in range(3))], 4)
-    assert [panel.title for panel in panels] == [
-        "batches 0-2: rows 0-2",
-        "batches 3-5: rows 3-5",
-        "batches 6-8: rows 6-8",
-        "batches 9-11: columns 0-2",
-    ]
-
-
 LINES = st.lists(
     st.tuples(st.booleans(), st.integers(0, 2), st.integers(-1, 8), st.integers(-1, 8)), max_size=30
 )
