@@ -409,7 +409,7 @@ def index_keys() -> list[Block]:
     """A row per value that a shot's line in the index has of the shot's record."""
     from labseq.recording import schema
 
-    rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.SHOT if field.in_index]
+    rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.IN_INDEX]
     return [Table(("key", "type", "description"), rows)]
 
 
