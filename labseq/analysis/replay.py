@@ -224,20 +224,12 @@ def _replay_plans(shot: Shot, planner: Planner, made: _Pipeline, grid: SiteGrid)
             plan = call_planner(planner, name, seen.occupancy, shot.target, guard)
             planning_s = perf_counter() - start_s
             report = check_plan(plan, seen.occupancy, shot.target, dop, grid, made.motion, name)
-            replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), is_same(plan, cycle.plan)
+            replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), plan.is_same(cycle.plan)
         except LabseqError as error:
             failure = str(error)
         found.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))
     guard.end()
     return found
-
-
-def is_same(one: Plan, other: Plan) -> bool:
-    """Whether two plans are the same, move by move."""
-    return all(
-        np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("moves", "batch_offsets", "linked", "path_shapes", "path_positions", "path_off")
-    )
 
 
 def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
