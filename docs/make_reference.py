@@ -13,8 +13,9 @@ import importlib
 import inspect
 import re
 import sys
+import textwrap
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from inspect import signature
 from pathlib import Path
@@ -25,10 +26,13 @@ import typer
 import labseq
 from labseq import builtin
 from labseq.cli.app import app
+from labseq.config.sequence import StepPolicySettings
+from labseq.config.validation import models_at
+from labseq.errors import LabseqError, Problem
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import KINDS, Registry
 from labseq.scaffold import reference
-from labseq.scaffold.reference import Block, Code, Table, definition, docstring, summary
+from labseq.scaffold.reference import Block, Code, Definition, Table, definition, docstring, summary
 from labseq.testing import SUITES, fakes, strategies
 from labseq.testing.contracts import HardwareContract
 
@@ -78,7 +82,22 @@ def text_of(part: str) -> str:
         LookupError: There is no such part.
     """
     name, *arguments = part.split()
-    return reference.markdown(PARTS[name](*arguments))
+    return markdown(PARTS[name](*arguments))
+
+
+def markdown(blocks: Iterable[Block]) -> str:
+    """Blocks as a part of a page."""
+    return "\n\n".join(map(_markdown, blocks))
+
+
+def _markdown(block: Block) -> str:
+    if isinstance(block, Table):
+        lines = [block.header, ["---"] * len(block.header), *block.rows]
+        cells = [[cell.replace("|", r"\|") for cell in line] for line in lines]
+        return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    if isinstance(block, Definition):
+        return f"- `{block.term}`\n\n{textwrap.indent(block.text, '  ')}"
+    return block if isinstance(block, str) else f"```{block.language}\n{block.text}\n```"
 
 
 @cache
@@ -97,7 +116,19 @@ def settings(kind: str, *names: str) -> list[Block]:
     if kind in KINDS:
         return [reference.settings(registry().get(kind, *names).settings_model)]
     keys = [name for name in names if name != "top"]
-    return [reference.file_settings(kind, *keys, top="top" in names)]
+    return [file_settings(kind, *keys, top="top" in names)]
+
+
+def file_settings(kind: str, *names: str, top: bool = False) -> Block:
+    """The keys of a file, or of the mapping of one of its keys.
+
+    Raises:
+        LookupError: There is no such key, or it has no keys of its own.
+    """
+    found = [StepPolicySettings] if names == ("shot", "policy") else models_at(reference.FILES[kind], names)
+    if len(found) != 1 or (names and found == [reference.FILES[kind]]):
+        raise LookupError(f"'{' '.join((kind, *names))}' has no keys of its own")
+    return reference.settings(found[0], top=top)
 
 
 def command(*names: str) -> list[Block]:
@@ -186,7 +217,46 @@ def role(name: str) -> list[Block]:
 
 def plugins(kind: str) -> list[Block]:
     """A section for each plugin of a kind."""
-    return reference.registered(registry(), kind)
+    blocks: list[Block] = []
+    for entry in (one for one in registry().entries() if one.kind == kind):
+        title = f"### {kind.replace('_', ' ').capitalize()} `{entry.name}`"
+        blocks += [title, *reference.entry_blocks(entry)]
+    return blocks or [f"labseq itself brings no {kind}."]
+
+
+def registry_methods() -> list[Block]:
+    """A definition for each method by which a plugin offers something."""
+    return [definition(getattr(Registry, kind), name=f"registry.{kind}") for kind in KINDS]
+
+
+def error_list() -> list[Block]:
+    """A definition per error, in the order of the tree, and of the problems that they hold."""
+    return [
+        *map(reference.error, reference.errors_by_name().values()),
+        Definition(Problem.__name__, docstring(Problem)),
+    ]
+
+
+def error_tree() -> list[Block]:
+    """Every error below the one that it is a kind of."""
+    return [Code("text", "\n".join(_branch(LabseqError, "")))]
+
+
+def _branch(found: type[LabseqError], indent: str) -> Iterator[str]:
+    others = [b.__name__ for b in found.__bases__ if not issubclass(b, LabseqError) and b is not Exception]
+    yield f"{indent}{found.__name__}" + (f" (also a {', '.join(others)})" if others else "")
+    for kind in reference.kinds_of(found):
+        yield from _branch(kind, f"{indent}    ")
+
+
+def attributes() -> list[Block]:
+    """A row per attribute: those of every dataset first."""
+    from labseq.recording import schema
+
+    rows = [("every dataset", f"`{name}`", "text", about) for name, about in schema.EVERYWHERE.items()]
+    for path, found in schema.attributes().items():
+        rows += [(f"`{path}`", f"`{name}`", kind, about) for name, (kind, about) in found.items()]
+    return [Table(("of", "attribute", "type", "description"), rows)]
 
 
 PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
@@ -201,17 +271,17 @@ PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
     "names": names,
     "source": source,
     "units": reference.units,
-    "registry": reference.registry_methods,
+    "registry": registry_methods,
     "hooks": reference.hooks,
-    "errors": reference.error_list,
-    "error-tree": reference.error_tree,
+    "errors": error_list,
+    "error-tree": error_tree,
     "exit-codes": reference.exit_codes,
     "plan-rules": reference.plan_rules,
     "events": reference.events,
     "quantities": reference.quantities,
     "datasets": reference.datasets,
     "columns": reference.columns,
-    "attributes": reference.attributes,
+    "attributes": attributes,
     "index": reference.index_keys,
 }
 """Name of a part -> makes it."""

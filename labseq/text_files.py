@@ -136,6 +136,27 @@ def something_else(path: Path) -> str:
         return ""
 
 
+def check_output(path: Path, kind: str, ending: str) -> None:
+    """Check name and folder of a file before the work that it is for.
+
+    Args:
+        path: The file.
+        kind: "an NPZ file".
+        ending: ".npz".
+
+    Raises:
+        ConfigError: It has another ending, its folder does not exist, or the path is not an ordinary file.
+    """
+    name, expected = visible(str(path)), f"a file that ends in {ending}"
+    if path.suffix.lower() != ending:
+        raise ConfigError(Problem(f"this is not the name of {kind}", name, expected=expected))
+    if not is_folder(path.parent):
+        folder = visible(str(path.parent))
+        raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))
+    if what := something_else(path):
+        raise ConfigError(Problem(what, name, expected=expected))
+
+
 def _other_kind(mode: int) -> str:
     if stat.S_ISDIR(mode):
         return "this is a folder"

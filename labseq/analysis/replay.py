@@ -18,7 +18,6 @@ from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean, format_error
 from labseq.model import (
-    CalibrationEntry,
     CycleRecord,
     MotionSpec,
     Plan,
@@ -28,7 +27,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
-from labseq.model.estimate import Estimate, mean
+from labseq.model.estimate import mean
 from labseq.motion import check_plan
 from labseq.recording import Run, Shot
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
@@ -193,44 +192,27 @@ class ReplayedPlan:
     failure: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class MeanCounts:
-    """Means over several plans; for each attribute see :class:`PlanCounts`.
+def mean_counts(plans: Sequence[PlanCounts]) -> dict[str, Any]:
+    """Means over several plans, by the names of :class:`PlanCounts`; unknown times are left out.
 
-    Attributes:
-        n_plans: Number of plans.
-        n_met: Number of plans that meet the target, if no atom is lost.
+    Returns:
+        Also ``n_plans``, and ``n_met``: the plans that meet the target if no atom is lost.
     """
-
-    n_plans: int
-    n_met: int
-    n_batches: Estimate
-    n_atom_moves: Estimate
-    duration_s: Estimate
-    planning_s: Estimate
-    filling: Estimate
-
-    @classmethod
-    def over(cls, plans: Sequence[PlanCounts]) -> MeanCounts:
-        """Average over plans; unknown times are left out."""
-
-        def mean_of(name: str) -> Estimate:
-            return mean([value for plan in plans if not math.isnan(value := getattr(plan, name))])
-
-        names = ("n_batches", "n_atom_moves", "duration_s", "planning_s", "filling")
-        return cls(len(plans), sum(plan.meets_target for plan in plans), *map(mean_of, names))
+    names = ("n_batches", "n_atom_moves", "duration_s", "planning_s", "filling")
+    values = {name: np.array([getattr(plan, name) for plan in plans], np.float64) for name in names}
+    means = {name: mean(of[~np.isnan(of)]) for name, of in values.items()}
+    return {"n_plans": len(plans), "n_met": sum(plan.meets_target for plan in plans), **means}
 
 
-def replay_plans(
-    shot: Shot, planner: Planner, name: str, degree_of_parallelism: int, grid: SiteGrid, motion: MotionSpec
-) -> list[ReplayedPlan]:
+def _replay_plans(shot: Shot, planner: Planner, made: _Pipeline, grid: SiteGrid) -> list[ReplayedPlan]:
     """Plan again for every image of a shot for which a plan was recorded.
 
     Raises:
         RecordingError: The shot cannot be read.
     """
     found: list[ReplayedPlan] = []
-    guard = Guard()
+    guard, name = Guard(), made.chosen["planner"].entry.name
+    dop = parallelism_of(made.chosen["planner"], planner, made.motion)
     for cycle in shot.cycles:
         seen = image_before(cycle, shot.images)
         if seen is None:
@@ -241,21 +223,13 @@ def replay_plans(
             start_s = perf_counter()
             plan = call_planner(planner, name, seen.occupancy, shot.target, guard)
             planning_s = perf_counter() - start_s
-            report = check_plan(plan, seen.occupancy, shot.target, degree_of_parallelism, grid, motion, name)
-            replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), is_same(plan, cycle.plan)
+            report = check_plan(plan, seen.occupancy, shot.target, dop, grid, made.motion, name)
+            replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), plan.is_same(cycle.plan)
         except LabseqError as error:
             failure = str(error)
         found.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))
     guard.end()
     return found
-
-
-def is_same(one: Plan, other: Plan) -> bool:
-    """Whether two plans are the same, move by move."""
-    return all(
-        np.array_equal(getattr(one, name), getattr(other, name))
-        for name in ("moves", "batch_offsets", "linked", "path_shapes", "path_positions", "path_off")
-    )
 
 
 def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
@@ -342,71 +316,50 @@ class Replay:
         return plans_same and not self.images.n_differing and not self.images.failures and not self.unreadable
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Pipeline:
-    """The planner and detector for the images of a point of the scan."""
+    """The planner and detector for the images of a point of the scan, by role."""
 
-    planner: Planner | None
-    planner_name: str
-    degree_of_parallelism: int
-    detector: Detector | None
-    motion: MotionSpec
+    made: dict[str, Any]
     chosen: dict[str, ChosenPlugin]
+    motion: MotionSpec
     streams: tuple[RandomStream, ...]
 
 
-@dataclass(slots=True)
 class _Replayer:
     """Constructs planner and detector once for each set of settings."""
 
-    run: Run
-    assembly: Assembly
-    grid: SiteGrid
-    calibrations: dict[str, CalibrationEntry]
-    changes: dict[str, list[Override]]
-    _pipelines: dict[tuple[int, int], _Pipeline] = field(default_factory=dict[tuple[int, int], _Pipeline])
-    _points: list[Point] = field(default_factory=list[Point])  # kept alive, so that no id is used twice
+    def __init__(self, run: Run, assembly: Assembly, changes: dict[str, list[Override]]) -> None:
+        self.grid = machine_of(run).grid
+        self._seed, self._host, self._changes = run.seed, assembly.hardware.host, changes
+        self._calibrations = calibrations_of(run)
+        self._pipelines: dict[tuple[int, int], tuple[Point, _Pipeline]] = {}  # by the ids of a point's parts
 
     def at(self, point: Point) -> _Pipeline:
         key = id(point.planner), id(point.hardware)
         if key not in self._pipelines:
-            self._points.append(point)
-            self._pipelines[key] = self._make(point)
-        return self._pipelines[key]
+            self._pipelines[key] = point, self._make(point)
+        return self._pipelines[key][1]
 
     def _make(self, point: Point) -> _Pipeline:
         own = {"planner": point.planner, "detector": point.hardware.chosen["detector"]}
-        names = self.changes or own
-        chosen = {kind: self._changed(kind, one) for kind, one in own.items() if kind in names}
+        chosen = {kind: self._changed(kind, own[kind]) for kind in own if kind in (self._changes or own)}
         motion = point.hardware.profile.motion
-        made, streams = construct(
-            chosen, Context(grid=self.grid, motion=motion, calibrations=self.calibrations), self.run.seed
-        )
+        context = Context(grid=self.grid, motion=motion, calibrations=self._calibrations)
+        made, streams = construct(chosen, context, self._seed)
         for one in made.values():
             if isinstance(one, NeedsWarmUp):
                 one.warm()
-        planner = made.get("planner")
-        return _Pipeline(
-            planner=planner,
-            planner_name=chosen["planner"].entry.name if planner is not None else "",
-            degree_of_parallelism=parallelism_of(chosen["planner"], planner, motion)
-            if planner is not None
-            else 0,
-            detector=made.get("detector"),
-            motion=motion,
-            chosen=chosen,
-            streams=streams,
-        )
+        return _Pipeline(made, chosen, motion, streams)
 
     def _changed(self, kind: str, own: ChosenPlugin) -> ChosenPlugin:
         """The run's own planner or detector, or its replacement."""
-        options = self.changes.get(kind)
+        options = self._changes.get(kind)
         if not options:
             return own
         assert own.document is not None
         document = own.document.override_all(options, may_add=(kind,))
-        choice = document.validate(Choice, (kind,)).placed(kind)
-        return resolve(self.assembly.hardware.host, document, kind, choice)
+        return resolve(self._host, document, kind, document.validate(Choice, (kind,)).placed(kind))
 
 
 def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None] = lambda _: None) -> Replay:
@@ -427,7 +380,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
     changes, wanted = request.changes(), shots_of(run, request.shots)
     assembly = assembly_of(run)
     scan_run = scan_run_of(assembly, run.seed, StopFlag())
-    replayer = _Replayer(run, assembly, machine_of(run).grid, calibrations_of(run), changes)
+    replayer = _Replayer(run, assembly, changes)
     plans: list[ReplayedPlan] = []
     images = ReplayedImages.none(replayer.grid.shape)
     unreadable: dict[int, str] = {}
@@ -438,11 +391,10 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
             for stream in pipeline.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:
-                if pipeline.detector is not None:
-                    images.add(shot, pipeline.detector)
-                if pipeline.planner is not None:
-                    name, dop = pipeline.planner_name, pipeline.degree_of_parallelism
-                    plans += replay_plans(shot, pipeline.planner, name, dop, replayer.grid, pipeline.motion)
+                if "detector" in pipeline.made:
+                    images.add(shot, pipeline.made["detector"])
+                if "planner" in pipeline.made:
+                    plans += _replay_plans(shot, pipeline.made["planner"], pipeline, replayer.grid)
             except RecordingError as error:
                 unreadable[shot.index] = str(error)
     return Replay(

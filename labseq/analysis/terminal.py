@@ -14,7 +14,15 @@ import numpy as np
 
 from labseq.analysis.campaigns import campaign_in, campaign_picture
 from labseq.analysis.overview import overview, picture_of, scan_picture
-from labseq.analysis.replay import MeanCounts, Replay, ReplayedImages, ReplayedPlan, ReplayRequest, replay
+from labseq.analysis.replay import (
+    PlanCounts,
+    Replay,
+    ReplayedImages,
+    ReplayedPlan,
+    ReplayRequest,
+    mean_counts,
+    replay,
+)
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.config.addresses import split_overrides
@@ -24,7 +32,7 @@ from labseq.console.runs import chosen_run
 from labseq.console.text import columns, count_of, percent, plural, settings_text
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
-from labseq.model.estimate import Estimate, as_mapping, mean
+from labseq.model.estimate import as_mapping, mean
 from labseq.pictures.figures import check_place
 from labseq.plain import to_plain
 from labseq.recording import Run
@@ -93,9 +101,8 @@ def _plan_lines(found: Replay) -> list[str]:
     header = ("", "plans", "batches", "atom moves", "duration", "planning", "filling", "target met")
     rows: list[tuple[str, ...]] = []
     for label, plans in _groups(found.plans):
-        made = [plan.replayed for plan in plans if plan.replayed is not None]
-        rows.append(_row(f"{label}, recorded", MeanCounts.over([plan.recorded for plan in plans])))
-        rows.append(_row(f"{label}, replayed", MeanCounts.over(made)))
+        rows.append(_row(f"{label}, recorded", mean_counts([plan.recorded for plan in plans])))
+        rows.append(_row(f"{label}, replayed", mean_counts(_made(plans))))
     n_same, n_failed = sum(plan.same for plan in found.plans), sum(bool(p.failure) for p in found.plans)
     lines = [_title("planner", found.used["planner"], found.changed["planner"])]
     lines += columns([header, *rows], right=range(1, len(header)))
@@ -117,21 +124,21 @@ def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedP
         yield "all", list(plans)
 
 
-def _row(label: str, means: MeanCounts) -> tuple[str, ...]:
+def _made(plans: Sequence[ReplayedPlan]) -> list[PlanCounts]:
+    return [plan.replayed for plan in plans if plan.replayed is not None]
+
+
+def _row(label: str, means: Mapping[str, Any]) -> tuple[str, ...]:
+    times = (means[name].value for name in ("duration_s", "planning_s"))
     return (
         label,
-        str(means.n_plans),
-        str(means.n_batches),
-        str(means.n_atom_moves),
-        _time(means.duration_s),
-        _time(means.planning_s),
-        percent(means.filling.value, 2),
-        count_of(means.n_met, means.n_plans),
+        str(means["n_plans"]),
+        str(means["n_batches"]),
+        str(means["n_atom_moves"]),
+        *("-" if math.isnan(time_s) else format_quantity(time_s, "time") for time_s in times),
+        percent(means["filling"].value, 2),
+        count_of(means["n_met"], means["n_plans"]),
     )
-
-
-def _time(duration_s: Estimate) -> str:
-    return "-" if math.isnan(duration_s.value) else format_quantity(duration_s.value, "time")
 
 
 def _image_lines(found: Replay) -> list[str]:
@@ -224,10 +231,9 @@ def as_values(found: Replay) -> dict[str, Any]:
 
 
 def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
-    made = [plan.replayed for plan in plans if plan.replayed is not None]
     return {
-        "recorded": as_mapping(MeanCounts.over([plan.recorded for plan in plans])),
-        "replayed": as_mapping(MeanCounts.over(made)),
+        "recorded": as_mapping(mean_counts([plan.recorded for plan in plans])),
+        "replayed": as_mapping(mean_counts(_made(plans))),
         "n_same": sum(plan.same for plan in plans),
         "n_invalid": sum(bool(plan.failure) for plan in plans),
         "plans": [asdict(plan) for plan in plans],

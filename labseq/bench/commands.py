@@ -237,7 +237,7 @@ def waveform(
     ] = 15,
     json: JsonFile = None,
 ) -> None:
-    """Measure rendering: by kind of segment, for a plan, and compared with stored waveforms and numpy."""
+    """Measure rendering on this computer: by kind of segment, and for a plan."""
     from labseq.bench.rendering import bench_waveform, report_text
     from labseq.console.output import json_writer, report_compiling, say
 

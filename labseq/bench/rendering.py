@@ -1,4 +1,4 @@
-"""Measures the speed of rendering tone programs, compared with the paper's method and with plain numpy."""
+"""Measures the speed of rendering tone programs."""
 
 from __future__ import annotations
 
@@ -15,20 +15,12 @@ from numpy.typing import NDArray
 from labseq.console.text import columns
 from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
 from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
-from labseq.motion.render_reference import render_reference
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.units import format_quantity
 
 N_CHANNELS: Final = 2
 CHUNK: Final = 1 << 18
 """Samples per chunk; all chunks are rendered into the same buffer, as by a streaming driver."""
-
-STORED: Final = 1 << 21
-"""Samples of each stored waveform: 84 MB in all."""
-
-STORED_5: Final = "stored waveforms, 5 tones"
-STORED_20: Final = "stored waveforms, 20 tones"
-NUMPY_20: Final = "numpy, 20 tones"
 
 Samples = NDArray[np.int16]
 
@@ -49,35 +41,21 @@ def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lamb
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Returns:
-        JSON-ready: ``rows``, one for each kind of segment and for a plan, stored waveforms and numpy last,
-        with samples of both channels per second, in 1e9; ``ratios`` of rendering times, whose goal is a
-        minimum, or a maximum if ``at_most``.
+        JSON-ready: ``rows``, one for each kind of segment and for a plan, with samples of both channels per
+        second, in 1e9, and the goal for the playing time over the rendering time.
     """
     from labseq.kernel import announcing, load_kernels
 
     moves = plan_moves(PLAN, announce=announce)
-    grid, rate_hz = moves.grid, comb_sample_rate(moves.grid)
+    rate_hz = comb_sample_rate(moves.grid)
     with announcing(announce):
         warm_rendering()
         load_kernels()
-        rows = [*_comb_rows(moves, rate_hz, repeats), *_other_ways(grid, rate_hz, repeats)]
-    time_of = {row["name"]: 1.0 / row["gigasamples_per_s"] for row in rows}
-    fast, stored, numpy = (time_of[name] for name in ("1 group, 20 tones", STORED_20, NUMPY_20))
-    ratios = (
-        ("20 tones over 5 tones", fast / time_of["1 group, 5 tones"], 1.3, True),
-        ("stored waveforms over comb, 20 tones", stored / fast, 5.0, False),
-        ("numpy over comb, 20 tones", numpy / fast, 100.0, False),
-    )
-    names = ("name", "value", "goal", "at_most")
-    return {
-        "rows": rows,
-        "ratios": [dict(zip(names, ratio, strict=True)) for ratio in ratios],
-        "sample_rate_hz": rate_hz,
-        "repeats": repeats,
-    }
+        rows = list(_rows(moves, rate_hz, repeats))
+    return {"rows": rows, "sample_rate_hz": rate_hz, "repeats": repeats}
 
 
-def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[dict[str, Any]]:
+def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[dict[str, Any]]:
     grid = moves.grid
     bare = replace(moves.motion, overhead_per_batch_s=0.0)
     plan = tone_program(moves.plan, grid, bare)
@@ -91,16 +69,13 @@ def _comb_rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[d
         ("plan 20 -> 15 at 7, pauses left out", plan, 2.5),
     ):
         renderer = Renderer(program, rate_hz)
-        taken_s = _best(partial(render_all, renderer), repeats)
-        yield _row(name, renderer.n_samples, rate_hz, taken_s, goal)
-
-
-def _other_ways(grid: SiteGrid, rate_hz: float, repeats: int) -> Generator[dict[str, Any]]:
-    stored = stored_waveforms(grid, rate_hz)
-    for name, n_tones in ((STORED_5, 5), (STORED_20, 20)):
-        yield _row(name, STORED, rate_hz, _best(partial(sum_all_stored, stored, n_tones), repeats))
-    n, program = CHUNK // 8, uniform_program(grid, 20, (1,))
-    yield _row(NUMPY_20, n, rate_hz, _best(partial(render_reference, program, rate_hz, 0, n), 1))
+        taken_s = min(timeit.repeat(partial(render_all, renderer), number=1, repeat=repeats))
+        yield {
+            "name": name,
+            "gigasamples_per_s": N_CHANNELS * renderer.n_samples / taken_s / 1e9,
+            "playing_over_rendering": renderer.n_samples / rate_hz / taken_s,
+            "goal": goal,
+        }
 
 
 def uniform_program(
@@ -136,10 +111,10 @@ def render_all(renderer: Renderer) -> None:
         for channel in range(N_CHANNELS):
             renderer.write(channel, at, out)
 
-    _in_two_threads(render, renderer.n_samples)
+    in_two_threads(render, renderer.n_samples)
 
 
-def _in_two_threads(render: Callable[[Samples, int], None], n_samples: int) -> None:
+def in_two_threads(render: Callable[[Samples, int], None], n_samples: int) -> None:
     """Render chunks that start at a sample into a buffer of each thread."""
 
     def work(start: int, stop: int) -> None:
@@ -154,59 +129,18 @@ def _in_two_threads(render: Callable[[Samples, int], None], n_samples: int) -> N
         later.result()
 
 
-def stored_waveforms(grid: SiteGrid, sample_rate_hz: float) -> NDArray[np.int16]:
-    """The stored waveforms of the paper's method, one for each tone, at a twentieth of full scale.
-
-    A waveform for each tone, each kind of segment and each distance does not fit into the
-    processor's caches, and neither do these.
-
-    Returns:
-        int16 (n_sites, STORED).
-    """
-    period = round(sample_rate_hz / float(np.diff(grid.column_frequency_hz[:2])[0]))
-    cycles = np.outer(grid.column_frequency_hz / sample_rate_hz, np.arange(period)) % 1.0
-    waves = np.rint(32767 / 20 * np.cos(2 * np.pi * cycles)).astype(np.int16)
-    return np.tile(waves, (1, -(-STORED // period)))[:, :STORED].copy()
-
-
-def sum_all_stored(stored: NDArray[np.int16], n_tones: int) -> None:
-    """The paper's method: sum ``n_tones`` stored waveforms for one channel, and take one for the other."""
-    from labseq.motion.render_direct_kernels import sum_stored
-
-    def add(out: Samples, at: int) -> None:
-        for picked in (np.arange(1), np.arange(n_tones)):
-            sum_stored(stored, picked, at, out)
-
-    _in_two_threads(add, STORED)
-
-
-def _best(call: Callable[[], object], repeats: int) -> float:
-    """Shortest duration of some calls, in seconds."""
-    return min(timeit.repeat(call, number=1, repeat=repeats))
-
-
-def _row(
-    name: str, n_samples: int, sample_rate_hz: float, taken_s: float, goal: float | None = None
-) -> dict[str, Any]:
-    return {
-        "name": name,
-        "gigasamples_per_s": N_CHANNELS * n_samples / taken_s / 1e9,
-        "playing_over_rendering": n_samples / sample_rate_hz / taken_s,
-        "goal": goal,
-    }
-
-
 def report_text(report: Mapping[str, Any]) -> list[str]:
-    """A table of the measurements, a table of the ratios of rendering times, and their extent."""
-    rows = [("two channels", "Gsample/s", "playing/rendering", "goal")]
-    for row in report["rows"]:
-        goal = "-" if row["goal"] is None else f">= {row['goal']:g}"
-        speed, ratio = row["gigasamples_per_s"], row["playing_over_rendering"]
-        rows.append((row["name"], f"{speed:.3g}", f"{ratio:.3g}", goal))
-    ratios = [("rendering times", "ratio", "goal")]
-    for ratio in report["ratios"]:
-        sign = "<=" if ratio["at_most"] else ">="
-        ratios.append((ratio["name"], f"{ratio['value']:.3g}", f"{sign} {ratio['goal']:g}"))
+    """A table of the measurements, and their extent."""
+    header = ("two channels", "Gsample/s", "playing/rendering", "goal")
+    rows = [
+        (
+            row["name"],
+            f"{row['gigasamples_per_s']:.3g}",
+            f"{row['playing_over_rendering']:.3g}",
+            f">= {row['goal']:g}",
+        )
+        for row in report["rows"]
+    ]
     rate = format_quantity(report["sample_rate_hz"], "frequency")
     extent = f"{rate}, two threads; the best of {report['repeats']}"
-    return [*columns(rows, right=(1, 2, 3)), "", *columns(ratios, right=(1, 2)), "", extent]
+    return [*columns([header, *rows], right=(1, 2, 3)), "", extent]

@@ -16,7 +16,7 @@ from labseq.files import whole_file
 from labseq.messages import visible
 from labseq.model import SegmentKind
 from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
-from labseq.text_files import is_folder, something_else
+from labseq.text_files import check_output
 
 SUFFIX: Final = ".npz"
 FILE_CHUNK: Final = 1 << 20
@@ -30,14 +30,7 @@ def check_samples_file(path: Path) -> None:
         ConfigError: It has another ending than .npz, its folder does not exist, or the path
             is not an ordinary file.
     """
-    name, expected = visible(str(path)), f"a file that ends in {SUFFIX}"
-    if path.suffix.lower() != SUFFIX:
-        raise ConfigError(Problem("this is not the name of an NPZ file", name, expected=expected))
-    if not is_folder(path.parent):
-        folder = visible(str(path.parent))
-        raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))
-    if what := something_else(path):
-        raise ConfigError(Problem(what, name, expected=expected))
+    check_output(path, "an NPZ file", SUFFIX)
 
 
 def save_samples(path: Path, waveform: PlannedWaveform) -> None:

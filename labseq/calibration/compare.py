@@ -14,9 +14,8 @@ from labseq.calibration.store import DECIDING, figure_of
 from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationEntry
 from labseq.plain import now
+from labseq.recording.schema import unit_of
 from labseq.units import format_quantity
-
-_UNITS: Final = ("hz", "m", "px", "rad", "s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,17 +64,6 @@ def compare(before: CalibrationEntry, after: CalibrationEntry) -> tuple[list[Dif
         if name in before.quality
     ]
     return values, figures
-
-
-def unit_of(name: str) -> str:
-    """The unit in the suffix of a name.
-
-    Example:
-        >>> unit_of("row_hz"), unit_of("error_m"), unit_of("error")
-        ('Hz', 'm', '')
-    """
-    end = name.rpartition("_")[2] if "_" in name else ""
-    return end.replace("hz", "Hz") if end in _UNITS else ""
 
 
 def _of_values(

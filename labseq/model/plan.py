@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
@@ -181,6 +181,10 @@ class Plan:
         object.__setattr__(self, "linked", read_only(linked, np.bool_, (n_batches,), "linked"))
         if self.path_shapes is not NO_SHAPES or len(self.path_positions) or len(self.path_off):
             self._check_paths(n_batches)
+
+    def is_same(self, other: Plan) -> bool:
+        """Whether another plan has the same moves in the same batches, along the same paths."""
+        return all(np.array_equal(getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
 
     def _check_paths(self, n_batches: int) -> None:
         shapes = read_only(self.path_shapes, np.int32, (-1, 3), "path_shapes")

@@ -39,7 +39,7 @@ _DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
 }
 """Columns that are computed from a line of the index: description, function."""
 
-_FIELDS: Final = tuple(field for field in schema.SHOT if field.in_index and field.name != "error")
+_FIELDS: Final = tuple(field for field in schema.IN_INDEX if field.name != "error")
 DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
     name: description for name, (description, _) in _DERIVED.items()
 }

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from labseq.errors import RecordingError
 from labseq.files import (
@@ -23,9 +23,7 @@ from labseq.files import (
     explained,
     lines_in,
     open_ordinary,
-    read_file,
     sync_folder,
-    whole_file,
     write_file,
 )
 from labseq.plain import dumps, now_utc, parse_object
@@ -48,6 +46,9 @@ QUARANTINE: Final = "quarantine"
 LOG_FILE: Final = "doctor.jsonl"
 
 _TO_QUARANTINE: Final = "moved to quarantine"
+_CHECK_PERMISSIONS: Final = "left: check its permissions and the disk"
+_MAX_FINDINGS: Final = 100
+"""Damaged lines of a file that are reported one by one."""
 _RUN_NAME: Final = re.compile(r"\d{4,}_.*", re.DOTALL)
 _CLAIM: Final = re.compile(r"\.\d{4,}\.claim")
 _YOUNG_S: Final = 60.0
@@ -121,8 +122,6 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
     if _is_in_progress(run_dir):
         report.in_progress.append(run_dir)
         return
-    holders = _Check(run_dir, dry_run=dry_run)
-    holders.check_holders()
     check = _Check(run_dir, dry_run=True)
     check.check_run()
     if check.findings and not dry_run:
@@ -138,7 +137,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
             check.check_run()
         finally:
             lock.release()
-    report.findings += holders.findings + check.findings
+    report.findings += check.findings
     report.n_runs += 1
     report.n_shots += check.n_whole
 
@@ -147,11 +146,8 @@ def _is_in_progress(run_dir: Path) -> bool:
     """Whether a process works on a run; for a run on another computer, as its folder says."""
     state = read_state_file(run_dir)
     process = Process.from_plain(state)
-    return (
-        state.get("state") == "running"
-        and process is not None
-        and (not process.is_here or process.is_running)
-    )
+    is_gone = process is None or (process.is_here and not process.is_running)
+    return state.get("state") == "running" and not is_gone
 
 
 class _LineFile:
@@ -159,45 +155,42 @@ class _LineFile:
 
     Attributes:
         path: The file.
+        rows: Number of a line, from 0 -> its JSON object; other lines are removed.
         added: Lines that are added at the end.
         problems: Each problem, its place, and its repair when the file is saved.
+
+    Raises:
+        RecordingError: It cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.rows: dict[int, dict[str, Any]] = {}
         self.added: list[bytes] = []
         self.problems: list[tuple[str, Path, str]] = []
+        self._lines = list(lines_in(path)) if path.exists() else []
         self._removed: set[int] = set()
-
-    def _lines(self) -> Iterator[tuple[int, bytes]]:
-        return enumerate(lines_in(self.path), start=1) if self.path.exists() else iter(())
-
-    def rows(self) -> Iterator[tuple[int, dict[str, Any]]]:
-        """The lines that are JSON objects, with their numbers; the others are removed at the end."""
         damaged: list[int] = []
-        for number, line in self._lines():
+        for number, line in enumerate(self._lines):
             row = parse_object(line)
             if not line.endswith(b"\n"):
                 self.remove([number], "torn last line")
             elif row is None:
                 damaged.append(number)
             else:
-                yield number, row
-        self.remove(damaged)
-        texts = [f"line {number} is damaged" for number in damaged]
-        if len(damaged) > _MAX_FINDINGS:
-            texts = [f"{len(damaged)} lines are damaged, from line {damaged[0]} on"]
-        self.problems += [(text, self.path, _TO_QUARANTINE) for text in texts]
+                self.rows[number] = row
+        for number in damaged[:_MAX_FINDINGS]:
+            self.remove([number], f"line {number + 1} is damaged")
+        self.remove(damaged[_MAX_FINDINGS:], f"{len(damaged) - _MAX_FINDINGS} more lines are damaged")
 
     def remove(self, numbers: Collection[int], what: str = "") -> None:
         """Remove lines; ``what`` is the reason, unless another finding reports it."""
         self._removed.update(numbers)
         if what and numbers:
-            texts = [what] if len(numbers) > _MAX_FINDINGS else [what] * len(numbers)
-            self.problems += [(text, self.path, _TO_QUARANTINE) for text in texts]
+            self.problems.append((what, self.path, _TO_QUARANTINE))
 
     def save(self) -> None:
-        """Write the file if it changes, line by line: an index can be larger than the memory.
+        """Write the file if it changes.
 
         Raises:
             RecordingError: It cannot be written; the old file is unchanged.
@@ -208,24 +201,12 @@ class _LineFile:
             with explained(goal):
                 goal.touch()
                 check_ordinary(goal)
-            with explained(goal), goal.open("ab") as file:
-                file.writelines(
-                    line.rstrip(b"\n") + b"\n" for number, line in self._lines() if number in self._removed
-                )
-            with explained(goal):
+                with goal.open("ab") as file:
+                    file.writelines(self._lines[n].rstrip(b"\n") + b"\n" for n in sorted(self._removed))
                 sync_folder(goal.parent)
         if self._removed or self.added:
-            with explained(self.path), whole_file(self.path) as file:
-                file.writelines(line for number, line in self._lines() if number not in self._removed)
-                file.writelines(line + b"\n" for line in self.added)
-
-
-class _Line(NamedTuple):
-    """What the index says of a file."""
-
-    number: int
-    sha256: str
-    n_bytes: int
+            kept = [line for number, line in enumerate(self._lines) if number not in self._removed]
+            write_file(self.path, b"".join([*kept, *(line + b"\n" for line in self.added)]))
 
 
 class _Check:
@@ -260,31 +241,16 @@ class _Check:
             self._check_state()
             self._check_shots(shots, str(record.get("run_id")))
             skipped = _LineFile(self.folder / folders.SKIPPED_FILE)
-            wrong = [number for number, row in skipped.rows() if not is_skip_row(row, record["n_shots"])]
-            skipped.remove(wrong, "a line names no shots of this run, or no reason")
+            for number, row in skipped.rows.items():
+                if not is_skip_row(row, record["n_shots"]):
+                    skipped.remove([number], "a line names no shots of this run, or no reason")
             logs = [results / name for name in names_in(results) if name.endswith(".jsonl")]
-            self._save(skipped)
-            for lines in map(_LineFile, (self.folder / folders.EVENTS_FILE, *logs)):
-                for _ in lines.rows():
-                    pass
+            for lines in (skipped, *map(_LineFile, (self.folder / folders.EVENTS_FILE, *logs))):
                 self._save(lines)
         except OSError as error:
             self._add(f"cannot be read: {str(error.strerror).lower()}", self.folder, _CHECK_PERMISSIONS)
         except RecordingError as error:
             self.report_unreadable(error)
-
-    def check_holders(self) -> None:
-        """Check for notes on lock holders that were left by ended processes of this computer."""
-        with suppress(RecordingError):  # of a folder that cannot be read, which other checks report
-            for name in names_in(self.folder):
-                if not name.endswith(".lock.holder"):
-                    continue
-                try:
-                    process = Process.from_plain(parse_object(read_file(self.folder / name)) or {})
-                except RecordingError:
-                    continue  # the file is just being written or deleted
-                if process is not None and process.is_here and not process.is_running:
-                    self._quarantine("a lock whose holder is gone", self.folder / name)
 
     def check_data_folder(self, stale: list[Marker]) -> None:
         """Check for leftovers in a data folder next to its runs."""
@@ -332,18 +298,16 @@ class _Check:
     def _check_shots(self, folder: Path, run_id: str) -> None:
         """Compare the index with the files of the shots."""
         index = _LineFile(self.folder / folders.INDEX_FILE)
-        of_file, file_of, wrong = dict[str, list[_Line]](), dict[int, str](), list[int]()
-        for number, row in index.rows():
+        of_file: dict[str, list[int]] = {}
+        for number, row in index.rows.items():
             if is_index_row(row) and _is_name(row):
-                of_file.setdefault(row["file"], []).append(_Line(number, row["sha256"], row["bytes"]))
-                if row["counts"]:
-                    file_of[row["shot"]] = row["file"]
+                of_file.setdefault(row["file"], []).append(number)
             else:
-                wrong.append(number)
-        index.remove(wrong, "a line of the index is not a shot's")
-        whole = {file for file, same in of_file.items() if self._check_file(self.folder / file, same, index)}
+                index.remove([number], "a line of the index is not a shot's")
+        whole = {file for file, same in of_file.items() if self._check_file(file, same, index)}
         self.n_whole += len(whole)
-        file_of = {shot: file for shot, file in file_of.items() if file in whole}
+        known = sorted(number for file in whole for number in of_file[file])
+        file_of = {row["shot"]: row["file"] for row in map(index.rows.__getitem__, known) if row["counts"]}
         for name in sorted(names_in(folder), key=lambda name: (len(name), name), reverse=True):
             if SHOT_FILE.fullmatch(file := f"{folder.name}/{name}") and file not in of_file:
                 self._check_stray(folder / name, run_id, file_of, index)
@@ -369,35 +333,32 @@ class _Check:
         index.problems.append(("no line in the index", path, "line added: the file is intact"))
         self.n_whole += 1
 
-    def _check_file(self, path: Path, lines: list[_Line], index: _LineFile) -> bool:
+    def _check_file(self, file: str, numbers: list[int], index: _LineFile) -> bool:
         """Whether the file of a shot exists unchanged; further lines of the index for it are removed."""
+        path = self.folder / file
         try:
-            n_bytes, sha256 = self._size_and_hash(path, {line.n_bytes for line in lines})
+            n_bytes, sha256 = _size_and_hash(path)
         except FileNotFoundError:
-            index.remove([line.number for line in lines])
+            index.remove(numbers)
             remedy = "its line moved to quarantine; if you find the file, put it back and run this again"
             index.problems.append(("the shot's file is missing", path, remedy))
             return False
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return False
-        good = [line.number for line in lines if line.sha256 == sha256]
+        good = [number for number in numbers if index.rows[number]["sha256"] == sha256]
         if not good:
-            what, remedy = _what_changed(n_bytes, lines[-1].n_bytes), f"{_TO_QUARANTINE}, with its line"
+            what = "the checksum does not hold: a byte has changed since it was written"
+            if n_bytes < (expected := index.rows[numbers[-1]]["bytes"]):
+                what = f"the shot's file is cut off: {n_bytes} of {expected} bytes"
+            remedy = f"{_TO_QUARANTINE}, with its line"
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
-                index.remove([line.number for line in lines])
+                index.remove(numbers)
             return False
-        second = [line.number for line in lines if line.number != good[-1]]
-        index.remove(second, f"a second line for {path.name}")
+        for number in numbers:
+            if number != good[-1]:
+                index.remove([number], f"a second line for {path.name}")
         return True
-
-    @staticmethod
-    def _size_and_hash(path: Path, sizes: Collection[int]) -> tuple[int, str]:
-        """Size of a file, and its SHA-256; "" for a huge one that has none of the sizes."""
-        with open_ordinary(path) as file:
-            n_bytes = os.fstat(file.fileno()).st_size
-            is_hashed = n_bytes < _HUGE or n_bytes in sizes
-            return n_bytes, hashlib.file_digest(file, "sha256").hexdigest() if is_hashed else ""
 
     def _row_of_stray(self, path: Path, run_id: str) -> dict[str, Any] | None:
         """The line for a file that has none, if the file is a whole shot of this run."""
@@ -412,8 +373,7 @@ class _Check:
             content = read_content(path)
             for _ in iter_frames(path):  # each must be readable
                 pass
-            n_bytes = path.stat().st_size
-            _, sha256 = self._size_and_hash(path, [n_bytes])
+            n_bytes, sha256 = _size_and_hash(path)
             with damage_reported(path):
                 row = index_row(content.record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
         except OSError as error:
@@ -462,20 +422,10 @@ class _Check:
         return repair is not None
 
 
-_CHECK_PERMISSIONS: Final = "left: check its permissions and the disk"
-
-
-_HUGE: Final = 1 << 30
-_MAX_FINDINGS: Final = 100
-"""Damaged lines of a file that are reported one by one."""
-
-
-def _what_changed(found: int, n_bytes: int) -> str:
-    if not found:
-        return "the shot's file is empty"
-    if found < n_bytes:
-        return f"the shot's file is cut off: {found} of {n_bytes} bytes"
-    return "the checksum does not hold: a byte has changed since it was written"
+def _size_and_hash(path: Path) -> tuple[int, str]:
+    """Size of a file, and its SHA-256."""
+    with open_ordinary(path) as file:
+        return os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _is_name(row: dict[str, Any]) -> bool:

@@ -14,6 +14,7 @@ from labseq.files import whole_file
 from labseq.recording.columns import Column, columns_of
 from labseq.recording.reader import Run
 from labseq.recording.tables import check_installed, dataframe_of, dataset_of, facts_of
+from labseq.text_files import check_output
 
 ENDINGS: Final = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc", "archive": ".h5"}
 """Kind of export -> suffix of its file."""
@@ -41,18 +42,8 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
         )
     if frames and kind != "archive":
         raise ConfigError(Problem(f"a {kind} file holds no frames", "--frames", hint="use --to archive"))
-    if path.suffix.lower() != ENDINGS[kind]:
-        wanted = f"a file that ends in {ENDINGS[kind]}"
-        raise ConfigError(Problem(f"this is not the name of a {kind} file", str(path), expected=wanted))
-    try:
-        has_folder, there = path.parent.is_dir(), [one for one in files_of(kind, path) if one.exists()]
-    except OSError as error:  # for a name that is too long
-        raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", str(path))) from error
-    if not has_folder:
-        raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
-    odd = [one for one in there if not one.is_file()]
-    if odd:
-        raise ConfigError(Problem("this is not an ordinary file", str(odd[0]), hint="choose another name"))
+    check_output(path, f"a {kind} file", ENDINGS[kind])
+    there = [one for one in files_of(kind, path) if one.exists()]
     if there and not replace:
         hint = "choose another name, or replace it with --force"
         raise ConfigError(Problem("this file already exists", str(there[0]), hint=hint))

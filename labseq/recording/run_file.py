@@ -302,7 +302,7 @@ def index_row(
     for timing in shot.timing:
         stage_s[timing.stage] = stage_s.get(timing.stage, 0.0) + timing.duration_s
     return {
-        **{field.name: field.value(shot) for field in schema.SHOT if field.in_index},
+        **{field.name: field.value(shot) for field in schema.IN_INDEX},
         "success": None if math.isnan(shot.filling_fraction) else shot.success,
         "counts": shot.status == "complete",
         "stage_s": stage_s,
@@ -337,7 +337,7 @@ def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[
 
 _NONE: Final = type(None)
 _KINDS: Final = {"int64": int, "bool": (bool, _NONE), "text": str, "float64": (float, int, _NONE)}
-_KINDS_IN_INDEX: Final = tuple((field.name, _KINDS[field.dtype]) for field in schema.SHOT if field.in_index)
+_KINDS_IN_INDEX: Final = tuple((field.name, _KINDS[field.dtype]) for field in schema.IN_INDEX)
 _ALWAYS: Final = ("shot", "attempt", "status", "success", "filling_fraction", "seen_defect_free_cycle")
 _NEEDED_IN_INDEX: Final = (
     *((name, kind) for name, kind in _KINDS_IN_INDEX if name in _ALWAYS),

@@ -23,7 +23,9 @@ a dataset costs 0.1 ms, however many columns it has.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from operator import attrgetter
@@ -73,30 +75,34 @@ class Field:
         name: Name of the attribute, dataset or column in the file.
         dtype: numpy's name of its type, "text" (UTF-8), "json", or "integer" (text beyond 64 bits).
         description: What it is.
-        source: Attribute of the record that it is read from, dotted, if it is not ``name``; or a
-            function of the record.
-        in_index: Whether the value is also in a shot's line of the index, and so a column of the exports.
+        attribute: Attribute of the record that it is read from, dotted.
     """
 
     name: str
     dtype: str
     description: str
-    source: str | Callable[[Any], Any] = ""
-    in_index: bool = True
+    attribute: str
 
     @property
     def units(self) -> str:
         """SI unit, "" for none."""
         return unit_of(self.name)
 
-    @property
-    def attribute(self) -> str:
-        """Name of the record's attribute; "" where a function of the record gives the value."""
-        return (self.source or self.name) if isinstance(self.source, str) else ""
-
     def value(self, record: Any) -> Any:
         """The value in a record."""
-        return self.source(record) if callable(self.source) else _getter(self.attribute)(record)
+        return _getter(self.attribute)(record)
+
+
+def _fields(text: str, **attributes: str) -> tuple[Field, ...]:
+    """Fields from lines of name, type and description; an indented line continues the one before.
+
+    Args:
+        text: The lines.
+        **attributes: Name -> attribute of the record, where that is another.
+    """
+    lines = re.sub(r"\n +", " ", textwrap.dedent(text).strip()).splitlines()
+    found = (line.split(None, 2) for line in lines)
+    return tuple(Field(name, dtype, about, attributes.get(name, name)) for name, dtype, about in found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,41 +114,25 @@ class Table:
         row: Meaning of a row.
         description: Meaning of the table.
         columns: Its columns.
+        arrays: For a table with several rows of a record: record -> column -> array, or number for all rows.
     """
 
     path: str
     row: str
     description: str
     columns: tuple[Field, ...]
+    arrays: Callable[[Any], Mapping[str, Any]] | None = None
 
     def rows(self, records: Iterable[Any]) -> NDArray[Any]:
-        """One row for each record; every column is read from an attribute."""
+        """The rows of all records."""
+        if self.arrays is not None:
+            dtype = [(column.name, column.dtype) for column in self.columns]
+            parts = [_together(dtype, self.arrays(record)) for record in records]
+            return np.concatenate([np.empty(0, dtype), *parts])
         found = list(map(attrgetter(*(column.attribute for column in self.columns)), records))
         values = zip(*found, strict=True) if found else [()] * len(self.columns)
-        arrays = [_column(column, list(of)) for column, of in zip(self.columns, values, strict=True)]
-        return self._table(len(found), arrays)
-
-    def rows_of_arrays(self, records: Sequence[Any], length: Callable[[Any], int]) -> NDArray[Any]:
-        """Several rows for each record; a column is read as an array, or as a number that is repeated.
-
-        Args:
-            length: Number of rows of a record.
-        """
-        ends = np.cumsum([0, *map(length, records)])
-        table = self._table(int(ends[-1]), [np.empty(0, column.dtype) for column in self.columns])
-        for record, start, stop in zip(records, ends, ends[1:], strict=False):
-            rows = table[start:stop]
-            for column in self.columns:
-                rows[column.name] = column.value(record)
-        return table
-
-    def _table(self, n_rows: int, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        kinds = [(column.name, array.dtype) for column, array in zip(self.columns, arrays, strict=True)]
-        table = np.empty(n_rows, kinds)
-        for column, array in zip(self.columns, arrays, strict=True):
-            if len(array):
-                table[column.name] = array
-        return table
+        arrays = {c.name: _column(c, list(of)) for c, of in zip(self.columns, values, strict=True)}
+        return _together([(name, array.dtype) for name, array in arrays.items()], arrays)
 
     def arguments(self, kind: type, table: NDArray[Any]) -> list[dict[str, Any]]:
         """Convert rows that were read to arguments for the constructor of a record.
@@ -156,6 +146,14 @@ class Table:
             if column.attribute in taken and column.name in (table.dtype.names or ())
         }
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _together(dtype: list[tuple[str, Any]], columns: Mapping[str, Any]) -> NDArray[Any]:
+    """Columns, of which numbers are repeated, as one table."""
+    table = np.empty(np.broadcast_shapes(*map(np.shape, columns.values())), dtype)
+    for name, values in columns.items():
+        table[name] = values
+    return table
 
 
 def _column(column: Field, values: list[Any]) -> NDArray[Any]:
@@ -172,83 +170,86 @@ def _plain_values(column: NDArray[Any]) -> list[Any]:
     return [value.decode() for value in column] if column.dtype.kind == "S" else column.tolist()
 
 
-SHOT: Final = (
-    Field("shot", "int64", "index of the shot in the run, from 0", "shot_index"),
-    Field("attempt", "int64", "index of the attempt at the shot, from 0"),
-    Field("status", "text", "complete, interrupted or failed"),
-    Field("error", "text", "why it did not complete, or empty"),
-    Field("t_start_utc", "text", "wall time of its start, ISO 8601, UTC"),
-    Field("t_end_utc", "text", "wall time of its end, ISO 8601, UTC"),
-    Field(
-        "success",
-        "bool",
-        "whether the last image step met the target; false (in the index null) where it is not judged",
-    ),
-    Field("filling_fraction", "float64", "filling of the target on the last image step; nan without one"),
-    Field(
-        "seen_defect_free_cycle", "int64", "index of the first cycle whose image met the target; -1 if none"
-    ),
-    Field("n_images", "int64", "number of images"),
-    Field("n_cycles", "int64", "number of rearrangement cycles"),
-    Field("n_batches", "int64", "batches that were played"),
-    Field("n_atom_moves", "int64", "atom moves that were played"),
-    Field("n_missing_atoms", "int64", "atoms that the loading fell short of the target"),
-    Field("seed", "integer", "seed of the run; text where it does not fit into 64 bits", in_index=False),
+IN_INDEX: Final = _fields(
+    """
+    shot                    int64    index of the shot in the run, from 0
+    attempt                 int64    index of the attempt at the shot, from 0
+    status                  text     complete, interrupted or failed
+    error                   text     why it did not complete, or empty
+    t_start_utc             text     wall time of its start, ISO 8601, UTC
+    t_end_utc               text     wall time of its end, ISO 8601, UTC
+    success                 bool     whether the last image step met the target;
+                                     false (in the index null) where it is not judged
+    filling_fraction        float64  filling of the target on the last image step; nan without one
+    seen_defect_free_cycle  int64    index of the first cycle whose image met the target; -1 if none
+    n_images                int64    number of images
+    n_cycles                int64    number of rearrangement cycles
+    n_batches               int64    batches that were played
+    n_atom_moves            int64    atom moves that were played
+    n_missing_atoms         int64    atoms that the loading fell short of the target
+    """,
+    shot="shot_index",
 )
-"""Attributes of ``/entry``, of a :class:`ShotRecord`."""
+"""Attributes of ``/entry``, of a :class:`ShotRecord`, which are also in a shot's line of the index."""
 
-SHOT_TEXTS: Final = (
-    Field("readings", "json", "values read from devices during the shot, SI: name -> value"),
-    Field("calibrations", "json", "the calibrations in use: kind -> id"),
+SHOT: Final = (
+    *IN_INDEX,
+    *_fields("seed integer seed of the run; text where it does not fit into 64 bits"),
+)
+"""All attributes of ``/entry``."""
+
+SHOT_TEXTS: Final = _fields(
+    """
+    readings      json  values read from devices during the shot, SI: name -> value
+    calibrations  json  the calibrations in use: kind -> id
+    """
 )
 """Texts in ``/entry``, of a :class:`ShotRecord`."""
 
-RUN: Final = (
-    Field("run_id", "text", "the run's folder below the data root: date/counter_name"),
-    Field("simulated", "bool", "whether all hardware was simulated"),
-    Field("record_frames", "text", "which frames are kept: all, last or none"),
-    Field("target", "text", "name of the target pattern", "target.name"),
-    Field("lattice", "text", "lattice of the grid"),
-    Field("grid_spacing_m", "float64", "spacing of the sites, in m"),
-    Field("sequence_sha256", "text", "SHA-256 of the sequence file"),
-    Field("profile_sha256", "text", "SHA-256 of the hardware profile"),
+RUN: Final = _fields(
+    """
+    run_id           text     the run's folder below the data root: date/counter_name
+    simulated        bool     whether all hardware was simulated
+    record_frames    text     which frames are kept: all, last or none
+    target           text     name of the target pattern
+    lattice          text     lattice of the grid
+    grid_spacing_m   float64  spacing of the sites, in m
+    sequence_sha256  text     SHA-256 of the sequence file
+    profile_sha256   text     SHA-256 of the hardware profile
+    """,
+    target="target.name",
 )
 """Attributes of ``/entry/run``, of a :class:`RunRecord`."""
 
-RUN_TEXTS: Final = (
-    Field("sequence", "text", "the sequence file", "sequence_text"),
-    Field("profile", "text", "the hardware profile", "profile_text"),
-    Field("steps", "json", "names of the steps of a shot, in order"),
-    Field("resolved", "json", "every setting after defaults and overrides, SI"),
-    Field(
-        "overrides", "json", "what --set and other options changed: address -> value, SI; unit; as written"
-    ),
-    Field("units", "json", "SI units of what was set and scanned: address -> unit"),
-    Field("plugins", "json", "name, version and origin of each plugin that was used"),
-    Field("devices", "json", "what each device reports about itself, SI: role -> values"),
-    Field("provenance", "json", "where the run comes from: versions, commits, host, user"),
+RUN_TEXTS: Final = _fields(
+    """
+    sequence    text  the sequence file
+    profile     text  the hardware profile
+    steps       json  names of the steps of a shot, in order
+    resolved    json  every setting after defaults and overrides, SI
+    overrides   json  what --set and other options changed: address -> value, SI; unit; as written
+    units       json  SI units of what was set and scanned: address -> unit
+    plugins     json  name, version and origin of each plugin that was used
+    devices     json  what each device reports about itself, SI: role -> values
+    provenance  json  where the run comes from: versions, commits, host, user
+    """,
+    sequence="sequence_text",
+    profile="profile_text",
 )
 """Texts in ``/entry/run``, of a :class:`RunRecord`."""
-
-_STEP: Final = Field("step", "i4", "index of the step in the shot, from 0")
-_CYCLE: Final = Field("cycle", "i4", "index of the rearrangement cycle in its step, from 0")
 
 IMAGES: Final = Table(
     "detection/images",
     "image",
     "all images, whether their frames were kept or not",
-    (
-        _STEP,
-        Field(
-            "cycle",
-            "i4",
-            "index of the rearrangement cycle that it ended, from 0; -1 for that of an image step",
-        ),
-        Field("t_start_s", "f8", "start of the exposure, from the start of the shot"),
-        Field("exposure_s", "f8", "exposure time"),
-        Field(
-            "name", "text", "its name, the same in every shot: that of its step, with the cycle that it ended"
-        ),
+    _fields(
+        """
+        step        i4    index of the step in the shot, from 0
+        cycle       i4    index of the rearrangement cycle that it ended, from 0; -1 for that of an image step
+        t_start_s   f8    start of the exposure, from the start of the shot
+        exposure_s  f8    exposure time
+        name        text  its name, the same in every shot: that of its step, with the cycle that it ended
+        """
     ),
 )
 """Of :class:`ImageRecord`."""
@@ -257,16 +258,15 @@ EXPOSURES: Final = Table(
     "camera/<name>/exposures",
     "frame",
     "when and how each frame was taken",
-    (
-        Field("number", "i4", "place in the camera's series as the camera counted it, from 0"),
-        Field("t_clock_s", "f8", "start of the exposure on the session's clock", "t_start_s"),
-        Field(
-            "t_device_s",
-            "f8",
-            "the camera's own time stamp, from a zero of its own; nan if it gives none",
-            "device_time_s",
-        ),
-        Field("exposure_s", "f8", "exposure time that the camera reports"),
+    _fields(
+        """
+        number      i4  place in the camera's series as the camera counted it, from 0
+        t_clock_s   f8  start of the exposure on the session's clock
+        t_device_s  f8  the camera's own time stamp, from a zero of its own; nan if it gives none
+        exposure_s  f8  exposure time that the camera reports
+        """,
+        t_clock_s="t_start_s",
+        t_device_s="device_time_s",
     ),
 )
 """Of :class:`Frame`."""
@@ -275,105 +275,106 @@ CYCLES: Final = Table(
     "rearrangement/cycles",
     "cycle",
     "the rearrangement cycles: plan, check, move, image",
-    (
-        _STEP,
-        _CYCLE,
-        Field("n_batches", "i4", "batches of the plan", "plan.n_batches"),
-        Field("n_batches_played", "i4", "batches that fitted into the window and were played"),
-        Field("n_atom_moves", "i4", "atom moves of the plan", "plan.n_atom_moves"),
-        Field(
-            "n_defects_predicted",
-            "i4",
-            "empty target sites after the whole plan if no atom is lost",
-            "report.n_defects",
-        ),
-        Field(
-            "n_surplus_predicted",
-            "i4",
-            "atoms after the whole plan on sites that must be empty",
-            "report.n_surplus",
-        ),
-        Field("t_start_s", "f8", "start of the cycle, from the start of the shot"),
-        Field("window_s", "f8", "time that the cycle had from its start to the end of the moves"),
-        Field(
-            "planned_duration_s",
-            "f8",
-            "from the start of the cycle to the end of the plan's last batch",
-            "report.duration_s",
-        ),
-        Field("moves_s", "f8", "modelled duration of what was played, overheads included"),
-        Field("late_s", "f8", "how long after the window the moves ended; 0 if they ended in time"),
+    _fields(
+        """
+        step                 i4  index of the step in the shot, from 0
+        cycle                i4  index of the rearrangement cycle in its step, from 0
+        n_batches            i4  batches of the plan
+        n_batches_played     i4  batches that fitted into the window and were played
+        n_atom_moves         i4  atom moves of the plan
+        n_defects_predicted  i4  empty target sites after the whole plan if no atom is lost
+        n_surplus_predicted  i4  atoms after the whole plan on sites that must be empty
+        t_start_s            f8  start of the cycle, from the start of the shot
+        window_s             f8  time that the cycle had from its start to the end of the moves
+        planned_duration_s   f8  from the start of the cycle to the end of the plan's last batch
+        moves_s              f8  modelled duration of what was played, overheads included
+        late_s               f8  how long after the window the moves ended; 0 if they ended in time
+        """,
+        n_batches="plan.n_batches",
+        n_atom_moves="plan.n_atom_moves",
+        n_defects_predicted="report.n_defects",
+        n_surplus_predicted="report.n_surplus",
+        planned_duration_s="report.duration_s",
     ),
 )
 """Of :class:`CycleRecord`."""
 
 
-def _batch_numbers(cycle: CycleRecord) -> NDArray[np.int_]:
-    return np.arange(cycle.plan.n_batches)
-
-
-def _moves_in_batch(cycle: CycleRecord) -> NDArray[np.int32]:
-    return np.diff(cycle.plan.batch_offsets)
-
-
-def _shapes(cycle: CycleRecord) -> NDArray[np.int32]:
+def _shapes(plan: Plan) -> NDArray[np.int32]:
     """Numbers of knots, row tones and column tones of each batch."""
-    shapes = cycle.plan.path_shapes
-    return shapes if len(shapes) else np.zeros((cycle.plan.n_batches, 3), np.int32)
+    return plan.path_shapes if len(plan.path_shapes) else np.zeros((plan.n_batches, 3), np.int32)
 
 
-def _path_places(cycle: CycleRecord) -> NDArray[np.int_]:
-    """Batch, axis, knot, tone and last knot of each position of a plan's paths, (n_positions, 5)."""
-    found: list[NDArray[Any]] = [np.empty((0, 5), np.int_)]
+def _batches(cycle: CycleRecord) -> dict[str, Any]:
+    plan, batch = cycle.plan, np.arange(cycle.plan.n_batches)
+    return {
+        "step": cycle.step,
+        "cycle": cycle.cycle,
+        "batch": batch,
+        "n_atom_moves": np.diff(plan.batch_offsets),
+        "n_tweezers": cycle.report.n_tweezers,
+        "end_s": cycle.report.batch_end_s,
+        "linked": plan.linked,
+        **dict(zip(_SHAPE, _shapes(plan).T, strict=True)),
+        "played": batch < cycle.n_batches_played,
+    }
+
+
+def _moves(cycle: CycleRecord) -> dict[str, Any]:
+    plan = cycle.plan
+    batch = np.repeat(np.arange(plan.n_batches), np.diff(plan.batch_offsets))
+    return {
+        "step": cycle.step,
+        "cycle": cycle.cycle,
+        "batch": batch,
+        **dict(zip(_SITES, plan.moves.T, strict=True)),
+        "linked": plan.linked[batch],
+        "played": batch < cycle.n_batches_played,
+    }
+
+
+def _paths(cycle: CycleRecord) -> dict[str, Any]:
+    """The positions of a plan's paths, by batch, axis, knot and tone."""
+    places: list[NDArray[Any]] = [np.empty((0, 5), np.int_)]
     off = cycle.plan.path_off
-    for batch, (n_knots, *n_tones) in enumerate(_shapes(cycle).tolist()):
+    for batch, (n_knots, *n_tones) in enumerate(_shapes(cycle.plan).tolist()):
         for axis, n in enumerate(n_tones):
             knot, tone = (index.ravel() for index in np.indices((n_knots, n)))
             ends, off = np.tile(off[:n], n_knots), off[n:]
             of = np.full_like(knot, batch), np.full_like(knot, axis)
-            found.append(np.stack([*of, knot, tone, ends], axis=1))
-    return np.concatenate(found)
+            places.append(np.stack([*of, knot, tone, ends], axis=1))
+    names = ("batch", "axis", "knot", "tone", "off_knot")
+    return {
+        "step": cycle.step,
+        "cycle": cycle.cycle,
+        "position": cycle.plan.path_positions,
+        **dict(zip(names, np.concatenate(places).T, strict=True)),
+    }
 
 
-def _batch_of_move(cycle: CycleRecord) -> NDArray[np.int_]:
-    return np.repeat(_batch_numbers(cycle), _moves_in_batch(cycle))
-
-
-_LINKED: Final = "whether the tweezers of the batch before stay on for this one"
-_PLAYED: Final = "whether it fitted into the window and was played"
+_SHAPE: Final = ("n_knots", "n_row_tones", "n_column_tones")
+_SITES: Final = ("from_row", "from_col", "to_row", "to_col")
 
 BATCHES: Final = Table(
     "rearrangement/batches",
     "batch",
     "the batches of all plans: moves made at the same time",
-    (
-        _STEP,
-        _CYCLE,
-        Field("batch", "i4", "index of the batch in its cycle, from 0", _batch_numbers),
-        Field("n_atom_moves", "i4", "atom moves in it", _moves_in_batch),
-        Field(
-            "n_tweezers",
-            "i4",
-            "mobile tweezers on in it, crossings without an atom included",
-            "report.n_tweezers",
-        ),
-        Field(
-            "end_s",
-            "f8",
-            "when it ends, from the start of the cycle, overheads included",
-            "report.batch_end_s",
-        ),
-        Field("linked", "?", _LINKED, "plan.linked"),
-        Field(
-            "n_knots",
-            "i4",
-            "knots of the tones' paths; 0 for a line batch",
-            lambda cycle: _shapes(cycle)[:, 0],
-        ),
-        Field("n_row_tones", "i4", "row tones with a path", lambda cycle: _shapes(cycle)[:, 1]),
-        Field("n_column_tones", "i4", "column tones with a path", lambda cycle: _shapes(cycle)[:, 2]),
-        Field("played", "?", _PLAYED, lambda cycle: _batch_numbers(cycle) < cycle.n_batches_played),
+    _fields(
+        """
+        step            i4  index of the step in the shot, from 0
+        cycle           i4  index of the rearrangement cycle in its step, from 0
+        batch           i4  index of the batch in its cycle, from 0
+        n_atom_moves    i4  atom moves in it
+        n_tweezers      i4  mobile tweezers on in it, crossings without an atom included
+        end_s           f8  when it ends, from the start of the cycle, overheads included
+        linked          ?   whether the tweezers of the batch before stay on for this one
+        n_knots         i4  knots of the tones' paths; 0 for a line batch
+        n_row_tones     i4  row tones with a path
+        n_column_tones  i4  column tones with a path
+        played          ?   whether it fitted into the window and was played
+        """
     ),
+    _batches,
 )
 """The batches of each :class:`CycleRecord`."""
 
@@ -381,27 +382,20 @@ MOVES: Final = Table(
     "rearrangement/moves",
     "atom move",
     "the atom moves of all plans",
-    (
-        _STEP,
-        _CYCLE,
-        Field("batch", "i4", "index of the batch in its cycle, from 0", _batch_of_move),
-        Field("from_row", "i2", "row that the atom is taken from", lambda cycle: cycle.plan.moves[:, 0]),
-        Field("from_col", "i2", "column that the atom is taken from", lambda cycle: cycle.plan.moves[:, 1]),
-        Field(
-            "to_row",
-            "i2",
-            "row that it is brought to; beyond the grid where it is ejected",
-            lambda cycle: cycle.plan.moves[:, 2],
-        ),
-        Field(
-            "to_col",
-            "i2",
-            "column that it is brought to; beyond the grid where it is ejected",
-            lambda cycle: cycle.plan.moves[:, 3],
-        ),
-        Field("linked", "?", _LINKED, lambda cycle: cycle.plan.linked[_batch_of_move(cycle)]),
-        Field("played", "?", _PLAYED, lambda cycle: _batch_of_move(cycle) < cycle.n_batches_played),
+    _fields(
+        """
+        step      i4  index of the step in the shot, from 0
+        cycle     i4  index of the rearrangement cycle in its step, from 0
+        batch     i4  index of the batch in its cycle, from 0
+        from_row  i2  row that the atom is taken from
+        from_col  i2  column that the atom is taken from
+        to_row    i2  row that it is brought to; beyond the grid where it is ejected
+        to_col    i2  column that it is brought to; beyond the grid where it is ejected
+        linked    ?   whether the tweezers of the batch before stay on for this one
+        played    ?   whether it fitted into the window and was played
+        """
     ),
+    _moves,
 )
 """The moves of each :class:`CycleRecord`."""
 
@@ -409,18 +403,19 @@ PATHS: Final = Table(
     "rearrangement/paths",
     "position",
     "the paths of the tones, where rows and columns move at once; left out if no plan has any",
-    (
-        _STEP,
-        _CYCLE,
-        Field(
-            "batch", "i4", "index of the batch in its cycle, from 0", lambda cycle: _path_places(cycle)[:, 0]
-        ),
-        Field("axis", "i1", "0 for a row tone, 1 for a column tone", lambda cycle: _path_places(cycle)[:, 1]),
-        Field("knot", "i4", "index of the knot, from 0", lambda cycle: _path_places(cycle)[:, 2]),
-        Field("tone", "i4", "index of the tone on its axis, from 0", lambda cycle: _path_places(cycle)[:, 3]),
-        Field("position", "f8", "row or column of the tone at the knot, in sites", "plan.path_positions"),
-        Field("off_knot", "i4", "knot at which the tone goes off", lambda cycle: _path_places(cycle)[:, 4]),
+    _fields(
+        """
+        step      i4  index of the step in the shot, from 0
+        cycle     i4  index of the rearrangement cycle in its step, from 0
+        batch     i4  index of the batch in its cycle, from 0
+        axis      i1  0 for a row tone, 1 for a column tone
+        knot      i4  index of the knot, from 0
+        tone      i4  index of the tone on its axis, from 0
+        position  f8  row or column of the tone at the knot, in sites
+        off_knot  i4  knot at which the tone goes off
+        """
     ),
+    _paths,
 )
 """The paths of the tones of each :class:`CycleRecord`, by batch, axis, knot and tone."""
 
@@ -428,15 +423,17 @@ TIMING: Final = Table(
     "timing",
     "stage",
     "how long each stage took, against its budget",
-    (
-        Field("stage", "text", "name of the stage: load, expose, detect, plan, check, prepare, play, ..."),
-        _STEP,
-        Field("cycle", "i4", "index of the rearrangement cycle, from 0; -1 outside of one"),
-        Field("t_start_s", "f8", "start on the session's clock, from the start of the shot"),
-        Field("duration_s", "f8", "duration on the session's clock; in a dry run the modelled time"),
-        Field("host_s", "f8", "duration on the computer's clock"),
-        Field("budget_s", "f8", "what it may take; nan without a budget"),
-        Field("over_budget", "?", "whether it took longer than its budget"),
+    _fields(
+        """
+        stage        text  name of the stage: load, expose, detect, plan, check, prepare, play, ...
+        step         i4    index of the step in the shot, from 0
+        cycle        i4    index of the rearrangement cycle, from 0; -1 outside of one
+        t_start_s    f8    start on the session's clock, from the start of the shot
+        duration_s   f8    duration on the session's clock; in a dry run the modelled time
+        host_s       f8    duration on the computer's clock
+        budget_s     f8    what it may take; nan without a budget
+        over_budget  ?     whether it took longer than its budget
+        """
     ),
 )
 """Of :class:`StageTiming`."""
@@ -445,20 +442,16 @@ STEPS: Final = Table(
     "steps",
     "step",
     "how long each step should have taken, and how long it took",
-    (
-        _STEP,
-        Field("name", "text", "name of the step"),
-        Field(
-            "timed_by", "text", "what timed it: computer, or hardware: camera, lines, static_tweezers, ..."
-        ),
-        Field("t_start_s", "f8", "start on the session's clock, from the start of the shot"),
-        Field("planned_s", "f8", "planned duration; at most, where the step may end earlier"),
-        Field(
-            "achieved_s",
-            "f8",
-            "duration as the hardware reports it, otherwise of the step on the session's clock",
-        ),
-        Field("host_s", "f8", "duration on the computer's clock with all calls; in a dry run the computing"),
+    _fields(
+        """
+        step        i4    index of the step in the shot, from 0
+        name        text  name of the step
+        timed_by    text  what timed it: computer, or hardware: camera, lines, static_tweezers, ...
+        t_start_s   f8    start on the session's clock, from the start of the shot
+        planned_s   f8    planned duration; at most, where the step may end earlier
+        achieved_s  f8    duration as the hardware reports it, otherwise of the step on the session's clock
+        host_s      f8    duration on the computer's clock with all calls; in a dry run the computing
+        """
     ),
 )
 """Of :class:`StepTiming`."""
@@ -475,7 +468,7 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
     """
     batches, moves = tables["batches"], tables["moves"]
     paths = tables.get("paths", np.empty(0, [("position", "f8"), ("knot", "i4"), ("off_knot", "i4")]))
-    sites = np.stack([moves[name] for name in ("from_row", "from_col", "to_row", "to_col")], axis=1)
+    sites = np.stack([moves[name] for name in _SITES], axis=1)
     found: list[CycleRecord] = []
     for row, known, occupancy in zip(
         tables["cycles"], CYCLES.arguments(CycleRecord, tables["cycles"]), predicted, strict=True
@@ -503,10 +496,9 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
 
 def _shapes_of(batches: NDArray[Any]) -> NDArray[np.int32]:
     """Shapes of the paths of batches that were read; files before version 4.1 have none."""
-    names = ("n_knots", "n_row_tones", "n_column_tones")
-    if names[0] not in (batches.dtype.names or ()):
+    if _SHAPE[0] not in (batches.dtype.names or ()):
         return np.zeros((len(batches), 3), np.int32)
-    return np.stack([batches[name] for name in names], axis=1)
+    return np.stack([batches[name] for name in _SHAPE], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,43 +523,33 @@ class Dataset:
 OF_DETECTOR: Final = "of the detector"
 """Units that the detector gives: counts, log-odds."""
 
+_ARRAYS: Final = """\
+target/fill              uint8    row, col         -    1 where the target must hold an atom
+target/clear             uint8    row, col         -    1 where the target must be empty
+camera/<name>/frames     uint16   frame, y, x      adu  frames as the camera delivered them
+camera/<name>/t_s        float64  frame            s    start of the exposure, from the start of the shot
+camera/<name>/image      int32    frame            -    row of detection/images that the frame belongs to
+detection/occupancy      uint8    image, row, col  -    1 where the detector saw an atom
+detection/confidence     float32  image, row, col  -    the detector's confidence in each site
+detection/sites_px       float64  row, col, yx     px   place of each site on the frames: y, x
+detection/t_s            float64  image            s    start of the exposure, from the start of the shot
+rearrangement/predicted  uint8    cycle, row, col  -    1 where the whole plan leaves an atom if none is lost
+"""
+
 ARRAYS: Final[Mapping[str, Dataset]] = {
-    array.path: array
-    for array in (
-        Dataset("target/fill", "uint8", "row, col", "1 where the target must hold an atom"),
-        Dataset("target/clear", "uint8", "row, col", "1 where the target must be empty"),
-        Dataset(
-            "camera/<name>/frames", "uint16", "frame, y, x", "frames as the camera delivered them", "adu"
-        ),
-        Dataset(
-            "camera/<name>/t_s", "float64", "frame", "start of the exposure, from the start of the shot", "s"
-        ),
-        Dataset("camera/<name>/image", "int32", "frame", "row of detection/images that the frame belongs to"),
-        Dataset("detection/occupancy", "uint8", "image, row, col", "1 where the detector saw an atom"),
-        Dataset(
-            "detection/confidence", "float32", "image, row, col", "the detector's confidence in each site"
-        ),
-        Dataset(
-            "detection/signal",
-            "float64",
-            "image, row, col",
-            "what the detector compared with the threshold; there is an atom where it is larger",
-            OF_DETECTOR,
-        ),
-        Dataset("detection/threshold", "float64", "row, col", "threshold of the signal", OF_DETECTOR),
-        Dataset(
-            "detection/sites_px", "float64", "row, col, yx", "place of each site on the frames: y, x", "px"
-        ),
-        Dataset(
-            "detection/t_s", "float64", "image", "start of the exposure, from the start of the shot", "s"
-        ),
-        Dataset(
-            "rearrangement/predicted",
-            "uint8",
-            "cycle, row, col",
-            "1 where the whole plan leaves an atom if none is lost",
-        ),
-    )
+    path: Dataset(path, dtype, axes, about, units.replace("-", ""))
+    for path, dtype, axes, units, about in (re.split(r"\s{2,}", line) for line in _ARRAYS.splitlines())
+} | {
+    "detection/signal": Dataset(
+        "detection/signal",
+        "float64",
+        "image, row, col",
+        "what the detector compared with the threshold; there is an atom where it is larger",
+        OF_DETECTOR,
+    ),
+    "detection/threshold": Dataset(
+        "detection/threshold", "float64", "row, col", "threshold of the signal", OF_DETECTOR
+    ),
 }
 """Path below ``/entry`` -> the array."""
 

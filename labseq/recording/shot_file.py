@@ -6,7 +6,6 @@ import contextlib
 import io
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, fields, replace
-from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final, cast
@@ -178,14 +177,9 @@ def _write_detection(group: Any, shot: ShotRecord, grid_shape: tuple[int, int]) 
 
 def _write_cycles(group: Any, shot: ShotRecord, grid_shape: tuple[int, int]) -> None:
     cycles = shot.cycles
-    moves = schema.MOVES.rows_of_arrays(cycles, attrgetter("plan.n_atom_moves"))
-    batches = schema.BATCHES.rows_of_arrays(cycles, attrgetter("plan.n_batches"))
-    write_table(group, schema.MOVES, moves)
-    write_table(group, schema.BATCHES, batches)
-    if any(cycle.plan.has_paths for cycle in cycles):
-        paths = schema.PATHS.rows_of_arrays(cycles, lambda cycle: len(cycle.plan.path_positions))
-        write_table(group, schema.PATHS, paths)
-    write_table(group, schema.CYCLES, schema.CYCLES.rows(cycles))
+    paths = [schema.PATHS] if any(cycle.plan.has_paths for cycle in cycles) else []
+    for table in (schema.MOVES, schema.BATCHES, *paths, schema.CYCLES):
+        write_table(group, table, table.rows(cycles))
     predicted = np.array([cycle.report.predicted for cycle in cycles], np.uint8)
     write_array(group, "rearrangement/predicted", predicted.reshape(len(cycles), *grid_shape))
 

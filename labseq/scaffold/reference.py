@@ -1,6 +1,6 @@
 """The reference: every key, plugin, command, role, event and field of a file, as topics.
 
-A topic is a list of blocks, which :func:`markdown` writes for the pages and :func:`plain` for the terminal.
+A topic is a list of blocks: :func:`plain` writes them for the terminal, docs/make_reference.py for the pages.
 The names of topics are words: ``step image``, ``profile grid spacing``, ``command bench planners``.
 """
 
@@ -81,21 +81,6 @@ class Topic:
 
 
 # How topics are written
-
-
-def markdown(blocks: Iterable[Block]) -> str:
-    """Blocks as a part of a page."""
-    return "\n\n".join(map(_markdown, blocks))
-
-
-def _markdown(block: Block) -> str:
-    if isinstance(block, Table):
-        lines = [block.header, ["---"] * len(block.header), *block.rows]
-        cells = [[cell.replace("|", r"\|") for cell in line] for line in lines]
-        return "\n".join(f"| {' | '.join(line)} |" for line in cells)
-    if isinstance(block, Definition):
-        return f"- `{block.term}`\n\n{textwrap.indent(block.text, '  ')}"
-    return block if isinstance(block, str) else f"```{block.language}\n{block.text}\n```"
 
 
 def plain(blocks: Iterable[Block], width: int) -> list[str]:
@@ -187,18 +172,6 @@ def settings(model: type[BaseModel] | None, *, top: bool = False) -> Block:
     return Table(_KEY_HEADER, rows) if rows else _NO_SETTINGS
 
 
-def file_settings(kind: str, *names: str, top: bool = False) -> Block:
-    """The keys of a file, or of the mapping of one of its keys.
-
-    Raises:
-        LookupError: There is no such key, or it has no keys of its own.
-    """
-    found = [StepPolicySettings] if names == ("shot", "policy") else models_at(FILES[kind], names)
-    if len(found) != 1 or (names and found == [FILES[kind]]):
-        raise LookupError(f"'{' '.join((kind, *names))}' has no keys of its own")
-    return settings(found[0], top=top)
-
-
 def _keys_of(
     model: type[BaseModel] | None, *, top: bool = False, prefix: str = ""
 ) -> Iterator[tuple[str, type[BaseModel], FieldInfo]]:
@@ -238,14 +211,6 @@ def entry_blocks(entry: Entry) -> list[Block]:
 def _about_entry(entry: Entry) -> str:
     text = summary(entry.factory, entry.settings_model)
     return text if entry.origin == builtin.__name__ else f"{text} From the plugin `{entry.origin}`.".lstrip()
-
-
-def registered(registry: Registry, kind: str) -> list[Block]:
-    """A section for everything that is registered for a kind of plugin."""
-    blocks: list[Block] = []
-    for entry in (one for one in registry.entries() if one.kind == kind):
-        blocks += [f"### {kind.replace('_', ' ').capitalize()} `{entry.name}`", *entry_blocks(entry)]
-    return blocks or [f"labseq itself brings no {kind}."]
 
 
 def units() -> list[Block]:
@@ -300,17 +265,12 @@ def hooks() -> list[Block]:
     return [definition(hook) for hook in public(hookspecs, inspect.isfunction)]
 
 
-def registry_methods() -> list[Block]:
-    """A definition for each method by which a plugin offers something."""
-    return [definition(getattr(Registry, kind), name=f"registry.{kind}") for kind in KINDS]
-
-
 def errors_by_name() -> dict[str, type[LabseqError]]:
     """Name -> error, each after the one that it is a kind of."""
 
     def walk(error: type[LabseqError]) -> Iterator[type[LabseqError]]:
         yield error
-        for kind in _kinds_of(error):
+        for kind in kinds_of(error):
             yield from walk(kind)
 
     return {error.__name__: error for error in walk(LabseqError)}
@@ -324,25 +284,9 @@ def error(found: type[LabseqError]) -> Definition:
     return Definition(found.__name__, f"{docstring(found)}\n\nExit code {code}.")
 
 
-def error_list() -> list[Block]:
-    """A definition per error, in the order of the tree, and of the problems that they hold."""
-    return [*map(error, errors_by_name().values()), Definition(Problem.__name__, docstring(Problem))]
-
-
-def error_tree() -> list[Block]:
-    """Every error below the one that it is a kind of."""
-    return [Code("text", "\n".join(_branch(LabseqError, "")))]
-
-
-def _kinds_of(found: type[LabseqError]) -> list[type[LabseqError]]:
+def kinds_of(found: type[LabseqError]) -> list[type[LabseqError]]:
+    """The errors that are kinds of an error."""
     return [kind for kind in found.__subclasses__() if kind.__module__ == errors.__name__]
-
-
-def _branch(found: type[LabseqError], indent: str) -> Iterator[str]:
-    others = [b.__name__ for b in found.__bases__ if not issubclass(b, LabseqError) and b is not Exception]
-    yield f"{indent}{found.__name__}" + (f" (also a {', '.join(others)})" if others else "")
-    for kind in _kinds_of(found):
-        yield from _branch(kind, f"{indent}    ")
 
 
 def exit_codes() -> list[Block]:
@@ -395,21 +339,11 @@ def columns() -> list[Block]:
     return blocks
 
 
-def attributes() -> list[Block]:
-    """A row per attribute: those of every dataset first."""
-    from labseq.recording import schema
-
-    rows = [("every dataset", f"`{name}`", "text", about) for name, about in schema.EVERYWHERE.items()]
-    for path, found in schema.attributes().items():
-        rows += [(f"`{path}`", f"`{name}`", kind, about) for name, (kind, about) in found.items()]
-    return [Table(("of", "attribute", "type", "description"), rows)]
-
-
 def index_keys() -> list[Block]:
     """A row per value that a shot's line in the index has of the shot's record."""
     from labseq.recording import schema
 
-    rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.SHOT if field.in_index]
+    rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.IN_INDEX]
     return [Table(("key", "type", "description"), rows)]
 
 

@@ -47,27 +47,11 @@ if TYPE_CHECKING:
         StepContract as StepContract,
     )
 
-_CONTRACTS: Final = (
-    "SUITES",
-    "AnalysisContract",
-    "ContractViolation",
-    "CameraContract",
-    "DetectorContract",
-    "DeviceContract",
-    "LinesContract",
-    "MobileTweezersContract",
-    "PatternContract",
-    "PlannerContract",
-    "ScannerContract",
-    "SimulationContract",
-    "StaticTweezersContract",
-    "StepContract",
-)
 _MODULES: Final = ("fakes", "strategies")
 
 
 def __getattr__(name: str) -> Any:
-    if name not in (*_MODULES, *_CONTRACTS):
+    if name.startswith("__"):
         raise AttributeError(f"module 'labseq.testing' has no attribute '{name}'")
     for package in ("pytest", "hypothesis"):
         if find_spec(package) is None:
@@ -75,8 +59,11 @@ def __getattr__(name: str) -> Any:
             raise ModuleNotFoundError(text, name=package)
     if name in _MODULES:
         return importlib.import_module(f"labseq.testing.{name}")
-    return getattr(importlib.import_module("labseq.testing.contracts"), name)
+    contracts = importlib.import_module("labseq.testing.contracts")
+    if name not in contracts.__all__:
+        raise AttributeError(f"module 'labseq.testing' has no attribute '{name}'")
+    return getattr(contracts, name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_CONTRACTS, *_MODULES})
+    return sorted({*globals(), *_MODULES, *importlib.import_module("labseq.testing.contracts").__all__})

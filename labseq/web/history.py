@@ -254,10 +254,7 @@ class Columns:
                 {
                     "shot": float(shot[first:end].mean()),
                     "n": int(judged.sum()),
-                    "filling": finite(average.value),
-                    "filling_interval": interval_of(average),
-                    "defect_free": finite(rate.value),
-                    "defect_free_interval": interval_of(rate),
+                    **judged_values(average, rate),
                 }
             )
         return bins
@@ -266,6 +263,16 @@ class Columns:
 def rate_of(success: NDArray[np.float64]) -> Rate:
     """The rate of ones among zeros and ones."""
     return Rate(int(success.sum()), len(success))
+
+
+def judged_values(filling: Estimate, rate: Rate) -> dict[str, Any]:
+    """Filling and defect-free fraction with their 68 % intervals, for JSON."""
+    return {
+        "filling": finite(filling.value),
+        "filling_interval": interval_of(filling),
+        "defect_free": finite(rate.value),
+        "defect_free_interval": interval_of(rate),
+    }
 
 
 def finite(value: float) -> float | None:

@@ -22,7 +22,7 @@ from labseq.recording import Run, Shot
 from labseq.recording.folders import EVENTS_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
 from labseq.recording.run_file import RunTime, read_run, read_state, target_of
 from labseq.recording.shot import caching_loader
-from labseq.web.history import RunHistory, finite, interval_of
+from labseq.web.history import RunHistory, finite, judged_values
 
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""
@@ -321,10 +321,7 @@ def _summary(run: OpenRun) -> dict[str, Any]:
         "n_done": run.history.n_shots,
         "status": status,
         "error": text_of(error, 400),
-        "filling": finite(columns.filling.value),
-        "filling_interval": interval_of(columns.filling),
-        "defect_free": finite(rate.value),
-        "defect_free_interval": interval_of(rate),
+        **judged_values(columns.filling, rate),
         "outcome": outcome,
         "has_scan": bool(record.get("scan")),
     }

@@ -27,7 +27,7 @@ from labseq.recording import Shot, open_run
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.points import SCANNER, ScanPoint
 from labseq.recording.run_file import read_state
-from labseq.web.history import Columns, finite, interval_of
+from labseq.web.history import Columns, finite, judged_values
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
 from labseq.web.shots import rows_of, shot_values
 
@@ -223,13 +223,9 @@ def head_of(run: OpenRun, record: Mapping[str, Any], status: str, error: str) ->
 
 def figures_of(columns: Columns) -> dict[str, Any]:
     """The main figures of a run with their 68 % intervals."""
-    filling, rate = columns.filling, columns.defect_free
-    cycles = columns.of_shots("n_cycles")
+    rate, cycles = columns.defect_free, columns.of_shots("n_cycles")
     return {
-        "filling": finite(filling.value),
-        "filling_interval": interval_of(filling),
-        "defect_free": finite(rate.value),
-        "defect_free_interval": interval_of(rate),
+        **judged_values(columns.filling, rate),
         "n_defect_free": rate.n,
         "n_judged": rate.n_trials,
         "n_seen": int((columns.of_shots("seen") >= 0).sum()),
@@ -392,10 +388,8 @@ def _point(point: ScanPoint, place: tuple[int, ...]) -> dict[str, Any]:
         "place": list(place),
         "written": [text_of(word, 60) for word in point.written.values()],
         "n_shots": len(point.shots),
-        "filling": finite(filling.value),
-        "filling_interval": interval_of(filling),
-        "defect_free": finite(rate.value),
-        "defect_free_interval": interval_of(rate) if rate.n_trials else [None, None],
+        **judged_values(filling, rate),
+        **({} if rate.n_trials else {"defect_free_interval": [None, None]}),
     }
 
 

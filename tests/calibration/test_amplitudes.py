@@ -52,10 +52,6 @@ def test_amplitudes_measured_on_frames_make_the_depths_of_moves_equal(tmp_path: 
     assert outcome.refused == ""
     assert np.std(true_depths(lab.profile)) < 0.006
     assert "rows and columns are equal to 0." in outcome.summary_lines[0]
-    again = lab.calibrate("amplitudes", seed=2)  # starts at the amplitudes in use
-    assert again.run.shots[0].readings["equalise.spreads"][0] < 0.01
-    rf = again.run.record["resolved"]["profile"]["mobile_tweezers"]["rf"]
-    assert rf["row_amplitudes"] == outcome.stored.entry.values["row_amplitudes"].tolist()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
 from labseq.registry import KINDS, Registry
 from labseq.scaffold import reference
-from labseq.scaffold.reference import Table, file_settings, settings
+from labseq.scaffold.reference import Table, settings
 from labseq.settings import Choice, PatternChoice
 
 from .scripts import load_script
@@ -158,7 +158,7 @@ def read_as(field: FieldInfo, value: object) -> object:
 
 
 def test_the_reference_says_which_keys_of_a_sequence_may_be_left_out(tmp_path: Path) -> None:
-    for key, row in rows_of(file_settings("sequence", top=True)).items():
+    for key, row in rows_of(SCRIPT.file_settings("sequence", top=True)).items():
         path = written(tmp_path, SEQUENCE, without=key)
         if row[2].startswith("required"):
             with pytest.raises(labseq.ConfigError, match=f"'{key}' is missing"):
@@ -170,7 +170,7 @@ def test_the_reference_says_which_keys_of_a_sequence_may_be_left_out(tmp_path: P
 
 
 def test_the_reference_says_which_keys_of_a_profile_may_be_left_out(tmp_path: Path) -> None:
-    for key, row in rows_of(file_settings("profile", top=True)).items():
+    for key, row in rows_of(SCRIPT.file_settings("profile", top=True)).items():
         path = written(tmp_path, PROFILE, without=key)
         if row[2] == "required":
             with pytest.raises(labseq.ConfigError, match=f"'{key}' is missing"):

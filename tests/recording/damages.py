@@ -153,12 +153,6 @@ def stop_left(run_dir: Path) -> None:
     (run_dir / "STOP").touch()
 
 
-def holder_left(run_dir: Path) -> None:
-    here = json.loads((run_dir / "STATE").read_text())["host"]
-    holder = {"what": "labseq resume", "pid": 2**22 + 1, "host": here, "since_utc": ""}
-    (run_dir / ".lock.holder").write_text(json.dumps(holder))
-
-
 def alien_file(run_dir: Path) -> None:
     (run_dir / "shots" / "shot_000007.h5").write_bytes(b"\x89PNG\r\n")
 
@@ -188,7 +182,7 @@ def edit_index(run_dir: Path, change: Callable[[list[bytes]], list[bytes]]) -> N
 
 MENDED = [
     torn_index, unended_line, doubled_line, two_lines_for_a_file, lost_line, lost_index, part_left,
-    torn_events, no_state, damaged_state, dead_run, damaged_line, line_of_no_shot, stop_left, holder_left,
+    torn_events, no_state, damaged_state, dead_run, damaged_line, line_of_no_shot, stop_left,
     alien_file, alien_hdf5, foreign_skip,
 ]  # fmt: skip
 LOST = [flipped_bit, truncated_file, empty_file, lost_file, shot_of_another_run, misnamed_shot]

@@ -209,14 +209,13 @@ def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> No
             "this file already exists; choose another name, or replace it with --force",
         ),
         ("netcdf", "a.nc", {"frames": True}, "--frames: a netcdf file holds no frames; use --to archive"),
-        ("archive", "folder.h5", {"replace": True}, "this is not an ordinary file"),
+        ("archive", "folder.h5", {"replace": True}, "folder.h5: this is a folder"),
     ],
 )
 def test_what_cannot_be_exported_is_told_before(
     tmp_path: Path, kind: str, name: str, options: dict[str, Any], message: str
 ) -> None:
     (tmp_path / "there.csv").write_text("old")
-    (tmp_path / "units.units.csv").write_text("old")
     (tmp_path / "folder.h5").mkdir()
     with pytest.raises(ConfigError, match=message):
         check_export(kind, tmp_path / name, **options)

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.analysis.replay import is_same
 from labseq.config.plan_file import parse_plan
 from labseq.errors import ConfigError
 from labseq.session.planning import PlanRequest, plan_moves
@@ -123,7 +122,7 @@ def test_atoms_end_where_the_plan_says(folder: Path, profile: str, overrides: tu
     assert max(cycle.report.n_tweezers) == 4
     assert cycle.plan.n_atom_moves > cycle.plan.n_batches
     assert record.images[-1].occupancy.tolist() == cycle.report.predicted.tolist()
-    assert is_same(cycle.plan, shot.plans[0])
+    assert cycle.plan.is_same(shot.plans[0])
     if profile == "bench_awg":
         flights = shot.atom_events["flights"]
         assert set(flights["fate"].tolist()) == {b"kept"}
@@ -135,7 +134,7 @@ def test_what_labseq_plan_writes_is_read_again(folder: Path) -> None:
     request = PlanRequest("random:5x5@0.6", str(folder / "s.yaml"), planner="lanes", seed=1)
     moves = plan_moves(request)
     values: dict[str, Any] = json.loads(json.dumps(moves.as_dict()))
-    assert is_same(parse_plan(json.dumps(values).encode(), "plan.json").plan, moves.plan)
+    assert parse_plan(json.dumps(values).encode(), "plan.json").plan.is_same(moves.plan)
     tones = values["batches"][0]["tones"]
     for words, key, wrong in (
         ("row_off holds knots from 1", "row_off", [9 for _ in tones["row_off"]]),

@@ -267,12 +267,6 @@ def _sites(atoms: Occupancy) -> str:
     return "\n".join("".join(".#"[atom] for atom in row) for row in atoms.tolist())
 
 
-def equal(plan: Plan, other: Plan) -> bool:
-    """Whether two plans are the same, batch for batch."""
-    fields = ("moves", "batch_offsets", "linked", "path_shapes", "path_positions", "path_off")
-    return all(np.array_equal(getattr(plan, name), getattr(other, name)) for name in fields)
-
-
 def same(target: TargetPattern) -> TargetPattern:
     """A copy, for a planner that may write into its input."""
     return TargetPattern(target.fill.copy(), target.clear.copy(), target.name)
@@ -390,7 +384,7 @@ class PlannerContract:
             again["after another input"] = plan_of(planner, same(target), atoms.copy())
             again["from a fresh instance"] = self.planned(factory, same(target), atoms.copy())
             for when, plan in again.items():
-                assert equal(first, plan), f"the plan is another {when}"
+                assert first.is_same(plan), f"the plan is another {when}"
 
     @promise("the input is left untouched", f"{_COPY}, and change only a copy of it: occupancy.copy()")
     def test_leaves_the_input_untouched(self, factory: PlannerFactory) -> None:

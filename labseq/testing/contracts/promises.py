@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import wraps
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final, NoReturn, ParamSpec, TypeVar
 
@@ -83,8 +84,7 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
 
     The sentence is kept as the test's attribute ``promise``. A test that cannot continue because
     another promise is broken is skipped if a test of that promise fails, so that a fault is reported once.
-    So is a test that fails while one of the suite's ``bases`` is broken: the first is a promise that all
-    others need; those after it count if their own test fails with an error of the same line.
+    So is a test that fails while one of the suite's ``bases``, promises that all others need, is broken.
     """
 
     def decorate(test: Callable[P, None]) -> Callable[P, None]:
@@ -98,11 +98,8 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
                     pytest.skip(f"cannot continue: {error}")
                 raise
             except _FAILURES as error:
-                for n, basis in enumerate(getattr(args[0], "bases", ())):
-                    if basis == text:
-                        break
-                    where = _where(error) if n else ()
-                    if _is_reported_elsewhere(basis, *args, *kwargs.values(), where=where):
+                for basis in takewhile(text.__ne__, getattr(args[0], "bases", ())):
+                    if _is_reported_elsewhere(basis, *args, *kwargs.values()):
                         pytest.skip(f"cannot continue: promise: {basis}")
                 raise ContractViolation(text, format_error(error), advice) from _of_the_plugin(error)
 
@@ -112,28 +109,16 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
     return decorate
 
 
-def _where(error: BaseException) -> tuple[object, ...]:
-    """The line that raised an error, if it is one of the plugin's; () else."""
-    cause = _of_the_plugin(error)
-    if cause is None or cause.__traceback__ is None:
-        return (error,)
-    last = traceback.extract_tb(cause.__traceback__)[-1]
-    return type(cause), last.filename, last.lineno
-
-
-def _is_reported_elsewhere(promise: str, *args: Any, where: tuple[object, ...] = ()) -> bool:
-    """Whether a test of that promise fails too, at this line if one is given.
-
-    ``args`` are the suite and its tests' arguments.
-    """
+def _is_reported_elsewhere(promise: str, *args: Any) -> bool:
+    """Whether a test of that promise fails too; ``args`` are the suite and its tests' arguments."""
     suite = args[0]
     tests = (getattr(type(suite), name) for name in dir(suite) if name.startswith("test_"))
     for test in tests:
         if getattr(test, "promise", None) == promise:
             try:
                 test.__wrapped__(*args)
-            except _FAILURES as error:
-                return not where or where == _where(error)
+            except _FAILURES:
+                return True
     return False
 
 

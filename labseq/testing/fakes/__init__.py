@@ -15,7 +15,6 @@ from labseq.testing.fakes.devices import (
 )
 from labseq.testing.fakes.lab import (
     FakeLab,
-    FixedDetector,
     ListSink,
     RecordingObserver,
     RecordingSimulation,
@@ -33,7 +32,6 @@ __all__ = [
     "FakeClock",
     "FakeLab",
     "FakeShot",
-    "FixedDetector",
     "Hang",
     "ListSink",
     "OneByOnePlanner",

@@ -75,13 +75,6 @@ class ScriptedDetector:
         return occupancy.copy(), np.ones(occupancy.shape, np.float32)
 
 
-class FixedDetector(ScriptedDetector):
-    """Returns the same occupancy for every frame."""
-
-    def __init__(self, occupancy: ArrayLike, frame_shape: tuple[int, int] | None = None) -> None:
-        super().__init__([occupancy], frame_shape)
-
-
 class ScriptedPlanner:
     """Returns the given plans, one after another; the last one is repeated.
 
