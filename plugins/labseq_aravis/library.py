@@ -107,18 +107,12 @@ SIGNATURES: Final[dict[str, str]] = {
     # GLib and GObject
     "g_clear_error": "v p",
     "g_free": "v p",
-    "g_object_set_property": "v psp",
+    "g_object_set": "v ps",  # and a value of the property's type, and None
     "g_object_unref": "v p",
     "g_quark_to_string": "s u",
     "g_random_set_seed": "v u",
     "g_signal_connect_data": "g pspppi",
     "g_signal_handler_disconnect": "v pg",
-    "g_value_init": "p pz",
-    "g_value_set_double": "v pd",
-    "g_value_set_enum": "v pi",
-    "g_value_set_int": "v pi",
-    "g_value_set_uint": "v pu",
-    "g_value_unset": "v p",
     # discovery
     "arv_device_error_quark": "u ",
     "arv_gc_error_quark": "u ",
@@ -198,8 +192,6 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_buffer_get_status": "i p",
     "arv_buffer_get_timestamp": "L p",
     "arv_buffer_new_allocate": "p z",
-    "arv_gv_stream_packet_resend_get_type": "z ",
-    "arv_gv_stream_socket_buffer_get_type": "z ",
     "arv_stream_push_buffer": "v pp",
     "arv_stream_timeout_pop_buffer": "p pL",
     # the simulated camera
@@ -240,17 +232,6 @@ class GError(ctypes.Structure):
     """GLib's error."""
 
     _fields_ = (("domain", ctypes.c_uint32), ("code", ctypes.c_int), ("message", ctypes.c_char_p))
-
-
-class GValue(ctypes.Structure):
-    """GLib's container for a value of any type."""
-
-    _fields_ = (("type", ctypes.c_size_t), ("data", ctypes.c_uint64 * 2))
-
-
-G_TYPE_INT: Final = 6 << 2
-G_TYPE_UINT: Final = 7 << 2
-G_TYPE_DOUBLE: Final = 15 << 2
 
 
 class Library:
@@ -297,20 +278,9 @@ class Library:
         finally:
             self.g_free(array)
 
-    def set_property(self, instance: int, name: str, value: float, type_: int) -> None:
-        """Set a property of an object; a type other than the constants above is that of an enumeration."""
-        box = GValue()
-        self.g_value_init(ctypes.byref(box), type_)
-        if type_ == G_TYPE_DOUBLE:
-            self.g_value_set_double(ctypes.byref(box), value)
-        elif type_ == G_TYPE_INT:
-            self.g_value_set_int(ctypes.byref(box), int(value))
-        elif type_ == G_TYPE_UINT:
-            self.g_value_set_uint(ctypes.byref(box), int(value))
-        else:
-            self.g_value_set_enum(ctypes.byref(box), int(value))
-        self.g_object_set_property(instance, name.encode(), ctypes.byref(box))
-        self.g_value_unset(ctypes.byref(box))
+    def set_property(self, instance: int, name: str, value: Any) -> None:
+        """Set a property of an object to a value of a C type."""
+        self.g_object_set(instance, name.encode(), value, None)
 
     def _name_of(self, domain: int, code: int) -> str:
         domains = {
