@@ -54,6 +54,8 @@ TOO_FAST: Final = 0.95
 class TtlLines(Lines):
     """A timing box with labseq's firmware.
 
+    Calls raise ``DeviceError`` if the box is not open, does not answer, was reset, or plays a program.
+
     Attributes:
         access: How the driver gets to the box.
     """
@@ -81,11 +83,7 @@ class TtlLines(Lines):
         return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MAX_EDGES, LATENCY_S)
 
     def warm(self) -> None:
-        """Do what takes long before the first shot.
-
-        Raises:
-            DeviceError: It failed.
-        """
+        """Do what takes long before the first shot."""
         self.access.warm()
 
     def open(self) -> None:
@@ -105,11 +103,7 @@ class TtlLines(Lines):
         self.access.lines_set(off_program(self._specs))
 
     def idle(self) -> None:
-        """Turn on the lines that are on between steps.
-
-        Raises:
-            DeviceError: The box is not open, or does not confirm it.
-        """
+        """Turn on the lines that are on between steps."""
         idle = idle_program(self._specs)
         self._opened().set_lines(mask_of(idle.on[-1].tolist(), self._specs))
         self.access.lines_set(idle)
@@ -173,11 +167,7 @@ class TtlLines(Lines):
         self._compiled, self._is_armed = (program, slot, len(edges)), False
 
     def arm(self) -> None:
-        """Prepare the program that was compiled last.
-
-        Raises:
-            DeviceError: Not open, nothing was compiled, a program runs, or the box was reset.
-        """
+        """Prepare the program that was compiled last."""
         box = self._opened()
         self._refuse_while_running("armed")
         if self._compiled is None:
@@ -189,11 +179,7 @@ class TtlLines(Lines):
         self._is_armed = True
 
     def fire(self) -> None:
-        """Start the program, or let the start input start it; returns at once.
-
-        Raises:
-            DeviceError: Not armed, or a program runs.
-        """
+        """Start the program, or let the start input start it; returns at once."""
         box = self._opened()
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
@@ -209,7 +195,6 @@ class TtlLines(Lines):
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
-            DeviceError: The box was reset or stopped, or the line is broken.
         """
         box = self._opened()
         max_wait_s = self.access.wait_until(self._end_s, timeout_s)
@@ -217,11 +202,7 @@ class TtlLines(Lines):
             self._wait_for_box(box, max_wait_s)
 
     def self_test(self) -> None:
-        """Write a program, read it back, and play one that changes no line.
-
-        Raises:
-            DeviceError: Not open, a program runs, or the box does something else.
-        """
+        """Write a program, read it back, and play one that changes no line."""
         box, slot = self._opened(), self._free_slot()
         self._refuse_while_running("tested")
         self._compiled, self._is_armed = None, False
