@@ -21,8 +21,8 @@ class AravisError(Exception):
     """The library or a camera refused something.
 
     Attributes:
-        code: Kind of error, with the library's name for it: "timeout", "not found", "not controller",
-            "out of range", ...; empty if it is not one of the library's.
+        code: Kind of error: "timeout", "not found", "not controller", ... of :data:`ERRORS`, else the
+            library's domain and number; empty if it is not one of the library's.
     """
 
     def __init__(self, message: str, code: str = "") -> None:
@@ -45,47 +45,22 @@ class PixelFormatError(AravisError):
         super().__init__(f"{text} or Mono16, unpacked; set PixelFormat", "pixel format")
 
 
-DEVICE_ERRORS: Final = (
-    "wrong feature",
-    "feature not found",
-    "not connected",
-    "protocol error",
-    "transfer error",
-    "timeout",
-    "not found",
-    "invalid parameter",
-    "no description",
-    "no stream channel",
-    "not controller",
-    "unknown",
-    "not implemented",
-    "invalid parameter",
-    "invalid address",
-    "write protected",
-    "bad alignment",
-    "access denied",
-    "busy",
-)
-"""Names of the codes in the library's error domain of devices (``ArvDeviceError``), from 0."""
+ERRORS: Final[dict[str, dict[int, str]]] = {
+    "arv_device_error_quark": {
+        1: "feature not found",
+        2: "not connected",
+        5: "timeout",
+        6: "not found",
+        10: "not controller",
+        17: "access denied",
+        18: "busy",
+    },
+    "arv_gc_error_quark": {4: "out of range", 7: "feature not found"},
+}
+"""Names of the errors that callers tell apart: by the function for their domain, and their code in it.
 
-DESCRIPTION_ERRORS: Final = (
-    "property not defined",
-    "value not defined",
-    "invalid value",
-    "empty enumeration",
-    "out of range",
-    "no device",
-    "not implemented",
-    "feature not found",
-    "not offered",
-    "invalid length",
-    "read only",
-    "no text to set",
-    "no text to get",
-    "invalid bits",
-    "invalid syntax",
-)
-"""Names of the codes in its error domain of a camera's description (``ArvGcError``), from 0."""
+The codes are those of the enumerations ``ArvDeviceError`` and ``ArvGcError``.
+"""
 
 TYPES: Final[dict[str, Any]] = {
     "v": None,
@@ -283,12 +258,10 @@ class Library:
         self.g_object_set(instance, name.encode(), value, None)
 
     def _name_of(self, domain: int, code: int) -> str:
-        domains = {
-            self.arv_device_error_quark(): DEVICE_ERRORS,
-            self.arv_gc_error_quark(): DESCRIPTION_ERRORS,
-        }
-        names = domains.get(domain, ())
-        return names[code] if 0 <= code < len(names) else f"{text(self.g_quark_to_string(domain))} {code}"
+        for quark, names in ERRORS.items():
+            if domain == getattr(self, quark)() and code in names:
+                return names[code]
+        return f"{text(self.g_quark_to_string(domain))} {code}"
 
     def _declared(self, name: str) -> Callable[..., Any]:
         if name not in SIGNATURES:
