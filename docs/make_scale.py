@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from labseq_grid.planner import GridPlanner, GridSettings
 from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_scans.planners import Mta1Planner, Mta1Settings, TetrisPlanner, TetrisSettings
+from labseq_scans.planners import LineSettings, Mta1Planner, TetrisPlanner
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.geometry import pattern
@@ -55,8 +55,8 @@ CHUNK: Final = 1 << 18
 PLANNERS: Final[dict[str, tuple[Any, Any]]] = {
     "psca": (PscaPlanner, PscaSettings),
     "grid": (GridPlanner, GridSettings),
-    "tetris": (TetrisPlanner, TetrisSettings),
-    "mta1": (Mta1Planner, Mta1Settings),
+    "tetris": (TetrisPlanner, LineSettings),
+    "mta1": (Mta1Planner, LineSettings),
 }
 
 

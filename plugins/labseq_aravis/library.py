@@ -21,8 +21,8 @@ class AravisError(Exception):
     """The library or a camera refused something.
 
     Attributes:
-        code: Kind of error, with the library's name for it: "timeout", "not found", "not controller",
-            "out of range", ...; empty if it is not one of the library's.
+        code: Kind of error: "timeout", "not found", "not controller", ... of :data:`ERRORS`, else the
+            library's domain and number; empty if it is not one of the library's.
     """
 
     def __init__(self, message: str, code: str = "") -> None:
@@ -45,47 +45,22 @@ class PixelFormatError(AravisError):
         super().__init__(f"{text} or Mono16, unpacked; set PixelFormat", "pixel format")
 
 
-DEVICE_ERRORS: Final = (
-    "wrong feature",
-    "feature not found",
-    "not connected",
-    "protocol error",
-    "transfer error",
-    "timeout",
-    "not found",
-    "invalid parameter",
-    "no description",
-    "no stream channel",
-    "not controller",
-    "unknown",
-    "not implemented",
-    "invalid parameter",
-    "invalid address",
-    "write protected",
-    "bad alignment",
-    "access denied",
-    "busy",
-)
-"""Names of the codes in the library's error domain of devices (``ArvDeviceError``), from 0."""
+ERRORS: Final[dict[str, dict[int, str]]] = {
+    "arv_device_error_quark": {
+        1: "feature not found",
+        2: "not connected",
+        5: "timeout",
+        6: "not found",
+        10: "not controller",
+        17: "access denied",
+        18: "busy",
+    },
+    "arv_gc_error_quark": {4: "out of range", 7: "feature not found"},
+}
+"""Names of the errors that callers tell apart: by the function for their domain, and their code in it.
 
-DESCRIPTION_ERRORS: Final = (
-    "property not defined",
-    "value not defined",
-    "invalid value",
-    "empty enumeration",
-    "out of range",
-    "no device",
-    "not implemented",
-    "feature not found",
-    "not offered",
-    "invalid length",
-    "read only",
-    "no text to set",
-    "no text to get",
-    "invalid bits",
-    "invalid syntax",
-)
-"""Names of the codes in its error domain of a camera's description (``ArvGcError``), from 0."""
+The codes are those of the enumerations ``ArvDeviceError`` and ``ArvGcError``.
+"""
 
 TYPES: Final[dict[str, Any]] = {
     "v": None,
@@ -107,18 +82,12 @@ SIGNATURES: Final[dict[str, str]] = {
     # GLib and GObject
     "g_clear_error": "v p",
     "g_free": "v p",
-    "g_object_set_property": "v psp",
+    "g_object_set": "v ps",  # and a value of the property's type, and None
     "g_object_unref": "v p",
     "g_quark_to_string": "s u",
     "g_random_set_seed": "v u",
     "g_signal_connect_data": "g pspppi",
     "g_signal_handler_disconnect": "v pg",
-    "g_value_init": "p pz",
-    "g_value_set_double": "v pd",
-    "g_value_set_enum": "v pi",
-    "g_value_set_int": "v pi",
-    "g_value_set_uint": "v pu",
-    "g_value_unset": "v p",
     # discovery
     "arv_device_error_quark": "u ",
     "arv_gc_error_quark": "u ",
@@ -198,8 +167,6 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_buffer_get_status": "i p",
     "arv_buffer_get_timestamp": "L p",
     "arv_buffer_new_allocate": "p z",
-    "arv_gv_stream_packet_resend_get_type": "z ",
-    "arv_gv_stream_socket_buffer_get_type": "z ",
     "arv_stream_push_buffer": "v pp",
     "arv_stream_timeout_pop_buffer": "p pL",
     # the simulated camera
@@ -240,17 +207,6 @@ class GError(ctypes.Structure):
     """GLib's error."""
 
     _fields_ = (("domain", ctypes.c_uint32), ("code", ctypes.c_int), ("message", ctypes.c_char_p))
-
-
-class GValue(ctypes.Structure):
-    """GLib's container for a value of any type."""
-
-    _fields_ = (("type", ctypes.c_size_t), ("data", ctypes.c_uint64 * 2))
-
-
-G_TYPE_INT: Final = 6 << 2
-G_TYPE_UINT: Final = 7 << 2
-G_TYPE_DOUBLE: Final = 15 << 2
 
 
 class Library:
@@ -297,28 +253,15 @@ class Library:
         finally:
             self.g_free(array)
 
-    def set_property(self, instance: int, name: str, value: float, type_: int) -> None:
-        """Set a property of an object; a type other than the constants above is that of an enumeration."""
-        box = GValue()
-        self.g_value_init(ctypes.byref(box), type_)
-        if type_ == G_TYPE_DOUBLE:
-            self.g_value_set_double(ctypes.byref(box), value)
-        elif type_ == G_TYPE_INT:
-            self.g_value_set_int(ctypes.byref(box), int(value))
-        elif type_ == G_TYPE_UINT:
-            self.g_value_set_uint(ctypes.byref(box), int(value))
-        else:
-            self.g_value_set_enum(ctypes.byref(box), int(value))
-        self.g_object_set_property(instance, name.encode(), ctypes.byref(box))
-        self.g_value_unset(ctypes.byref(box))
+    def set_property(self, instance: int, name: str, value: Any) -> None:
+        """Set a property of an object to a value of a C type."""
+        self.g_object_set(instance, name.encode(), value, None)
 
     def _name_of(self, domain: int, code: int) -> str:
-        domains = {
-            self.arv_device_error_quark(): DEVICE_ERRORS,
-            self.arv_gc_error_quark(): DESCRIPTION_ERRORS,
-        }
-        names = domains.get(domain, ())
-        return names[code] if 0 <= code < len(names) else f"{text(self.g_quark_to_string(domain))} {code}"
+        for quark, names in ERRORS.items():
+            if domain == getattr(self, quark)() and code in names:
+                return names[code]
+        return f"{text(self.g_quark_to_string(domain))} {code}"
 
     def _declared(self, name: str) -> Callable[..., Any]:
         if name not in SIGNATURES:

@@ -6,7 +6,7 @@ import ctypes
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from labseq_aravis.library import G_TYPE_INT, G_TYPE_UINT, AravisError, Library, PixelFormatError
+from labseq_aravis.library import AravisError, Library, PixelFormatError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,9 +20,6 @@ MONO: Final = {
     "Mono16": 0x01100007,
 }
 """Codes of the supported formats, by name, after the Pixel Format Naming Convention of GenICam."""
-
-NAMES: Final = {code: name for name, code in MONO.items()}
-"""Names of those formats, by code."""
 
 
 def unpacked(
@@ -46,7 +43,7 @@ def unpacked(
     """
     import numpy as np  # the process of a simulated camera starts faster without it
 
-    if pixel_format not in NAMES:
+    if pixel_format not in MONO.values():
         raise PixelFormatError(pixel_format)
     height, width = shape
     dtype = np.dtype(np.uint8 if pixel_format == MONO["Mono8"] else "<u2")
@@ -101,14 +98,12 @@ class Buffer:
         status: "success", or the reason why there is no image: one of :data:`STATUS_NAMES`, or "unknown".
         frame_id: Number given by the camera; GigE cameras count 1 to 65535 and again from 1.
         camera_time_ns: Start of its transfer or exposure on the camera's clock, in nanoseconds.
-        pixel_format: Name of its pixel format; "" if there is no image.
         image: uint16 (height, width), a copy; None unless the status is "success".
     """
 
     status: str
     frame_id: int
     camera_time_ns: int
-    pixel_format: str
     image: NDArray[np.uint16] | None
 
 
@@ -126,16 +121,15 @@ class Stream:
         """Set the options, for frames of ``payload`` bytes."""
         if not self._is_ethernet:
             return
-        lib = self._library
-        self._set("packet-resend", int(options.resend), lib.arv_gv_stream_packet_resend_get_type())
+        self._set("packet-resend", ctypes.c_int(options.resend))
         for name, time_s in (
             ("packet-timeout", options.packet_timeout_s),
             ("frame-retention", options.frame_retention_s),
         ):
             if time_s is not None:
-                self._set(name, round(time_s * 1e6), G_TYPE_UINT)
-        self._set("socket-buffer", 0, lib.arv_gv_stream_socket_buffer_get_type())  # fixed
-        self._set("socket-buffer-size", max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER), G_TYPE_INT)
+                self._set(name, ctypes.c_uint(round(time_s * 1e6)))
+        self._set("socket-buffer", ctypes.c_int(0))  # fixed
+        self._set("socket-buffer-size", ctypes.c_int(max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER)))
 
     def allocate(self, n_buffers: int, payload: int) -> None:
         """Add buffers of ``payload`` bytes each."""
@@ -173,10 +167,10 @@ class Stream:
             status,
             lib.arv_buffer_get_frame_id(buffer),
             lib.arv_buffer_get_timestamp(buffer),
-            *(self._image(buffer) if status == "success" else ("", None)),
+            self._image(buffer) if status == "success" else None,
         )
 
-    def _image(self, buffer: int) -> tuple[str, NDArray[np.uint16]]:
+    def _image(self, buffer: int) -> NDArray[np.uint16]:
         lib = self._library
         n_bytes, x_padding, y_padding = ctypes.c_size_t(), ctypes.c_int(), ctypes.c_int()
         address = lib.arv_buffer_get_image_data(buffer, ctypes.byref(n_bytes))
@@ -185,11 +179,10 @@ class Stream:
         lib.arv_buffer_get_image_padding(buffer, ctypes.byref(x_padding), ctypes.byref(y_padding))
         shape = lib.arv_buffer_get_image_height(buffer), lib.arv_buffer_get_image_width(buffer)
         pixel_format = lib.arv_buffer_get_image_pixel_format(buffer)
-        image = unpacked(address, n_bytes.value, pixel_format, shape, x_padding.value)
-        return NAMES[pixel_format], image
+        return unpacked(address, n_bytes.value, pixel_format, shape, x_padding.value)
 
-    def _set(self, name: str, value: int, type_: Any) -> None:
-        self._library.set_property(self._open_handle(), name, value, type_)
+    def _set(self, name: str, value: Any) -> None:
+        self._library.set_property(self._open_handle(), name, value)
 
     def _open_handle(self) -> int:
         if self._handle is None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
 from labseq_aravis import Buffer, Camera, Stream, StreamOptions
 
-from labseq.plugin import DeviceError, ExposureResult, LimitError, Series, format_quantity
+from labseq.plugin import DeviceError, ExposureResult, LimitError, Series, Trigger, format_quantity
 from labseq_genicam.connection import Link
 from labseq_genicam.settings import GenicamSettings
 
@@ -21,10 +21,6 @@ FAULTS: Final[Mapping[str, str]] = {"success": "", "missing packets": INCOMPLETE
 
 RATE: Final = "AcquisitionFrameRate"
 ROUNDING: Final = 1e-6
-
-Start: TypeAlias = Literal["software", "line", "free", "series", "width"]
-"""What starts the exposures: a software trigger, an edge at an input, or the camera at its frame rate; an
-edge that starts a series at the frame rate; a pulse as long as the exposure."""
 
 BURST: Final = "FrameBurstStart"
 SERIES: Final = ("AcquisitionStart", BURST)
@@ -49,52 +45,52 @@ class Acquisition:
         self._settings = settings
         self._options = StreamOptions(settings.packet_timeout, settings.frame_timeout)
         self._stream: Stream | None = None
-        self._start: Start | None = None
+        self._trigger: Trigger | None = None  # while it acquires
         self._counter = FrameCounter()
         self._n_buffers = self._n_triggered = self._first = self._n_frames = 0
         self._exposure_s = math.nan
 
-    def prepare(self, series: Series, start: Start) -> float:
+    def prepare(self, series: Series, trigger: Trigger) -> float:
         """Get ready for a series; nothing is exposed yet.
 
         Args:
             series: The series.
-            start: What starts its exposures.
+            trigger: What starts its exposures; a simulated camera may be triggered in another way.
 
         Returns:
             Time from one exposure to the next where the camera times them, in seconds; else nan.
         """
-        continues = start == self._start == "software" and self._has_all_frames()
+        continues = trigger == self._trigger == "software" and self._has_all_frames()
         if not continues:
             self.stop()
         period_s = math.nan
         with self._link.doing("prepare the series") as camera:
             if not continues:
-                self._set_trigger(camera, start)
-            if start == "width":
+                self._set_trigger(camera, trigger)
+            if trigger == "bulb":
                 self._exposure_s = series.exposure_s
             else:
                 self._set_exposure(camera, series.exposure_s)
             if series.trigger in ("internal", "external_start"):
-                period_s = self._set_period(camera, series, start)
-            if start == "series":
+                period_s = self._set_period(camera, series, trigger)
+            if trigger == "external_start":
                 self._set_series_trigger(camera, series.n_frames)
             self._provide(camera, series.n_frames)
         self._first, self._n_frames = self._n_triggered, series.n_frames
         return period_s
 
-    def begin(self, start: Start) -> None:
+    def begin(self, trigger: Trigger) -> None:
         """Start the prepared series, unless the camera is already waiting for triggers."""
-        if self._start is None:
+        if self._trigger is None:
             with self._link.doing("start the series") as camera:
-                is_counted = start == "series" and series_trigger(camera) != BURST
+                is_counted = trigger == "external_start" and series_trigger(camera) != BURST
                 camera.start(self._n_frames if is_counted else None)
-            self._start = start
+            self._trigger = trigger
 
     @property
     def is_running(self) -> bool:
         """Whether the camera is already waiting for triggers, or exposes."""
-        return self._start is not None
+        return self._trigger is not None
 
     def fire(self) -> None:
         """Start an exposure."""
@@ -110,7 +106,7 @@ class Acquisition:
         number = self._counter.number(buffer.frame_id if buffer.image is not None else None) - self._first
         if number < 0:  # of an earlier series
             return None
-        if self._start in ("free", "series") and number >= self._n_frames - 1:
+        if self._trigger in ("internal", "external_start") and number >= self._n_frames - 1:
             self.stop()
         time_s = 1e-9 * buffer.camera_time_ns if buffer.camera_time_ns else math.nan
         fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
@@ -118,11 +114,11 @@ class Acquisition:
 
     def stop(self) -> None:
         """End the acquisition; frames that were not read are dropped, including those being transferred."""
-        stream, start = self._stream, self._start
-        self._stream = self._start = None
+        stream, trigger = self._stream, self._trigger
+        self._stream = self._trigger = None
         if self._link.is_gone:
             return  # the link closes the stream
-        if start is not None:
+        if trigger is not None:
             with self._link.doing("stop the series") as camera:
                 camera.stop()
         if stream is not None:
@@ -149,16 +145,16 @@ class Acquisition:
         camera.set_exposure_s(exposure_s)
         self._exposure_s = camera.exposure_s
 
-    def _set_trigger(self, camera: Camera, start: Start) -> None:
+    def _set_trigger(self, camera: Camera, trigger: Trigger) -> None:
         if camera.is_available("ExposureMode"):
-            camera.set_string("ExposureMode", WIDTH if start == "width" else "Timed")
-        if start in ("free", "series"):
+            camera.set_string("ExposureMode", WIDTH if trigger == "bulb" else "Timed")
+        if trigger in ("internal", "external_start"):
             camera.set_trigger(None)
             return
-        source = "Software" if start == "software" else self._settings.trigger_line
+        source = "Software" if trigger == "software" else self._settings.trigger_line
         self._check_source(camera, source)
         camera.set_trigger(source)
-        if start != "software" and self._settings.trigger_edge == "falling":
+        if trigger != "software" and self._settings.trigger_edge == "falling":
             camera.set_string("TriggerActivation", "FallingEdge")
 
     def _check_source(self, camera: Camera, source: str) -> None:
@@ -177,7 +173,7 @@ class Acquisition:
         if trigger == BURST:
             camera.set_integer(BURST_COUNT, n_frames)
 
-    def _set_period(self, camera: Camera, series: Series, start: Start) -> float:
+    def _set_period(self, camera: Camera, series: Series, trigger: Trigger) -> float:
         """Set the rate at which a camera exposes by itself; returns its period."""
         exposure_s, setting, wanted_hz = series.exposure_s, "frame_rate", self._settings.frame_rate
         if series.trigger == "external_start":
@@ -194,7 +190,7 @@ class Acquisition:
         if not low_hz <= rate_hz <= high_hz * (1.0 + ROUNDING):
             limit = f"{low_hz:g} to {high_hz:g} per second at this exposure"
             raise LimitError(f"{self._link.name}: frame rate", f"{rate_hz:g}", limit)
-        if start == "software":  # of the simulated camera
+        if trigger == "software":  # of the simulated camera
             return 1.0 / rate_hz
         camera.set_frame_rate_hz(rate_hz)
         return 1.0 / camera.frame_rate_hz

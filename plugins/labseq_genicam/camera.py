@@ -89,10 +89,10 @@ class GenicamCamera(CameraDriver):
             self._connection.close()
 
     def _start(self, series: Series) -> None:
-        acquisition, start = self._opened(), self._connection.start_of(series)
-        period_s = acquisition.prepare(series, start)
+        acquisition, trigger = self._opened(), self._connection.trigger_of(series)
+        period_s = acquisition.prepare(series, trigger)
         self._connection.arm(series, period_s, acquisition)
-        acquisition.begin(start)
+        acquisition.begin(trigger)
 
     def _fire(self) -> None:
         self._connection.fire(self._opened())

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 
 from labseq_aravis import AravisError, Camera, LibraryMissingError, load_library
 
-from labseq.plugin import Context, DeviceError, ExposureResult, Series
+from labseq.plugin import Context, DeviceError, ExposureResult, Series, Trigger
 from labseq_genicam.settings import SIMULATED, GenicamSettings
 
 if TYPE_CHECKING:
-    from labseq_genicam.acquisition import Acquisition, Start
+    from labseq_genicam.acquisition import Acquisition
 
 GONE: Final = frozenset({"timeout", "not connected"})
 """Codes of errors which mean that a camera no longer answers."""
@@ -27,15 +27,6 @@ HINTS: Final = {
     "`camera: simulated`",
 }
 """What to do, by the code of an error."""
-
-STARTS: Final[dict[str, Start]] = {
-    "software": "software",
-    "internal": "free",
-    "external": "line",
-    "external_start": "series",
-    "bulb": "width",
-}
-"""What starts the exposures of a camera, by trigger."""
 
 
 def simulated_settings() -> dict[str, str | None] | str:
@@ -73,9 +64,9 @@ class CameraConnection:
     def close(self) -> None:
         """Release what ``open`` took; legal in any state."""
 
-    def start_of(self, series: Series) -> Start:
+    def trigger_of(self, series: Series) -> Trigger:
         """What starts the camera's exposures in a series."""
-        return STARTS[series.trigger]
+        return series.trigger
 
     def arm(self, series: Series, period_s: float, acquisition: Acquisition) -> None:
         """Called before the acquisition of a series starts.

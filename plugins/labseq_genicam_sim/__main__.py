@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq_aravis.camera import Camera
-from labseq_aravis.library import G_TYPE_DOUBLE, AravisError, load_library
+from labseq_aravis.library import AravisError, load_library
 
 from labseq_genicam_sim.description import MODEL, REGISTERS, TEXTS, VENDOR, description
 from labseq_genicam_sim.messages import (
@@ -122,7 +122,7 @@ class SimulatedCamera:
     def _lose(self, fraction: float, n: int) -> None:
         """Lose this fraction of the next frame's packets, the same ones each time."""
         self._library.g_random_set_seed(n)
-        self._library.set_property(self._camera, "gvsp-lost-ratio", fraction, G_TYPE_DOUBLE)
+        self._library.set_property(self._camera, "gvsp-lost-ratio", ctypes.c_double(fraction))
 
     def _register(self, address: int) -> int:
         value = ctypes.c_uint32()

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from labseq_genicam.acquisition import Acquisition, Start
+from labseq_genicam.acquisition import Acquisition
 from labseq_genicam.connection import CameraConnection, translated_errors
 from labseq_genicam.settings import GenicamSettings
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from labseq.plugin import (
     Frame,
     Series,
     SimulatedSensor,
+    Trigger,
     trigger_line,
 )
 from labseq_genicam_sim.description import EXPOSURE_US
@@ -80,15 +81,15 @@ class SimulatedConnection(CameraConnection):
         self.clear()
         self._fake.stop()
 
-    def start_of(self, series: Series) -> Start:
+    def trigger_of(self, series: Series) -> Trigger:
         """What starts the camera's exposures.
 
         A camera that runs without a trigger does not wait for a virtual clock, and edges of lines come from
         the simulation: in both cases the camera is triggered by software at the right time.
         """
-        if series.trigger in ("software", "internal"):
-            return "free" if series.trigger == "internal" and not self._clock.virtual else "software"
-        return "software" if self._is_wired else super().start_of(series)
+        is_timed = series.trigger == "internal" and self._clock.virtual
+        by_line = series.trigger not in ("software", "internal") and self._is_wired
+        return "software" if is_timed or by_line else series.trigger
 
     def arm(self, series: Series, period_s: float, acquisition: Acquisition) -> None:
         """Get ready for a series, before the camera starts."""
@@ -134,7 +135,7 @@ class SimulatedConnection(CameraConnection):
         series = self._series
         if series is None or self._acquisition is None:
             return None
-        if self.start_of(series) != "software":
+        if self.trigger_of(series) != "software":
             return timeout_s  # only the camera knows when it exposes
         start_s = self._clock.now()
         if series.trigger == "internal" and self._n_exposed == self._n_due:

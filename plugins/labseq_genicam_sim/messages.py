@@ -100,16 +100,6 @@ class Exposure:
     reverse_x: int = 0
     reverse_y: int = 0
 
-    @property
-    def exposure_s(self) -> float:
-        """Exposure time, in seconds."""
-        return self.exposure_us * 1e-6
-
-    @property
-    def gain(self) -> float:
-        """The camera's gain; 0 unless it was set."""
-        return self.gain_steps * GAIN_STEP
-
 
 class Channel:
     """Messages over a pipe in each direction; any thread may send, one receives."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -147,16 +148,19 @@ class GridPlanner:
         self._may_land = motion.empty_tweezers_may_land
         self._grid = context.grid
         self._weave = lane_weave(context.grid, motion) if settings.lanes == "weaving" else 0.0
-        self._kernel: Callable[..., Any] | None = None
+
+    @cached_property
+    def _kernel(self) -> Callable[..., Any]:
+        from labseq_grid.kernels_plan import plan_grid
+
+        return plan_grid
 
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
         if self._in_lines is not None:
             self._in_lines.warm()
-            return
-        from labseq_grid.kernels_plan import plan_grid
-
-        self._kernel = plan_grid
+        else:
+            _ = self._kernel
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target and clear what must be empty.
@@ -181,9 +185,6 @@ class GridPlanner:
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "grid") from error
-        if self._kernel is None:
-            self.warm()
-        assert self._kernel is not None
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
         arrays = self._kernel(
             occupied, fill, target.fill, target.clear, self._limits, self._slots, self._may_land, self._weave

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -103,17 +104,20 @@ class PscaPlanner:
         self._order = _ORDERS[settings.row_order]
         self._grid = context.grid
         self._motion = motion
-        self._kernel: Kernel | None = None
 
-    def warm(self) -> None:
-        """Compile the kernels, or load them from the cache."""
+    @cached_property
+    def _kernel(self) -> Kernel:
         if self._settings.variant == "paper":
             from labseq_psca.kernels_paper import plan_as_in_paper as kernel
         else:
             from labseq_psca.kernels_fewest import plan_fewest as kernel
+        return kernel
+
+    def warm(self) -> None:
+        """Compile the kernels, or load them from the cache."""
+        _ = self._kernel
         if self._repair_below > 0:
             importlib.import_module("labseq_psca.kernels_repair")
-        self._kernel = kernel
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target and clear what must be empty.
@@ -152,9 +156,6 @@ class PscaPlanner:
     def _sort_and_compress(
         self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
-        if self._kernel is None:
-            self.warm()
-        assert self._kernel is not None
         return self._kernel(occupied, fill, clear, *self._limits, self._eject_slots, self._order)
 
     def _repair(self, occupied: Occupancy, fill: NDArray[np.bool_], target: TargetPattern) -> Plan:

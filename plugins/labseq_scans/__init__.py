@@ -9,6 +9,6 @@ LABSEQ_API = 1
 def labseq_register(registry: Registry) -> None:
     """Offer the planners ``mta1`` and ``tetris`` and the pattern ``interleaved``."""
     planners, pattern = "labseq_scans.planners", "labseq_scans.pattern"
-    registry.planner("mta1", f"{planners}:Mta1Planner", f"{planners}:Mta1Settings")
-    registry.planner("tetris", f"{planners}:TetrisPlanner", f"{planners}:TetrisSettings")
+    registry.planner("mta1", f"{planners}:Mta1Planner", f"{planners}:LineSettings")
+    registry.planner("tetris", f"{planners}:TetrisPlanner", f"{planners}:LineSettings")
     registry.pattern("interleaved", f"{pattern}:interleaved", f"{pattern}:InterleavedSettings")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from pydantic import Field
 from labseq.plugin import (
     Context,
     MotionSpec,
+    Occupancy,
     Plan,
     PlanError,
     Settings,
@@ -29,7 +30,7 @@ Growing = tuple[NDArray[np.int32], int, int]
 
 
 class LineSettings(Settings):
-    """Settings of a planner that moves atoms of one line at a time."""
+    """Settings of ``tetris`` and ``mta1``."""
 
     degree_of_parallelism: int = Field(
         default=7,
@@ -38,16 +39,8 @@ class LineSettings(Settings):
     )
 
 
-class TetrisSettings(LineSettings):
-    """Settings of the planner ``tetris``."""
-
-
-class Mta1Settings(LineSettings):
-    """Settings of the planner ``mta1``."""
-
-
 class LinePlanner(ABC):
-    """Base of the planners that scan lines.
+    """Base of the planners that scan lines: Tetris and MTA1 differ in their kernel, and what it returns.
 
     Args:
         settings: The planner's settings.
@@ -69,11 +62,10 @@ class LinePlanner(ABC):
         self._column_tones = min(dop, motion.max_column_tones)
         self._eject_slots = motion.eject_slots
         self._grid = context.grid
-        self._kernel: Callable[..., Any] | None = None
 
-    @abstractmethod
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
+        importlib.import_module(f"labseq_scans.kernels_{self.name}")
 
     @abstractmethod
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
@@ -92,17 +84,14 @@ class LinePlanner(ABC):
                 target's shape.
         """
 
-    def _run(self, occupancy: ArrayLike, target: TargetPattern, tones: tuple[int, int]) -> Any:
-        """Run the kernel for an occupancy, with the fill sites that its atoms suffice for."""
+    def _sites(self, occupancy: ArrayLike, target: TargetPattern) -> tuple[Occupancy, Occupancy, Occupancy]:
+        """What the kernels take: the atoms, the fill sites that they suffice for, the sites to clear."""
         try:
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), self.name) from error
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
-        if self._kernel is None:
-            self.warm()
-        assert self._kernel is not None
-        return self._kernel(occupied, fill, target.clear, *tones, self._eject_slots)
+        return occupied, fill, target.clear
 
 
 def as_plan(grown: Growing) -> Plan:
@@ -121,22 +110,19 @@ class TetrisPlanner(LinePlanner):
 
     Example:
         >>> target = TargetPattern(fill=[[False, False], [True, True]], clear=[[True, True], [False, False]])
-        >>> plan = TetrisPlanner(TetrisSettings(), Context()).plan([[True, True], [False, False]], target)
+        >>> plan = TetrisPlanner(LineSettings(), Context()).plan([[True, True], [False, False]], target)
         >>> plan.moves.tolist()
         [[0, 0, 1, 0], [0, 1, 1, 1]]
     """
 
     name = "tetris"
 
-    def warm(self) -> None:
-        """Compile the kernels, or load them from the cache."""
-        from labseq_scans.kernels_tetris import plan_tetris
-
-        self._kernel = plan_tetris
-
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """See :meth:`LinePlanner.plan`."""
-        return as_plan(self._run(occupancy, target, (self._column_tones, self._row_tones)))
+        from labseq_scans.kernels_tetris import plan_tetris
+
+        sites = self._sites(occupancy, target)
+        return as_plan(plan_tetris(*sites, self._column_tones, self._row_tones, self._eject_slots))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,18 +177,12 @@ class Mta1Planner(LinePlanner):
 
     Example:
         >>> target = TargetPattern(fill=[[False, True], [True, False]], clear=[[False, False]] * 2)
-        >>> plan = Mta1Planner(Mta1Settings(), Context()).plan([[True, False], [False, True]], target)
+        >>> plan = Mta1Planner(LineSettings(), Context()).plan([[True, False], [False, True]], target)
         >>> plan.moves.tolist()
         [[0, 0, 1, 0], [1, 1, 0, 1]]
     """
 
     name = "mta1"
-
-    def warm(self) -> None:
-        """Compile the kernels, or load them from the cache."""
-        from labseq_scans.kernels_mta1 import plan_mta1
-
-        self._kernel = plan_mta1
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """See :meth:`LinePlanner.plan`."""
@@ -210,5 +190,8 @@ class Mta1Planner(LinePlanner):
 
     def scan(self, occupancy: ArrayLike, target: TargetPattern) -> ScannedPlan:
         """Make the same plan, and keep the scans that it is made of; arguments as for :meth:`plan`."""
-        grown, (passed, n_scans) = self._run(occupancy, target, (self._row_tones, self._column_tones))
+        from labseq_scans.kernels_mta1 import plan_mta1
+
+        sites = self._sites(occupancy, target)
+        grown, (passed, n_scans) = plan_mta1(*sites, self._row_tones, self._column_tones, self._eject_slots)
         return ScannedPlan(as_plan(grown), passed[:n_scans].copy())

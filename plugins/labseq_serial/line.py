@@ -156,13 +156,12 @@ def open_line(settings: SerialSettings, device: str, clock: Clock) -> Port:
 
 def _find(usb: UsbSettings, device: str) -> str:
     """The port of an adapter."""
-    wanted = {"vid": usb.vid, "pid": usb.pid, "serial_number": usb.serial}
-    given = {key: value for key, value in wanted.items() if value is not None}
     fits = usb.ports()
     if len(fits) == 1:
         return fits[0].device
     described = ", ".join(
-        f"{key} {value:#06x}" if isinstance(value, int) else f"{key} {value}" for key, value in given.items()
+        f"{key} {value:#06x}" if isinstance(value, int) else f"{key} {value}"
+        for key, value in usb.given.items()
     )
     if fits:
         names = ", ".join(f"{port.device} ({port.serial_number})" for port in fits)

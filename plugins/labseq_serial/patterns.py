@@ -19,31 +19,14 @@ _SHORT: Final = ".12g"
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """Literal text, and the placeholder after it.
-
-    Attributes:
-        literal: The text.
-        name: Name of the argument; "" for none.
-        spec: How it is written, as Python's ``format`` takes it.
-    """
-
-    literal: str
-    name: str = ""
-    spec: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Template:
     """A command with placeholders for arguments: ``FREQ {frequency:.3f}``.
 
     Attributes:
-        text: As the profile has it.
-        pieces: What it is made of.
+        pieces: Literal text, then name and format of the argument after it; "" for none.
     """
 
-    text: str
-    pieces: tuple[Piece, ...]
+    pieces: tuple[tuple[str, str, str], ...]
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -56,26 +39,20 @@ class Template:
             >>> Template.parse("FREQ {frequency:.3f}").names
             ('frequency',)
         """
-        pieces: list[Piece] = []
+        expected = "expected {name} or {name:format}; {{ for a brace"
         try:
             found = list(string.Formatter().parse(text))
         except ValueError as error:
-            problem = f"'{text}' is not a template: {error}"
-            raise ValueError(f"{problem}; expected {{name}} or {{name:format}}; {{{{ for a brace") from None
-        for literal, name, spec, conversion in found:
-            if name is None:
-                pieces.append(Piece(literal))
-            elif not name.isidentifier() or conversion or "{" in (spec or ""):
-                text = f"the placeholder '{{{name}}}' is not the name of an argument"
-                raise ValueError(f"{text}; expected {{name}} or {{name:format}}; {{{{ for a brace")
-            else:
-                pieces.append(Piece(literal, name, spec or ""))
-        return cls(text, tuple(pieces))
+            raise ValueError(f"'{text}' is not a template: {error}; {expected}") from None
+        for _, name, spec, conversion in found:
+            if name is not None and (not name.isidentifier() or conversion or "{" in (spec or "")):
+                raise ValueError(f"the placeholder '{{{name}}}' is not the name of an argument; {expected}")
+        return cls(tuple((literal, name or "", spec or "") for literal, name, spec, _ in found))
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of its placeholders, in order."""
-        return tuple(dict.fromkeys(piece.name for piece in self.pieces if piece.name))
+        return tuple(self._specs)
 
     def format(self, values: Mapping[str, Sent]) -> str:
         """Fill in the arguments.
@@ -88,8 +65,8 @@ class Template:
             'F01 80.000'
         """
         return "".join(
-            piece.literal + (_written(values[piece.name], piece) if piece.name else "")
-            for piece in self.pieces
+            literal + (_written(values[name], name, spec) if name else "")
+            for literal, name, spec in self.pieces
         )
 
     def rounded(self, values: Mapping[str, Sent]) -> dict[str, Sent]:
@@ -103,9 +80,8 @@ class Template:
             {'frequency': 80.0}
         """
         return {
-            piece.name: _read(_written(values[piece.name], piece), type(values[piece.name]), piece.spec)
-            for piece in self.pieces
-            if piece.name
+            name: _read(_written(values[name], name, spec), type(values[name]), spec)
+            for name, spec in self._specs.items()
         }
 
     def read(self, text: str, types: Mapping[str, type[Sent]]) -> dict[str, Sent] | None:
@@ -121,32 +97,34 @@ class Template:
         match = self._pattern(types).fullmatch(text)
         if match is None:
             return None
-        specs = {piece.name: piece.spec for piece in self.pieces}
         try:
-            return {name: _read(match[name], types[name], specs[name]) for name in self.names}
+            return {name: _read(match[name], types[name], spec) for name, spec in self._specs.items()}
         except ValueError:
             return None
+
+    @property
+    def _specs(self) -> dict[str, str]:
+        return {name: spec for _, name, spec in self.pieces if name}
 
     def _pattern(self, types: Mapping[str, type[Sent]]) -> re.Pattern[str]:
         parts: list[str] = []
         seen: set[str] = set()
-        for piece in self.pieces:
-            parts.append(re.escape(piece.literal))
-            if piece.name in seen:
-                parts.append(f"(?P={piece.name})")
-            elif piece.name:
-                seen.add(piece.name)
-                parts.append(f"(?P<{piece.name}>{_place(types[piece.name], piece.spec)})")
+        for literal, name, spec in self.pieces:
+            parts.append(re.escape(literal))
+            if name in seen:
+                parts.append(f"(?P={name})")
+            elif name:
+                seen.add(name)
+                parts.append(f"(?P<{name}>{_place(types[name], spec)})")
         return re.compile("".join(parts), re.DOTALL)
 
 
-def _written(value: Sent, piece: Piece) -> str:
-    spec = piece.spec or (_SHORT if isinstance(value, float) else "")
+def _written(value: Sent, name: str, spec: str) -> str:
     try:
-        return format(value, spec)
+        return format(value, spec or (_SHORT if isinstance(value, float) else ""))
     except ValueError as error:
         kind = {float: "a float", int: "a whole number", str: "text"}[type(value)]
-        problem = f"'{{{piece.name}:{piece.spec}}}' is not a format of {kind}: {error}"
+        problem = f"'{{{name}:{spec}}}' is not a format of {kind}: {error}"
         raise ValueError(f"{problem}; expected one such as .3f or 03d") from None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
@@ -27,8 +27,6 @@ from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
 RESERVED: Final = frozenset({"self", "name", "owner", "timeout_s", "function"})
 """Names that arguments cannot have, because labseq's own calls use them."""
 _SLACK: Final = 1e-9
-
-"""Seconds, more than 0; "0.5 s"."""
 
 
 class CallSettings(Settings):
@@ -142,9 +140,9 @@ class CommandSettings(Settings):
             if name not in self.arguments:
                 meant = closest(name, self.arguments)
                 hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
-                raise setting_error(
-                    f"'{{{name}}}' is not an argument", _listed(self.arguments), hint, at=("send",)
-                )
+                names = one_of(list(self.arguments))
+                expected = names if self.arguments else "no placeholder: the command has no arguments"
+                raise setting_error(f"'{{{name}}}' is not an argument", expected, hint, at=("send",))
         for name in self.arguments:
             if name not in names:
                 what = f"the argument '{name}' has no place in '{clean(self.send)}'"
@@ -219,10 +217,6 @@ def call_of(call: Call) -> tuple[str, Mapping[str, Scalar]]:
     return (call, {}) if isinstance(call, str) else (call.do, call.arguments)
 
 
-def _listed(names: Mapping[str, object] | Sequence[str]) -> str:
-    return f"one of {', '.join(names)}" if names else "no placeholder: the command has no arguments"
-
-
 SIMULATED: Final = "simulated"
 """The port of a simulated instrument."""
 _SCHEMES: Final = ("socket", "rfc2217")
@@ -241,15 +235,20 @@ class UsbSettings(Settings):
     pid: int | None = Field(default=None, ge=0, le=0xFFFF, description="product's number, as 0x6001")
     serial: Text | None = Field(default=None, description="serial number")
 
+    @property
+    def given(self) -> dict[str, int | str]:
+        """What is given, by the names that pyserial has for it."""
+        wanted = {"vid": self.vid, "pid": self.pid, "serial_number": self.serial}
+        return {key: value for key, value in wanted.items() if value is not None}
+
     def ports(self) -> list[Any]:
         """The ports of this computer whose adapter fits."""
-        wanted = {"vid": self.vid, "pid": self.pid, "serial_number": self.serial}
-        given = {key: value for key, value in wanted.items() if value is not None}
-        return [port for port in ports_here() if all(getattr(port, k, None) == v for k, v in given.items())]
+        given = self.given.items()
+        return [port for port in ports_here() if all(getattr(port, key, None) == it for key, it in given)]
 
     @model_validator(mode="after")
     def _check_any(self) -> Self:
-        if self.vid is None and self.pid is None and self.serial is None:
+        if not self.given:
             raise setting_error("this fits every adapter", "vid, pid or serial")
         return self
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import ClassVar, Final
 
 import numpy as np
@@ -37,11 +37,10 @@ class SingleTweezerPlanner(ABC):
         del settings  # the signature of every factory
         self._may_eject = context.motion.eject_slots > 0
         self._grid = context.grid
-        self._kernel: Callable[..., Moves] | None = None
 
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
-        self._kernel = self._load()
+        importlib.import_module("labseq_single.kernels")
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target and clear what must be empty.
@@ -65,23 +64,14 @@ class SingleTweezerPlanner(ABC):
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), self.name) from error
-        if self._kernel is None:
-            self.warm()
-        assert self._kernel is not None
         order = from_the_centre(target.fill, self._grid)[: np.count_nonzero(occupied)]
         fill = np.zeros_like(target.fill)
         fill.reshape(-1)[order] = True
-        moves, linked, n = self._run(self._kernel, occupied, fill, target.clear, order)
+        moves, linked, n = self._moves(occupied, fill, target.clear, order)
         return Plan(moves[:n], np.arange(n + 1, dtype=np.int32), linked[:n])
 
     @abstractmethod
-    def _load(self) -> Callable[..., Moves]:
-        """Import the kernel."""
-
-    @abstractmethod
-    def _run(
-        self, kernel: Callable[..., Moves], occupied: Bools, fill: Bools, clear: Bools, order: Ints
-    ) -> Moves:
+    def _moves(self, occupied: Bools, fill: Bools, clear: Bools, order: Ints) -> Moves:
         """Run the kernel; ``order`` lists the fill sites, row * n_cols + col, the innermost first."""
 
 
@@ -100,22 +90,21 @@ class LsapPlanner(SingleTweezerPlanner):
     name = "lsap"
     power: ClassVar[int] = 1
 
-    def _load(self) -> Callable[..., Moves]:
+    def warm(self) -> None:
+        """Compile the kernels, or load them from the cache, and import scipy."""
+        super().warm()
+        importlib.import_module("scipy.optimize")
+
+    def _moves(self, occupied: Bools, fill: Bools, clear: Bools, order: Ints) -> Moves:
         from scipy.optimize import linear_sum_assignment
 
         from labseq_single.kernels import plan_assignment
 
-        self._assign: Callable[..., tuple[Ints, Ints]] = linear_sum_assignment
-        return plan_assignment
-
-    def _run(
-        self, kernel: Callable[..., Moves], occupied: Bools, fill: Bools, clear: Bools, order: Ints
-    ) -> Moves:
         sources = np.flatnonzero(occupied)
         stays = ~clear.reshape(-1)[sources]  # of equal sums, the one that leaves fewest atoms to clear
         cost = travel(order, sources, fill.shape[1]) ** self.power * (len(order) + 1) + stays
-        _, chosen = self._assign(cost)
-        return kernel(occupied, fill, clear, sources[chosen], order, self._may_eject)
+        _, chosen = linear_sum_assignment(cost)
+        return plan_assignment(occupied, fill, clear, sources[chosen], order, self._may_eject)
 
 
 class LsapSquaredPlanner(LsapPlanner):
@@ -130,16 +119,11 @@ class CompressionPlanner(SingleTweezerPlanner):
 
     name = "compression"
 
-    def _load(self) -> Callable[..., Moves]:
+    def _moves(self, occupied: Bools, fill: Bools, clear: Bools, order: Ints) -> Moves:
         from labseq_single.kernels import plan_compression
 
-        return plan_compression
-
-    def _run(
-        self, kernel: Callable[..., Moves], occupied: Bools, fill: Bools, clear: Bools, order: Ints
-    ) -> Moves:
         del order
-        return kernel(occupied, fill, clear, layers(fill), self._may_eject)
+        return plan_compression(occupied, fill, clear, layers(fill), self._may_eject)
 
 
 class HcaPlanner(SingleTweezerPlanner):
@@ -147,16 +131,11 @@ class HcaPlanner(SingleTweezerPlanner):
 
     name = "hca"
 
-    def _load(self) -> Callable[..., Moves]:
+    def _moves(self, occupied: Bools, fill: Bools, clear: Bools, order: Ints) -> Moves:
         from labseq_single.kernels import plan_clusters
 
-        return plan_clusters
-
-    def _run(
-        self, kernel: Callable[..., Moves], occupied: Bools, fill: Bools, clear: Bools, order: Ints
-    ) -> Moves:
         del order
-        return kernel(occupied, fill, clear, self._may_eject)
+        return plan_clusters(occupied, fill, clear, self._may_eject)
 
 
 def travel(goals: Ints, sources: Ints, n_cols: int) -> Ints:

@@ -3,14 +3,13 @@
 labseq's watchdog loads this file by its path; it needs nothing but Python's standard library. The
 streaming process, which alone has the radio open, is asked to end: it ramps the tones down and closes the
 radio. If it hangs it is killed, and then the radio's buffer runs dry. Its transmitters stay on with their
-gain until somebody opens it again, and the leakage of the local oscillator with them; so this file, run as a
-program of its own, opens the radio, sets the lowest gains and closes it.
+gain until somebody opens it again, and the leakage of the local oscillator with them; so another process of
+the streaming program opens the radio, sets the lowest gains and closes it.
 """
 
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import signal
 import subprocess
@@ -28,7 +27,7 @@ KILL_S = 5.0
 OPEN_S = 60.0
 """How long a radio may take to open: some load their firmware."""
 PAUSE_S = 1e-3
-TX = 0
+STAYS_ON = "it plays nothing any more, but its transmitters stay on with their gain: switch it off by hand"
 
 
 class EmergencyError(Exception):
@@ -148,9 +147,10 @@ def _runs_windows(pid: int) -> bool:
 
 def _switch_off_again(device: str, channels: Sequence[int], environment: Mapping[str, str]) -> str:
     """Open the radio in a process of its own, set the lowest gains, close it."""
-    command = [sys.executable, "-I", __file__, device, json.dumps(list(channels))]
+    program = "labseq_soapy_stream.streamer"
+    command = [sys.executable, "-P", "-m", program, "--off", device, *map(str, channels)]
     try:
-        done = subprocess.run(  # noqa: S603 - this file
+        done = subprocess.run(  # noqa: S603 - our own module
             command,
             env={**os.environ, **environment},
             capture_output=True,
@@ -165,48 +165,3 @@ def _switch_off_again(device: str, channels: Sequence[int], environment: Mapping
         reason = (done.stderr.strip().splitlines() or [f"code {done.returncode}"])[-1]
         raise EmergencyError(f"the radio '{device}' cannot be opened again: {reason}; {STAYS_ON}")
     return "radio opened again, lowest gains set, closed"
-
-
-STAYS_ON = "it plays nothing any more, but its transmitters stay on with their gain: switch it off by hand"
-
-
-class _Range(ctypes.Structure):
-    _fields_ = (("minimum", ctypes.c_double), ("maximum", ctypes.c_double), ("step", ctypes.c_double))
-
-
-def _lower_gains(device: str, channels: Sequence[int]) -> None:
-    """Open a radio through the C interface of SoapySDR, and set the lowest gains."""
-    names = {"darwin": ["libSoapySDR.0.8.dylib"], "win32": ["SoapySDR.dll"]}
-    library: Any = None
-    for name in names.get(sys.platform, ["libSoapySDR.so.0.8", "libSoapySDR.so"]):
-        with suppress(OSError):
-            library = library or ctypes.CDLL(name)
-    if library is None:
-        raise EmergencyError("the library SoapySDR cannot be loaded")
-    handle, place = ctypes.c_void_p, (ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t)
-    library.SoapySDRDevice_makeStrArgs.restype = handle
-    library.SoapySDRDevice_getGainRange.restype = _Range
-    library.SoapySDRDevice_getGainRange.argtypes = place
-    library.SoapySDRDevice_setGain.argtypes = (*place, ctypes.c_double)
-    library.SoapySDRDevice_lastError.restype = ctypes.c_char_p
-    radio = handle(library.SoapySDRDevice_makeStrArgs(device.encode()))
-
-    def check(failed: bool) -> None:
-        if failed:
-            text = (library.SoapySDRDevice_lastError() or b"it failed without a message").decode()
-            raise EmergencyError(text)
-
-    check(not radio)
-    try:
-        for channel in channels:
-            lowest = library.SoapySDRDevice_getGainRange(radio, TX, channel).minimum
-            check(library.SoapySDRDevice_setGain(radio, TX, channel, lowest) != 0)
-    finally:
-        check(library.SoapySDRDevice_unmake(radio) != 0)
-
-
-if __name__ == "__main__":
-    try:
-        _lower_gains(sys.argv[1], json.loads(sys.argv[2]))
-    except EmergencyError as error:
-        sys.exit(str(error))

@@ -5,8 +5,7 @@ Figures and where they are from: README.md, "The connection".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 Bus: TypeAlias = Literal["usb2", "usb3", "1gbe", "10gbe"]
 
@@ -19,19 +18,14 @@ BUSES: Final[dict[str, tuple[str, float]]] = {
 """Value of the setting -> name, bytes of samples per second."""
 
 
-@dataclass(frozen=True, slots=True)
-class KnownRadio:
-    """A radio that its arguments name.
-
-    Attributes:
-        name: For messages.
-        bus: Its fastest connection.
-        most_hz: Highest sample rate with two channels; None: as the connection allows.
-    """
+class KnownRadio(NamedTuple):
+    """A radio that its arguments name."""
 
     name: str
     bus: Bus
+    """Its fastest connection."""
     most_hz: float | None = None
+    """Highest sample rate with two channels; None: as the connection allows."""
 
 
 _B2X0: Final = KnownRadio("a USRP B2x0", "usb3", 30.72e6)
@@ -54,13 +48,6 @@ def read_arguments(text: str) -> dict[str, str]:
     return {key.strip(): value.strip() for key, _, value in pairs}
 
 
-def known_radio(device: str) -> KnownRadio | None:
-    """The radio that a device's arguments name, if labseq knows it."""
-    arguments = read_arguments(device)
-    names = (arguments.get(key, "") for key in ("product", "type", "name", "driver"))
-    return next((_KNOWN[name] for name in names if name in _KNOWN), None)
-
-
 def tunes_digitally(device: str) -> bool:
     """Whether a radio is known to shift the samples away from its local oscillator."""
     arguments = read_arguments(device)
@@ -78,7 +65,9 @@ def too_fast(device: str, bus: Bus | None, stream: str, rate_hz: float) -> tuple
         stream: Arguments of its stream; with ``WIRE=sc8`` a sample has 2 bytes instead of 4.
         rate_hz: Samples per second and channel.
     """
-    radio = known_radio(device)
+    arguments = read_arguments(device)
+    names = (arguments.get(key, "") for key in ("product", "type", "name", "driver"))
+    radio = next((_KNOWN[name] for name in names if name in _KNOWN), None)
     most_hz = float("inf")
     why = ""
     if radio is not None and radio.most_hz is not None:

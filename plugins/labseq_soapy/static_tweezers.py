@@ -62,6 +62,9 @@ class SoapyStaticTweezers(StaticTweezers):
     unless the profile says otherwise. The depth of a tweezer is proportional to the product of the powers
     of its two tones, so both amplitudes scale with the fourth root of the depth.
 
+    Calls that need the light raise ``DeviceError`` if the stream is dead, and once ``TransientError`` if the
+    radio ran out of samples, or missed packets, while the array was on.
+
     Args:
         settings: The radio, and how it is used.
         context: Name, grid, clock, simulation, calibrated amplitudes.
@@ -94,11 +97,7 @@ class SoapyStaticTweezers(StaticTweezers):
         return TweezersFacts(1 / self._settings.sample_rate, SHORTEST_RELEASE_S, LATENCY_S)
 
     def warm(self) -> None:
-        """Do what takes long before the first shot.
-
-        Raises:
-            DeviceError: It failed.
-        """
+        """Do what takes long before the first shot."""
         self.radio.warm()
 
     def open(self) -> None:
@@ -135,19 +134,12 @@ class SoapyStaticTweezers(StaticTweezers):
 
         Raises:
             LimitError: Wrong number of tones, negative or not finite, or too much together.
-            TransientError: The radio ran out of samples while the array was on.
-            DeviceError: Not open, or the stream is dead.
         """
         self._checked()
         self._load(amplitudes)
 
     def start(self) -> None:
-        """Ramp the array to its nominal depth; no effect if it is there.
-
-        Raises:
-            TransientError: The radio ran out of samples while the array was on.
-            DeviceError: Not open, or the stream is dead.
-        """
+        """Ramp the array to its nominal depth; no effect if it is there."""
         self._checked()
         if not self._is_loaded:
             self._load(self._amplitudes)
@@ -159,8 +151,6 @@ class SoapyStaticTweezers(StaticTweezers):
 
         Raises:
             LimitError: A depth or duration that the array cannot have.
-            TransientError: The radio ran out of samples while the array was on.
-            DeviceError: Not open, or the stream is dead.
         """
         self._checked()
         deepest = self._settings.max_depth
@@ -181,8 +171,6 @@ class SoapyStaticTweezers(StaticTweezers):
 
         Raises:
             LimitError: A duration that is too short, or not finite.
-            TransientError: The radio ran out of samples while the array was on.
-            DeviceError: Not open, or the stream is dead.
         """
         self._checked()
         if not SHORTEST_RELEASE_S <= duration_s < math.inf:
@@ -223,12 +211,7 @@ class SoapyStaticTweezers(StaticTweezers):
         return "the array stays on after the run" if self._settings.after_run == "on" else ""
 
     def leave_on(self) -> bool:
-        """Have the streaming process go on without labseq, at the present depth, if ``after_run`` is on.
-
-        Raises:
-            TransientError: The radio ran out of samples while the array was on.
-            DeviceError: The stream is dead.
-        """
+        """Have the streaming process go on without labseq, at the present depth, if ``after_run`` is on."""
         link = self._link
         if (
             self._settings.after_run == "off"
@@ -250,21 +233,13 @@ class SoapyStaticTweezers(StaticTweezers):
         return Emergency(Path(__file__).with_name("emergency.py"), self._link.emergency_arguments())
 
     def check_interlocks(self) -> None:
-        """Check that the stream is alive; called at the start of each shot and before each pick-up.
-
-        Raises:
-            TransientError: The radio ran out of samples since the last call, while the array was on.
-            DeviceError: Not open, or the stream is dead.
-        """
+        """Check that the stream is alive; called at the start of each shot and before each pick-up."""
         self._checked()
 
     def self_test(self) -> None:
         """Check that the stream runs, the radio is locked, and the calibrated amplitudes are possible.
 
         The light stays off.
-
-        Raises:
-            DeviceError: Not open, or something is wrong.
         """
         self._checked()
         self._check_locks()

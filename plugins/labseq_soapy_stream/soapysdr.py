@@ -407,3 +407,17 @@ def read_back(radio: Radio, setup: Setup) -> Facts:
         gain_db=[radio.get("Gain", channel) for channel in setup.channels],
         locks=locks,
     )
+
+
+def lower_gains(device: str, channels: Sequence[int]) -> None:
+    """Open a radio that a killed process left transmitting, set the lowest gains, and close it.
+
+    Raises:
+        SoapyError: It cannot be opened, or refuses something.
+    """
+    radio = Radio(device)
+    try:
+        for channel in channels:
+            radio.set("Gain", channel, radio.gain_range(channel)[0])
+    finally:
+        radio.close()

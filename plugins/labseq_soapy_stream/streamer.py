@@ -1,5 +1,7 @@
 """The process that keeps the radio supplied: ``python -m labseq_soapy_stream.streamer``.
 
+With ``--off DEVICE CHANNEL ...`` it only sets the lowest gains of a radio.
+
 It is a separate process so that nothing that labseq does can make the stream run dry, and so that the light
 is ramped down when labseq is killed or hangs. :mod:`labseq_soapy_stream.messages` describes the messages.
 """
@@ -24,7 +26,7 @@ import numpy as np
 
 from labseq_soapy_stream.messages import Setup, received, send
 from labseq_soapy_stream.output import BLOCK, Output, Samples
-from labseq_soapy_stream.soapysdr import SoapyError, Stream, open_radio, read_back, set_up
+from labseq_soapy_stream.soapysdr import SoapyError, Stream, lower_gains, open_radio, read_back, set_up
 
 STALL_S: Final = 2.0
 """A stream that takes no samples for so long is dead."""
@@ -265,6 +267,13 @@ def remove_own(file: Path) -> None:
 
 def main() -> int:
     """Run the process; returns its exit code."""
+    if sys.argv[1:2] == ["--off"]:
+        try:
+            lower_gains(sys.argv[2], [int(channel) for channel in sys.argv[3:]])
+        except SoapyError as error:
+            sys.stderr.write(f"{error}\n")
+            return 3
+        return 0
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to labseq, which ramps down
     pipe = os.dup(1)
     os.dup2(2, 1)  # the output of the radio's module goes to the log

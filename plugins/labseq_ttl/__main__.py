@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 box.set_serial_number(given.serial)
             identity, state = box.identify(), box.state()
         finally:
-            box.line.close()
+            box.close()
     except LabseqError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_code

@@ -7,8 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from labseq.plugin import (
     BROKEN,
@@ -49,12 +48,7 @@ CAUSES: Final = {1: "power-up", 2: "reset input", 4: "supply voltage too low", 8
 
 
 def open_box(name: str, device: str) -> Port:
-    """Open the serial port of a box exclusively.
-
-    Args:
-        name: Name of the port, as in the profile.
-        device: Name of the box, for messages.
-    """
+    """Open the serial port ``name`` exclusively; ``device`` is for messages."""
     return open_port(name, device, BAUD_RATE, write_timeout=WRITE_TIMEOUT_S)
 
 
@@ -213,49 +207,32 @@ class Conversation:
             raise DeviceError(self._device, f"the line to the box broke ({reason}); unplugged?") from error
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """What the box reports about itself.
-
-    Attributes:
-        serial_number: The number that it was given.
-        boots: How often it has started in its life, modulo 65536.
-        cause: Why it started last.
-    """
+class Identity(NamedTuple):
+    """What the box reports about itself."""
 
     serial_number: int
+    """The number that it was given."""
     boots: int
+    """How often it has started in its life, modulo 65536."""
     cause: str
+    """Why it started last."""
 
 
-@dataclass(frozen=True, slots=True)
-class BoxState:
-    """What the box is doing.
-
-    Attributes:
-        boots: How often it has started.
-        runs: Programs played to their end since then, modulo 65536.
-        on: What is on: bit n is channel n.
-        polarity: Outputs that are low when they are on.
-    """
+class BoxState(NamedTuple):
+    """What the box is doing."""
 
     boots: int
+    """How often it has started."""
     runs: int
+    """Programs played to their end since then, modulo 65536."""
     on: int
+    """What is on: bit n is channel n."""
     polarity: int
+    """Outputs that are low when they are on."""
 
 
-class Box:
-    """A timing box on an open port.
-
-    Attributes:
-        line: The conversation with it.
-    """
-
-    def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
-        self.line = Conversation(port, device, clock, max_wait_s)
-        self._device = device
-        self._max_wait_s = max_wait_s
+class Box(Conversation):
+    """The commands of a timing box on an open port."""
 
     def identify(self) -> Identity:
         """Wait until the box answers, and check that it is one."""
@@ -272,33 +249,33 @@ class Box:
 
     def state(self, tries: int = TRIES) -> BoxState:
         """Read what it is doing; it does not answer while a program runs."""
-        return BoxState(*self._numbers(self.line.ask("state", tries=tries)[1:], 4))
+        return BoxState(*self._numbers(self.ask("state", tries=tries)[1:], 4))
 
     def set_polarity(self, mask: int) -> None:
         """Store permanently which outputs are low when they are on."""
-        self.line.ask(f"polarity {mask:x}")
+        self.ask(f"polarity {mask:x}")
 
     def set_serial_number(self, number: int) -> None:
         """Store a serial number permanently."""
-        self.line.ask(f"serial {number:x}")
+        self.ask(f"serial {number:x}")
 
     def set_watchdog_timeout(self, timeout_s: float) -> None:
         """Turn all lines off if nothing is received for this long; 0: never."""
-        self.line.ask(f"timeout {round(timeout_s * 1e3):x}")
+        self.ask(f"timeout {round(timeout_s * 1e3):x}")
 
     def set_lines(self, mask: int) -> None:
         """Turn lines on and off at once."""
-        self.line.ask(f"set {mask:x}")
+        self.ask(f"set {mask:x}")
 
     def put(self, slot: int, edges: Sequence[Edge]) -> None:
         """Write a program."""
         for first in range(0, len(edges), PER_LINE):
             words = [f"{ticks:x} {mask:x}" for ticks, mask in edges[first : first + PER_LINE]]
-            self.line.ask(f"put {slot:x} {first:x} {' '.join(words)}")
+            self.ask(f"put {slot:x} {first:x} {' '.join(words)}")
 
     def get(self, slot: int, i: int) -> Edge:
         """Read an edge of a program back."""
-        ticks, mask = self._numbers(self.line.ask(f"get {slot:x} {i:x}"), 2)
+        ticks, mask = self._numbers(self.ask(f"get {slot:x} {i:x}"), 2)
         return ticks, mask
 
     def arm(self, slot: int, n_edges: int) -> int:
@@ -307,24 +284,42 @@ class Box:
         Returns:
             How often the box has started.
         """
-        (boots,) = self._numbers(self.line.ask(f"arm {slot:x} {n_edges:x}"), 1)
+        (boots,) = self._numbers(self.ask(f"arm {slot:x} {n_edges:x}"), 1)
         return boots
 
     def fire(self, *, external: bool = False) -> None:
         """Play the program now, or at the next edge of the start input; the command is never repeated."""
-        self.line.ask("await" if external else "fire", again=False)
+        self.ask("await" if external else "fire", again=False)
 
-    def ask_numbers(self, question: str, n: int) -> list[int]:
-        """Send a command that is answered with ``n`` numbers."""
-        return self._numbers(self.line.ask(question), n)
+    def lead(self, masks: Sequence[int], deadline_s: float) -> bool:
+        """Accept a leader's edges from now on.
+
+        Args:
+            masks: The outputs for busy, ready and failed; 0 for none.
+            deadline_s: Longest time from an edge to its answer; 0: any.
+
+        Returns:
+            Whether the start input is high.
+        """
+        words = " ".join(f"{mask:x}" for mask in (*masks, int(deadline_s * 1e3)))
+        (level,) = self._numbers(self.ask(f"lead {words}"), 1)
+        return bool(level)
+
+    def leader(self) -> list[int]:
+        """State towards the leader, edges accepted, whether one was refused, level of the start input."""
+        return self._numbers(self.ask("leader"), 4)
+
+    def answer_leader(self, *, is_ready: bool) -> list[int]:
+        """Raise `ready` or `failed`; returns the state before, and whether an edge was refused meanwhile."""
+        return self._numbers(self.ask(f"answer {is_ready:d}"), 2)
 
     def _first_answer(self) -> list[str]:
         deadline_s = time.monotonic() + max(BOOT_S, self._max_wait_s)
         try_s = max(BOOT_TRY_S, self._max_wait_s / 2)
         while True:
-            self.line.send(b"\n")  # ends an unfinished line of another program
+            self.send(b"\n")  # ends an unfinished line of another program
             try:
-                return self.line.ask("id", max_wait_s=try_s, tries=1)
+                return self.ask("id", max_wait_s=try_s, tries=1)
             except DeviceTimeoutError:
                 if time.monotonic() > deadline_s:
                     raise

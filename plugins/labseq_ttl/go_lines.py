@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, format_quantity
@@ -44,7 +43,6 @@ class GoLines(TtlLines):
     def __init__(self, settings: TtlSettings, go: GoSettings, context: Context) -> None:
         super().__init__(settings, context)
         self._go = go
-        self._pins: LeaderPins | None = None
         self._is_owed = False
         self._news: deque[str] = deque(maxlen=100)
 
@@ -57,10 +55,10 @@ class GoLines(TtlLines):
         """Answer a `go` that waits for an answer, turn all lines off and disconnect; legal in any state."""
         try:
             self.safe_state()
-            if self._pins is not None and self._box is not None:
-                self._pins.end()
+            if self._box is not None:
+                self._box.ask("deaf")  # a `go` without an answer has failed
         finally:
-            self._pins, self._is_owed = None, False
+            self._is_owed = False
             self._disconnect()
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
@@ -71,16 +69,16 @@ class GoLines(TtlLines):
             DeviceTimeoutError: It did not come in time.
             StopRequested: The operator asked the run to stop.
         """
-        pins, box = self._opened_pins(), self._opened()
+        box = self._opened()
         if signal != GO:
             raise DeviceError(self._name, f"unknown signal '{signal}'; expected '{GO}'")
         timeout_s = self.access.raise_go(timeout_s)
         until_s = self._clock.now() + timeout_s
-        while not self._take(pins):
+        while not self._take(box):
             left_s = until_s - self._clock.now()
             if left_s <= 0:
-                raise self._no_go(timeout_s, is_high=pins.look().is_high)
-            if (event := box.line.new_events(min(left_s, LOOK_S))) is not None:
+                raise self._no_go(timeout_s, is_high=bool(box.leader()[3]))
+            if (event := box.new_events(min(left_s, LOOK_S))) is not None:
                 self._handle(event)
         return ""
 
@@ -93,13 +91,13 @@ class GoLines(TtlLines):
         del about  # an edge carries no more than that
         if not self._is_owed:
             return ""
-        pins = self._opened_pins()
+        box = self._opened()
         self._clock.check()  # a stop now is better than one between `ready` and its confirmation
-        is_late, more_came = pins.answer(is_ready=state == "ready")
+        was, more_came = box.answer_leader(is_ready=state == "ready")
         self._is_owed = False
         if more_came:
             self._news.append(MORE)
-        if is_late:
+        if is_late := was == LATE:
             self._news.append("the shot is not over at the deadline; the leader received `failed`")
         return "late" if is_late else state
 
@@ -118,94 +116,28 @@ class GoLines(TtlLines):
 
     def _connect(self) -> None:
         super()._connect()
+        pins = (self._go.busy, self._go.ready, self._go.failed)
+        masks = [0 if pin is None else 1 << pin for pin in pins]
         try:
-            deadline_s = self._go.deadline if self.access.real_time else 0.0
-            self._pins = LeaderPins(self._opened(), self._go, deadline_s)
-            if self._pins.poll_input():
+            if self._opened().lead(masks, self._go.deadline if self.access.real_time else 0.0):
                 self._news.append(HIGH)
         except BaseException:
             self._disconnect()
             raise
 
-    def _take(self, pins: LeaderPins) -> bool:
-        """Take a `go` that the box has detected, unless its deadline has passed."""
-        leader = pins.look()
-        if not leader.has_gone or self._is_owed:
+    def _take(self, box: Box) -> bool:
+        """Take a `go` that the box has accepted, unless its deadline has passed."""
+        state = box.leader()[0]
+        if state not in (OWED, LATE) or self._is_owed:
             return False
-        if leader.is_late:
+        if state == LATE:
             self._news.append("no step waited for `go` before its deadline; the leader received `failed`")
-            pins.answer(is_ready=False)
+            box.answer_leader(is_ready=False)
             return False
         self._is_owed = True
         return True
-
-    def _opened_pins(self) -> LeaderPins:
-        self._opened()
-        assert self._pins is not None
-        return self._pins
 
     def _no_go(self, timeout_s: float, *, is_high: bool) -> DeviceTimeoutError:
         what = f"no rising edge at the box's start input within {format_quantity(timeout_s, 'time')}"
         why = "it is high: not wired, or raised before labseq was ready" if is_high else "it is low"
         return DeviceTimeoutError(self._name, f"{what}; {why}; see 'timeout' of the wait", timeout_s)
-
-
-@dataclass(frozen=True, slots=True)
-class Leader:
-    """The state of the box towards the leader.
-
-    Attributes:
-        state: DEAF, IDLE, OWED or LATE of the protocol.
-        n_go_signals: Edges that the box accepted since its start.
-        more_came: Whether one came that it could not accept.
-        is_high: Level of the start input.
-    """
-
-    state: int
-    n_go_signals: int
-    more_came: bool
-    is_high: bool
-
-    @property
-    def has_gone(self) -> bool:
-        """Whether a `go` was accepted that labseq has not answered."""
-        return self.state in (OWED, LATE)
-
-    @property
-    def is_late(self) -> bool:
-        """Whether its deadline has passed."""
-        return self.state == LATE
-
-
-class LeaderPins:
-    """The start input and the outputs of a leader; its deadline is 0 if it has none."""
-
-    def __init__(self, box: Box, settings: GoSettings, deadline_s: float) -> None:
-        self._box = box
-        self._settings = settings
-        self._deadline_s = deadline_s
-
-    def poll_input(self) -> bool:
-        """Accept rising edges from now on; returns whether the input is high."""
-        pins = (self._settings.busy, self._settings.ready, self._settings.failed)
-        masks = " ".join(f"{0 if pin is None else 1 << pin:x}" for pin in pins)
-        (level,) = self._box.ask_numbers(f"lead {masks} {int(self._deadline_s * 1e3):x}", 1)
-        return bool(level)
-
-    def look(self) -> Leader:
-        """Read the state; a quick command."""
-        state, n_go_signals, more, level = self._box.ask_numbers("leader", 4)
-        return Leader(state, n_go_signals, bool(more), bool(level))
-
-    def answer(self, *, is_ready: bool) -> tuple[bool, bool]:
-        """Raise `ready` or `failed`, and lower `busy`.
-
-        Returns:
-            Whether the deadline had passed, and whether further edges came meanwhile.
-        """
-        was, more = self._box.ask_numbers(f"answer {is_ready:d}", 2)
-        return was == LATE, bool(more)
-
-    def end(self) -> None:
-        """Accept no more edges; a `go` without an answer has failed."""
-        self._box.line.ask("deaf")

@@ -25,7 +25,7 @@ from labseq.plugin import (
 )
 from labseq_ttl.access import choose_box
 from labseq_ttl.box import Box, Identity, cause_text, late_error
-from labseq_ttl.programs import MAX_EDGES, Slots, edges_of, mask_of
+from labseq_ttl.programs import MAX_EDGES, edges_of, mask_of
 from labseq_ttl.protocol import (
     CHANNELS,
     EDGES,
@@ -33,6 +33,7 @@ from labseq_ttl.protocol import (
     OUTPUTS,
     SHORTEST,
     SHORTEST_S,
+    SLOTS,
     TICK_S,
     VERSION,
     Edge,
@@ -53,6 +54,8 @@ TOO_FAST: Final = 0.95
 class TtlLines(Lines):
     """A timing box with labseq's firmware.
 
+    Calls raise ``DeviceError`` if the box is not open, does not answer, was reset, or plays a program.
+
     Attributes:
         access: How the driver gets to the box.
     """
@@ -69,7 +72,7 @@ class TtlLines(Lines):
         self._box: Box | None = None
         self._identity = Identity(0, 0, "")
         self._heartbeat: Heartbeat | None = None
-        self._slots = Slots()
+        self._slot_of: dict[tuple[Edge, ...], int] = {}
         self._n_boots = self._n_runs = 0
         self._was_lost = False
         self._forget()
@@ -80,11 +83,7 @@ class TtlLines(Lines):
         return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MAX_EDGES, LATENCY_S)
 
     def warm(self) -> None:
-        """Do what takes long before the first shot.
-
-        Raises:
-            DeviceError: It failed.
-        """
+        """Do what takes long before the first shot."""
         self.access.warm()
 
     def open(self) -> None:
@@ -104,11 +103,7 @@ class TtlLines(Lines):
         self.access.lines_set(off_program(self._specs))
 
     def idle(self) -> None:
-        """Turn on the lines that are on between steps.
-
-        Raises:
-            DeviceError: The box is not open, or does not confirm it.
-        """
+        """Turn on the lines that are on between steps."""
         idle = idle_program(self._specs)
         self._opened().set_lines(mask_of(idle.on[-1].tolist(), self._specs))
         self.access.lines_set(idle)
@@ -130,8 +125,8 @@ class TtlLines(Lines):
         if self._box is None:
             return
         try:
-            self._box.line.stop()
-            self._box.line.drop_messages()
+            self._box.stop()
+            self._box.drop_messages()
         except DeviceError:
             self._was_lost = True
         if self._was_lost:
@@ -141,7 +136,7 @@ class TtlLines(Lines):
 
     def emergency(self) -> Emergency | None:
         """The byte that turns all lines off; a box that is reset by the opening of its port does so too."""
-        return None if self._box is None else self._box.line.emergency()
+        return None if self._box is None else self._box.emergency()
 
     def check_program(self, program: LineProgram) -> None:
         """Refuse a program that the box cannot play.
@@ -164,19 +159,15 @@ class TtlLines(Lines):
             raise DeviceError(self._name, text)
         edges = edges_of(program, self._specs, self._name)
         self._refuse_while_running("compiled")
-        slot = self._slots.find(edges)
+        slot = self._slot_of.pop(edges, None)
         if slot is None:
-            slot = self._slots.free()
+            slot = self._free_slot()
             box.put(slot, edges)
-            self._slots.keep(edges, slot)
+        self._slot_of[edges] = slot  # the one used last comes last
         self._compiled, self._is_armed = (program, slot, len(edges)), False
 
     def arm(self) -> None:
-        """Prepare the program that was compiled last.
-
-        Raises:
-            DeviceError: Not open, nothing was compiled, a program runs, or the box was reset.
-        """
+        """Prepare the program that was compiled last."""
         box = self._opened()
         self._refuse_while_running("armed")
         if self._compiled is None:
@@ -188,11 +179,7 @@ class TtlLines(Lines):
         self._is_armed = True
 
     def fire(self) -> None:
-        """Start the program, or let the start input start it; returns at once.
-
-        Raises:
-            DeviceError: Not armed, or a program runs.
-        """
+        """Start the program, or let the start input start it; returns at once."""
         box = self._opened()
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
@@ -208,7 +195,6 @@ class TtlLines(Lines):
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
-            DeviceError: The box was reset or stopped, or the line is broken.
         """
         box = self._opened()
         max_wait_s = self.access.wait_until(self._end_s, timeout_s)
@@ -216,12 +202,8 @@ class TtlLines(Lines):
             self._wait_for_box(box, max_wait_s)
 
     def self_test(self) -> None:
-        """Write a program, read it back, and play one that changes no line.
-
-        Raises:
-            DeviceError: Not open, a program runs, or the box does something else.
-        """
-        box, slot = self._opened(), self._slots.free()
+        """Write a program, read it back, and play one that changes no line."""
+        box, slot = self._opened(), self._free_slot()
         self._refuse_while_running("tested")
         self._compiled, self._is_armed = None, False
         written = bit_pattern()
@@ -235,7 +217,7 @@ class TtlLines(Lines):
         started_s, expected_s = time.monotonic(), TEST_TICKS * TICK_S
         box.fire()
         self.access.fired(None)
-        event = box.line.new_events(TEST_WAIT_S)
+        event = box.new_events(TEST_WAIT_S)
         took_s = time.monotonic() - started_s
         if event is None or event[0] != "done":
             sent = "nothing" if event is None else " ".join(event)
@@ -258,13 +240,13 @@ class TtlLines(Lines):
     def _connect(self) -> None:
         """Open the port, check the box, turn all lines off, and set what stays the same."""
         self._forget()
-        self._slots.clear()
+        self._slot_of.clear()
         try:
             self._box = box = Box(self.access.connect(), self._name, self._clock, self.access.max_wait_s)
             self._identity = box.identify()
             self._check_serial_number(self._identity.serial_number)
-            box.line.drop_messages()
-            box.line.ask("off")
+            box.drop_messages()
+            box.ask("off")
             state = box.state()
             if state.polarity != self._polarity:
                 box.set_polarity(self._polarity)
@@ -284,9 +266,8 @@ class TtlLines(Lines):
         timeout_s = self._settings.watchdog_timeout if self.access.real_time else 0.0
         box.set_watchdog_timeout(timeout_s)
         if timeout_s:
-            self._heartbeat = Heartbeat(
-                lambda: box.line.send(b"\n"), timeout_s
-            )  # the box ignores empty lines
+            # the box ignores empty lines
+            self._heartbeat = Heartbeat(lambda: box.send(b"\n"), timeout_s)
             self._heartbeat.start()
 
     def _disconnect(self) -> None:
@@ -295,7 +276,7 @@ class TtlLines(Lines):
             heartbeat.stop()
         box, self._box = self._box, None
         if box is not None:
-            box.line.close()
+            box.close()
         self.access.disconnect()
 
     def _forget(self) -> None:
@@ -308,14 +289,20 @@ class TtlLines(Lines):
             raise DeviceError(self._name, "not open; call open() first")
         return self._box
 
+    def _free_slot(self) -> int:
+        """A slot for a new program, if need be that of the program that was not used for the longest time."""
+        if len(self._slot_of) < SLOTS:
+            return min({*range(SLOTS)} - {*self._slot_of.values()})
+        return self._slot_of.pop(next(iter(self._slot_of)))
+
     def _refuse_while_running(self, what: str) -> None:
-        while (event := self._opened().line.new_events()) is not None:
+        while (event := self._opened().new_events()) is not None:
             self._handle(event)
         if self._is_running or not self.access.is_over(self._end_s):
             raise DeviceError(self._name, f"{what} while a program runs; call wait() first")
 
     def _wait_for_box(self, box: Box, timeout_s: float) -> None:
-        while (event := box.line.new_events(timeout_s)) is not None:
+        while (event := box.new_events(timeout_s)) is not None:
             self._handle(event)
             if not self._is_running:
                 return
@@ -355,7 +342,7 @@ class TtlLines(Lines):
 
     def _was_reset(self, n_boots: int, cause: int = 0) -> NoReturn:
         self._forget()
-        self._slots.clear()
+        self._slot_of.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
         text = f"the box was reset (reason: {cause_text(cause)}) and turned all lines off"
         raise DeviceError(self._name, f"{text}; check its supply and cable")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from labseq.plugin import LimitError, LineProgram, LineSpec, format_quantity
-from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, SLOTS, TICK_S, Edge
+from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, TICK_S, Edge
 
 MAX_EDGES: Final = EDGES - 1
 """Edges of a program; one more marks its end."""
@@ -61,30 +60,3 @@ def _edge(program: LineProgram, i: int) -> str:
     before = program.on[i - 1] if i else np.zeros_like(now)
     names = ", ".join(f"'{line}'" for line, new in zip(program.lines, now != before, strict=True) if new)
     return f"of {names or 'no line'} at {format_quantity(float(program.t_s[i]), 'time', 7)}"
-
-
-class Slots:
-    """The programs that the box stores; a new one replaces the one that was not used for the longest time."""
-
-    def __init__(self) -> None:
-        self._slot_of: OrderedDict[tuple[Edge, ...], int] = OrderedDict()
-
-    def find(self, program: tuple[Edge, ...]) -> int | None:
-        """The slot of a program, which counts as used now; None if the box does not store it."""
-        if program in self._slot_of:
-            self._slot_of.move_to_end(program)
-        return self._slot_of.get(program)
-
-    def free(self) -> int:
-        """A slot for a new program; the program that was there is dropped."""
-        if len(self._slot_of) < SLOTS:
-            return min(set(range(SLOTS)) - set(self._slot_of.values()))
-        return self._slot_of.popitem(last=False)[1]
-
-    def keep(self, program: tuple[Edge, ...], slot: int) -> None:
-        """Record that a program is in a slot."""
-        self._slot_of[program] = slot
-
-    def clear(self) -> None:
-        """Drop all: the box was reset."""
-        self._slot_of.clear()

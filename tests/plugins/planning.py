@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from labseq_grid.planner import GridPlanner, GridSettings
 from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_scans.planners import Mta1Planner, Mta1Settings, TetrisPlanner, TetrisSettings
+from labseq_scans.planners import LineSettings, Mta1Planner, TetrisPlanner
 from labseq_single.planner import CompressionPlanner, HcaPlanner, LsapPlanner, LsapSquaredPlanner
 from numpy.typing import NDArray
 
@@ -37,11 +37,11 @@ def grid(context: Context, dop: int) -> GridPlanner:
 
 
 def mta1(context: Context, dop: int) -> Mta1Planner:
-    return Mta1Planner(Mta1Settings(degree_of_parallelism=dop), context)
+    return Mta1Planner(LineSettings(degree_of_parallelism=dop), context)
 
 
 def tetris(context: Context, dop: int) -> TetrisPlanner:
-    return TetrisPlanner(TetrisSettings(degree_of_parallelism=dop), context)
+    return TetrisPlanner(LineSettings(degree_of_parallelism=dop), context)
 
 
 def single(planner: type[Any]) -> MakePlanner:

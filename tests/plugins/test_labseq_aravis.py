@@ -94,7 +94,7 @@ def test_frames_arrive_as_they_were_made(fake: FakeCamera) -> None:
                 buffer = stream.pop(WAIT_S)
                 assert buffer is not None
                 assert buffer.image is not None
-                assert (buffer.status, buffer.pixel_format) == ("success", pixel_format)
+                assert buffer.status == "success"
                 np.testing.assert_array_equal(buffer.image, np.minimum(first + 1000 * n, largest))
                 ids.append(buffer.frame_id)
                 times.append(buffer.camera_time_ns)

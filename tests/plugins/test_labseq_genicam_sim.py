@@ -39,8 +39,7 @@ def test_region_exposure_gain_and_binning_reach_what_makes_the_pixels() -> None:
         camera.trigger()
         assert stream.pop(WAIT_S) is not None
     (request,) = requests
-    assert request.exposure_s == pytest.approx(0.045)
-    assert request.gain == pytest.approx(12.5)
+    assert (request.exposure_us, request.gain_steps) == (45_000, 12_500)
     assert [request.x, request.y, request.width, request.height] == list(REGION.values())
     assert (request.n, request.binning_y, request.binning_x) == (0, 1, 2)
 

@@ -67,7 +67,7 @@ a:
         (
             "{f:.1f}",
             "{F:.1f}",
-            "10:13: '{F}' is not an argument; expected one of f, n, wave; did you mean",
+            "10:13: '{F}' is not an argument; expected one of 'f', 'n', 'wave'; did you mean",
         ),
         ("{f:.1f},", "", "12:9: the argument 'f' has no place in 'FREQ {n:02d},{wave}'; expected a placeho"),
         ("{f:.1f}", "{f:.1q}", "10:13: '{f:.1q}' is not a format of a float"),

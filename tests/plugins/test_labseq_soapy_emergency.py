@@ -107,8 +107,8 @@ def test_a_radio_that_cannot_be_opened_again_may_transmit_and_the_text_says_so(t
     with pytest.raises(script.EmergencyError) as error:
         script.off(dead.pid, 1, str(opened), 0.01, "driver=none", [0, 1], {})
     assert str(error.value) == (
-        "the radio 'driver=none' cannot be opened again: SoapySDR::Device::make() no match; it plays nothing "
-        "any more, but its transmitters stay on with their gain: switch it off by hand"
+        "the radio 'driver=none' cannot be opened again: makeStrArgs: SoapySDR::Device::make() no match; "
+        "it plays nothing any more, but its transmitters stay on with their gain: switch it off by hand"
     )
     assert opened.exists(), "the next attempt tries it again"
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_ttl.lines import TtlLines
-from labseq_ttl.programs import MAX_EDGES, Slots, as_played, edges_of
+from labseq_ttl.programs import MAX_EDGES, as_played, edges_of
 from labseq_ttl.protocol import CHANNELS, SHORTEST, SLOTS, TICK_S, unframed
 from labseq_ttl.settings import TtlSettings
 from pydantic import ValidationError
@@ -86,27 +86,17 @@ def test_it_says_what_it_is(simulated_by: str) -> None:
     assert about["lines"] == {"cooling": 2, "mot": 3, "imaging": 4, "camera": 5, "shutter": 6}
 
 
-def test_a_known_program_is_not_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_known_program_is_sent_again_only_after_one_not_used_for_longest_gave_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with rig() as lab:
         sent: list[int] = []
         put = lab.driver_box.put
         monkeypatch.setattr(lab.driver_box, "put", lambda slot, edges: (sent.append(slot), put(slot, edges)))
-        for kind in ("load", "image", "load", "image"):
-            lab.fire(kind)
+        for n in (*range(SLOTS), 0, SLOTS, 0, 1, 2):
+            lab.fire("image", 1e-3 * (n + 1))
             lab.lines.wait(1.0)
-    assert sent == [0, 1]
-
-
-def test_the_program_that_was_not_used_for_the_longest_time_gives_way() -> None:
-    slots = Slots()
-    programs = [((0, n),) for n in range(SLOTS + 1)]
-    for program in programs[:-1]:
-        slots.keep(program, slots.free())
-    assert slots.find(programs[0]) == 0
-    assert slots.free() == 1
-    slots.keep(programs[-1], 1)
-    assert slots.find(programs[1]) is None
-    assert [slots.find(program) for program in (programs[0], programs[2], programs[-1])] == [0, 2, 1]
+    assert sent == [*range(SLOTS), 1, 2, 3]
 
 
 def two_edges_apart(apart_s: float) -> LineProgram:
