@@ -335,6 +335,13 @@ class SimulatedLibrary:
             self._shared.disconnect()
         self.card = self._shared = None
 
+    def functions(self) -> tuple[int, int]:
+        """Addresses of the C functions that read and that write a register of 64 bits."""
+        functions = _library().functions
+        names = "spcm_dwGetParam_i64", "spcm_dwSetParam_i64"
+        get, put = (ctypes.cast(functions[name], ctypes.c_void_p).value or 0 for name in names)
+        return get, put
+
     def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:
         """Have the card call a driver's step whenever it is due; False if time is real."""
         card = self.card or _library().cards.get(self._name)
