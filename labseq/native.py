@@ -122,12 +122,12 @@ N_TIMER: Final = 10
 _CLOCK, _FIRST, _SECOND, _SCALE, _PER, _SLEEP, _SECONDS, _TICKS, _PAUSE = range(9)
 
 
-def new_timer() -> Ints:
-    """int64 (N_TIMER,) for :func:`now_ns` and :func:`sleep_ns`, by one thread at a time.
+def new_timer(timer: Ints | None = None) -> Ints:
+    """int64 (N_TIMER,), new or given, for :func:`now_ns` and :func:`sleep_ns`, by one thread at a time.
 
     The time is that of ``time.perf_counter``.
     """
-    timer = np.zeros(N_TIMER, np.int64)
+    timer = np.zeros(N_TIMER, np.int64) if timer is None else timer
     address = timer.ctypes.data + 8 * _SECONDS
     if sys.platform == "win32":
         frequency, library = ctypes.c_int64(), ctypes.windll.kernel32

@@ -25,6 +25,7 @@ from labseq.motion.render_kernels import (
     MAX_GROUPS,
     N_CHIRPS,
     N_FIELDS,
+    N_KEYS,
     N_ROWS32,
     N_ROWS64,
     N_STATE,
@@ -34,11 +35,13 @@ from labseq.motion.render_kernels import (
     SILENT,
     START,
     START_AMPLITUDE,
+    STRIP_KEYS,
     WORKSPACE,
     Axis,
     Workspace,
     apply_envelope,
     envelope,
+    is_there,
     store,
     strip_samples,
 )
@@ -259,7 +262,7 @@ def add_steep(
 @helper_kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {WORKSPACE})")
 def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, workspace: Workspace) -> None:
     """Add tone ``k`` of segment ``i`` to ``n`` samples, the first of them ``x`` samples after its start."""
-    tones, _, course, _, _, _, _, _, _, length, _, _ = axis
+    tones, _, course, _, _, _, _, _, _, length, _, _, _ = axis
     work, nodes = workspace[1], workspace[7]
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     if shared:
@@ -281,19 +284,21 @@ def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, works
 @helper_kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
 def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
     """Render a part of segment ``i`` tone by tone; see :func:`render_comb`."""
-    tones, offsets, _, _, _, _, _, _, delta, length, _, block = axis
+    tones, offsets, _, _, _, _, _, at, delta, length, _, block, number = axis
     work = workspace[1]
     shared, first, last = envelope(tones, offsets[i], offsets[i + 1])
     slope = (last - first) / length[i]
-    strip = strip_samples(block)
+    strip, n_samples = strip_samples(block), at[i + 1] - at[i]
     for s in range(skip // strip, (skip + len(out) - 1) // strip + 1):
         x = s * strip + delta[i]
         start, stop = max(0, skip - s * strip), min(strip, skip + len(out) - s * strip)
-        work[SAMPLES, :stop] = np.float32(0.0)
-        for k in range(offsets[i], offsets[i + 1]):
-            add_direct(axis, i, k, x, stop, shared, workspace)
-        if first != last:
-            apply_envelope(work[SAMPLES], stop, first + slope * x, slope)
+        if not is_there(workspace[6], STRIP_KEYS, number, i, s):
+            whole = min(strip, n_samples - s * strip)
+            work[SAMPLES, :whole] = np.float32(0.0)
+            for k in range(offsets[i], offsets[i + 1]):
+                add_direct(axis, i, k, x, whole, shared, workspace)
+            if first != last:
+                apply_envelope(work[SAMPLES], whole, first + slope * x, slope)
         store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
 
 
@@ -321,9 +326,9 @@ def render(axis: Axis, start: int, out: NDArray[np.int16], workspace: Workspace)
 
 N_OUT: Final = 0
 """The word of an axis that says how many samples :func:`render_at` renders."""
-_SIZES: Final = 1  # tones, segments, rows of the teeth, period, block, width of the workspace
-_STEP: Final = 7
-_ARRAYS: Final = 8  # addresses of ten arrays of the axis and nine of the workspace
+_SIZES: Final = 1  # tones, segments, rows of the teeth, period, block, number, width of the workspace
+_STEP: Final = 8
+_ARRAYS: Final = 9  # addresses of ten arrays of the axis and nine of the workspace
 N_WORDS: Final = _ARRAYS + 19
 
 
@@ -335,11 +340,11 @@ def describe(axis: Axis, workspace: Workspace, out: NDArray[np.int16], words: ND
         The address of ``out``.
     """
     words[N_OUT] = len(out)
-    tones, offsets, course, path, tooth, group, teeth, first, delta, length, step, block = axis
+    tones, offsets, course, path, tooth, group, teeth, first, delta, length, step, block, number = axis
     sums, work, tables, lanes, state, chirps, keys, nodes, repeated = workspace
     words[_SIZES], words[_SIZES + 1] = tones.shape[1], len(path)
     words[_SIZES + 2], words[_SIZES + 3] = teeth.shape
-    words[_SIZES + 4], words[_SIZES + 5] = block, work.shape[1]
+    words[_SIZES + 4], words[_SIZES + 5], words[_SIZES + 6] = block, number, work.shape[1]
     words.view(np.float64)[_STEP] = step
     at = words[_ARRAYS:]
     at[0], at[1], at[2], at[3] = tones.ctypes.data, offsets.ctypes.data, course.ctypes.data, path.ctypes.data
@@ -365,7 +370,7 @@ def render_at(address: int, start: int, out: int) -> int:
     """
     words = carray(pointer(address), N_WORDS, np.int64)
     n_tones, n, n_teeth, period = words[_SIZES], words[_SIZES + 1], words[_SIZES + 2], words[_SIZES + 3]
-    block, width, at = words[_SIZES + 4], words[_SIZES + 5], words[_ARRAYS:]
+    block, number, width, at = words[_SIZES + 4], words[_SIZES + 5], words[_SIZES + 6], words[_ARRAYS:]
     axis = (
         carray(pointer(at[0]), (N_FIELDS, n_tones), np.float64),
         carray(pointer(at[1]), n + 1, np.int32),
@@ -379,6 +384,7 @@ def render_at(address: int, start: int, out: int) -> int:
         carray(pointer(at[9]), n, np.float64),
         words.view(np.float64)[_STEP],
         block,
+        number,
     )
     workspace = (
         carray(pointer(at[10]), (N_ROWS64, width), np.float64),
@@ -387,7 +393,7 @@ def render_at(address: int, start: int, out: int) -> int:
         carray(pointer(at[13]), (MAX_GROUPS, 4, LANES + 1), np.float64),
         carray(pointer(at[14]), (MAX_GROUPS, N_STATE), np.float64),
         carray(pointer(at[15]), (N_CHIRPS, 2, width), np.float32),
-        carray(pointer(at[16]), 2 * N_CHIRPS + 1, np.float64),
+        carray(pointer(at[16]), N_KEYS, np.float64),
         carray(pointer(at[17]), (3, width // LANES), np.int32),
         carray(pointer(at[18]), width, np.int16),
     )

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
 from functools import lru_cache
+from itertools import count
 from typing import TYPE_CHECKING, Final, NoReturn
 
 import numpy as np
@@ -34,6 +35,11 @@ BLOCK: Final = 1536
 MIN_REUSED: Final = 1 << 19
 MAX_REUSED: Final = 1 << 26
 """Samples of both channels, of waveforms whose memory :func:`render` uses again: 1 to 128 MB."""
+
+BLOCK_AT: Final = 11
+"""Where an axis has the samples of a block."""
+
+_NUMBERS: Final = count()
 
 NO_SAMPLES: Final = np.empty(0, np.int16)
 
@@ -261,31 +267,31 @@ class Renderer:
         from labseq.motion.render_kernels import new_workspace
 
         axis, words = self._axes[channel], np.empty(N_WORDS, np.int64)
-        free = _free_workspaces(axis[-1])
+        free = _free_workspaces(axis[BLOCK_AT])
         try:
             workspace = free.pop()
         except IndexError:
-            workspace = new_workspace(axis[-1])
+            workspace = new_workspace(axis[BLOCK_AT])
         place = describe(axis, workspace, out, words)
         render_at(words.ctypes.data, start, place)
         free.append(workspace)
 
-    def words(self, workspaces: dict[int, Workspace]) -> NDArray[np.int64]:
+    def words(self, workspaces: dict[tuple[int, int], Workspace]) -> NDArray[np.int64]:
         """The program for a kernel that calls the function at :func:`render_address`, int64 (2, N_WORDS).
 
         Args:
-            workspaces: Those of the thread that renders, by size of block; the kernel uses them, and what is
-                missing is added. They and the renderer must live as long as the kernel renders.
+            workspaces: Those of the thread that renders, by channel and size of block; the kernel uses them,
+                and what is missing is added. They and the renderer must live as long as the kernel renders.
         """
         from labseq.motion.render_direct_kernels import N_WORDS, describe
         from labseq.motion.render_kernels import new_workspace
 
         words = np.zeros((N_CHANNELS, N_WORDS), np.int64)
-        for axis, row in zip(self._axes, words, strict=True):
-            block = axis[-1]
-            if block not in workspaces:
-                workspaces[block] = new_workspace(block)
-            describe(axis, workspaces[block], NO_SAMPLES, row)
+        for channel, axis in enumerate(self._axes):
+            block = axis[BLOCK_AT]
+            if (channel, block) not in workspaces:
+                workspaces[channel, block] = new_workspace(block)
+            describe(axis, workspaces[channel, block], NO_SAMPLES, words[channel])
         return words
 
 
@@ -399,7 +405,7 @@ def _prepare(
         array.flags.writeable = False
     return (
         tones, axis.offsets, program.course, path, tooth, group, comb.teeth, first_sample, delta, length,
-        comb.step, comb.block,
+        comb.step, comb.block, next(_NUMBERS),
     )  # fmt: skip
 
 

@@ -138,7 +138,7 @@ class Stream:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
         self._first = np.zeros((max(FIRST, block), 2), np.int16)
         self._scratch = np.zeros((2, k.CHUNK), np.int16)
-        self._workspaces: dict[int, Any] = {}
+        self._workspaces: dict[tuple[int, int], Any] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
         self._is_on = self._is_filling = self._has_thread = False
@@ -223,7 +223,7 @@ class Stream:
 
     def _made(self, program: ToneProgram) -> Program:
         renderer = Renderer(program, self._rate_hz)
-        axes, words = renderer.words(self._workspaces), np.zeros(k.N_AXIS + 1, np.int64)
+        axes, words = renderer.words(self._workspaces), np.zeros(k.N_PROGRAM, np.int64)
         n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
         words[k.LENGTH], words[k.ROW_CHANNEL] = self._whole_blocks(n_samples), self._row_channel
         words[k.AXES], words[k.N_AXIS] = axes.ctypes.data, axes.shape[1]

@@ -35,9 +35,11 @@ N_QUEUE: Final = 4
 ends, from where on the ring holds silence again, error code of the library, and whether the loop runs."""
 N_WORDS: Final = 27
 
-LENGTH, ROW_CHANNEL, READY_MADE, N_READY, AXES, N_AXIS = range(6)
+LENGTH, ROW_CHANNEL, READY_MADE, N_READY, AXES, N_AXIS, BEGAN = range(7)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples that
-were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis."""
+were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop writes the
+place in the stream at which it begins."""
+N_PROGRAM: Final = 7
 
 CHUNK: Final = 1 << 18
 """Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
@@ -104,7 +106,7 @@ def supply_program(box: Words, room: int) -> int:
     a longer one takes less time than it plays.
     """
     place = box[QUEUE + (box[TAKEN] - 1) % N_QUEUE]
-    program = carray(pointer(place), N_AXIS + 1, np.int64)
+    program = carray(pointer(place), N_PROGRAM, np.int64)
     done, at = box[WRITTEN] - box[START], box[WRITTEN] % box[N_RING]
     ahead = (box[N_RING] - room + box[ON_CARD]) // box[BLOCK] * box[BLOCK]
     n = min(room, box[END] - box[WRITTEN], box[N_RING] - at, max(box[BLOCK], min(CHUNK, ahead)))
@@ -159,7 +161,8 @@ def supply(box: Words, rate_hz: int) -> int:
     if in_ring < 0:
         return in_ring
     if box[WRITTEN] >= box[END] and box[TAKEN] < box[QUEUED]:
-        program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), 1, np.int64)
+        program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), N_PROGRAM, np.int64)
+        program[BEGAN] = box[WRITTEN]
         box[START], box[END] = box[WRITTEN], box[WRITTEN] + program[LENGTH]
         box[TAKEN] += 1
     if box[WRITTEN] < box[END]:
