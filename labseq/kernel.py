@@ -14,6 +14,7 @@ An edit anywhere therefore leads to a new file.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import hashlib
 import importlib
@@ -75,7 +76,7 @@ def const(dtype: str, ndim: int) -> str:
     return f"Array({dtype}, {ndim}, 'C', readonly=True)"
 
 
-def kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[F], F]:
+def kernel(signature: str | Sequence[str], *, fused: bool = False, for_c: bool = False) -> Callable[[F], F]:
     """Compile a function for the given signatures, without the GIL, into the cache.
 
     With ``NUMBA_DISABLE_JIT=1`` the function stays plain Python.
@@ -85,8 +86,14 @@ def kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[
             or several of them.
         fused: Let ``a * b + c`` be rounded once instead of twice, where the processor
             can. That is faster, but the last digit may differ between processors.
+        for_c: Code in C calls it, too, by :func:`c_address`; its only signature takes and returns int64.
     """
-    return _decorator(signature, fused, is_helper=False)
+    return _decorator(signature, fused, is_helper=False, for_c=for_c)
+
+
+def c_address(function: Callable[..., Any]) -> int:
+    """Address at which code in C can call a kernel that is made for it; it is loaded if need be."""
+    return cast("_Kernel", function).c_address
 
 
 def helper_kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[F], F]:
@@ -145,9 +152,13 @@ def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
             raise error if isinstance(error, LabseqError) else PluginLoadError(one.module, reason) from error
 
 
-def _decorator(signature: str | Sequence[str], fused: bool, *, is_helper: bool) -> Callable[[F], F]:
+def _decorator(
+    signature: str | Sequence[str], fused: bool, *, is_helper: bool, for_c: bool = False
+) -> Callable[[F], F]:
     signatures = [signature] if isinstance(signature, str) else list(signature)
-    return lambda function: cast("F", _Kernel(cast("FunctionType", function), signatures, fused, is_helper))
+    return lambda function: cast(
+        "F", _Kernel(cast("FunctionType", function), signatures, fused, is_helper, for_c)
+    )
 
 
 def _numba() -> Any:
@@ -163,14 +174,18 @@ def _is_interpreted() -> bool:
 class _Kernel:
     """A function that is compiled, or loaded from the cache, when it is first needed."""
 
-    def __init__(self, function: FunctionType, signatures: list[str], fused: bool, is_helper: bool) -> None:
+    def __init__(
+        self, function: FunctionType, signatures: list[str], fused: bool, is_helper: bool, for_c: bool
+    ) -> None:
         update_wrapper(self, function)
         self.function = function
         self.signatures = signatures
         self.is_helper = is_helper
+        self.for_c = for_c
         self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"} if fused else False}
         self._dispatcher: Any = None  # for kernels that call it, and for itself while it is compiled
         self._call: Callable[..., Any] = self._first_call
+        self._c_address = 0
         _PENDING[self] = None
 
     def __call__(self, *args: Any) -> Any:
@@ -217,19 +232,33 @@ class _Kernel:
             if self._call == self._first_call:
                 try:
                     codes = [*map(self._load, range(len(self.signatures)))]
+                    self._c_address = codes[0][2]
                     self._call = calling(self.function.__name__, codes)
                 except (AttributeError, ImportError, LookupError):  # another numba than machine_code knows
                     self._call = _numba().njit(self.signatures, **self._options)(self.function)
                 if not self.is_helper:
                     _PENDING.pop(self, None)
 
-    def _load(self, number: int) -> tuple[MachineCode, Callable[..., Any]]:
+    @cached_property
+    def c_address(self) -> int:
+        """See :func:`c_address`; of a function in Python where kernels are not compiled."""
+        if self._call == self._first_call and not _is_interpreted():
+            self.load()
+        if not self._c_address:
+            word = ctypes.c_int64
+            self._for_c = ctypes.CFUNCTYPE(word, *[word] * self.function.__code__.co_argcount)(self)
+            self._c_address = ctypes.cast(self._for_c, ctypes.c_void_p).value or 0
+        return self._c_address
+
+    def _load(self, number: int) -> tuple[MachineCode, Callable[..., Any], int]:
         path = self.path(number, "python")
         with suppress(Exception):  # whatever is wrong with the cache, it can be compiled
             return load(_read(path))
         _announce_compiling(self)
         code = compile_for_python(
-            [*self.compile().overloads.values()][number], is_only=len(self.signatures) == 1
+            [*self.compile().overloads.values()][number],
+            is_only=len(self.signatures) == 1,
+            for_c=self.for_c,
         )
         _write(path, pickle.dumps(code))
         return load(code)
@@ -273,7 +302,7 @@ class _Kernel:
     def source(self) -> str:
         """What it is compiled from, without the kernels that it calls."""
         constants = [_constant(name, value) for name, value in sorted(self.named.items())]
-        options = (self.module, self.function.__qualname__, self.signatures, self._options)
+        options = (self.module, self.function.__qualname__, self.signatures, self._options, self.for_c)
         return repr((options, _code(self.function.__code__), [text for text in constants if text]))
 
     @cached_property

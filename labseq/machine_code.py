@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 """Raised when this module makes other machine code of the same kernel."""
 NDARRAY: Final = "labseq_ndarray"
 """Symbol of the class of arrays in machine code; numba would import all of itself to find it."""
@@ -49,6 +49,7 @@ class MachineCode(NamedTuple):
 
     Attributes:
         entry: Symbol of the function that takes Python objects.
+        c_entry: Symbol of the function that C code can call; "" if there is none.
         object_code: The content of an object file.
         symbols: Symbol outside of it -> name in :func:`_symbols`.
         environments: Symbol -> Python objects that the code uses.
@@ -57,6 +58,7 @@ class MachineCode(NamedTuple):
     """
 
     entry: str
+    c_entry: str
     object_code: bytes
     symbols: dict[str, str]
     environments: dict[str, list[object]]
@@ -88,12 +90,13 @@ def _processor() -> tuple[str, ...]:
     )
 
 
-def compile_for_python(result: Any, *, is_only: bool) -> MachineCode:
+def compile_for_python(result: Any, *, is_only: bool, for_c: bool = False) -> MachineCode:
     """Machine code that Python can call.
 
     Args:
         result: Numba's result of compiling, which has none yet for Python objects.
         is_only: Whether it is the kernel's only signature, which converts numbers.
+        for_c: Whether code in C calls it, too.
     """
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.environment import lookup_environment
@@ -115,6 +118,8 @@ def compile_for_python(result: Any, *, is_only: bool) -> MachineCode:
     library = codegen.create_library(function.qualname)
     library._optimize_final_module = library._finalize_final_module = _do_nothing  # noqa: SLF001
     context.create_cpython_wrapper(library, function, result.environment, None, release_gil=True)
+    if for_c:  # of the class, because this process may make only bitcode
+        type(context).create_cfunc_wrapper(context, library, function, result.environment, None)
     library.add_linking_library(result.library)
     library.add_linking_library(rtsys.library)
     with global_compiler_lock:
@@ -132,6 +137,7 @@ def compile_for_python(result: Any, *, is_only: bool) -> MachineCode:
     ]
     return MachineCode(
         function.llvm_cpython_wrapper_name,
+        function.llvm_cfunc_wrapper_name if for_c else "",
         codegen._tm.emit_object(module),  # noqa: SLF001
         {name: f"numba_{name}" if name in INTR_MATH else name for name in sorted(names)},
         constants | {function.env_name: result.environment.consts},
@@ -210,7 +216,9 @@ def make_only_bitcode() -> None:
 def _do_nothing(*_: object) -> None: ...
 
 
-def calling(name: str, functions: Sequence[tuple[MachineCode, Callable[..., Any]]]) -> Callable[..., Any]:
+def calling(
+    name: str, functions: Sequence[tuple[MachineCode, Callable[..., Any], int]]
+) -> Callable[..., Any]:
     """One function that calls the first of several that takes its arguments.
 
     Args:
@@ -225,15 +233,18 @@ def calling(name: str, functions: Sequence[tuple[MachineCode, Callable[..., Any]
         raise TypeError(f"No matching definition of kernel '{name}' for {', '.join(kinds)}")
 
     names = ", ".join(f"a{number}" for number in range(functions[0][0].n_parameters))
-    calls = [f"f{number}({names}) if {code.test} else" for number, (code, _) in enumerate(functions)]
-    scope = {f"f{number}": function for number, (_, function) in enumerate(functions)}
+    calls = [f"f{number}({names}) if {code.test} else" for number, (code, *_) in enumerate(functions)]
+    scope = {f"f{number}": function for number, (_, function, _) in enumerate(functions)}
     return eval(f"lambda {names}: {' '.join(calls)} refuse({names})", TESTED | scope | {"refuse": refuse})  # noqa: S307
 
 
-def load(code: MachineCode) -> tuple[MachineCode, Callable[..., Any]]:
+def load(code: MachineCode) -> tuple[MachineCode, Callable[..., Any], int]:
     """The function of machine code, in an engine of its own: names may be the same in two files.
 
     It trusts that its arguments pass the test.
+
+    Returns:
+        The code, the function for Python, and the address of the one for C, 0 if there is none.
 
     Raises:
         LookupError: The code needs a function that is not there.
@@ -263,7 +274,7 @@ def load(code: MachineCode) -> tuple[MachineCode, Callable[..., Any]]:
     function = dynfunc.make_function(
         sys.modules[__name__], "kernel", "", entry, unused, (engine, environments)
     )
-    return code, function
+    return code, function, engine.get_function_address(code.c_entry) if code.c_entry else 0
 
 
 @cache

@@ -45,7 +45,7 @@ from labseq.errors import (
 from labseq.files import cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
-from labseq.kernel import const, helper_kernel, kernel
+from labseq.kernel import c_address, const, helper_kernel, kernel
 from labseq.messages import clean, closest, install_hint, missing_package, visible
 from labseq.model import (
     COMPUTER,
@@ -96,10 +96,12 @@ from labseq.motion import (
     choose_plan,
     fitting_batches,
     render,
+    render_address,
     tone_program,
     warm_rendering,
 )
 from labseq.motion.tones import site_time_s
+from labseq.native import call_c, carray, new_timer, now_ns, pointer, sleep_ns, swap
 from labseq.processes import Process
 from labseq.realtime import raise_priority
 from labseq.recording import Run, open_run
@@ -274,7 +276,10 @@ __all__ = [
     "Waveform",
     "as_occupancy",
     "block",
+    "c_address",
     "cache_root",
+    "call_c",
+    "carray",
     "check_plan",
     "check_size",
     "check_step",
@@ -299,6 +304,8 @@ __all__ = [
     "missing_package",
     "nearest",
     "nearest_to_centre",
+    "new_timer",
+    "now_ns",
     "off_program",
     "offers",
     "one_of",
@@ -306,17 +313,21 @@ __all__ = [
     "open_run",
     "parse_quantity",
     "pattern",
+    "pointer",
     "port_identities",
     "ports_here",
     "ports_text",
     "raise_priority",
     "render",
+    "render_address",
     "scaled",
     "serial_emergency",
     "setting_error",
     "settle",
     "site_time_s",
+    "sleep_ns",
     "state_root",
+    "swap",
     "tone_program",
     "trigger_line",
     "unknown_name",

@@ -219,7 +219,6 @@ class _Measured(Step):
     def __init__(self) -> None:
         self.plans: list[tuple[int, float]] = []
         self.settle_s: list[float] = []
-        self.after_s: list[float] = []
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002
         """Empty: its duration is not planned."""
@@ -244,7 +243,6 @@ class _Measured(Step):
         self.plans.append((plan.n_batches, report.duration_s))
         play_prepared(shot, report.duration_s, 0, rest_of(shot, plan, n_first, plan.n_batches))
         restore_priority()
-        self.after_s.append(mobile.after_start_s if offers(mobile, "after_start_s") else 0.0)
 
 
 def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
@@ -274,7 +272,6 @@ def _report(
     times["prepare"][0] -= times["tones"][0]
     times["light"][0] -= settle_s
     light_s, modelled_s = times["light"]
-    times["start"][0] -= np.array(measured.after_s[N_WARM:])
     total_s = light_s - times["start"][0]
     between_s = total_s - sum(times[name][0] for name in HOST_STAGES)
     stages = [Stage.of(name, *times[name]) for name in HOST_STAGES]

@@ -15,7 +15,7 @@ from labseq.motion.axes import (
 )
 from labseq.motion.check import RULES, check_plan
 from labseq.motion.hold import all_on_program, cross_offsets_m, hold_program, hold_time_s
-from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render
+from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_address
 from labseq.motion.survival import Survival, choose_plan, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
 
@@ -39,6 +39,7 @@ __all__ = [
     "hold_time_s",
     "predict_survival",
     "render",
+    "render_address",
     "tone_program",
     "warm",
     "warm_rendering",

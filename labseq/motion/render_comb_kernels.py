@@ -46,6 +46,8 @@ from labseq.motion.render_kernels import (
     SAMPLES,
     START,
     START_AMPLITUDE,
+    STRIP_KEYS,
+    TABLES,
     TONES,
     V_ROW,
     WITHIN,
@@ -59,6 +61,7 @@ from labseq.motion.render_kernels import (
     fill_table,
     find_chirp,
     fit_cubic,
+    is_there,
     multiply,
     off_tooth,
     repeat,
@@ -304,18 +307,20 @@ def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace
     It is worked out strip by strip, each from its start, so that a sample does not depend
     on the stretch.
     """
-    _, offsets, _, path, _, _, _, _, delta, lengths, _, block = axis
-    work, lanes, state = workspace[1], workspace[3], workspace[4]
+    _, offsets, _, path, _, _, _, _, delta, lengths, _, block, number = axis
+    work, lanes, state, keys = workspace[1], workspace[3], workspace[4], workspace[6]
     shared, first, last = envelope(axis[0], offsets[i], offsets[i + 1])
     blended, length = path[i] == BLENDED, lengths[i]
     slope = (last - first) / length
     n_groups = axis[5][offsets[i] : offsets[i + 1]].max() + 1
-    for g in range(n_groups):
-        fill_group(axis, i, g, shared, blended, workspace)
-    if blended:
-        for j in range(block):
-            work[WITHIN, j] = np.float32(j / length)
+    if not is_there(keys, TABLES, number, i, 0):  # else the stretch before was of this segment, too
+        for g in range(n_groups):
+            fill_group(axis, i, g, shared, blended, workspace)
+        if blended:
+            for j in range(block):
+                work[WITHIN, j] = np.float32(j / length)
     if first == last and not blended and has_period(n_groups, block, length, workspace):
+        keys[STRIP_KEYS] = -1
         work[SAMPLES, :block] = np.float32(0.0)
         for g in range(n_groups):
             enter_block(state[g], lanes[g], delta[i], float(block))
@@ -323,19 +328,21 @@ def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace
         store(workspace[8], block, work[SAMPLES], 0)
         repeat(out, skip, workspace[8], block)
         return
-    strip = strip_samples(block)
+    strip, n_samples = strip_samples(block), axis[7][i + 1] - axis[7][i]
     for s in range(skip // strip, (skip + len(out) - 1) // strip + 1):
         x = s * strip + delta[i]
         start, stop = max(0, skip - s * strip), min(strip, skip + len(out) - s * strip)
-        work[SAMPLES, :stop] = np.float32(0.0)
-        for g in range(n_groups):
-            enter_block(state[g], lanes[g], x, float(block))
-            if blended:
-                add_blended_group(workspace, g, stop, block, x / length, block / length)
-            else:
-                add_group(workspace, g, stop, block)
-        if first != last:
-            apply_envelope(work[SAMPLES], stop, first + slope * x, slope)
+        if not is_there(keys, STRIP_KEYS, number, i, s):
+            whole = min(strip, n_samples - s * strip)  # a stretch that follows needs the rest
+            work[SAMPLES, :whole] = np.float32(0.0)
+            for g in range(n_groups):
+                enter_block(state[g], lanes[g], x, float(block))
+                if blended:
+                    add_blended_group(workspace, g, whole, block, x / length, block / length)
+                else:
+                    add_group(workspace, g, whole, block)
+            if first != last:
+                apply_envelope(work[SAMPLES], whole, first + slope * x, slope)
         store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
 
 

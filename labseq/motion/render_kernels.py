@@ -29,6 +29,11 @@ LANES: Final = 32
 N_CHIRPS: Final = 8
 """Number of cached chirps: to the right, to the left and parked, on two axes, and two spare ones."""
 
+TABLES: Final = 2 * N_CHIRPS + 1
+STRIP_KEYS: Final = TABLES + 3
+N_KEYS: Final = STRIP_KEYS + 3
+"""Behind the keys of the chirps: what tables and samples there are of, number of the axis, segment, strip."""
+
 FREQUENCY_GRID: Final = 2.0**44
 CHIRP_GRID: Final = 2.0**62
 
@@ -115,7 +120,7 @@ def find_chirp(frequency: float, chirp: float, n: int, chirps: Singles, keys: Fl
         chirp: In cycles per sample squared.
         n: Samples of a block.
         chirps: float32 (N_CHIRPS, 2, >= n + LANES), those that there are; updated.
-        keys: float64 (2 N_CHIRPS + 1,), frequency and chirp of each, and how many were filled in.
+        keys: float64 (N_KEYS,), frequency and chirp of each, and how many were filled in.
         lanes: Scratch, see :func:`fill_chirp`.
 
     Returns:
@@ -388,12 +393,12 @@ STRIP: Final = 8192
 """Maximum number of samples of a strip of several blocks."""
 
 Axis: TypeAlias = tuple[
-    Floats, Ints, Bytes, Bytes, Ints, Bytes, Floats, NDArray[np.int64], Floats, Floats, float, int
+    Floats, Ints, Bytes, Bytes, Ints, Bytes, Floats, NDArray[np.int64], Floats, Floats, float, int, int
 ]
 """An axis: tones, offsets, course, path, tooth and group (see :mod:`labseq.motion.render_kernels`),
 cosine and sine of each tooth over a period, each segment's first sample (and the end of the last),
 the time from its start to there and its length, both in samples, the spacing of the teeth in cycles
-per sample, and the samples of a block."""
+per sample, the samples of a block, and a number that no other axis has."""
 
 Workspace: TypeAlias = tuple[Floats, Singles, Singles, Floats, Floats, Singles, Floats, Ints, Samples]
 """The workspace of one thread, see :func:`new_workspace`."""
@@ -401,7 +406,7 @@ Workspace: TypeAlias = tuple[Floats, Singles, Singles, Floats, Floats, Singles, 
 AXIS: Final = (
     f"Tuple(({const('float64', 2)}, {const('int32', 1)}, {const('int8', 1)}, {const('int8', 1)},"
     f" {const('int32', 1)}, {const('int8', 1)}, {const('float64', 2)}, {const('int64', 1)},"
-    f" {const('float64', 1)}, {const('float64', 1)}, float64, int64))"
+    f" {const('float64', 1)}, {const('float64', 1)}, float64, int64, int64))"
 )
 WORKSPACE: Final = (
     "Tuple((float64[:, ::1], float32[:, ::1], float32[:, :, ::1], float64[:, :, ::1], float64[:, ::1],"
@@ -424,7 +429,7 @@ def new_workspace(block: int) -> Workspace:
         float32 (MAX_GROUPS, N_SUMS, width): tables of each group.
         float64 (MAX_GROUPS, 4, LANES + 1): lanes of each group.
         float64 (MAX_GROUPS, N_STATE): state of each group.
-        float32 (N_CHIRPS, 2, width), float64 (2 N_CHIRPS + 1,): chirps, and which they are.
+        float32 (N_CHIRPS, 2, width), float64 (N_KEYS,): chirps, their keys, and those of the tables.
         int32 (3, width / LANES): nodes of a tone.
         int16 (width,): a block that is repeated.
     """
@@ -436,10 +441,19 @@ def new_workspace(block: int) -> Workspace:
         np.zeros((MAX_GROUPS, 4, LANES + 1)),
         np.zeros((MAX_GROUPS, N_STATE)),
         np.zeros((N_CHIRPS, 2, width), np.float32),
-        np.append(np.full(2 * N_CHIRPS, np.nan), 0.0),
+        np.concatenate([np.full(2 * N_CHIRPS, np.nan), [0.0], np.full(N_KEYS - TABLES, -1.0)]),
         np.zeros((3, width // LANES), np.int32),
         np.zeros(width, np.int16),
     )
+
+
+@helper_kernel(f"boolean({F64}, int64, int64, int64, int64)")
+def is_there(keys: Floats, at: int, number: int, i: int, strip: int) -> bool:
+    """Whether tables or samples are those of a strip of segment ``i``; from now on they are."""
+    if keys[at] == number and keys[at + 1] == i and keys[at + 2] == strip:
+        return True
+    keys[at], keys[at + 1], keys[at + 2] = number, i, strip
+    return False
 
 
 @helper_kernel("void(int16[::1], int64, float32[::1], int64)")

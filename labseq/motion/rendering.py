@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
 from functools import lru_cache
+from itertools import count
 from typing import TYPE_CHECKING, Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LimitError
+from labseq.kernel import c_address
 from labseq.model import AxisTones, SiteGrid, ToneProgram, Waveform
 
 if TYPE_CHECKING:
@@ -33,6 +35,13 @@ BLOCK: Final = 1536
 MIN_REUSED: Final = 1 << 19
 MAX_REUSED: Final = 1 << 26
 """Samples of both channels, of waveforms whose memory :func:`render` uses again: 1 to 128 MB."""
+
+BLOCK_AT: Final = 11
+"""Where an axis has the samples of a block."""
+
+_NUMBERS: Final = count()
+
+NO_SAMPLES: Final = np.empty(0, np.int16)
 
 _FREE_SAMPLES: Final[deque[NDArray[np.int16]]] = deque(maxlen=2)
 
@@ -254,17 +263,47 @@ class Renderer:
             start: First sample, counted from the start of the program.
             out: Result, int16 (n,), contiguous.
         """
-        from labseq.motion.render_direct_kernels import render
+        from labseq.motion.render_direct_kernels import N_WORDS, describe, render_at
         from labseq.motion.render_kernels import new_workspace
 
-        axis = self._axes[channel]
-        free = _free_workspaces(axis[-1])
+        axis, words = self._axes[channel], np.empty(N_WORDS, np.int64)
+        free = _free_workspaces(axis[BLOCK_AT])
         try:
             workspace = free.pop()
         except IndexError:
-            workspace = new_workspace(axis[-1])
-        render(axis, start, out, workspace)
+            workspace = new_workspace(axis[BLOCK_AT])
+        place = describe(axis, workspace, out, words)
+        render_at(words.ctypes.data, start, place)
         free.append(workspace)
+
+    def words(self, workspaces: dict[tuple[int, int], Workspace]) -> NDArray[np.int64]:
+        """The program for a kernel that calls the function at :func:`render_address`, int64 (2, N_WORDS).
+
+        Args:
+            workspaces: Those of the thread that renders, by channel and size of block; the kernel uses them,
+                and what is missing is added. They and the renderer must live as long as the kernel renders.
+        """
+        from labseq.motion.render_direct_kernels import N_WORDS, describe
+        from labseq.motion.render_kernels import new_workspace
+
+        words = np.zeros((N_CHANNELS, N_WORDS), np.int64)
+        for channel, axis in enumerate(self._axes):
+            block = axis[BLOCK_AT]
+            if (channel, block) not in workspaces:
+                workspaces[channel, block] = new_workspace(block)
+            describe(axis, workspaces[channel, block], NO_SAMPLES, words[channel])
+        return words
+
+
+def render_address() -> int:
+    """Address of a C function that renders a part of an axis, with three arguments, all int64.
+
+    The address of a row of :meth:`Renderer.words`, whose first word is the number of samples, the first
+    sample, and where to write them, as int16. It takes no lock of Python.
+    """
+    from labseq.motion.render_direct_kernels import render_at
+
+    return c_address(render_at)
 
 
 @lru_cache(maxsize=4)
@@ -366,7 +405,7 @@ def _prepare(
         array.flags.writeable = False
     return (
         tones, axis.offsets, program.course, path, tooth, group, comb.teeth, first_sample, delta, length,
-        comb.step, comb.block,
+        comb.step, comb.block, next(_NUMBERS),
     )  # fmt: skip
 
 

@@ -53,7 +53,7 @@ METHODS: Final[Mapping[str, frozenset[str]]] = {
 }
 """Kind of device -> what clients may call, beside ``open`` and ``close``."""
 _OF_HARDWARE: Final = ("settling_timeout_s", "idle_output")
-_LIVE: Final = ("start_delay_s", "after_start_s", "beginning_s")
+_LIVE: Final = ("start_delay_s", "beginning_s")
 PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
     "camera": (*_OF_HARDWARE, "facts"),
     "static_tweezers": (*_OF_HARDWARE, "facts"),

@@ -269,11 +269,6 @@ class MobileTweezers(Hardware):
         return 0.0
 
     @property
-    def after_start_s(self) -> float:
-        """How long the last ``play`` went on, on the computer's clock, after the start was under way."""
-        return 0.0
-
-    @property
     def beginning_s(self) -> float:
         """Playing time after which a program can be cut and its rest follow by :meth:`append`; inf: never.
 

@@ -405,10 +405,9 @@ class RunningShot:
         if start is not None and self._frame_s is not None:
             mobile, (frame_s, host_s) = self.mobile_tweezers, self._frame_s
             delay_s = mobile.start_delay_s if offers(mobile, "start_delay_s") else 0.0
-            after_s = mobile.after_start_s if offers(mobile, "after_start_s") else 0.0
             cycle = self.record.images[-1].cycle + 1 if self.record.images else -1
-            host_taken_s = time.perf_counter() - host_s - after_s
-            taken_s = self.clock.now() - frame_s + delay_s - (0.0 if self.clock.virtual else after_s)
+            host_taken_s = time.perf_counter() - host_s
+            taken_s = self.clock.now() - frame_s + delay_s
             self._frame_s = None
             self.stage_done("light", taken_s, host_taken_s, cycle=cycle)
         self._events.release()

@@ -310,11 +310,6 @@ class RemoteMobileTweezers(RemoteHardware, MobileTweezers):
         return float(self._link.known("start_delay_s", 0.0))
 
     @property
-    def after_start_s(self) -> float:
-        """That of the served tweezers."""
-        return float(self._link.known("after_start_s", 0.0))
-
-    @property
     def beginning_s(self) -> float:
         """That of the served tweezers."""
         return float(self._link.known("beginning_s", math.inf))

@@ -103,6 +103,11 @@ class AwgCard:
             raise DeviceError(self.name, f"{action}: {error}") from error
 
     @property
+    def handle(self) -> int:
+        """The handle of the driver library, as an address."""
+        return ctypes.cast(self._card.handle(), ctypes.c_void_p).value or 0
+
+    @property
     def product(self) -> str:
         """Product name, such as "M4i.6631-x8"."""
         return str(self._card.product_name())

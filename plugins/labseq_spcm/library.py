@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
 import io
 import os
@@ -51,6 +52,13 @@ class VendorLibrary:
 
     def disconnect(self) -> None:
         """Release the card; no effect if it is not connected."""
+
+    def functions(self) -> tuple[int, int]:
+        """Addresses of the C functions that read and that write a register of 64 bits."""
+        module = importlib.import_module("spcm_core.pyspcm")
+        functions = module.spcm_dwGetParam_i64, module.spcm_dwSetParam_i64_
+        get, put = (ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions)
+        return get, put
 
     def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:  # noqa: ARG002
         """Whether time is virtual, so that no thread is needed for what goes on beside the calls: never.

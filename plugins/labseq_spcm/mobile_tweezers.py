@@ -290,11 +290,6 @@ class SpcmMobileTweezers(MobileTweezers):
         return float(self._facts.get("trigger_delay_s", 0.0))
 
     @property
-    def after_start_s(self) -> float:
-        """In the mode ``stream`` the time for more samples than the first."""
-        return self._mode.after_start_s if isinstance(self._mode, Stream) else 0.0
-
-    @property
     def beginning_s(self) -> float:
         """A fraction of a program's length for the modes ``stream`` and ``dds``."""
         return math.inf if self._mode is None else self._mode.beginning_s

@@ -5,33 +5,43 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from labseq.plugin import (
     Context,
     DeviceError,
     LabseqError,
     Plan,
+    Renderer,
     ToneProgram,
     TransientError,
     format_quantity,
+    new_timer,
     raise_priority,
+    render_address,
     tone_program,
 )
+from labseq_spcm import stream_kernels as k
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples
-from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES
-from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
+from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES, SAMPLE_STEP
+from labseq_spcm.replay_fifo import InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 
-FIRST: Final = 1 << 17
-"""Samples of a program that are rendered before it starts: 0.21 ms at 625 MS/s, behind 0.25 ms of silence."""
+FIRST: Final = 1 << 16
+"""Samples of a program that are rendered before it starts: 0.1 ms at 625 MS/s, behind 0.25 ms of silence."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 LOCK_RETRY_S: Final = 10e-6
 """After that time the thread tries again if a call of the driver is at work."""
+FILLING_POLL_S: Final = 20e-6
+"""Time between two looks at a card that is filled before its start."""
+HALT_S: Final = 0.1
+"""Longest time that the loop may take to end; it looks for that after each part that it renders."""
 PLAYING_POLL_S: Final = 1e-3
 """Longest time between two looks at the ring while a program plays."""
 BUS_SAMPLES: Final = 1 << 22
@@ -68,19 +78,36 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
     raise DeviceError(name, f"{text}; {hint}")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Program:
+    """A program as the loop takes it.
+
+    Attributes:
+        words: See :mod:`labseq_spcm.stream_kernels`.
+        axes: Those of its renderer.
+        renderer: It owns the memory of the axes.
+        playing_s: Its length.
+    """
+
+    words: NDArray[np.int64]
+    axes: NDArray[np.int64]
+    renderer: Renderer
+    playing_s: float
+
+
 class Stream:
     """Keeps the card supplied from ``idle`` to ``halt``. See ``PlayMode``.
 
     Samples go into a ring in the computer, from there over the bus into the card's buffer and its
     output FIFO, and from there to the outputs. While no program plays, silence is handed over one
     look-ahead before it is played. A program follows the last silence that was handed over; it is
-    rendered faster than it is played, so the ring is soon full. A thread looks after the ring; on a
-    virtual clock the simulated card calls the same steps in its time.
+    rendered faster than it is played, so the ring is soon full. A compiled loop does that in a thread
+    of its own, without Python's lock (:mod:`labseq_spcm.stream_kernels`); on a virtual clock the simulated
+    card calls its steps in its time. Python starts the card, also after it ran dry.
 
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
         delay_s: From ``start`` to the first sample at the output, at most.
-        after_start_s: How long the last ``start`` went on after it had handed the first samples over.
 
     Raises:
         DeviceError: The bus is too slow for the sample rate.
@@ -88,7 +115,7 @@ class Stream:
 
     max_wait_s = PLAYING_POLL_S
     beginning_s = BEGINNING_S
-    render_s = after_start_s = 0.0
+    render_s = 0.0
 
     def __init__(
         self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
@@ -105,23 +132,34 @@ class Stream:
         least = 2 * self._whole_blocks(self._ahead + self._on_card)
         n_samples = max(self._whole_blocks(math.ceil(settings.fill_s * sample_rate_hz)), least)
         self._ring = Buffer().reserve(n_samples)
+        self._ring[:] = 0  # so that the memory is there
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
-        self._first = np.zeros((FIRST, 2), np.int16)
-        self._chunk = np.zeros((2, CHUNK), np.int16)
-        self._lock = threading.Lock()
+        self._first = np.zeros((max(FIRST, block), 2), np.int16)
+        self._scratch = np.zeros((2, k.CHUNK), np.int16)
+        self._workspaces: dict[tuple[int, int], Any] = {}
+        self._lock = threading.RLock()
         self._stop = threading.Event()
         self._is_on = self._is_filling = self._has_thread = False
         self._failure: LabseqError | None = None
-        self._prepared: InterleavedRenderer | None = None
-        self._program: InterleavedRenderer | None = None
-        self._remainder: InterleavedRenderer | None = None
-        self._n_rendered = 0
-        self._n_written = self._n_fetched = self._start = self._end = self._silent_from = 0
+        self._prepared: Program | None = None
+        self._queued: list[Program] = []
+        self._box = self._new_box()
         self.n_underruns = 0
         self._check_bus()
         self._set_mode(settings)
+
+    def _new_box(self) -> NDArray[np.int64]:
+        """The words that Python and the loop share; a loop that has not ended yet keeps its own."""
+        box = np.zeros(k.N_WORDS, np.int64)
+        box[k.GET], box[k.SET] = self._card.library.functions()
+        box[k.HANDLE], box[k.RENDER] = self._card.handle, render_address()
+        box[k.RING], box[k.N_RING] = self._ring.ctypes.data, len(self._ring)
+        box[k.BLOCK], box[k.ON_CARD], box[k.AHEAD] = self._block, self._on_card, self._ahead
+        box[k.SILENCE], box[k.SCRATCH] = self._silence.ctypes.data, self._scratch.ctypes.data
+        box[k.VALUE] = box[k.FOUND :].ctypes.data
+        return box
 
     def _check_bus(self) -> None:
         """Time a transfer to the card's memory; the best of three counts."""
@@ -147,37 +185,49 @@ class Stream:
         card.set(spcm.SPC_DATA_OUTBUFSIZE, settings.card_buffer, "size of the card's buffer in bytes")
         card.write_setup()
 
-    # Calls of the driver: they read the status before they take the lock, so that virtual time catches up.
-
     def idle(self) -> None:
         """Start the stream; no effect if it is on."""
         with self._lock:
             if self._is_on:
                 return
+            self._box, self._queued = self._new_box(), []
             self._begin()
             self._is_on, self._stop = True, threading.Event()
-        self._has_thread = not self._card.library.call_in_virtual_time(self._step)
+        self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
-            threading.Thread(target=self._run, args=(self._stop,), name="spcm stream", daemon=True).start()
+            arguments = self._box, self._stop
+            threading.Thread(target=self._run, args=arguments, name="spcm stream", daemon=True).start()
 
     def halt(self) -> None:
         """End the supply and drop the programs; the card is stopped by the caller."""
         self._stop.set()
         self._card.library.call_in_virtual_time(None)
         with self._lock:
-            self._is_on, self._failure = False, None
-            self._prepared = self._program = self._remainder = None
+            box, self._is_on, self._failure, self._prepared = self._box, False, None, None
+            box[k.STOP] = 1
+            until_s = time.perf_counter() + HALT_S
+            while box[k.IS_FEEDING] and time.perf_counter() < until_s:
+                time.sleep(50e-6)
 
     def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
         """Render the first samples of a program; returns its playing time in seconds."""
         start_s = time.perf_counter()
-        renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel, self._chunk)
-        self._n_rendered = min(FIRST, self._whole_blocks(renderer.n_samples))
-        renderer.write(0, self._first[: self._n_rendered])
-        self._prepared = renderer
+        made = self._made(program)
+        n_ready = min(len(self._first), int(made.words[k.LENGTH]))
+        k.render_ready(self._box, made.words, self._first.ctypes.data, n_ready)
+        made.words[k.READY_MADE], made.words[k.N_READY] = self._first.ctypes.data, n_ready
+        self._prepared = made
         self.render_s = time.perf_counter() - start_s
         self._check_failure()
-        return renderer.n_samples / self._rate_hz
+        return made.playing_s
+
+    def _made(self, program: ToneProgram) -> Program:
+        renderer = Renderer(program, self._rate_hz)
+        axes, words = renderer.words(self._workspaces), np.zeros(k.N_PROGRAM, np.int64)
+        n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
+        words[k.LENGTH], words[k.ROW_CHANNEL] = self._whole_blocks(n_samples), self._row_channel
+        words[k.AXES], words[k.N_AXIS] = axes.ctypes.data, axes.shape[1]
+        return Program(words, axes, renderer, n_samples / self._rate_hz)
 
     def start(self, command: int) -> None:  # noqa: ARG002 - the card runs already
         """Have the prepared program follow what was handed over."""
@@ -185,22 +235,21 @@ class Stream:
         with self._lock:
             program, self._prepared = self._prepared, None
             if program is not None:  # else another thread has made the card safe
-                self._start_or_restart()
-                self._queue_program(program)
-                self._supply_until(self._start + self._n_rendered)
-                spliced_s = time.perf_counter()
-                # a beginning as a whole: this thread makes the rest next, and keeps others from Python
-                self._supply_until(min(self._end, self._n_written + int(BEGINNING_S * self._rate_hz)))
-                self.after_start_s = time.perf_counter() - spliced_s
+                self._queue(program)
 
     def append(self, program: ToneProgram) -> float:
         """Have the rest of a program follow its beginning, or the silence after it."""
-        renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel, self._chunk)
+        made = self._made(program)
         self._check_failure()
         with self._lock:
-            self._remainder = renderer
-            self._supply_until(self._n_written + self._on_card)
-        return renderer.n_samples / self._rate_hz
+            self._queue(made)
+        return made.playing_s
+
+    def _queue(self, program: Program) -> None:
+        box, n = self._box, int(self._box[k.QUEUED])
+        self._queued = [*self._queued[1 - k.N_QUEUE :], program]  # the loop may still use the ones before
+        box[k.QUEUE + n % k.N_QUEUE] = program.words.ctypes.data
+        box[k.QUEUED] = n + 1
 
     def triggered(self) -> bool:
         """Whether the program has begun: the stream has no trigger."""
@@ -209,10 +258,9 @@ class Stream:
     def finished(self) -> bool:
         """Whether the program has been played to its end."""
         self._check_failure()
-        with self._lock:
-            if self._remainder is None and self._n_written - self._in_ring() >= self._end + self._on_card:
-                self._program = None
-            return self._program is None
+        box = self._box
+        is_taken = box[k.TAKEN] == box[k.QUEUED]
+        return bool(is_taken and box[k.FETCHED] >= box[k.END] + self._on_card)
 
     def _check_failure(self) -> None:
         """Let a virtual clock's steps be done, and raise the error that ended the stream."""
@@ -223,145 +271,98 @@ class Stream:
         if failure is not None:
             raise failure
 
-    # The supply, one step at a time
-
-    def _run(self, stop: threading.Event) -> None:
+    def _run(self, box: NDArray[np.int64], stop: threading.Event) -> None:
         """The thread."""
         raise_priority()  # so that the card does not run dry because other programs are busy
-        while (pause_s := self._step()) is not None and not stop.wait(pause_s):
-            pass
+        timer, rate_hz, code = new_timer(), int(self._rate_hz), 0
+        while (pause_s := self._step(box, code)) is not None:
+            if pause_s:
+                stop.wait(pause_s)
+                code = 0
+            else:
+                code = k.feed(box, rate_hz, timer)
 
-    def _step(self) -> float | None:
-        """Supply the card; returns after how many seconds that is due again, None if never."""
-        if not self._lock.acquire(blocking=False):
+    def _virtual_step(self) -> float | None:
+        """What the thread does, a step at a time."""
+        pause_s = self._step(self._box, 0)
+        if pause_s != 0.0:
+            return pause_s
+        code = k.supply(self._box, int(self._rate_hz))
+        return self._step(self._box, code) if code < 0 else 1e-9 * code
+
+    def _step(self, box: NDArray[np.int64], code: int) -> float | None:
+        """Do what is left to Python: the start of the card, and what follows a code of the loop.
+
+        Returns:
+            Time to wait, in seconds; 0: the loop can go on; None: it is over.
+        """
+        if not self._lock.acquire(blocking=False):  # the driver is about to halt, or to read a failure
             return LOCK_RETRY_S
         try:
-            if not self._is_on:
+            if not self._is_on or box is not self._box:
                 return None
-            return self._supply()
+            if code:
+                self._recover(code)
+            return self._start() if self._is_filling else 0.0
         except LabseqError as failure:
             self._is_on, self._failure = False, failure
             return None
         finally:
             self._lock.release()
 
-    def _supply_until(self, handed: int) -> None:
-        """Hand over as many samples, or as there is room for."""
-        while self._n_written < handed and self._supply() == 0.0:
-            pass
-
-    def _supply(self) -> float:
-        """Hand over what there is room for; returns after how many seconds that is due again."""
-        in_ring = self._start_or_restart()
-        try:
-            return self._fill(in_ring)
-        except DeviceError:
-            if self._card.running:
-                raise
-            self._recover(self._n_written - self._in_ring())  # it ran dry just now
-            return 0.0
-
-    def _fill(self, in_ring: int) -> float:
-        """The same, with ``in_ring`` samples in the ring.
-
-        A part of a program is as long as what is ahead of the outputs: each part costs 0.1 ms for the tables
-        of its tones, and a longer one takes less time than it plays.
-        """
-        if self._remainder is not None and self._n_written >= self._end:
-            rest, self._remainder, self._n_rendered = self._remainder, None, 0
-            self._queue_program(rest)
-        if self._program is not None and self._n_written < self._end:
-            room = min(len(self._ring) - in_ring, self._end - self._n_written)
-            if room:
-                ahead = (in_ring + self._on_card) // self._block * self._block
-                part = max(self._block, min(CHUNK, ahead))
-                self._hand_over_program(self._program, min(room, part))
-                return 0.0
-            return min(PLAYING_POLL_S, len(self._ring) / 8 / self._rate_hz)
-        self._hand_over_silence(self._ahead - in_ring)
-        return self._ahead / 2 / self._rate_hz
-
-    def _start_or_restart(self) -> int:
-        """Start the card once it has samples, begin again if it ran dry; returns the samples in the ring."""
+    def _start(self) -> float:
+        """Start the card as soon as it has samples; returns how long to wait, in seconds."""
         card, spcm = self._card, self._card.spcm
-        in_ring = self._in_ring()
-        fetched, before = self._n_written - in_ring, self._n_fetched
-        self._n_fetched = fetched
-        if self._is_filling:
-            if fetched >= self._to_start:
-                start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
-                card.command(start, "start of the stream")
-                self._is_filling = False
-        elif (not in_ring or fetched == before) and not card.running:
-            self._recover(fetched)
-            return self._in_ring()
-        return in_ring
+        if k.look(self._box) == k.FAILED:
+            raise self._error()
+        if self._box[k.FETCHED] < self._to_start:
+            return FILLING_POLL_S
+        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
+        card.command(start, "start of the stream")
+        self._is_filling = False
+        return 0.0
 
     def _begin(self) -> None:
         """Fill the card with silence; it is started when it has some."""
-        card, spcm = self._card, self._card.spcm
+        card, spcm, box = self._card, self._card.spcm, self._box
         card.stop()
-        self._n_written, self._n_fetched, self._silent_from = 0, 0, len(self._ring)
+        box[k.WRITTEN] = box[k.FETCHED] = box[k.START] = box[k.END] = 0
+        box[k.SILENT_FROM] = len(self._ring)
         card.define_transfer(self._ring, self._block * FRAME_BYTES)
-        self._hand_over_silence(self._ahead + self._on_card)
+        if k.supply_silence(box, self._ahead + self._on_card):
+            raise self._error()
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
         self._is_filling = True
 
-    def _queue_program(self, program: InterleavedRenderer | None) -> None:
-        """Have a program follow what was handed over."""
-        self._program, self._start = program, self._n_written
-        self._end = self._n_written + (self._whole_blocks(program.n_samples) if program else 0)
+    def _error(self) -> DeviceError:
+        """The error that the library reported to the loop."""
+        return DeviceError(self._card.name, f"supplying the card: {self._card.clear_error()}")
 
-    def _recover(self, fetched: int) -> None:
+    def _recover(self, code: int) -> None:
         """The card has run dry, or was stopped: begin again, with the program if it cannot have begun.
 
         Raises:
             TransientError: In the middle of a program.
+            DeviceError: The card runs, but the library reports an error.
         """
+        box = self._box
+        if code == k.FAILED:
+            error = self._error()
+            if self._card.running:
+                raise error
+            if k.look(box) == k.FAILED:
+                raise self._error()
+        start, end, fetched = (int(box[word]) for word in (k.START, k.END, k.FETCHED))
         # only whole blocks are reported as fetched: a part of the first one may have been played
-        may_have_begun = self._start <= fetched and self._start < self._n_written
-        if self._program is not None and may_have_begun and fetched < self._end:
-            share = f"{(fetched - self._start) / (self._end - self._start):.0%} of the program was played"
+        may_have_begun = start <= fetched and start < box[k.WRITTEN]
+        if may_have_begun and fetched < end:
+            share = f"{(fetched - start) / (end - start):.0%} of the program was played"
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
             raise TransientError(f"{text} the mode replay", self._card.name)
         self.n_underruns += 1
+        if fetched < end:
+            box[k.TAKEN] -= 1
         self._begin()
-        if self._program is not None:
-            self._queue_program(None if fetched >= self._end else self._program)
-
-    def _in_ring(self) -> int:
-        """Samples that were handed over and that the card has not reported as fetched."""
-        free = self._card.read(self._card.spcm.SPC_DATA_AVAIL_USER_LEN) // FRAME_BYTES
-        return len(self._ring) - free
 
     def _whole_blocks(self, n_samples: int) -> int:
         return -(-n_samples // self._block) * self._block
-
-    def _hand_over_silence(self, n_samples: int) -> None:
-        n_samples = min(len(self._ring), n_samples // self._block * self._block)
-        if n_samples <= 0:
-            return
-        if self._n_written < self._silent_from:
-            for n in range(0, n_samples, self._block):
-                at = (self._n_written + n) % len(self._ring)
-                self._ring[at : at + self._block] = self._silence
-        self._hand_over(n_samples)
-
-    def _hand_over_program(self, program: InterleavedRenderer, n_samples: int) -> None:
-        """Copy or render the next part of the program into the ring; behind its end there is silence."""
-        at, done = self._n_written % len(self._ring), self._n_written - self._start
-        part = self._ring[at : at + n_samples]
-        if done < self._n_rendered:
-            part = part[: self._n_rendered - done]
-            part[:] = self._first[done : done + len(part)]
-        else:
-            start_s = time.perf_counter()
-            program.write(done, part)
-            self.render_s += time.perf_counter() - start_s
-        self._silent_from = self._end + len(self._ring)
-        self._hand_over(len(part))
-
-    def _hand_over(self, n_samples: int) -> None:
-        card = self._card
-        card.write(card.spcm.SPC_DATA_AVAIL_CARD_LEN, n_samples * FRAME_BYTES, "handing samples over")
-        self._n_written += n_samples

@@ -33,11 +33,13 @@ from labseq.plugin import (
     RfSpan,
     RfTones,
     Simulation,
+    c_address,
     offers,
 )
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
 from labseq_spcm_sim.emergency import PREFIX as SHARED
+from labseq_spcm_sim.fifo_kernels import read_register, write_register
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import FULL_SCALE, SampleSpan, Span
 from labseq_spcm_sim.setup import ErrorInfo, Number
@@ -142,6 +144,12 @@ class Library:
         if name == "spcm_hOpen":
             return (first or b"").decode(errors="replace") in self.cards
         return first in self._handles  # closed ones too: the vendor's library must never see them
+
+    def point_handle_to(self, card: Card, address: int) -> None:
+        """Have the handle of an open card point to an address that functions in C find there."""
+        for handle, opened in self._open.items():
+            if opened is card:
+                ctypes.c_int64.from_address(handle).value = address
 
     # The functions, by their names in small letters, with the arguments of their signatures.
 
@@ -334,6 +342,19 @@ class SimulatedLibrary:
         if self._shared is not None:
             self._shared.disconnect()
         self.card = self._shared = None
+
+    def functions(self) -> tuple[int, int]:
+        """Addresses of the C functions that read and that write a register of 64 bits.
+
+        In real time those of a card in this process need Python for other registers than a stream's only.
+        """
+        library, card = _library(), self.card or _library().cards.get(self._name)
+        names = "spcm_dwGetParam_i64", "spcm_dwSetParam_i64"
+        read, write = (ctypes.cast(library.functions[name], ctypes.c_void_p).value or 0 for name in names)
+        if self._clock.virtual or not isinstance(card, SimulatedCard):
+            return read, write
+        library.point_handle_to(card, card.direct_words(read, write))
+        return c_address(read_register), c_address(write_register)
 
     def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:
         """Have the card call a driver's step whenever it is due; False if time is real."""

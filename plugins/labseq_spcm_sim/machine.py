@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from labseq_spcm_sim import registers as r
+import numpy as np
+
+from labseq_spcm_sim import fifo_kernels as k, registers as r
 from labseq_spcm_sim.dds import CoreOutputs, Dds
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
 from labseq_spcm_sim.output import Amplifier, SampleSpan, Span
@@ -49,6 +51,7 @@ class Machine:
         self.model = model
         self.amplifiers = (Amplifier(model), Amplifier(model))
         self.dds = Dds(model.n_dds_cores, model.dds_queue)
+        self.words = np.zeros(k.N_WORDS, np.int64)
         self.samples: list[Record] = []
         self.tones: list[CoreOutputs] = []
         self._power_on()
@@ -256,7 +259,8 @@ class Machine:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
             rate_hz, room_bytes = setup[r.SPC_SAMPLERATE], setup.on_card(r.SPC_DATA_OUTBUFSIZE)
-            self.fifo = Fifo(buffer, setup.frame_bytes, rate_hz, room_bytes, self.model.bus_bytes_per_s)
+            bus = self.model.bus_bytes_per_s
+            self.fifo = Fifo(self.words, buffer, setup.frame_bytes, rate_hz, room_bytes, bus)
         elif buffer.n_bytes > (room := setup[r.SPC_MEMSIZE] * setup.frame_bytes):
             raise refuse(buffer.n_bytes, f"at most {room} bytes; set the memory size first")
         self.buffer = buffer

@@ -12,7 +12,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_spcm_sim import registers as r
+from labseq_spcm_sim import fifo_kernels as k, registers as r
 from labseq_spcm_sim.output import ROUNDING
 from labseq_spcm_sim.setup import OUTPUT_FIFO_BYTES, Refusal, refuse
 
@@ -184,10 +184,6 @@ class Replay:
         return cut(self._stretches, self._rate, now_s)
 
 
-SMALL: Final = 1e-3
-"""Bytes that are a rounding error of time."""
-
-
 def _repeats(data: Samples, n: int) -> bool:
     """Whether all blocks of ``n`` samples are equal; most that are not differ at once."""
     return np.array_equal(data[n : n + 8], data[: len(data[n : n + 8])]) and bool(
@@ -203,6 +199,7 @@ class Fifo:
     stops: an underrun.
 
     Args:
+        words: Where its state is, for code in C; see ``fifo_kernels``.
         buffer: The ring.
         frame_bytes: Bytes of one sample of all active channels.
         sample_rate_hz: Sample rate.
@@ -212,6 +209,7 @@ class Fifo:
 
     def __init__(
         self,
+        words: NDArray[np.int64],
         buffer: Buffer,
         frame_bytes: int,
         sample_rate_hz: float,
@@ -221,23 +219,38 @@ class Fifo:
         self._buffer = buffer
         self._frame = frame_bytes
         self._rate = sample_rate_hz
-        self._room = room_bytes
-        self._bus = bus_bytes_per_s
-        self._total = math.inf
-        self._handed = 0
-        self._transferred = 0.0
-        self._consumed = 0.0
-        self._now_s = -math.inf
-        self._play_s = math.inf
         self._pieces: list[tuple[int, Stretch]] = []
-        self._dma = False
-        self.failed = False
-        self.finished = False
+        self._words, self._real = words, words.view(np.float64)
+        words[k.ADDRESS], words[k.N_BYTES], words[k.NOTIFY] = (
+            buffer.address,
+            buffer.n_bytes,
+            buffer.notify_bytes,
+        )
+        words[k.FRAME] = frame_bytes
+        words[k.HANDED] = words[k.DMA] = words[k.FAILED] = words[k.FINISHED] = 0
+        words[k.N_ENTRIES] = words[k.N_READ] = words[k.HAS_LEFT_OUT] = 0
+        self._real[k.RATE : k.NOW] = sample_rate_hz, room_bytes, bus_bytes_per_s, math.inf, 0.0, 0.0
+        self._real[k.NOW], self._real[k.PLAY] = -math.inf, math.inf
+
+    @property
+    def failed(self) -> bool:
+        """Whether the output found no data."""
+        return bool(self._words[k.FAILED])
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything was played."""
+        return bool(self._words[k.FINISHED])
+
+    @property
+    def play_s(self) -> float:
+        """When the output starts; inf if that is not known."""
+        return float(self._real[k.PLAY])
 
     def set_length(self, n_samples: int) -> None:
         """The card is started, with the number of samples per channel to play; 0: until the stop."""
-        self._total = n_samples * self._frame if n_samples else math.inf
-        self._room += OUTPUT_FIFO_BYTES
+        self._real[k.TOTAL] = n_samples * self._frame if n_samples else math.inf
+        self._real[k.ROOM] += OUTPUT_FIFO_BYTES
 
     def hand_over(self, n_bytes: int) -> None:
         """The user has filled bytes, which the card may now fetch."""
@@ -246,16 +259,39 @@ class Fifo:
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
         if n_bytes:
-            self._keep(self._buffer.fetch(self._handed, n_bytes))
-            self._handed += n_bytes
+            handed = int(self._words[k.HANDED])
+            self._take_kept()
+            self._keep(handed, n_bytes, self._buffer.fetch(handed, n_bytes))
+            self._words[k.HANDED] += n_bytes
 
-    def _keep(self, data: Samples) -> None:
-        """Remember samples that will be played: no silence, and of equal blocks only the first."""
+    def _take_kept(self) -> None:
+        """Take over what was handed over beside Python.
+
+        Raises:
+            RuntimeError: The memory for it was full.
+        """
+        words, entry, data = self._words, np.zeros(4, np.int64), np.empty(0, np.uint8)
+        while k.take(words, entry, data) or entry[3]:
+            if entry[3] > len(data):
+                data = np.empty(entry[3], np.uint8)
+                continue
+            self._keep(int(entry[0]), int(entry[1]), data[: entry[3]].view(np.int16))
+        if words[k.HAS_LEFT_OUT]:
+            raise RuntimeError("the simulated card has not kept all that it played; read it more often")
+
+    def _keep(self, start: int, n_bytes: int, data: Samples) -> None:
+        """Remember samples that will be played, no silence, and of equal blocks only the first.
+
+        Args:
+            start: Their place in the stream, in bytes.
+            n_bytes: How many are played; ``data`` is repeated.
+            data: Samples.
+        """
         words = data.view(np.uint64) if data.nbytes % 8 == 0 else data.view(np.uint16)
         if not words.max():  # several times faster than any()
             return
         data = data.reshape(-1, self._frame // 2)
-        first, n_samples = self._handed // self._frame, len(data)
+        first, n_samples = start // self._frame, n_bytes // self._frame
         block = self._buffer.notify_bytes // self._frame
         if block and not n_samples % block and _repeats(data, block):
             data = data[:block]
@@ -269,82 +305,39 @@ class Fifo:
     def switch_dma(self, on: bool, now_s: float) -> None:
         """Whether the bus fetches what was handed over."""
         self.advance(now_s)
-        self._dma = on
+        self._words[k.DMA] = on
 
     @property
     def user_bytes(self) -> int:
         """Bytes that are free for the user, in whole notify sizes."""
-        done = math.floor(self._transferred + SMALL)
-        notified = done - done % max(1, self._buffer.notify_bytes)
-        return self._buffer.n_bytes - (self._handed - notified)
+        return int(k.user_bytes(self._words))
 
     @property
     def levels(self) -> tuple[float, float]:
         """Bytes that were handed over and wait in the computer, and that wait on the card."""
-        return self._handed - self._transferred, self._transferred - self._consumed
+        fetched = float(self._real[k.FETCHED])
+        return float(self._words[k.HANDED]) - fetched, fetched - float(self._real[k.PLAYED])
 
     @property
     def block_ready(self) -> bool:
         """Whether there is room for a block, or all was transferred."""
-        return self.user_bytes >= max(1, self._buffer.notify_bytes) or self._transferred >= self._handed
-
-    @property
-    def _over(self) -> bool:
-        return self.failed or self.finished
-
-    def _drain(self) -> float:
-        """Bytes per second that the output takes now."""
-        return self._rate * self._frame if self._now_s >= self._play_s and not self._over else 0.0
-
-    def _speed(self) -> float:
-        """Bytes per second on the bus now."""
-        if not self._dma or self._over or self._transferred >= self._handed - SMALL:
-            return 0.0
-        full = self._transferred - self._consumed >= self._room - SMALL
-        return min(self._bus, self._drain()) if full else self._bus
+        is_idle = self._real[k.FETCHED] >= self._words[k.HANDED]
+        return self.user_bytes >= max(1, self._buffer.notify_bytes) or bool(is_idle)
 
     def advance(self, now_s: float) -> None:
         """Let bytes flow up to now."""
-        if self._now_s == -math.inf:
-            self._now_s = now_s
-        while self._now_s < now_s and not self._over:
-            self._flow(now_s)
-        self._now_s = max(self._now_s, now_s)
-
-    def _flow(self, now_s: float) -> None:
-        """Transfer until something changes: the start, the end of the data, full, empty, or now."""
-        drain, speed = self._drain(), self._speed()
-        fill = self._transferred - self._consumed
-        if drain > speed and fill <= SMALL:
-            self.failed = True
-            return
-        spans = [now_s - self._now_s]
-        if self._now_s < self._play_s:
-            spans.append(self._play_s - self._now_s)
-        if speed:
-            spans.append((self._handed - self._transferred) / speed)
-        if speed > drain:
-            spans.append((self._room - fill) / (speed - drain))
-        if drain > speed:
-            spans.append(fill / (drain - speed))
-        if drain:
-            spans.append((self._total - self._consumed) / drain)
-        step_s = min(spans)
-        at_least_s = math.nextafter(self._now_s, math.inf)
-        self._now_s = now_s if step_s == spans[0] else max(self._now_s + step_s, at_least_s)
-        self._transferred = min(float(self._handed), self._transferred + speed * step_s)
-        self._consumed = min(self._transferred, self._consumed + drain * step_s)
-        self.finished = self._consumed >= self._total - SMALL
+        k.advance(self._words, now_s)
 
     def trigger(self, out_s: float) -> None:
         """The first trigger starts the output."""
-        self._play_s = min(self._play_s, out_s)
+        self._real[k.PLAY] = min(self._real[k.PLAY], out_s)
 
     def played(self, now_s: float) -> list[Stretch]:
         """The samples that were output so far."""
-        n_samples = math.floor((self._consumed + SMALL) / self._frame)
+        self._take_kept()
+        n_samples, play_s = math.floor((self._real[k.PLAYED] + k.SMALL) / self._frame), self.play_s
         stretches = [
-            Stretch(self._play_s + first / self._rate, piece.samples, min(piece.n_samples, n_samples - first))
+            Stretch(play_s + first / self._rate, piece.samples, min(piece.n_samples, n_samples - first))
             for first, piece in self._pieces
             if first < n_samples
         ]
@@ -352,6 +345,7 @@ class Fifo:
 
     def forget(self, before_s: float) -> None:
         """Drop the data that were played before a time."""
-        if self._play_s < before_s:
-            n_samples = (before_s - self._play_s) * self._rate
+        self._take_kept()
+        if self.play_s < before_s:
+            n_samples = (before_s - self.play_s) * self._rate
             self._pieces = [piece for piece in self._pieces if piece[0] + piece[1].n_samples > n_samples]

@@ -1,0 +1,159 @@
+"""For kernels that call functions in C, read memory by its address, and keep time, without Python's lock.
+
+A kernel that runs in a thread of its own for as long as a run takes cannot be given new arguments: it finds
+what changes at addresses. Addresses and handles are int64 throughout.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import math
+import sys
+import time
+from collections.abc import Callable
+from functools import cached_property, partial
+from inspect import Parameter, Signature
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.kernel import helper_kernel
+
+Ints = NDArray[np.int64]
+
+
+class _Builtin:
+    """A function that kernels call and numba has to be taught; Python calls its own version."""
+
+    def __init__(self, in_python: Callable[..., Any], for_numba: Callable[[], Any]) -> None:
+        self._in_python = in_python
+        self._for_numba = for_numba
+
+    def __call__(self, *args: Any) -> Any:
+        return self._in_python(*args)
+
+    @cached_property
+    def _numba_type_(self) -> Any:
+        """Numba asks for it when it compiles a call."""
+        from numba.core.registry import cpu_target
+
+        function, known = self._for_numba(), cast("Any", cpu_target).typing_context
+        known.refresh()
+        return known.resolve_value_type(function)
+
+
+_FUNCTION: Final = ctypes.CFUNCTYPE(ctypes.c_uint32, *[ctypes.c_int64] * 3)
+
+
+def _call(address: int, a: int, b: int, c: int) -> int:
+    return int(_FUNCTION(address)(a, b, c))
+
+
+def _array(address: int, shape: Any, dtype: Any) -> NDArray[Any]:
+    n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory: Any = (ctypes.c_char * n_bytes).from_address(address)
+    return np.frombuffer(memory, dtype).reshape(shape)
+
+
+def _pointer(address: int) -> int:
+    return address
+
+
+def _swap(address: int, value: int) -> int:
+    word = ctypes.c_int64.from_address(address)
+    before, word.value = word.value, value
+    return before
+
+
+def _taught(n_arguments: int, result: str, write: Callable[..., Any]) -> Any:
+    """Numba's version of a function of int64, whose instructions ``write(ir, builder, values)`` adds."""
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
+
+    signature = getattr(types, result)(*[types.int64] * n_arguments)
+
+    def code(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return write(ir, builder, values)
+
+    def typing(_context: Any, *_arguments: Any) -> Any:
+        return signature, code
+
+    names = ["context", *(f"a{number}" for number in range(n_arguments))]
+    parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+    cast("Any", typing).__signature__ = Signature(parameters)  # numba looks at it
+    return cast("Any", intrinsic)(typing)
+
+
+def _write_call(ir: Any, builder: Any, values: Any) -> Any:
+    function = ir.FunctionType(ir.IntType(32), [ir.IntType(64)] * 3).as_pointer()
+    builder.fence("seq_cst")  # other threads see in order what is written before and after
+    result = builder.call(builder.inttoptr(values[0], function), values[1:])
+    builder.fence("seq_cst")
+    return builder.zext(result, ir.IntType(64))
+
+
+def _write_pointer(ir: Any, builder: Any, values: Any) -> Any:
+    return builder.inttoptr(values[0], ir.IntType(8).as_pointer())
+
+
+def _write_swap(ir: Any, builder: Any, values: Any) -> Any:
+    word = builder.inttoptr(values[0], ir.IntType(64).as_pointer())
+    return builder.atomic_rmw("xchg", word, values[1], "seq_cst")
+
+
+call_c: Any = _Builtin(_call, partial(_taught, 4, "int64", _write_call))
+"""``call_c(address, a, b, c)`` calls a C function with up to three integers or pointers; returns its uint32.
+
+Arguments that it does not take are ignored, as in the calling conventions of all 64-bit systems."""
+
+pointer: Any = _Builtin(_pointer, partial(_taught, 1, "voidptr", _write_pointer))
+"""``pointer(address)`` for :data:`carray`."""
+
+carray: Any = _Builtin(_array, lambda: cast("Any", importlib.import_module("numba")).carray)
+"""``carray(pointer(address), shape, dtype)`` is the array at an address."""
+
+swap: Any = _Builtin(_swap, partial(_taught, 2, "int64", _write_swap))
+"""``swap(address, value)`` sets an int64 and returns what it was, in one step for all threads."""
+
+N_TIMER: Final = 10
+_CLOCK, _FIRST, _SECOND, _SCALE, _PER, _SLEEP, _SECONDS, _TICKS, _PAUSE = range(9)
+
+
+def new_timer(timer: Ints | None = None) -> Ints:
+    """int64 (N_TIMER,), new or given, for :func:`now_ns` and :func:`sleep_ns`, by one thread at a time.
+
+    The time is that of ``time.perf_counter``.
+    """
+    timer = np.zeros(N_TIMER, np.int64) if timer is None else timer
+    address = timer.ctypes.data + 8 * _SECONDS
+    if sys.platform == "win32":
+        frequency, library = ctypes.c_int64(), ctypes.windll.kernel32
+        library.QueryPerformanceFrequency(ctypes.byref(frequency))
+        clock, sleep = library.QueryPerformanceCounter, library.SwitchToThread
+        shared = math.gcd(10**9, frequency.value)
+        timer[_FIRST] = address
+        timer[_SCALE], timer[_PER] = 10**9 // shared, frequency.value // shared
+    else:
+        library = ctypes.CDLL(None)
+        clock, sleep = library.clock_gettime, library.nanosleep
+        timer[_FIRST], timer[_SECOND], timer[_SCALE], timer[_PER] = time.CLOCK_MONOTONIC, address, 10**9, 1
+    for at, function in ((_CLOCK, clock), (_SLEEP, sleep)):
+        timer[at] = ctypes.cast(function, ctypes.c_void_p).value or 0
+    return timer
+
+
+@helper_kernel("int64(int64[::1])")
+def now_ns(timer: Ints) -> int:
+    """The time in nanoseconds."""
+    call_c(timer[_CLOCK], timer[_FIRST], timer[_SECOND], 0)
+    return timer[_SECONDS] * timer[_SCALE] // timer[_PER] + timer[_TICKS]  # pyright: ignore[reportReturnType]
+
+
+@helper_kernel("void(int64[::1], int64)")
+def sleep_ns(timer: Ints, duration_ns: int) -> None:
+    """Wait less than a second; on Windows it returns as soon as other threads had their turn."""
+    timer[_PAUSE], timer[_PAUSE + 1] = 0, duration_ns
+    call_c(timer[_SLEEP], timer[_PAUSE:].ctypes.data, 0, 0)
