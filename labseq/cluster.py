@@ -22,7 +22,7 @@ from labseq import __version__
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, error_text, format_error, install_hint
 from labseq.processes import is_loopback
-from labseq.workers import Do, Make, ProcessWorkers, Workers
+from labseq.workers import Do, Make, ProcessWorkers, Workers, finished
 
 CA_FILE: Final = "ca.pem"
 CLIENT_FILE: Final = "client.pem"
@@ -214,7 +214,14 @@ def connect(address: str, keys: Path | None) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # other versions of packages that labseq does not use there
-            return Client(address, security=security, timeout=_ANSWER_S, set_as_default=False)
+            # results come from the workers, by way of the scheduler only where that is not possible
+            return Client(
+                address,
+                security=security,
+                timeout=_ANSWER_S,
+                set_as_default=False,
+                direct_to_workers=True,
+            )
     except Exception as error:
         hint = "is it running, with the certificates of the same folder?" if security else "is it running?"
         raise _problem(address, f"no scheduler answers: {error_text(error)}", hint=hint) from error
@@ -236,7 +243,9 @@ _prepared: Final[dict[str, Do]] = {}
 
 
 def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any:
-    """Carry out a task on a worker; one at a time, whatever the worker's number of threads.
+    """Carry out a task on a worker.
+
+    Whatever the worker's number of threads, one task is in work at a time, and others only wait for the disk.
 
     Returns:
         The result; None if the worker is not prepared and was not given the recipe.
@@ -254,4 +263,5 @@ def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any
             while len(_prepared) >= _MAX_PREPARED:
                 del _prepared[next(iter(_prepared))]
             _prepared[run] = make(recipe)
-        return _prepared[run](argument)
+        result = _prepared[run](argument)
+    return finished(result)

@@ -9,20 +9,23 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import signal
+import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, Protocol, Self, cast
+from types import ModuleType
+from typing import Any, Final, Literal, Protocol, Self, cast
 
 from labseq.errors import LabseqError
 from labseq.messages import error_text
 
 Do = Callable[[Any], Any]
-"""Carries out the task with this argument."""
+"""Carries out the task with this argument; returns its result, or an :class:`Unfinished` one."""
 Make = Callable[[Any], Do]
 """Prepares a worker from the recipe that all workers get; a function of a module, for it is sent by name."""
 
@@ -32,8 +35,8 @@ QUEUED: Final = 2
 """Tasks that a worker is given at once, so that it need not wait for the next one."""
 MAX_LOST: Final = 3
 """Workers that a task may end before the work ends too: perhaps it needs more memory than there is."""
-_READY: Final = -1
-"""In place of the number of a task: the worker is prepared."""
+_START: Final = -1
+"""In place of the number of a task: the preparation of a worker."""
 _FAREWELL_S: Final = 1.0
 
 
@@ -67,6 +70,24 @@ class Workers(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """A task of which a last part is left, which waits for the disk.
+
+    A worker does that part beside its next task.
+
+    Attributes:
+        finish: Does the last part; returns the result of the task.
+    """
+
+    finish: Callable[[], Any]
+
+
+def finished(result: Any) -> Any:
+    """The result of a task, or of an unfinished one, which is finished now."""
+    return result.finish() if isinstance(result, Unfinished) else result
+
+
 def portable(error: Exception) -> LabseqError:
     """An error as another process can receive it: as it is, or its text if it cannot be pickled."""
     if isinstance(error, LabseqError):
@@ -77,19 +98,26 @@ def portable(error: Exception) -> LabseqError:
 
 @dataclass(slots=True, eq=False)
 class _Worker:
-    """A worker process, and the tasks that it has been given: number -> argument, the first one in work."""
+    """A worker process.
+
+    Attributes:
+        connection: Takes tasks to it, and brings its answers.
+        process: The process.
+        tasks: The tasks that it has been given: number -> argument.
+        at: The task that it has begun last, or its start; None if it waits.
+    """
 
     connection: Connection
     process: BaseProcess
-    is_ready: bool = False
     tasks: dict[int, Any] = field(default_factory=dict[int, Any])
+    at: int | None = _START
 
     @classmethod
     def start(cls, make: Make, recipe: Any) -> Self:
         context: Any = multiprocessing.get_context("spawn")  # the same everywhere, and no locks are inherited
         ours, theirs = context.Pipe()
         process: BaseProcess = context.Process(target=_serve, args=(theirs, make, recipe), daemon=True)
-        with _ignored(signal.SIGINT):  # which the process then ignores, too
+        with _ignored(signal.SIGINT), _without_main():  # the process then ignores it, too
             process.start()
         theirs.close()
         return cls(ours, process)
@@ -146,16 +174,19 @@ class ProcessWorkers:
             if worker.connection not in ready:
                 continue
             try:
-                task, answer, error = cast("tuple[int, Any, LabseqError | None]", worker.connection.recv())
+                what, task, answer = cast("_Answer", worker.connection.recv())
             except (EOFError, OSError):
                 self._workers[number] = self._replacement(worker)
                 continue
-            if error is not None:
-                raise error
-            if task == _READY:
-                worker.is_ready = True
-                self._n_lost[_READY] = 0
+            if what == "failed":
+                raise answer
+            if what == "begins":
+                worker.at = task
+            elif what == "ready":
+                worker.at = None
+                self._n_lost[_START] = 0
             else:
+                worker.at = None if worker.at == task else worker.at
                 del worker.tasks[task]
                 found.append((task, answer))
         return found
@@ -167,11 +198,10 @@ class ProcessWorkers:
             LabseqError: The task that it was at, or the start, has ended too many workers.
         """
         lost.end()
-        task = next(iter(lost.tasks), None) if lost.is_ready else _READY
-        if task is not None:
-            self._n_lost[task] += 1
-            if self._n_lost[task] >= MAX_LOST:
-                what = "starting" if task == _READY else f"{self._what} {task}"
+        if lost.at is not None:
+            self._n_lost[lost.at] += 1
+            if self._n_lost[lost.at] >= MAX_LOST:
+                what = "starting" if lost.at == _START else f"{self._what} {lost.at}"
                 code = lost.process.exitcode
                 raise LabseqError(
                     f"{what} has ended {MAX_LOST} worker processes (exit code {code}); perhaps the memory "
@@ -190,18 +220,39 @@ class ProcessWorkers:
             worker.end()
 
 
+_Answer = tuple[Literal["ready", "begins", "done", "failed"], int, Any]
+"""What a worker sends: the event, its task, and the result or the error."""
+
+
 def _serve(connection: Connection, make: Make, recipe: Any) -> None:
     """Carry out tasks in a worker process until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
-    with suppress(EOFError, OSError):  # the first process has ended
+    sending = threading.Lock()
+
+    def send(*answer: *_Answer) -> None:
+        with sending:
+            connection.send(answer)
+
+    def finish(task: int, result: Any) -> None:
+        try:
+            send("done", task, finished(result))
+        except Exception as error:  # noqa: BLE001 - the first process raises it
+            send("failed", task, portable(error))
+
+    with suppress(EOFError, OSError), ThreadPoolExecutor(1) as beside:  # the first process has ended
         try:
             do = make(recipe)
-            connection.send((_READY, None, None))
+            send("ready", _START, None)
+            last = None
             while True:
                 task, argument = connection.recv()
-                connection.send((task, do(argument), None))
+                send("begins", task, None)
+                result = do(argument)
+                if last is not None:
+                    last.result()  # one at a time is finished, so that memory does not grow
+                last = beside.submit(finish, task, result)
         except Exception as error:  # noqa: BLE001 - the first process raises it
-            connection.send((_READY, None, portable(error)))
+            send("failed", _START, portable(error))
 
 
 @contextmanager
@@ -215,3 +266,14 @@ def _ignored(number: int) -> Generator[None]:
         yield
     finally:
         signal.signal(number, before)
+
+
+@contextmanager
+def _without_main() -> Generator[None]:
+    """Hide the program that is running: a process that is started would run it as well, to import from it."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

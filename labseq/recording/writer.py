@@ -151,7 +151,7 @@ class RunWriter:
         """Write an attempt at a shot that was made into a file elsewhere.
 
         Args:
-            row: Its line in the index, as :func:`encoded` or :func:`write_encoded` give it.
+            row: Its line in the index, as :func:`encoded` gives it; with the SHA-256 of a file on the disk.
             data: The bytes of its file; or that file, on the disk and in the folder of the shots, which is
                 renamed.
 
@@ -165,7 +165,7 @@ class RunWriter:
                 data.replace(path)
                 sync_folder(path.parent)
         else:
-            sha256 = _write_hashed(path, data)
+            sha256 = write_hashed(path, data)
         row = {**row, "file": file, "sha256": sha256}
         self._index.append(row, sync=True)
         self.last_row = row
@@ -235,19 +235,7 @@ def encoded(encoder: ShotEncoder, run: RunRecord, shot: ShotRecord) -> tuple[dic
     return index_row(shot, run.target, file="", sha256="", n_bytes=data.nbytes), data
 
 
-def write_encoded(
-    encoder: ShotEncoder, run: RunRecord, shot: ShotRecord, path: Path
-) -> tuple[dict[str, Any], Path]:
-    """The same, with its file already on the disk, at ``path``.
-
-    Raises:
-        RecordingError: The disk is full, or the record contradicts itself.
-    """
-    row, data = encoded(encoder, run, shot)
-    return {**row, "sha256": _write_hashed(path, data)}, path
-
-
-def _write_hashed(path: Path, data: bytes | memoryview) -> str:
+def write_hashed(path: Path, data: bytes | memoryview) -> str:
     """Write a file; returns its SHA-256, which is computed while the disk writes."""
     with ThreadPoolExecutor(1) as beside:
         checksum = beside.submit(lambda: hashlib.sha256(data).hexdigest())

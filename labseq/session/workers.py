@@ -1,8 +1,9 @@
 """A simulated run whose shots are taken by workers; this process records them in order.
 
 Each shot draws its random numbers from the run's seed and its own index, so that it does not matter where it
-is taken. A worker assembles the run from its record, as a resumed run does, takes whole shots, and writes or
-sends their files. A file gets its name, and its line in the index, when all shots before it have theirs.
+is taken. A worker assembles the run from its record, as a resumed run does, takes whole shots, and writes
+their files, or sends them where it does not see the run's folder. A file gets its name, and its line in the
+index, when all shots before it have theirs.
 """
 
 from __future__ import annotations
@@ -11,19 +12,22 @@ import gc
 import io
 import os
 import pickle
+import secrets
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.cluster import check_workers, open_workers
 from labseq.config.document import StoredText
-from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.files import write_file
 from labseq.guard import StopFlag
 from labseq.model import Frame, RunRecord, ShotRecord
 from labseq.recording import RunWriter
 from labseq.recording.folders import SHOTS_FOLDER
-from labseq.recording.writer import encoded, run_id_of, write_encoded
+from labseq.recording.writer import encoded, run_id_of, write_hashed
 from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leader import leaders
@@ -38,7 +42,7 @@ from labseq.session.provenance import run_record
 from labseq.session.resume import changes_between, plain_record
 from labseq.session.scan import Point
 from labseq.session.scan_run import OwnShots, ScanRun
-from labseq.workers import POLL_S, QUEUED, portable
+from labseq.workers import POLL_S, QUEUED, Unfinished, portable
 
 _AHEAD: Final = 1
 """Shots per worker that may wait to be recorded, besides those that are handed out."""
@@ -95,14 +99,16 @@ class Recipe:
         record: The run's record, with the descriptions of its devices.
         run_id: Its id.
         options: Its options.
-        folder: Where the worker writes the files of shots; None: it sends them.
+        folder: The folder for the files of shots.
+        mark: Name of a file there; a worker that does not see it is on a computer with other disks.
         keeps_frames: Whether the frames of a shot are sent too.
     """
 
     record: RunRecord
     run_id: str
     options: Options
-    folder: Path | None
+    folder: str
+    mark: str
     keeps_frames: bool
 
 
@@ -112,7 +118,7 @@ class TakenShot:
 
     Attributes:
         events: In order: the events, name and values, and the attempts at the shot: the line in the index,
-            and the bytes of the file or its path.
+            and the bytes of the file, or its name once it is written.
         given_up: The shot, and why, if it failed for good.
         error: The error that ends the run, or None.
     """
@@ -154,9 +160,13 @@ class ShotWorker:
         self._point: Point | None = None
         self._own: OwnShots | None = None
         self._events: list[tuple[Any, Any]] = []
+        self._name = secrets.token_hex(4)
+        folder = Path(recipe.folder)
+        has_folder = (folder / recipe.mark).is_file() and os.access(folder, os.W_OK)
+        self._folder = folder if has_folder else None
 
-    def __call__(self, task: tuple[int, Place]) -> bytes:
-        """Take a shot; returns its :class:`TakenShot`, pickled."""
+    def __call__(self, task: tuple[int, Place]) -> Unfinished:
+        """Take a shot; its files are written, and its :class:`TakenShot` pickled, when it is finished."""
         shot, place = task
         point = self._point_at(place)
         if self._own is None:
@@ -167,10 +177,30 @@ class ShotWorker:
             given_up = dict(self._own.take(shot, point))
         except LabseqError as failure:
             error = portable(failure)
-        taken, buffer = TakenShot(self._events, given_up, error), io.BytesIO()
+        return Unfinished(partial(self._finish, TakenShot(self._events, given_up, error)))
+
+    def _finish(self, taken: TakenShot) -> bytes:
+        if self._folder is not None:
+            taken = self._written(taken, self._folder)
+        buffer = io.BytesIO()
         pickler = pickle.Pickler if self._recipe.keeps_frames else _WithoutFrames
         pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(taken)
         return buffer.getvalue()
+
+    def _written(self, taken: TakenShot, folder: Path) -> TakenShot:
+        """A shot whose files are on the disk; after one that cannot be written, nothing has happened."""
+        events = list[tuple[Any, Any]]()
+        for what, value in taken.events:
+            if isinstance(what, str):
+                events.append((what, value))
+                continue
+            name = f"shot_{what['shot']:06}_{what['attempt']}.{self._name}.{_LEFT_BY}.part"
+            try:
+                sha256 = write_hashed(folder / name, value)
+            except RecordingError as error:
+                return TakenShot(events, taken.given_up, error)
+            events.append(({**what, "sha256": sha256}, name))
+        return replace(taken, events=events)
 
     def _point_at(self, place: Place) -> Point:
         """The settings of a point; the same object for following shots of the same point."""
@@ -208,14 +238,9 @@ class ShotWorker:
             self._events.append((name, dict(values)))
 
     def write_shot(self, shot: ShotRecord) -> None:
-        """Write or keep the file of an attempt at a shot."""
-        if self._recipe.folder is None:
-            row, data = encoded(self._encoder, self._record, shot)
-            self._events.append((row, bytes(data)))
-        else:
-            name = f"shot_{shot.shot_index:06}_{shot.attempt}.{os.getpid()}.{_LEFT_BY}.part"
-            path = self._recipe.folder / SHOTS_FOLDER / name
-            self._events.append(write_encoded(self._encoder, self._record, shot, path))
+        """Keep the file of an attempt at a shot."""
+        row, data = encoded(self._encoder, self._record, shot)
+        self._events.append((row, data if self._folder is not None else bytes(data)))
 
 
 def _assembled_again(recipe: Recipe) -> Assembly:
@@ -263,9 +288,12 @@ class WorkersShots:
         self._n_handed_out = 0  # of the shots of the run, those skipped included
         self._out: set[int] = set()
         self._done: dict[int, bytes] = {}
-        needs, folder = observers.need_frames, writer.run_dir if options.scheduler is None else None
+        self._folder = writer.run_dir / SHOTS_FOLDER
+        mark = f"{secrets.token_hex(8)}.{_LEFT_BY}.part"
+        write_file(self._folder / mark, b"")
         for_worker = replace(options, output=None, keys=None)
-        recipe = Recipe(writer.run, run_id_of(writer.run_dir), for_worker, folder, needs)
+        run_id, needs_frames = run_id_of(writer.run_dir), observers.need_frames
+        recipe = Recipe(writer.run, run_id, for_worker, str(self._folder), mark, needs_frames)
         self._workers = open_workers(
             options.workers, options.scheduler, options.keys, ShotWorker, recipe, "shot"
         )
@@ -288,7 +316,7 @@ class WorkersShots:
             if isinstance(name, str):
                 self._observers.event(name, values)
             else:
-                self._writer.add_shot(name, values)
+                self._writer.add_shot(name, self._folder / values if isinstance(values, str) else values)
         if taken.error is not None:
             raise taken.error
         return taken.given_up
@@ -310,5 +338,5 @@ class WorkersShots:
     def close(self) -> None:
         """End the workers, and remove the files of shots that were not recorded."""
         self._workers.close()
-        for path in (self._writer.run_dir / SHOTS_FOLDER).glob(f"*.{_LEFT_BY}.part*"):
+        for path in self._folder.glob(f"*.{_LEFT_BY}.part*"):
             path.unlink(missing_ok=True)

@@ -109,7 +109,7 @@ def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
     plugins = tuple({**one, "version": "0.0"} if one["name"] == "psca" else one for one in record.plugins)
     other = replace(record, provenance={**record.provenance, "labseq": "0.0"}, plugins=plugins)
     with pytest.raises(ConfigError, match=r"a worker on .* would take other shots: labseq was 0.0"):
-        ShotWorker(Recipe(other, "x", Options(shots=1), None, keeps_frames=False))
+        ShotWorker(Recipe(other, "x", Options(shots=1), "", "", keeps_frames=False))
 
 
 def test_a_cluster_takes_the_same_shots(tmp_path: Path) -> None:
