@@ -31,6 +31,7 @@ from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.safe import construct_hardware
 from labseq.wire import (
     LOST_S,
+    PATIENT_S,
     PROTOCOL,
     MessageError,
     find_keys,
@@ -289,8 +290,9 @@ class Server:
                 live.add(id(session.run))
                 if passed_s > LOST_S / 2:  # this computer stood still, not the client
                     session.beat_s += passed_s
-                if now_s - session.beat_s > LOST_S:
-                    device.end_session(session, f"no sign of life for {LOST_S:g} s")
+                lost_s = PATIENT_S if device.kind == "simulation" else LOST_S
+                if now_s - session.beat_s > lost_s:
+                    device.end_session(session, f"no sign of life for {lost_s:g} s")
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
                 device.rescue_if_stuck(session)

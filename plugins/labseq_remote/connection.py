@@ -76,6 +76,7 @@ class Connection:
         self._controlling = threading.Lock()
         self._number = self._question = 0
         self._lost = ""
+        self._lost_s = wire.PATIENT_S if kind == "simulation" else wire.LOST_S
         self._is_abandoned = False
         self._ended = threading.Event()
         self._heard_s = time.monotonic()
@@ -160,7 +161,7 @@ class Connection:
         """End the connection; the server makes the device safe if that was not done."""
         if not self._ended.is_set():
             with suppress(LabseqError):
-                self.ask("bye", BYE_S if self._lost else wire.LOST_S)
+                self.ask("bye", BYE_S if self._lost else self._lost_s)
             self._ended.set()
             with self._controlling:
                 self._control.close()
@@ -196,7 +197,7 @@ class Connection:
             about |= {"n": self._question, "op": what}
             if "session" not in about and what != "hello":
                 about["session"] = self._token
-            timeout_s = wire.LOST_S if timeout_s is None else timeout_s
+            timeout_s = self._lost_s if timeout_s is None else timeout_s
             try:
                 self._control.send_multipart(wire.pack(about))
                 while self._has_answer(time.monotonic() + timeout_s, monitor):
@@ -284,7 +285,7 @@ class Connection:
 
     def _is_missing(self, sent_s: float) -> bool:
         """Whether the server has not got the call, or its reply was lost on the way."""
-        is_late = time.monotonic() > sent_s + wire.LOST_S and self._heard_s > sent_s + wire.LOST_S
+        is_late = time.monotonic() > sent_s + self._lost_s and self._heard_s > sent_s + self._lost_s
         return is_late and not self._beat["running"] and not self._calls.poll(0)
 
     def _result(self, reply: dict[str, Any]) -> Any:
