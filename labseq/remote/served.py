@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from labseq.errors import ConfigError, DeviceError, LabseqError
@@ -37,6 +37,9 @@ RESCUE_S: Final = 5.0
 MAX_REASONS: Final = 64
 """Number of sessions whose end is remembered, for clients that ask later."""
 
+CLOSED: Final = "closed"
+"""Why a session is over that the client has ended."""
+
 _COMMON: Final = frozenset(
     {"safe_state", "describe", "versions", "warm", "settle", "self_test", "poll", "check_interlocks"}
 )
@@ -46,10 +49,6 @@ METHODS: Final[Mapping[str, frozenset[str]]] = {
     "mobile_tweezers": _COMMON | {"check_program", "prepare", "play", "wait", "prepare_beginning", "append"},
     "device": _COMMON | {"command", "read", "check_command"},
     "lines": _COMMON | {"check_program", "idle", "compile", "arm", "fire", "wait"},
-    "simulation": frozenset(
-        {"begin_shot", "load", "play", "expose", "describe", "truth", "losses", "atom_events", "warnings"}
-        | {"readout_fraction", "prepare_sensor"}
-    ),
 }
 """Kind of device -> what clients may call, beside ``open`` and ``close``."""
 _OF_HARDWARE: Final = ("settling_timeout_s", "idle_output")
@@ -60,11 +59,12 @@ PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
     "mobile_tweezers": (*_OF_HARDWARE, "waits_for_trigger", *_LIVE),
     "device": _OF_HARDWARE,
     "lines": (*_OF_HARDWARE, "lines_facts"),
-    "simulation": ("sensor_shape", "loading_probability"),
 }
 _CHANGES_LIVE: Final = frozenset({"prepare", "prepare_beginning", "append", "play"})
 _LOOKS: Final = frozenset({"describe", "versions"})
 """What a client that is not the owner gets from the owner's device."""
+_WITHOUT_OPENING: Final = _LOOKS | {"safe_state", "warm", "check_program", "check_command"}
+"""What it may call."""
 
 
 class Abort(StopFlag):
@@ -91,19 +91,32 @@ class SharedTime(VirtualClock):
         super().sleep(duration_s)
         self.waits_s.append(duration_s)
 
-    def begin_call(self, now_s: float) -> None:
-        """Take over the client's time."""
+    def begin_call(self, now_s: float) -> list[float]:
+        """Take over the client's time; returns what receives the waits."""
         self._now_s, self.waits_s = now_s, []
+        return self.waits_s
+
+    def catch_up(self, now_s: float) -> None:
+        """Take over a later time of another server of the run."""
+        self._now_s = max(self._now_s, now_s)
 
 
 @dataclass(eq=False)
 class Run:
-    """What the sessions of one run of a client share: virtual time, random numbers and the simulation."""
+    """What the sessions of one run of a client share: virtual time, random numbers and the simulation.
 
+    Attributes:
+        key: Names the run at all servers.
+        simulation: The simulation, if this server has it.
+        begun_by: The session that constructed it.
+    """
+
+    key: bytes
     clock: SharedTime = field(default_factory=SharedTime)
     streams: list[RandomStream] = field(default_factory=list[RandomStream])
     place: tuple[int, int] | None = None
     simulation: Any = None
+    begun_by: Session | None = None
 
     def begin_shot(self, place: tuple[int, int]) -> None:
         """Start the random numbers of a shot, unless it is under way."""
@@ -111,6 +124,13 @@ class Run:
             self.place = place
             for stream in self.streams:
                 stream.begin_shot(*place)
+
+    def catch_up(self, now_s: float | None, place: tuple[int, int] | None) -> None:
+        """Take over time and shot from the server of the simulation, when that asks a device here."""
+        if now_s is not None:
+            self.clock.catch_up(now_s)
+        if place is not None:
+            self.begin_shot(place)
 
 
 @dataclass(eq=False)
@@ -126,9 +146,11 @@ class Session:
         ended: Why it is over; "" while it is not.
         number: Number of the last call.
         reply: The parts of its reply; empty while it is carried out.
+        sender: The sender's name at the device's socket.
         running_s: When it began; nan while none is carried out.
         aborted_s: When it was aborted, to be made safe beside it; inf if it was not.
         rescue: The outcome of that: "", "under way", "safe", or why it failed.
+        simulation: The simulation of another server that its device acts on, or None.
     """
 
     peer: str
@@ -139,6 +161,7 @@ class Session:
     ended: str = ""
     number: int = 0
     reply: list[Any] = field(default_factory=list[Any])
+    sender: bytes = b""
     call: str = ""
     running_s: float = float("nan")
     aborted_s: float = float("inf")
@@ -146,6 +169,7 @@ class Session:
     abort: Abort = field(default_factory=Abort)
     clock: Clock | None = None
     device: Any = None
+    simulation: Any = None
     is_open: bool = False
     watchdog: Watchdog | None = None
 
@@ -162,6 +186,7 @@ class ServedDevice:
         owner: The session that opened the device, or None.
         sessions: Token -> session.
         ended: Token -> why that session ended, of the last ones.
+        is_busy: Whether its thread does something else than wait for messages.
 
     Args:
         name: Its role, or its name in the profile.
@@ -169,6 +194,7 @@ class ServedDevice:
         socket: A ROUTER; used in the device's thread only.
         is_known: Whether a client's key is still known.
         report: Receives what happens, for the operator.
+        simulation: The plugin of a simulation at another server, or None.
     """
 
     def __init__(
@@ -178,16 +204,21 @@ class ServedDevice:
         socket: Any,
         is_known: Callable[[str], bool],
         report: Callable[[str], object],
+        simulation: ChosenPlugin | None = None,
     ) -> None:
         self.name = name
         self.kind = chosen.entry.kind
         self.owner: Session | None = None
         self.sessions: dict[bytes, Session] = {}
         self.ended: dict[bytes, str] = {}
+        self.is_busy = False
         self._chosen = chosen
         self._socket = socket
         self._is_known = is_known
         self._report = report
+        self._simulation = simulation
+        self._methods = METHODS.get(self.kind, frozenset())
+        self._properties = PROPERTIES.get(self.kind, ())
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name=f"labseq {name}", daemon=True)
 
@@ -249,25 +280,37 @@ class ServedDevice:
         import zmq
 
         self._socket.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
-        while True:
-            try:
-                frames = self._socket.recv_multipart(copy=False)
-            except zmq.Again:
-                frames = []
-            if frames:
-                try:
-                    answer = self._answer(frames)
-                    if answer:
-                        self._socket.send_multipart([frames[0], *answer], copy=False)
-                except zmq.ZMQError:
-                    pass  # the client is gone
-                except Exception as error:  # noqa: BLE001 - no message may end this thread
-                    self._report(f"{self.name}: a message could not be answered: {format_error(error)}")
-            for session in [one for one in self.sessions.values() if one.ended]:
-                self._close(session)
-            if self._ended.is_set() and not self.sessions:
-                self._socket.close()
-                return
+        while not (self._ended.is_set() and not self.sessions):
+            self._step()
+        self._socket.close()
+
+    def _step(self) -> None:
+        """Answer the next message, if one comes within LOOK_S, and close sessions that have ended."""
+        import zmq
+
+        self.is_busy = False
+        try:
+            frames = self._socket.recv_multipart(copy=False)
+        except zmq.Again:
+            frames = []
+        self.is_busy = True
+        if frames:
+            self._handle(frames)
+        for session in [one for one in self.sessions.values() if one.ended and not one.is_running]:
+            self._close(session)
+
+    def _handle(self, frames: list[Any]) -> None:
+        try:
+            self._send(frames[0], self._answer(frames))
+        except Exception as error:  # noqa: BLE001 - no message may end this thread
+            self._report(f"{self.name}: a message could not be answered: {format_error(error)}")
+
+    def _send(self, receiver: Any, parts: list[Any]) -> None:
+        import zmq
+
+        if parts:
+            with suppress(zmq.ZMQError):  # the client is gone
+                self._socket.send_multipart([receiver, *parts], copy=False)
 
     def _answer(self, frames: list[Any]) -> list[Any]:
         """The reply to a message; empty for one that is not answered."""
@@ -298,11 +341,11 @@ class ServedDevice:
             self.end_session(session, f"its calls came out of order: {number} after {session.number}")
             return self._refusal(number, session.ended)
         session.number, session.call, session.reply = number, call, []
+        session.sender = bytes(frames[0])
         session.abort.clear()
         session.aborted_s, session.rescue, session.running_s = float("inf"), "", time.monotonic()
-        try:
-            session.reply = self._reply(session, args, named, now_s, place)
-        finally:
+        session.reply = self._reply(session, args, named, now_s, place)
+        if session.reply:  # else it comes later
             session.running_s = float("nan")
         return session.reply
 
@@ -312,9 +355,7 @@ class ServedDevice:
     def _reply(
         self, session: Session, args: list[Any], named: dict[str, Any], now_s: Any, place: Any
     ) -> list[Any]:
-        time_ = session.run.clock
-        if now_s is not None:
-            time_.begin_call(now_s)
+        waits_s = [] if now_s is None else session.run.clock.begin_call(now_s)
         answer: dict[str, Any] = {"n": session.number}
         try:
             if isinstance(place, tuple) and len(place) == 2:
@@ -324,7 +365,7 @@ class ServedDevice:
         except BaseException as error:  # noqa: BLE001 - of the driver's class; it goes to the client
             answer["error"] = report_error(error)
         answer["now"] = time.monotonic()
-        answer["waits"] = time_.waits_s if now_s is not None else []
+        answer["waits"] = waits_s
         try:
             return pack(answer)
         except MessageError as error:
@@ -341,23 +382,31 @@ class ServedDevice:
             return self._open(session)
         if call == "close":
             return self._close_device(session)
-        if call not in METHODS[self.kind]:
+        if call not in self._methods:
             raise DeviceError(self.name, f"a client cannot call {call[:40]!r}")
         if call == "warm":
             if offers(session.device, "warm"):
                 session.device.warm()
             return load_kernels()
-        looks = call in _LOOKS and self.owner is not None and self.kind != "simulation"
-        device = self.owner.device if looks and self.owner is not None else session.device
+        value = self._call(session, args, named)
+        return dict(value) if isinstance(value, Mapping) else value
+
+    def _call(self, session: Session, args: list[Any], named: dict[str, Any]) -> Any:
+        """Call a method of the driver."""
+        call, device = session.call, session.device
+        if not session.is_open and call not in _WITHOUT_OPENING:
+            raise DeviceError(self.name, "this connection has not opened it")
         if call == "safe_state":
             if not session.is_open:
                 return None
             with session.abort.held():
                 return device.safe_state()
+        if call in _LOOKS and self.owner is not None:
+            device = self.owner.device
         value = getattr(device, call)(*args, **named)
         if call == "leave_on" and value:
             self._forget(session)
-        return dict(value) if isinstance(value, Mapping) else value
+        return value
 
     def _attach(self, session: Session, about: dict[str, Any]) -> dict[str, Any]:
         """Construct the client's object of the driver."""
@@ -372,27 +421,32 @@ class ServedDevice:
             session.clock,
             calibrations=about["calibrations"],
             lines=tuple(about["lines"]),
-            simulation=session.run.simulation,
         )
-        role = "simulation" if self.kind == "simulation" else about["name"]
-        made, streams = construct({role: self._chosen}, context, about["seed"])
-        session.device = made[role]
-        session.run.streams += streams
-        if session.run.place is not None:
-            for stream in streams:
-                stream.begin_shot(*session.run.place)
-        if self.kind == "simulation":
-            session.run.simulation = session.device
+        session.device = self._construct(session, context, about)
         return {
-            "abilities": [name for name in METHODS[self.kind] if offers(session.device, name)],
+            "abilities": [name for name in self._methods if offers(session.device, name)],
             "plugin": self._chosen.entry.name,
             "settings": self._chosen.dump(),
         }
 
+    def _construct(self, session: Session, context: Context, about: Mapping[str, Any]) -> Any:
+        run, seed = session.run, about["seed"]
+        simulation = run.simulation
+        if simulation is None and self._simulation is not None:
+            made, _ = construct({"simulation": self._simulation}, context, seed)
+            session.simulation = simulation = made["simulation"]
+            simulation.join(run.key, run.catch_up)
+        made, streams = construct({context.name: self._chosen}, replace(context, simulation=simulation), seed)
+        run.streams += streams
+        if run.place is not None:
+            for stream in streams:
+                stream.begin_shot(*run.place)
+        return made[context.name]
+
     def _state(self, session: Session) -> dict[str, Any]:
         """Values of properties that the last call may have changed."""
         if session.call in ("attach", "open"):
-            names: tuple[str, ...] = PROPERTIES[self.kind]
+            names = self._properties
         elif session.call in _CHANGES_LIVE and self.kind == "mobile_tweezers":
             names = _LIVE
         else:
@@ -403,9 +457,6 @@ class ServedDevice:
         return state
 
     def _open(self, session: Session) -> None:
-        if self.kind == "simulation":
-            session.device.open()
-            return
         if self.owner not in (None, session):
             assert self.owner is not None
             raise DeviceError(self.name, f"in use by {self.owner.who}; one at a time can use it")
@@ -423,12 +474,10 @@ class ServedDevice:
 
     def _close_device(self, session: Session) -> None:
         """Close it; the owner gives it up."""
-        if self.kind == "simulation" or not session.is_open:
-            session.device.close()
-            return
         with session.abort.held():
             session.device.close()
-        self._forget(session)
+        if session.is_open:
+            self._forget(session)
 
     def _forget(self, session: Session) -> None:
         session.is_open = False
@@ -443,23 +492,26 @@ class ServedDevice:
         """End a session: its device is made safe and closed if the client has not done so."""
         self.ended = {**dict([*self.ended.items()][-MAX_REASONS:]), session.token: session.ended}
         del self.sessions[session.token]
-        if session.device is None or not (session.is_open or self.kind == "simulation"):
-            return
+        if session.is_open:
+            self._make_safe(session)
+        if session.simulation is not None:
+            session.simulation.close()
+
+    def _make_safe(self, session: Session) -> None:
+        """Make the device of a session that has ended safe, and close it."""
         failures: list[str] = []
         begun_s = time.monotonic()
         with session.abort.held():
-            for method in ("safe_state", "close") if session.is_open else ("close",):
+            for method in ("safe_state", "close"):
                 try:
                     getattr(session.device, method)()
                 except Exception as error:  # noqa: BLE001 - of the driver's class
                     failures.append(f"{method}() failed: {format_error(error)}")
-        if not session.is_open:
-            return
         after_s = time.monotonic() - begun_s
         outcome = "; ".join(failures) or f"made safe in {1e3 * after_s:.0f} ms"
         self._report(f"{self.name}: the connection of {session.who} ended ({session.ended}); {outcome}")
         if failures and session.watchdog is not None:
-            session.watchdog.end()
+            session.watchdog.end()  # it switches off what it was not asked to forget
             session.watchdog = None
         with suppress(LabseqError):
             self._forget(session)

@@ -20,9 +20,10 @@ from labseq.errors import ConfigError, DeviceError, LabseqError, Problem, StopRe
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import clean, format_error
 from labseq.plain import now
-from labseq.remote.served import LOOK_S, Run, ServedDevice, Session
+from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
+from labseq.remote.simulation import ServedSimulation
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.session.chosen import HARDWARE_KINDS
+from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin
 from labseq.session.devices import check_each_device
 from labseq.session.lab import timeouts_of
 from labseq.session.locks import lock_devices
@@ -30,6 +31,7 @@ from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.safe import construct_hardware
 from labseq.wire import (
     LOST_S,
+    PATIENT_S,
     PROTOCOL,
     MessageError,
     find_keys,
@@ -105,44 +107,58 @@ def serving(
         hint = "'labseq keys new' makes keys; --plain is for addresses such as tcp://127.0.0.1:5760"
         raise ConfigError(Problem(f"{how.address} can be reached by others, and needs keys", hint=hint))
     keys = None if how.plain else find_keys(keys_root(), how.key)
-    hardware = _served(resolve_profile(profile, overrides=profile_overrides(overrides)), how.devices)
+    whole = resolve_profile(profile, overrides=profile_overrides(overrides))
+    hardware = replace(whole, chosen=_served(whole, how.devices))
+    simulation = next(
+        filter(_is_remote, [one for one in whole.chosen.values() if one.entry.kind == "simulation"]), None
+    )
     with ExitStack() as stack:
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
         report(f"tests {', '.join(hardware.chosen)}")
-        _test(hardware, report)
-        server = Server(hardware, host, port, keys, report)
+        _test(hardware, simulation, report)
+        server = Server(hardware, simulation, host, port, keys, report)
         stack.callback(server.end)
         server.start()
         yield server
 
 
-def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> ResolvedProfile:
-    """The profile with the devices that are served: those named, else the real ones, else all."""
+def _is_remote(chosen: ChosenPlugin) -> bool:
+    return chosen.entry.name == "remote"
+
+
+def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> dict[str, ChosenPlugin]:
+    """The devices that are served: those named, else the real ones, else all."""
     kinds = HARDWARE_KINDS | {"simulation"}
     able = {name: one for name, one in hardware.chosen.items() if one.entry.kind in kinds}
     for name in names:
         if name not in able:
             expected = one_of([*able])
             raise ConfigError(Problem(f"the profile has no device '{clean(name)}'", expected=expected))
-    real = [name for name, one in able.items() if not one.virtual_time]
-    chosen = {name: able[name] for name in names or real or able}
-    if remote := [name for name, one in chosen.items() if one.entry.name == "remote"]:
+    if remote := [name for name in names if _is_remote(able[name])]:
         raise ConfigError(f"'{remote[0]}' is itself on another computer; serve it there")
-    return replace(hardware, chosen=chosen)
+    here = {name: one for name, one in able.items() if not _is_remote(one)}
+    real = [name for name, one in here.items() if not one.virtual_time]
+    return {name: here[name] for name in names or real or here}
 
 
-def _test(hardware: ResolvedProfile, report: Callable[[str], object]) -> None:
+def _test(
+    hardware: ResolvedProfile, simulation: ChosenPlugin | None, report: Callable[[str], object]
+) -> None:
     """Raise the first failure of a device, after all were tried."""
+    if simulation is not None:
+        hardware = replace(hardware, chosen={**hardware.chosen, "simulation": simulation})
     is_virtual = hardware.virtual_time
     clock = VirtualClock(StopFlag()) if is_virtual else RealClock(StopFlag())
     made, refused = construct_hardware(hardware, clock)
-    simulation = made.pop("simulation", None)
+    made_simulation = made.pop("simulation", None)
     failures: list[LabseqError] = [*refused.values()]
-    if simulation is not None or not is_virtual:
+    if made_simulation is not None or not is_virtual:
         for found in check_each_device(
-            made.items(), timeouts_of(hardware.profile), StopFlag(), simulation, report
+            made.items(), timeouts_of(hardware.profile), StopFlag(), made_simulation, report
         ):
             failures += [one for one in (found.failure, found.unsafe, found.unclosed) if one is not None]
+            if found.name == "simulation" and failures:
+                break  # the others act on it
     for failure in failures[1:]:
         report(f"error: {failure}")
     if failures:
@@ -154,6 +170,7 @@ class Server:
 
     Args:
         hardware: The profile, with the devices that are served.
+        simulation: The plugin of the simulation at another server that they act on, or None.
         host: Address to listen on.
         port: The control's port; the devices have the next ones.
         keys: Keys of this computer; None without keys.
@@ -163,6 +180,7 @@ class Server:
     def __init__(
         self,
         hardware: ResolvedProfile,
+        simulation: ChosenPlugin | None,
         host: str,
         port: int,
         keys: Any,
@@ -175,7 +193,7 @@ class Server:
         self._known: Mapping[bytes, str] = known_keys(keys_root()) if keys is not None else {}
         self._zmq = zmq.Context()
         self._auth: Any = None
-        self._runs: dict[tuple[str, bytes], Run] = {}
+        self._runs: dict[bytes, Run] = {}
         self._ended = threading.Event()
         self._failure: BaseException | None = None
         self.devices: dict[str, ServedDevice] = {}
@@ -183,7 +201,8 @@ class Server:
             self._control = server_socket(self._zmq, host, port, keys)
             for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
                 socket = server_socket(self._zmq, host, port + number, keys)
-                device = ServedDevice(name, chosen, socket, self.is_known, self._report)
+                served = ServedSimulation if chosen.entry.kind == "simulation" else ServedDevice
+                device = served(name, chosen, socket, self.is_known, self._report, simulation)
                 self.devices[name] = device
         except ConfigError:
             self._zmq.destroy(linger=0)
@@ -271,8 +290,9 @@ class Server:
                 live.add(id(session.run))
                 if passed_s > LOST_S / 2:  # this computer stood still, not the client
                     session.beat_s += passed_s
-                if now_s - session.beat_s > LOST_S:
-                    device.end_session(session, f"no sign of life for {LOST_S:g} s")
+                lost_s = PATIENT_S if device.kind == "simulation" else LOST_S
+                if now_s - session.beat_s > lost_s:
+                    device.end_session(session, f"no sign of life for {lost_s:g} s")
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
                 device.rescue_if_stuck(session)
@@ -321,7 +341,7 @@ class Server:
         if not isinstance(message["run"], bytes) or len(message["run"]) != 16:
             raise MessageError("it names no run")
         name = self._known.get(peer.encode(), "this computer")
-        run = self._runs.setdefault((peer, message["run"]), Run())
+        run = self._runs.setdefault(message["run"], Run(message["run"]))
         session = Session(peer, f"{name} ({clean(str(message['who']))})", run)
         device.sessions[session.token] = session
         return {**about, "session": session.token, "port": self._ports[device.name]}
@@ -340,13 +360,14 @@ class Server:
         )
 
     def _beat(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
-        _, session = self._of(message, peer)
+        device, session = self._of(message, peer)
         session.beat_s = time.monotonic()
-        return {"number": session.number, "running": session.is_running, "rescue": session.rescue}
+        running = session.is_running or device.is_busy
+        return {"number": session.number, "running": running, "rescue": session.rescue}
 
     def _bye(self, message: Mapping[str, Any], peer: str) -> None:
         device, session = self._of(message, peer)
-        device.end_session(session, "closed")
+        device.end_session(session, CLOSED)
 
     def _abort(self, message: Mapping[str, Any], peer: str) -> None:
         device, session = self._of(message, peer)

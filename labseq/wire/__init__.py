@@ -6,6 +6,7 @@ from labseq.wire.messages import MessageError, error_of, pack, report_error, unp
 from labseq.wire.sockets import (
     BEAT_S,
     LOST_S,
+    PATIENT_S,
     PROTOCOL,
     client_socket,
     endpoint,
@@ -17,6 +18,7 @@ from labseq.wire.sockets import (
 __all__ = [
     "BEAT_S",
     "LOST_S",
+    "PATIENT_S",
     "PROTOCOL",
     "MessageError",
     "client_socket",

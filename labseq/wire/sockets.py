@@ -21,6 +21,8 @@ BEAT_S: Final = 0.15
 """Interval of the heartbeats of a connection."""
 LOST_S: Final = 0.75
 """A connection without a heartbeat for so long is lost."""
+PATIENT_S: Final = 5.0
+"""The same for a simulation, which has no outputs that could stay on."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]@]+):(\d{1,5})")
 

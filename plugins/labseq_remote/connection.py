@@ -9,16 +9,18 @@ import threading
 import time
 import weakref
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Final
 
 from labseq.plugin import Clock, Context, DeviceError, Frame, LabseqError, StopRequested, wire
+from labseq_remote.events import Monitor
 from labseq_remote.settings import RemoteSettings
 
 POLL_S: Final = 0.05
 """How often a call that waits looks for a stop request."""
-CONNECT_S: Final = 2.0
-"""How long connecting may take."""
+CONNECT_S: Final = 5.0
+"""How long connecting may take; a connection that is refused fails at once."""
 GRACE_S: Final = 1.0
 """How long a call may take to end after it was aborted."""
 BYE_S: Final = 0.1
@@ -28,6 +30,19 @@ SAFE_S: Final = 4.0
 
 _runs: weakref.WeakKeyDictionary[Clock, bytes] = weakref.WeakKeyDictionary()
 """The session's clock -> what names the run at the servers: its devices there share one simulation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joins:
+    """The simulation of a run that has been begun by another process, or by another connection.
+
+    Attributes:
+        run: Names the run.
+        seen_by: Name of the camera, not that of the atoms, whose view of it is wanted; "" for it itself.
+    """
+
+    run: bytes
+    seen_by: str = ""
 
 
 class _NoAnswer(DeviceError):  # noqa: N818 - it may be explained
@@ -41,22 +56,27 @@ class Connection:
         settings: Where the device is.
         context: The driver's context, which the server constructs its driver with.
         kind: Kind of the device, "camera".
+        joins: The simulation to use; None to have a new one, or a device.
 
     Raises:
         DeviceError: The server does not answer, refuses, or has another version.
         ConfigError: Keys are missing, or the served driver refuses its settings.
     """
 
-    def __init__(self, settings: RemoteSettings, context: Context, kind: str) -> None:
+    def __init__(
+        self, settings: RemoteSettings, context: Context, kind: str, joins: Joins | None = None
+    ) -> None:
         wire.require_packages()
         self.address = settings.address
         self._name = context.name or kind
         self._clock = context.clock
         self._random = context.random
+        self._joins = joins
         self._calling = threading.Lock()
         self._controlling = threading.Lock()
         self._number = self._question = 0
         self._lost = ""
+        self._lost_s = wire.PATIENT_S if kind == "simulation" else wire.LOST_S
         self._is_abandoned = False
         self._ended = threading.Event()
         self._heard_s = time.monotonic()
@@ -102,7 +122,7 @@ class Connection:
                 "args": list(args),
                 "named": named,
                 "now": self._clock.now() if self._clock.virtual else None,
-                "shot": self._random.place,
+                "shot": self._random.place if self._joins is None else None,
             }
             try:
                 parts = wire.pack(message)
@@ -141,7 +161,7 @@ class Connection:
         """End the connection; the server makes the device safe if that was not done."""
         if not self._ended.is_set():
             with suppress(LabseqError):
-                self.ask("bye", BYE_S if self._lost else wire.LOST_S)
+                self.ask("bye", BYE_S if self._lost else self._lost_s)
             self._ended.set()
             with self._controlling:
                 self._control.close()
@@ -154,8 +174,16 @@ class Connection:
         self._is_abandoned = True
         self._ended.set()
 
-    def ask(self, what: str, timeout_s: float | None = None, **about: Any) -> Any:
+    def ask(
+        self, what: str, timeout_s: float | None = None, monitor: Monitor | None = None, **about: Any
+    ) -> Any:
         """Ask the control of the server; also while a call is out.
+
+        Args:
+            what: The question.
+            timeout_s: How long the answer may take; by default as long as a heartbeat.
+            monitor: Ends the waiting if the connection cannot be made.
+            **about: What belongs to it.
 
         Raises:
             DeviceError: It refuses, or does not answer in time.
@@ -169,12 +197,10 @@ class Connection:
             about |= {"n": self._question, "op": what}
             if "session" not in about and what != "hello":
                 about["session"] = self._token
-            timeout_s = wire.LOST_S if timeout_s is None else timeout_s
-            deadline_s = time.monotonic() + timeout_s
+            timeout_s = self._lost_s if timeout_s is None else timeout_s
             try:
                 self._control.send_multipart(wire.pack(about))
-                # an answer that is there counts, even if this computer stood still meanwhile
-                while self._control.poll(int(1e3 * max(0.0, deadline_s - time.monotonic()))):
+                while self._has_answer(time.monotonic() + timeout_s, monitor):
                     answer = _read(self._control.recv_multipart())
                     if answer.get("n") in (self._question, 0):
                         if "error" in answer:
@@ -186,21 +212,27 @@ class Connection:
                 raise self._failure(f"{error.strerror}") from error
         raise _NoAnswer(self._name, f"the server did not answer within {timeout_s:.3g} s (at {self.address})")
 
+    def _has_answer(self, deadline_s: float, monitor: Monitor | None) -> bool:
+        """Wait for an answer of the control; one that is there counts, even if this computer stood still."""
+        if monitor is None:
+            return bool(self._control.poll(int(1e3 * max(0.0, deadline_s - time.monotonic()))))
+        while not self._control.poll(0):
+            if time.monotonic() > deadline_s or monitor.has_failed(POLL_S):
+                return False
+        return True
+
     def _hello(self, settings: RemoteSettings, kind: str) -> dict[str, Any]:
         """Begin the session; if that fails, the events of the socket say why."""
-        from labseq_remote.events import reason_of
-
-        monitor = self._control.get_monitor_socket()
+        monitor = Monitor(self._control)
         self._control.connect(wire.endpoint(settings.host, settings.port))
-        me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": _run_of(self._clock)}
+        run = run_of(self._clock) if self._joins is None else self._joins.run
+        me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": run}
         who = f"{platform.node()}, process {os.getpid()}"
         try:
-            about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
+            about = self.ask("hello", CONNECT_S, monitor, device=settings.device, kind=kind, who=who, **me)
         except _NoAnswer as error:
-            why = reason_of(monitor)
-            raise self._failure(why) if why else error from None
+            raise self._failure(monitor.reason) if monitor.reason else error from None
         finally:
-            self._control.disable_monitor()
             monitor.close()
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
             raise self._failure("it is no server of this version of labseq")
@@ -216,6 +248,7 @@ class Connection:
             "calibrations": dict(context.calibrations),
             "seed": context.random.seed,
             "virtual": bool(context.clock.virtual),
+            "joins": None if self._joins is None else self._joins.seen_by,
         }
 
     def _await(self, name: str, parts: list[Any], stoppable: bool) -> dict[str, Any]:
@@ -226,7 +259,7 @@ class Connection:
         stopped_s: float | None = None
         try:
             self._calls.send_multipart(parts, copy=False)
-            while not self._lost:
+            while not self._lost and not self._ended.is_set():
                 try:
                     frames = self._calls.recv_multipart(copy=False)
                 except zmq.Again:  # after POLL_S
@@ -248,11 +281,11 @@ class Connection:
                     self._clock.check()
         except zmq.ZMQError as error:
             self._lose(str(error.strerror))
-        raise self._failure(self._lost)
+        raise self._failure(self._lost or "the connection is closed")
 
     def _is_missing(self, sent_s: float) -> bool:
         """Whether the server has not got the call, or its reply was lost on the way."""
-        is_late = time.monotonic() > sent_s + wire.LOST_S and self._heard_s > sent_s + wire.LOST_S
+        is_late = time.monotonic() > sent_s + self._lost_s and self._heard_s > sent_s + self._lost_s
         return is_late and not self._beat["running"] and not self._calls.poll(0)
 
     def _result(self, reply: dict[str, Any]) -> Any:
@@ -306,7 +339,8 @@ def _read(parts: Any) -> dict[str, Any]:
     return message if isinstance(message, dict) else {}
 
 
-def _run_of(clock: Clock) -> bytes:
+def run_of(clock: Clock) -> bytes:
+    """What names the run of a session's clock at the servers."""
     return _runs.setdefault(clock, secrets.token_bytes(16))
 
 

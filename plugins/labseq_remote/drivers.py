@@ -3,138 +3,31 @@
 from __future__ import annotations
 
 import math
-import weakref
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import (
-    WHOLE_SENSOR,
     Camera,
     CameraFacts,
     Context,
     Device,
-    DeviceError,
     Frame,
     Hardware,
     LineProgram,
     Lines,
     LinesFacts,
     MobileTweezers,
-    Occupancy,
-    SensorMode,
-    Signal,
-    Simulation,
     StaticTweezers,
     ToneProgram,
     Trigger,
     TweezersFacts,
 )
-from labseq_remote.connection import Connection
-from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
-
-
-class _Link:
-    """The connection of a driver: made when it is first needed, again after it was closed."""
-
-    def __init__(self, settings: RemoteSettings, context: Context, kind: str) -> None:
-        self.settings = settings
-        self.name = context.name or kind
-        self.is_open = False
-        self._context = context
-        self._kind = kind
-        self._connection: Connection | None = None
-        self._state: dict[str, Any] = {}
-        self._about: dict[str, Any] = {}
-
-    def connect(self) -> Connection:
-        """The connection.
-
-        Raises:
-            DeviceError: The server does not answer, or refuses.
-        """
-        if self._connection is None:
-            if isinstance(self._context.simulation, RemoteSimulation):  # its devices are constructed with it
-                self._context.simulation.connect()
-            self._connection = made = Connection(self.settings, self._context, self._kind)
-            weakref.finalize(self, made.abandon)
-            self._about = made.about
-            made.state = self._state = {**self._state, **made.state}
-        return self._connection
-
-    def call(self, name: str, *args: Any, **named: Any) -> Any:
-        """Call a method of the open device.
-
-        Raises:
-            DeviceError: It is not open, or the connection is lost.
-        """
-        if not self.is_open:
-            raise DeviceError(self.name, f"it is not open (at {self.settings.address})")
-        return self.connect().call(name, *args, **named)
-
-    def call_if_able(self, name: str, default: Any = None) -> Any:
-        """Call an optional method if the served driver has it."""
-        return self.call(name) if name in self.about["abilities"] else default
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """What the server says about itself and its driver."""
-        if not self._about:
-            self.connect()
-        return self._about
-
-    def known(self, name: str, default: Any) -> Any:
-        """The value of a property, as it was after the last call."""
-        if not self._about:
-            self.connect()
-        return self._state.get(name, default)
-
-    def open(self) -> None:
-        """Connect, and open the device for this client alone."""
-        if self._connection is not None and self._connection.lost:
-            self.end()
-        try:
-            self.connect().call("open", stoppable=False)
-        except BaseException:
-            self.end()
-            raise
-        self.is_open = True
-
-    def make_safe(self) -> None:
-        """Make the device safe if it was opened."""
-        if self.is_open:
-            self.connect().make_safe()
-
-    def close(self) -> None:
-        """Close the device, and end the connection."""
-        if not self.is_open:
-            return self.end()
-        self.is_open = False
-        try:
-            self.connect().call("close", stoppable=False)
-        finally:
-            self.end()
-
-    def end(self) -> None:
-        """End the connection."""
-        connection, self._connection, self.is_open = self._connection, None, False
-        if connection is not None:
-            connection.close()
-
-    def describe(self) -> dict[str, Any]:
-        """What the device says of itself, and where it is."""
-        about = self.about
-        remote = {
-            "address": self.settings.address,
-            "device": self.settings.device,
-            "host": about["host"],
-            "labseq": about["labseq"],
-            "settings": about["settings"],
-        }
-        return {**self.connect().call("describe"), "remote": remote}
+from labseq_remote.link import Link
+from labseq_remote.settings import RemoteSettings
+from labseq_remote.simulation import RemoteSimulation
 
 
 class RemoteHardware(Hardware):
@@ -152,7 +45,9 @@ class RemoteHardware(Hardware):
     _kind: ClassVar[str]
 
     def __init__(self, settings: RemoteSettings, context: Context) -> None:
-        self._link = _Link(settings, context, self._kind)
+        simulation = context.simulation
+        first = simulation.connect if isinstance(simulation, RemoteSimulation) else None
+        self._link = Link(settings, context, self._kind, first)
 
     def open(self) -> None:
         """Connect, and open the device for this client alone.
@@ -380,83 +275,3 @@ class RemoteLines(RemoteHardware, Lines):
     def wait(self, timeout_s: float) -> None:
         """Wait for its end."""
         self._link.call("wait", timeout_s)
-
-
-class RemoteSimulation(Simulation):
-    """The simulation that simulated devices of a server act on; it keeps to the clock of this run.
-
-    Args:
-        settings: Where it is.
-        context: What the simulation there is constructed with, too.
-    """
-
-    def __init__(self, settings: RemoteSimulationSettings, context: Context) -> None:
-        self._link = _Link(settings, context, "simulation")
-
-    def connect(self) -> None:
-        """Construct it at the server."""
-        self._link.connect()
-
-    def open(self) -> None:
-        """Draw the disorder of the machine."""
-        self._link.open()
-
-    def close(self) -> None:
-        """Discard the state."""
-        with suppress(DeviceError):  # the server does it by itself when the connection is lost
-            self._link.close()
-
-    def begin_shot(self) -> None:
-        """Remove all atoms."""
-        self._link.call("begin_shot")
-
-    def load(self, t_start_s: float, duration_s: float) -> None:
-        """The atom source is on."""
-        self._link.call("load", t_start_s, duration_s)
-
-    def play(self, role: str, signal: Signal, t_start_s: float) -> None:
-        """Receive the output of a device of this computer."""
-        self._link.call("play", role, signal, t_start_s)
-
-    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        """The frame of a camera of this computer."""
-        return self._link.call("expose", t_start_s, exposure_s, mode)
-
-    def describe(self) -> Mapping[str, Any]:
-        """Every constant of the model, and where it runs."""
-        return self._link.describe()
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """That of the served simulation."""
-        rows, columns = self._link.known("sensor_shape", (0, 0))
-        return rows, columns
-
-    def warnings(self) -> Sequence[str]:
-        """Those of the served simulation."""
-        return self._link.connect().call("warnings")
-
-    def readout_fraction(self, mode: SensorMode) -> float:
-        """That of the served simulation."""
-        return self._link.connect().call("readout_fraction", mode)
-
-    def prepare_sensor(self, mode: SensorMode) -> None:
-        """Compute there what frames share."""
-        self._link.connect().call("prepare_sensor", mode)
-
-    @property
-    def loading_probability(self) -> float | None:
-        """That of the served simulation."""
-        return self._link.known("loading_probability", None)
-
-    def truth(self) -> Occupancy | None:
-        """The current true occupancy."""
-        return self._link.call("truth")
-
-    def losses(self) -> Mapping[str, int]:
-        """Atoms lost since the shot began."""
-        return self._link.call("losses")
-
-    def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
-        """Events of the shot."""
-        return self._link.call("atom_events", since_s)

@@ -70,7 +70,9 @@ class Served:
 
 
 @contextmanager
-def served(folder: Path, profile: str = PROFILE, *, plain: bool = True) -> Generator[Served]:
+def served(
+    folder: Path, profile: str = PROFILE, *, plain: bool = True, devices: tuple[str, ...] = ()
+) -> Generator[Served]:
     """A server of a profile."""
     path = folder / "served.yaml"
     path.write_text(profile, encoding="utf-8")
@@ -78,7 +80,7 @@ def served(folder: Path, profile: str = PROFILE, *, plain: bool = True) -> Gener
     for _ in range(5):
         port = free_port(12)
         try:
-            how = Serving(f"tcp://127.0.0.1:{port}", plain=plain)
+            how = Serving(f"tcp://127.0.0.1:{port}", devices, plain=plain)
             with serving(str(path), (), how, told.append) as server:
                 yield Served(server, port, told)
             return

@@ -12,10 +12,10 @@ from labseq_remote.drivers import (
     RemoteDevice,
     RemoteLines,
     RemoteMobileTweezers,
-    RemoteSimulation,
     RemoteStaticTweezers,
 )
 from labseq_remote.settings import RemoteSimulationSettings
+from labseq_remote.simulation import RemoteSimulation
 
 from labseq.plugin import Context, SiteGrid
 from labseq.testing import (

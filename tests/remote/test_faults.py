@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import zmq
 from labseq_remote import connection
-from labseq_remote.drivers import RemoteCamera, RemoteDevice, RemoteSimulation
+from labseq_remote.drivers import RemoteCamera, RemoteDevice
 from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
+from labseq_remote.simulation import RemoteSimulation
 from labseq_virtual.devices import VirtualDevice
 
 from labseq import wire

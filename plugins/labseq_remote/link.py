@@ -1,0 +1,133 @@
+"""The connection of a driver, made when it is first needed."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+from labseq.plugin import Context, DeviceError
+from labseq_remote.connection import Connection, Joins
+from labseq_remote.settings import RemoteSettings
+
+
+class Link:
+    """The connection of a driver: made when it is first needed, again after it was closed.
+
+    Args:
+        settings: Where the device is.
+        context: The driver's context.
+        kind: Kind of the device.
+        first: Connects the simulation, which must be there before the devices that act on it.
+
+    Attributes:
+        joins: The simulation to use, if it is one of a run that has begun.
+    """
+
+    def __init__(
+        self,
+        settings: RemoteSettings,
+        context: Context,
+        kind: str,
+        first: Callable[[], object] | None = None,
+    ) -> None:
+        self.settings = settings
+        self.name = context.name or kind
+        self.is_open = False
+        self._context = context
+        self._kind = kind
+        self._first = first
+        self.joins: Joins | None = None
+        self._connection: Connection | None = None
+        self._state: dict[str, Any] = {}
+        self._about: dict[str, Any] = {}
+
+    def connect(self) -> Connection:
+        """The connection.
+
+        Raises:
+            DeviceError: The server does not answer, or refuses.
+        """
+        if self._connection is None:
+            if self._first is not None:
+                self._first()
+            self._connection = made = self.another(self.joins)
+            weakref.finalize(self, made.abandon)
+            self._about = made.about
+            made.state = self._state = {**self._state, **made.state}
+        return self._connection
+
+    def another(self, joins: Joins | None) -> Connection:
+        """A connection beside that one."""
+        return Connection(self.settings, self._context, self._kind, joins)
+
+    def call(self, name: str, *args: Any, **named: Any) -> Any:
+        """Call a method of the open device.
+
+        Raises:
+            DeviceError: It is not open, or the connection is lost.
+        """
+        if not self.is_open and self.joins is None:
+            raise DeviceError(self.name, f"it is not open (at {self.settings.address})")
+        return self.connect().call(name, *args, **named)
+
+    def call_if_able(self, name: str, default: Any = None) -> Any:
+        """Call an optional method if the served driver has it."""
+        return self.call(name) if name in self.about["abilities"] else default
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the server says about itself and its driver."""
+        if not self._about:
+            self.connect()
+        return self._about
+
+    def known(self, name: str, default: Any) -> Any:
+        """The value of a property, as it was after the last call."""
+        if not self._about:
+            self.connect()
+        return self._state.get(name, default)
+
+    def open(self) -> None:
+        """Connect, and open the device for this client alone."""
+        if self._connection is not None and self._connection.lost:
+            self.end()
+        try:
+            self.connect().call("open", stoppable=False)
+        except BaseException:
+            self.end()
+            raise
+        self.is_open = True
+
+    def make_safe(self) -> None:
+        """Make the device safe if it was opened."""
+        if self.is_open:
+            self.connect().make_safe()
+
+    def close(self) -> None:
+        """Close the device, and end the connection."""
+        if not self.is_open:
+            return self.end()
+        self.is_open = False
+        try:
+            self.connect().call("close", stoppable=False)
+        finally:
+            self.end()
+
+    def end(self) -> None:
+        """End the connection."""
+        connection, self._connection, self.is_open = self._connection, None, False
+        if connection is not None:
+            connection.close()
+
+    def describe(self) -> dict[str, Any]:
+        """What the device says of itself, and where it is."""
+        about = self.about
+        remote = {
+            "address": self.settings.address,
+            "device": self.settings.device,
+            "host": about["host"],
+            "labseq": about["labseq"],
+            "settings": about["settings"],
+        }
+        return {**self.connect().call("describe"), "remote": remote}
