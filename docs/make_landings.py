@@ -83,7 +83,7 @@ def follow(path: TweezerPath, rng: np.random.Generator) -> tuple[Floats, Floats]
         state, alive, record,
         path.along_m[:, None] / (2 * HALF_M), path.fraction[:, None].copy(), columns, np.ones_like(columns),
         FRAME_S * np.arange(n_frames, dtype=np.float64), depth[None], KELVIN * path.depth_k,
-        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S),
+        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S), np.zeros(GROUP), 0.0,
     )  # fmt: skip
     after = energies(state, sites, depth, beams[0], beams[1])
     after[~alive | (after >= 0)] = np.inf

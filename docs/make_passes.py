@@ -67,7 +67,7 @@ def n_taken(
     follow_atoms(
         state, alive, record, rows, np.ones_like(rows), columns, np.ones_like(columns),
         FRAME_S * np.arange(n_frames + 1, dtype=np.float64), depth[None], KELVIN * depth_k,
-        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S),
+        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S), np.zeros(GROUP), 0.0,
     )  # fmt: skip
     kept = alive & (energies(state, sites, depth, beams[0], beams[1]) < 0)
     return int(np.count_nonzero(~kept))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
-from labseq_virtual.handover import KELVIN, full_amplitudes
+from labseq_virtual.handover import KELVIN, full_amplitudes, pair_survival
 from labseq_virtual.jumps import JUMPS, find_jumps
 from labseq_virtual.rf_analysis import (
     WINDOW,
@@ -203,6 +203,7 @@ class RfTransport:
         loss_factor: float,
         thermal: Floats | None = None,
         relax: Callable[[Floats, Floats], Floats] = lambda heat, _elapsed_s: heat,
+        pairs: float | None = None,
     ) -> Counter[str]:
         """Move the atoms in the light of a pulse.
 
@@ -215,11 +216,13 @@ class RfTransport:
             thermal: float64 (2, n_rows, n_cols), temperatures of the atoms, as they would be at the nominal
                 depth, and the times that they belong to; changed in place. By default that of the settings.
             relax: Temperatures after a time without moves, in s.
+            pairs: Probability that one of two atoms that meet is left. By default that of the settings.
 
         Returns:
             Number of atoms lost by each cause: hand_over, transport, collision, ejected.
         """
         lost: Counter[str] = Counter()
+        pairs = pair_survival(self._settings) if pairs is None else pairs
         if thermal is None:
             thermal = np.stack(
                 [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
@@ -229,7 +232,7 @@ class RfTransport:
             on_s, off_s = t_s[bright[[0, -1]]] if len(bright) else t_s[[0, -1]]
             thermal[0] = relax(thermal[0], np.maximum(0.0, on_s - thermal[1]))
             thermal[1] = on_s
-            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor, thermal, off_s)
+            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor, thermal, off_s, pairs)
         return lost
 
     def _carry_batch(
@@ -242,6 +245,7 @@ class RfTransport:
         loss_factor: float,
         thermal: Floats,
         off_s: float,
+        pairs: float,
     ) -> Counter[str]:
         from labseq_virtual.flight_kernels import (
             COLLIDED,
@@ -264,9 +268,10 @@ class RfTransport:
         record = np.full((len(row), N_COLUMNS), np.nan)
         n_steps = math.ceil((t_s[1] - t_s[0]) / STEP_S)
         full = KELVIN * self._light.depth
+        luck = rng.spawn(1)[0].random(len(row))
         follow_atoms(
             state, alive, record, rows, row_depth, cols, col_depth, t_s,
-            static, full, self._plane, self._beams, n_steps,
+            static, full, self._plane, self._beams, n_steps, luck, pairs,
         )  # fmt: skip
         to_row, to_col, energy = self._arrivals(state, static)
         bound = energy < 0

@@ -215,7 +215,7 @@ def find_site(atom: Floats, plane: Floats, static_depth: Floats, site: Floats) -
 
 @kernel(
     f"void(float64[:, ::1], boolean[::1], float64[:, ::1], {TABLE}, {TABLE}, {TABLE}, {TABLE}, {VECTOR}, "
-    f"{TABLE}, float64, {TABLE}, {VECTOR}, int64)"
+    f"{TABLE}, float64, {TABLE}, {VECTOR}, int64, {VECTOR}, float64)"
 )
 def follow_atoms(
     state: Floats,
@@ -231,12 +231,14 @@ def follow_atoms(
     plane: Floats,
     beams: Floats,
     n_steps: int,
+    luck: Floats,
+    pair_survival: float,
 ) -> None:
     """Follow every atom from the first frame to the last.
 
     Between frames, positions and depths change linearly. An atom feels its nearest static tweezer and its
-    nearest mobile one. An atom bound by its static tweezer is not moved while no mobile one is near. Two
-    atoms within a waist of each other are both lost.
+    nearest mobile one. An atom bound by its static tweezer is not moved while no mobile one is near. Of two
+    atoms that come within a waist of each other, collisions in the light leave one or none, at once.
 
     Args:
         state: The atoms, (n_atoms, 6); changed in place.
@@ -252,6 +254,8 @@ def follow_atoms(
         plane: The plane of the sites.
         beams: The beams.
         n_steps: Integration steps from frame to frame.
+        luck: A uniform random number for each atom (n_atoms,).
+        pair_survival: Probability that one of two atoms is left.
     """
     site, tweezer = np.empty(4), np.empty(9)
     moving = np.zeros(len(alive), np.bool_)
@@ -280,9 +284,12 @@ def follow_atoms(
                 if not (moving[i] and moving[j] and alive[i] and alive[j]):
                     continue
                 if math.hypot(state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]) < beams[2]:
-                    alive[i] = alive[j] = False
-                    record_loss(state[i], plane, record[i], t_s[k + 1], 1.0)
-                    record_loss(state[j], plane, record[j], t_s[k + 1], 1.0)
+                    one_left = luck[i] < pair_survival
+                    alive[i], alive[j] = one_left and luck[j] < 0.5, one_left and luck[j] >= 0.5
+                    if not alive[i]:
+                        record_loss(state[i], plane, record[i], t_s[k + 1], 1.0)
+                    if not alive[j]:
+                        record_loss(state[j], plane, record[j], t_s[k + 1], 1.0)
 
 
 @kernel(f"void(float64[:, ::1], {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, float64, int64, float64)")

@@ -36,8 +36,6 @@ Floats = NDArray[np.float64]
 KELVIN: Final = 1.380649e-23 / (86.909180531 * 1.66053906660e-27)
 """m^2/s^2 per kelvin: energies per mass of 87Rb (AME2020, CODATA 2018)."""
 
-REFERENCE_SPEED_M_S: Final = 0.13
-"""Speed that the setting ``adiabatic_depth`` belongs to: the paper's."""
 REFERENCE_TONES: Final = 19
 """Further tones that the setting ``intermodulation`` belongs to: the paper measured it on 20 tweezers."""
 (
@@ -56,7 +54,8 @@ REFERENCE_TONES: Final = 19
     SHALLOW_LOSS,
     COOLING_HZ,
     NOISE_HZ,
-) = range(15)
+    PAIR_SURVIVAL,
+) = range(16)
 """Indices of the constants in the array that the kernels take."""
 
 
@@ -95,8 +94,34 @@ def noise_hz(settings: SimulationSettings) -> float:
     return 2 / 3 * stiffness / 4 * settings.intensity_noise
 
 
+RECOIL_K: Final = 0.36196e-6
+"""Recoil temperature of 87Rb on its D2 line (D. Steck, Rubidium 87 D Line Data)."""
+
+
+def recoil_heat(settings: SimulationSettings) -> float:
+    """How much hotter the light of an image keeps the atoms than the cooling alone would, in kelvin.
+
+    Each photon adds a third of the recoil temperature in a harmonic well (R. Grimm, M. Weidemueller,
+    Y. Ovchinnikov, Adv. At. Mol. Opt. Phys. 42, 95, 2000), which cooling takes away within ``cooling_time``.
+    """
+    return settings.scattering_rate * RECOIL_K / 3 * settings.cooling_time
+
+
+def pair_survival(settings: SimulationSettings) -> float:
+    """Probability that collisions in the cooling light leave one of two atoms in a tweezer, and not none.
+
+    Blue-detuned light takes one or both atoms of a pair (T. Gruenzweig et al., Nat. Phys. 6, 951, 2010).
+    Loading ends with such collisions: of n atoms one is left with P(n) = p P(n - 1) + (1 - p) P(n - 2), if p
+    is the probability that a collision takes one only; P(0) = 0 and P(1) = 1 give P = 1 / (2 - p) for many
+    atoms. So p follows from the loading; below 50 %, where sites stay empty for other reasons, it is 0.
+    """
+    if settings.pair_survival is not None:
+        return settings.pair_survival
+    return max(0.0, 2.0 - 1.0 / max(settings.loading, 0.5))
+
+
 def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
-    """The constants for the kernels, float64 (15,), in the order of the names above, in SI."""
+    """The constants for the kernels, float64 (16,), in the order of the names above, in SI."""
     a1, a2 = grid.axes
     light = settings.mobile_light
     named = {
@@ -115,6 +140,7 @@ def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
         SHALLOW_LOSS: light.shallow_loss,
         COOLING_HZ: 1 / settings.cooling_time,
         NOISE_HZ: noise_hz(settings),
+        PAIR_SURVIVAL: pair_survival(settings),
     }
     return np.array([named[place] for place in range(len(named))])
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -32,6 +33,8 @@ DEPTH_K: Final = 300e-6
 WAIST_M: Final = 0.98e-6
 SITE_M: Final = 4.49e-6
 """Depth and waist of the static tweezers that the tables belong to, and their distance."""
+REFERENCE_SPEED_M_S: Final = 0.13
+"""The paper's speed."""
 TRANSIT_S: Final = 10e-6
 """Transit time of the sound that the tables belong to."""
 
@@ -111,6 +114,12 @@ def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
         came, last = (format_quantity(each, "speed") for each in (motion.speed_m_s, clear_m_s))
         what = f"profile.mobile_tweezers.speed is {came}; above {last} the sound's chirp blurs the tweezers"
         texts.append(f"{what}: that more atoms are lost is right, how many is not to be trusted")
+    elif motion.speed_m_s > REFERENCE_SPEED_M_S and motion.pick_up_s < light.transit_time:
+        ramp, sound = (format_quantity(each, "time") for each in (motion.pick_up_s, light.transit_time))
+        what = f"profile.mobile_tweezers.pick_up is {ramp}; the sound takes {sound} across the beam"
+        texts.append(
+            f"{what}: a start that follows so soon at more than 130 um/ms loses more atoms than here"
+        )
     return texts
 
 
@@ -150,14 +159,20 @@ def lowering(
     Returns:
         Losses, and temperatures of the atoms that stay relative to an adiabatic change, (n_atoms,).
     """
-    if fraction < FRACTIONS[0] / 2:  # off: nothing stays, and a safe state does not wait for an import
+    if fraction < FRACTIONS[0] / 2:  # off: nothing stays
         return np.ones(len(depth_k)), np.ones(len(depth_k))
-    from scipy.interpolate import interpn
-
-    times = np.log([*DURATIONS_S])
     duration = np.log(np.maximum(duration_s * np.sqrt(depth_k / DEPTH_K), DURATIONS_S[0]))
-    at = np.stack([np.full(len(depth_k), fraction), duration, temperature_k * DEPTH_K / depth_k], axis=1)
-    axes = (np.array(FRACTIONS), times, np.array(TEMPERATURES))
-    at = np.clip(at, [axis[0] for axis in axes], [axis[-1] for axis in axes])
-    loss, warmer = (interpn(axes, one, at) for one in tables()["lowering"])
-    return loss, warmer
+    places = np.full(len(depth_k), fraction), duration, temperature_k * DEPTH_K / depth_k
+    axes = np.array(FRACTIONS), np.log(DURATIONS_S), np.array(TEMPERATURES)
+    upper, part = list[NDArray[np.intp]](), list[Floats]()
+    for axis, place in zip(axes, places, strict=True):
+        upper.append(np.clip(np.searchsorted(axis, place), 1, len(axis) - 1))
+        below, above = axis[upper[-1] - 1], axis[upper[-1]]
+        part.append(np.clip((place - below) / (above - below), 0.0, 1.0))
+    table = tables()["lowering"]
+    found = np.zeros((2, len(depth_k)))
+    for corner in product((0, 1), repeat=3):  # linear between the points
+        weight = np.prod([p if up else 1 - p for up, p in zip(corner, part, strict=True)], axis=0)
+        i, j, k = (u - 1 + up for up, u in zip(corner, upper, strict=True))
+        found += weight * table[:, i, j, k]
+    return found[0], found[1]

@@ -31,7 +31,7 @@ from labseq.plugin import (
     TweezerAmplitudes,
 )
 from labseq_virtual.flight import RfTransport
-from labseq_virtual.handover import noise_hz
+from labseq_virtual.handover import noise_hz, recoil_heat
 from labseq_virtual.images import Exposure
 from labseq_virtual.lights import Lights
 from labseq_virtual.mobile_light import MobileLight, MobileTones, with_true_response
@@ -234,7 +234,7 @@ class VirtualSimulation(Simulation):
         image, lost = self._exposure.take(self._occupied, exposure_s, rng, mode, light_on, power)
         self._lost += lost
         self._now_s = t_start_s + exposure_s
-        aim = self._at_nominal(self._settings.imaging_temperature or self._settings.temperature)
+        aim = self._at_nominal(self._settings.temperature + recoil_heat(self._settings))
         self._thermal[0] = aim + (self._thermal[0] - aim) * math.exp(
             -exposure_s * light_on / self._settings.cooling_time
         )
@@ -342,8 +342,9 @@ class VirtualSimulation(Simulation):
             if self._occupied.any():
                 cooled = self._lights.fraction_on("cooling", pulse.start_s, pulse.end_s)
                 relax = partial(self._relaxed, cooled=cooled)
+                pairs = None if cooled > 0 else 0.0
                 self._lost += self._flight.carry(
-                    self._occupied, pulse, depth, rng, factor, self._thermal, relax
+                    self._occupied, pulse, depth, rng, factor, self._thermal, relax, pairs
                 )
             self._lose_to_vacuum(pulse.end_s)
         self._lost += self._static.receive_until(until_s, self._occupied, self._random.shot)

@@ -13,12 +13,12 @@ Rules, in the order in which they act on a segment:
    (``handover.py``).
 3. Tones of one axis that come closer than 0.45 sites, or pass one another, mix the atoms on both: they are
    lost.
-4. A crossing that moves over an atom on a site, or ends on one, knocks it out, if it is deeper than a static
-   tweezer. The first to arrive loses its own atom too.
+4. A crossing that moves over an atom on a site knocks it out, if it is deeper than a static tweezer. The
+   first to arrive may lose its own atom too: two atoms in one tweezer collide in the light (``handover.py``).
 5. A crossing that passes beside an atom may take it along, and lose its own; an empty one that goes off on an
    atom may take that (``responses.py``).
-6. A crossing that switches off drops its atom on the nearest site, with the losses of ``handover.py``; two
-   atoms on one site are both lost; outside the grid the atom is gone (ejected).
+6. A crossing that switches off drops its atom on the nearest site, with the losses of ``handover.py``; of
+   two atoms on one site one is left, or none; outside the grid the atom is gone (ejected).
 
 Atoms still held when the program ends are lost. The velocity profile within a segment does not matter here:
 all tones follow the same one, so it does not change which atoms meet, or in which order.
@@ -34,7 +34,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
-from labseq_virtual.handover import COOLING_HZ, constants, full_amplitudes, merging_distance, tone_table
+from labseq_virtual.handover import (
+    COOLING_HZ,
+    PAIR_SURVIVAL,
+    constants,
+    full_amplitudes,
+    merging_distance,
+    pair_survival,
+    tone_table,
+)
 from labseq_virtual.responses import move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import TonePositions
@@ -126,6 +134,7 @@ class Transport:
         n_segments = min(n_segments, program.n_segments)
         draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), 3))
         self._constants[COOLING_HZ] = cooled / self._settings.cooling_time
+        self._constants[PAIR_SURVIVAL] = pair_survival(self._settings) if cooled > 0 else 0.0
         if thermal is None:
             thermal = np.stack(
                 [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]

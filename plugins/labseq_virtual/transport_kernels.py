@@ -34,10 +34,10 @@ from labseq_virtual.handover import (
     NOISE_HZ,
     ON_END,
     ON_START,
+    PAIR_SURVIVAL,
     PER_TONE,
     POWER_END,
     POWER_START,
-    REFERENCE_SPEED_M_S,
     REFERENCE_TONES,
     SHALLOW_LOSS,
     SKEW,
@@ -49,7 +49,7 @@ from labseq_virtual.handover import (
     TRANSPORT_LOSS,
 )
 from labseq_virtual.response_kernels import carry, hand_over, land_on, pass_by, relaxed
-from labseq_virtual.responses import BESIDE
+from labseq_virtual.responses import BESIDE, REFERENCE_SPEED_M_S
 from labseq_virtual.transport import COLLISION, EJECTED, FASTEST, HAND_OVER, PROGRAM, TRANSPORT
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ Ints = NDArray[np.int64]
 States = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
-TABLE = const("float64", 2)
+TABLE, VECTOR = const("float64", 2), const("float64", 1)
 
 (
     RISK,
@@ -183,8 +183,8 @@ def first_to_hit(paths: Floats, n: int, r: int, c: int, tolerance: float) -> int
 
 
 @helper_kernel(
-    f"int64(boolean[:, ::1], {TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64, float64, float64[:, ::1], "
-    "int64[::1])"
+    f"int64(boolean[:, ::1], {TABLE}, {TABLE}, int8[:, ::1], {TABLE}, float64[:, :, ::1], "
+    f"{VECTOR}, float64[:, ::1], int64[::1])"
 )
 def sweep(
     occupied: Mask,
@@ -192,16 +192,17 @@ def sweep(
     col: Floats,
     state: States,
     depth: Floats,
-    min_depth: float,
-    tolerance: float,
+    course: Floats,
+    constants: Floats,
     paths: Floats,
     work: Ints,
 ) -> int:
     """Rule 4: moving crossings knock out atoms on sites; returns the number of atoms lost.
 
     The motion is a straight line from the start to the end of a segment. The first crossing to arrive
-    loses its own atom too.
+    may lose its own atom too.
     """
+    min_depth, tolerance = constants[STATIC_DEPTH], constants[TOLERANCE]
     n_lost = 0
     n = find_paths(row, col, state, depth, min_depth, paths, work)
     top, bottom = span(paths, n, 0, occupied.shape[0], tolerance) if n > 0 else (0, 0)
@@ -214,13 +215,14 @@ def sweep(
             occupied[r, c] = False
             n_lost += 1
             i, j = work[first] // len(col), work[first] % len(col)
-            if state[i, j] == HELD:
+            if state[i, j] == HELD and constants[PAIR_SURVIVAL] > 0.0:
+                course[i, j, LOST] = 1.0 - (1.0 - course[i, j, LOST]) * constants[PAIR_SURVIVAL]
+            elif state[i, j] == HELD:
                 state[i, j] = EMPTY
                 n_lost += 1
     return n_lost
 
 
-VECTOR = const("float64", 1)
 OUTPUT = "float64[:, ::1]"
 SITES = "boolean[:, ::1]"
 STATES = "int8[:, ::1]"
@@ -539,9 +541,23 @@ def pass_atoms(
                         course[i, j, LOST] = 1.0 - (1.0 - course[i, j, LOST]) * (1.0 - loss)
 
 
-@helper_kernel("int64(boolean[:, ::1], int64[::1], int64)")
-def land(occupied: Mask, sites: Ints, n: int) -> int:
-    """Put n atoms on their sites, all at once; atoms that share a site are lost; returns their number."""
+@helper_kernel("float64(int64, float64)")
+def one_left(n: int, pair_survival: float) -> float:
+    """Probability that n atoms in a tweezer end as one, not none: P(n) of ``handover.pair_survival``."""
+    return (1.0 - (pair_survival - 1.0) ** n) / (2.0 - pair_survival)
+
+
+@helper_kernel(f"int64(boolean[:, ::1], int64[::1], {VECTOR}, int64, float64)")
+def land(occupied: Mask, sites: Ints, luck: Floats, n: int, pair_survival: float) -> int:
+    """Put n atoms on their sites, all at once; returns how many of those that share a site are lost.
+
+    Args:
+        occupied: Sites that hold an atom; changed in place.
+        sites: Site of each atom (at least n,); changed in place.
+        luck: A uniform random number for each atom, likewise.
+        n: Number of atoms.
+        pair_survival: Probability that one of two atoms is left.
+    """
     n_lost = 0
     for k in range(n):
         site, n_here = int(sites[k]), 0
@@ -553,8 +569,8 @@ def land(occupied: Mask, sites: Ints, n: int) -> int:
                 n_here += 1
         r, c = site // occupied.shape[1], site % occupied.shape[1]
         n_here += int(occupied[r, c])
-        occupied[r, c] = n_here == 1
-        n_lost += n_here if n_here > 1 else 0
+        occupied[r, c] = luck[k] < one_left(n_here, pair_survival)
+        n_lost += n_here - int(occupied[r, c])
     return n_lost
 
 
@@ -603,7 +619,7 @@ def set_down(
     hazards: Floats,
 ) -> int:
     """Rule 6: crossings that switch off drop their atoms; returns the number of draws used so far."""
-    n = 0
+    n, luck = 0, np.empty(len(work))
     for i in range(len(row)):
         for j in range(len(col)):
             if row[i, ON_END] * col[j, ON_END] > 0.0:
@@ -629,10 +645,11 @@ def set_down(
                 lost[TRANSPORT] += 1
             else:
                 work[n] = r * static.shape[1] + c
+                luck[n] = (draw[2] - in_motion) / (1.0 - in_motion)  # uniform, as the draw was not below it
                 thermal[0, r, c], thermal[1, r, c] = heat, now_s
                 hazards[r, c] = 0.0
                 n += 1
-    lost[COLLISION] += land(occupied, work, n)
+    lost[COLLISION] += land(occupied, work, luck, n, constants[PAIR_SURVIVAL])
     return n_drawn
 
 
@@ -798,9 +815,7 @@ def play(
     pick_up(occupied, thermal, now_s, static, row, col, state, depth, course, constants, merging, hazards)
     lost[COLLISION] += mix(row, col, state)
     if moves(row) or moves(col):
-        lost[COLLISION] += sweep(
-            occupied, row, col, state, depth, constants[STATIC_DEPTH], constants[TOLERANCE], paths, work
-        )
+        lost[COLLISION] += sweep(occupied, row, col, state, depth, course, constants, paths, work)
     pass_atoms(
         occupied, thermal, now_s, static, row, col, state, depth, course, max(duration_s, INSTANT_S),
         constants, tables, hazards,

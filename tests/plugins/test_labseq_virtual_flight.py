@@ -67,12 +67,12 @@ class Light:
         self.depth = np.array(depth, np.float64)[:, None]
         self.t_s: Floats = np.arange(len(row), dtype=np.float64) * HOP_S
 
-    def act(self, state: Floats, n_steps: int = 25) -> tuple[NDArray[np.bool_], Floats]:
+    def act(self, state: Floats, n_steps: int = 25, pairs: float = 0.0) -> tuple[NDArray[np.bool_], Floats]:
         """Move atoms; returns who is alive and the record."""
         alive, record = np.ones(len(state), np.bool_), np.full((len(state), N_COLUMNS), np.nan)
         follow_atoms(
             state, alive, record, self.rows, np.ones_like(self.rows), self.cols, self.depth, self.t_s,
-            np.full(GRID.shape, STATIC), MOBILE, plane(), BEAMS, n_steps,
+            np.full(GRID.shape, STATIC), MOBILE, plane(), BEAMS, n_steps, np.full(len(state), 0.3), pairs,
         )  # fmt: skip
         return alive, record
 
@@ -162,12 +162,14 @@ def test_a_shallow_tweezer_leaves_the_atom_behind_and_a_distant_one_does_too() -
         assert np.hypot(*(state[0, :2] - GRID.positions_m[5, 3])) < WAIST
 
 
-def test_two_atoms_in_one_tweezer_are_both_lost() -> None:
+@pytest.mark.parametrize(("pairs", "left"), [(0.2, 0), (0.4, 1)])
+def test_of_two_atoms_in_one_tweezer_collisions_leave_one_or_none(pairs: float, left: int) -> None:
     state = at_rest((5, 3), (5, 5), (5, 9))
-    alive, record = carriage(3).act(state)
-    assert alive.tolist() == [False, False, True]
-    assert record[:2, COLLIDED].tolist() == [1.0, 1.0]
-    assert record[0, LOST_S] == record[1, LOST_S] > 60e-6
+    alive, record = carriage(3).act(state, pairs=pairs)
+    assert alive[:2].sum() == left
+    assert alive[2]
+    assert (record[~alive, COLLIDED] == 1).all()
+    assert (record[~alive, LOST_S] > 60e-6).all()
 
 
 def test_an_atom_in_flight_is_lost_when_nothing_catches_it() -> None:
@@ -178,7 +180,7 @@ def test_an_atom_in_flight_is_lost_when_nothing_catches_it() -> None:
     assert record[0, LOST_S] < 10e-6
 
 
-SURE = SimulationSettings(transport_loss=0.0)
+SURE = SimulationSettings(transport_loss=0.0, pair_survival=0.0)
 
 
 def fly(

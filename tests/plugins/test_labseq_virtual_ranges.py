@@ -22,6 +22,8 @@ PAPER = SimulationSettings()
             ["profile.mobile_tweezers.speed is 150 um/ms; above 144 um/ms"],
         ),
         (MotionSpec(speed_m_s=4.0), ["speed is 4000 um/ms; the virtual lab knows heat and loss from 0 "]),
+        (MotionSpec(speed_m_s=0.25, pick_up_s=2e-6), ["pick_up is 2 us; the sound takes 10 us across"]),
+        (MotionSpec(pick_up_s=2e-6), []),
         (MotionSpec(drop_off_s=1e-3), ["drop_off is 1 ms; the virtual lab knows"]),
     ],
 )

@@ -122,6 +122,22 @@ def test_a_slow_ramp_loses_the_atoms_that_an_adiabatic_one_does(depth: float, te
     assert n_atoms(simulation) / 400 == pytest.approx(float(stays[0]), abs=0.08)
 
 
+def test_an_image_heats_by_the_recoil_of_its_photons_against_the_cooling() -> None:
+    rate_hz, recoil_k, cooling_s, at_k, step_s = 125e3, 0.36196e-6, 1e-3, 15e-6, 1e-6
+    simulation = new_simulation(loading=1.0, depth_disorder=0.0, scattering_rate=rate_hz, imaging_loss=0.0)
+    simulation.load(1.0, 0.5)
+    simulation.expose(2.0, 2e-3)
+    before = n_atoms(simulation)
+    simulation.play("static_tweezers", TweezerAmplitudes(*[np.full(20, 1 / 20)] * 2, dark_s=20e-6), 2.002)
+    heat = at_k
+    for _ in range(2000):
+        heat += step_s * (rate_hz * recoil_k / 3 - (heat - at_k) / cooling_s)
+    light = {"depth": 300e-6, "waist": 0.98e-6, "wavelength": 808e-9, "mass": 86.9}
+    stays = MODELS["release_recapture"].evaluate(np.array([20e-6]), heat, 1.0, *light.values())
+    assert heat > 27e-6
+    assert n_atoms(simulation) / before == pytest.approx(float(stays[0]), abs=0.08)
+
+
 def test_the_lifetime_acts_between_events_whatever_their_number() -> None:
     survived, total = 0, 0
     for seed in range(10):
@@ -357,6 +373,7 @@ CALM = {
     "lifetime": 2e6,
     "imaging_loss": 0.0,
     "transport_loss": 0.0,
+    "pair_survival": 0.0,
     "loading": 1.0,
     "loading_time": 1e-3,
     "image": {"frame": (2, 2)},

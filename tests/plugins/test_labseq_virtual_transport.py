@@ -70,6 +70,7 @@ def test_tones_have_errors_of_their_own_that_belong_to_the_machine() -> None:
 
 
 FULL = np.ones(GRID.shape)
+QUIET = {"transport_loss": 0.0, "temperature": 1e-6, "pair_survival": 0.0}
 
 
 def atoms(*sites: tuple[int, int], grid: SiteGrid = GRID) -> NDArray[np.bool_]:
@@ -84,7 +85,7 @@ def after(
 ) -> set[tuple[int, int]]:
     """Where the atoms are after a program."""
     occupied = atoms(*sites, grid=tape.grid)
-    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
+    settings = SimulationSettings.model_validate(QUIET | physics)
     transport = Transport(tape.grid, MotionSpec(), settings)
     n = len(tape.segments) if n_segments is None else n_segments
     transport.carry(occupied, tape.program(), n, np.ones(tape.grid.shape), np.random.default_rng(0), 1.0)
@@ -258,7 +259,7 @@ SURE_LOSS = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
 def test_every_loss_has_its_cause(
     tape: ToneProgramBuilder, before: Sites, physics: dict[str, Any], expected: dict[str, int]
 ) -> None:
-    settings = SimulationSettings.model_validate({"transport_loss": 0.0, "temperature": 1e-6} | physics)
+    settings = SimulationSettings.model_validate(QUIET | physics)
     occupied = atoms(*before)
     n, rng = len(tape.segments), np.random.default_rng(0)
     lost = Transport(GRID, MotionSpec(), settings).carry(occupied, tape.program(), n, FULL, rng, 1.0)

@@ -23,6 +23,7 @@ from labseq_virtual.handover import (
     START,
     constants,
     merging_distance,
+    pair_survival,
 )
 from labseq_virtual.response_kernels import carry, hand_over, land_on, pass_by
 from labseq_virtual.response_tables import drop_off, landing, passing, pick_up, transport
@@ -133,7 +134,7 @@ class NaiveTransport:
         loaded &= ~mixed
         down, right = (row[:, END] - row[:, START])[:, None], (col[:, END] - col[:, START])[None, :]
         if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
-            self._sweep(lit & (depth > self.settings.static_depth), loaded, row, col)
+            self._sweep(lit & (depth > self.settings.static_depth), loaded, course, row, col)
         self._pass(lit, loaded, course, depth, row, col, duration_s)
         for i, j in np.argwhere(lit):
             kernels.advance(
@@ -219,7 +220,7 @@ class NaiveTransport:
         near &= on[:, None] & on & ~np.eye(len(tones), dtype=np.bool_)
         return near.any(axis=1)
 
-    def _sweep(self, strong: Mask, loaded: Mask, row: Floats, col: Floats) -> None:
+    def _sweep(self, strong: Mask, loaded: Mask, course: Floats, row: Floats, col: Floats) -> None:
         row_step, col_step = row[:, END] - row[:, START], col[:, END] - col[:, START]
         i, j = np.nonzero(strong & ((np.abs(row_step) > AT_REST)[:, None] | (np.abs(col_step) > AT_REST)))
         r, c = np.nonzero(self.occupied)
@@ -233,8 +234,14 @@ class NaiveTransport:
         hit &= (to_r - down) ** 2 + (to_c - right) ** 2 > self.settings.site_tolerance**2
         struck = hit.any(axis=0)
         first = np.unique(np.where(hit, when, np.inf).argmin(axis=0)[struck])
-        self.lost["collision"] += count(struck) + count(loaded[i[first], j[first]])
-        loaded[i[first], j[first]] = False
+        self.lost["collision"] += count(struck)
+        pairs = pair_survival(self.settings)
+        if pairs == 0:
+            self.lost["collision"] += count(loaded[i[first], j[first]])
+            loaded[i[first], j[first]] = False
+        for k in np.argmin(np.where(hit, when, np.inf), axis=0)[struck]:
+            if loaded[i[k], j[k]]:
+                course[i[k], j[k], kernels.LOST] = 1 - (1 - course[i[k], j[k], kernels.LOST]) * pairs
         self.occupied[r[struck], c[struck]] = False
 
     def _land(self, empty: Mask, course: Floats, row: Floats, col: Floats, duration_s: float) -> None:
@@ -275,15 +282,25 @@ class NaiveTransport:
         self.thermal[0, r[stays], c[stays]] = heat[stays]
         self.thermal[1, r[stays], c[stays]] = self.now_s + duration_s
         self.hazards[r[stays], c[stays]] = 0.0
-        n_atoms = self.occupied.astype(int)
+        n_atoms, luck = self.occupied.astype(int), np.zeros(GRID.shape)
         np.add.at(n_atoms, (r[stays], c[stays]), 1)
+        for k in np.flatnonzero(stays)[::-1]:  # that of the first atom that arrives counts
+            luck[r[k], c[k]] = (draws[k, 2] - risks[k, 2]) / (1 - risks[k, 2])
+        kept = (n_atoms > 0) & (luck < np.vectorize(self._one_left)(n_atoms))
         self.lost.update(
             ejected=count(~inside),
             hand_over=count(inside & fallen),
             transport=count(inside & dropped),
-            collision=int(n_atoms[n_atoms > 1].sum()),
+            collision=int(n_atoms.sum()) - count(kept),
         )
-        self.occupied[...] = n_atoms == 1
+        self.occupied[...] = kept
+
+    def _one_left(self, n: int) -> float:
+        """A collision takes one of two atoms, with ``pair_survival``, or both, until at most one is left."""
+        if n < 2:
+            return float(n)
+        p = pair_survival(self.settings)
+        return p * self._one_left(n - 1) + (1 - p) * self._one_left(n - 2)
 
 
 PLACES = st.one_of(st.integers(-4, 24).map(lambda n: n / 4), st.floats(-1.5, 6.5))
@@ -329,6 +346,7 @@ PHYSICS = st.fixed_dictionaries(
         "transport_loss": st.sampled_from([0.0, 0.3]),
         "transport_loss_per_tone": st.sampled_from([0.0, 0.05]),
         "temperature": st.sampled_from([1e-6, 60e-6]),
+        "pair_survival": st.sampled_from([None, 0.0, 0.4]),
         "site_tolerance": st.sampled_from([0.25, 0.1, 0.45]),
         "mobile_light": st.fixed_dictionaries(
             {
@@ -488,6 +506,19 @@ def test_the_move_of_the_paper_loses_nothing_to_heat_and_faster_ones_do() -> Non
     assert losses[1] < 0.02
     assert 0.02 < losses[2] < 0.95
     assert losses[3] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("loading", [0.5, 0.75, 0.9])
+def test_collisions_leave_one_of_two_atoms_as_often_as_the_loading_says(loading: float) -> None:
+    """The loading brings many atoms into a tweezer; each collision takes one or two of them."""
+    pairs, rng = pair_survival(SimulationSettings(loading=loading)), np.random.default_rng(3)
+    n_atoms = rng.poisson(30, 40_000)
+    while (n_atoms > 1).any():
+        n_atoms -= np.where(n_atoms > 1, np.where(rng.random(len(n_atoms)) < pairs, 1, 2), 0)
+    assert n_atoms.mean() == pytest.approx(loading, abs=0.01)
+    assert kernels.one_left(1, pairs) == pytest.approx(1.0)
+    assert kernels.one_left(2, pairs) == pytest.approx(pairs)
+    assert (kernels.one_left(40, pairs) + kernels.one_left(41, pairs)) / 2 == pytest.approx(loading)
 
 
 def test_more_tones_make_shallower_tweezers() -> None:
