@@ -10,7 +10,6 @@ from typing import Any, Final, NamedTuple
 
 from pydantic import BaseModel
 
-from labseq import builtin as builtins
 from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
@@ -19,7 +18,6 @@ from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, TargetPattern
-from labseq.plugins import PluginHost
 from labseq.recording.points import SCANNER
 from labseq.recording.results import PREFIX
 from labseq.roles import Context, Step
@@ -31,12 +29,13 @@ from labseq.session.chosen import (
     construct_one,
     construct_target,
     dump,
+    load_plugins,
     resolve,
     validate,
 )
 from labseq.session.options import Options
 from labseq.session.policies import check_quantity, make_policy, with_policies
-from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile, with_tones
+from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of, written
@@ -258,11 +257,8 @@ def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
 
 def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemCollector) -> None:
     """Check the settings in a sequence whose profile has errors, except for plugins from plugin folders."""
-    host = PluginHost()
-    host.load_builtin(builtins)
-    host.load_entry_points()
-    choices = [("pattern", sequence.target), ("planner", sequence.planner)]
-    for kind, choice in choices:
+    host = load_plugins(found=found)
+    for kind, choice in (("pattern", sequence.target), ("planner", sequence.planner)):
         if choice is not None and host.registry.find(kind, choice.use) is not None:
             with found:
                 resolve(host, document, kind, choice)
@@ -293,8 +289,12 @@ def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
         amplitudes = {"row_amplitudes": [*rf.row_amplitudes], "column_amplitudes": [*rf.column_amplitudes]}
         roles["mobile_tweezers"] |= {"rf": roles["mobile_tweezers"]["rf"] | amplitudes}
     devices = {name: hardware.chosen[name].dump() for name in spec.devices}
-    grid = with_tones(core["grid"], hardware.grid, spec.grid_model())
-    return {**core, "grid": grid, **roles, "devices": devices}
+    own = spec.grid_model()
+    for axis in ("row_frequency", "column_frequency"):
+        tones, before = (getattr(grid, f"{axis}_hz").tolist() for grid in (hardware.grid, own))
+        if tones != before:  # changed by calibrations
+            core["grid"][axis]["table"] = tones
+    return {**core, **roles, "devices": devices}
 
 
 def make_target(

@@ -71,7 +71,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         line_specs=profile.line_specs,
         budgets=profile.budgets.model_dump(),
     )
-    refuse_wrong_wiring(hardware.document, lab)
+    _refuse_wrong_wiring(hardware.document, lab)
     return lab
 
 
@@ -183,8 +183,8 @@ def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
     return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
 
 
-def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
-    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger it."""
+def _refuse_wrong_wiring(document: Document, lab: Lab) -> None:
+    """Raise for lines that the timing box does not have, that would harm the camera, or cannot trigger it."""
     problems: list[Problem] = []
     camera = lab.step_context.camera
     if lab.lines is not None and offers(lab.lines, "lines_facts"):
@@ -205,16 +205,6 @@ def wiring_problems(document: Document, lab: Lab) -> list[Problem]:
         loc = ("lines", "channels", wired.name, "triggers")
         what = "the mobile tweezers take no external trigger"
         problems.append(document.problem(loc, what, "mobile tweezers that do, such as `spcm`"))
-    return problems
-
-
-def refuse_wrong_wiring(document: Document, lab: Lab) -> None:
-    """Raise the problems found by :func:`wiring_problems`.
-
-    Raises:
-        ConfigError: There is at least one problem.
-    """
-    problems = wiring_problems(document, lab)
     if problems:
         raise ConfigError(problems)
 

@@ -6,7 +6,6 @@ import math
 import signal
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -91,7 +90,7 @@ def make_policy(
             policies[number] = _step_policy(document, spec, otherwise)
     is_whole = len(steps) == len(sequence.shot)
     for number, (spec, policy) in enumerate(zip(sequence.shot, policies, strict=True)):
-        if is_whole and policy.retries and not _is_repeatable(steps[number][1]):
+        if is_whole and policy.retries and not getattr(steps[number][1], "repeatable", False):
             what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
             hint = "write 'on_failure: repeat_shot'"
             found.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
@@ -110,37 +109,22 @@ def with_policies(
     document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """The settings of the steps for the record, each with its policy."""
-    return [
-        {
-            **dumped,
-            "policy": document.validate(StepPolicySettings, spec.policy_loc).model_dump(
-                mode="json", exclude_unset=True
-            ),
-        }
-        if _has(document, spec)
-        else dict(dumped)
-        for spec, dumped in zip(sequence.shot, dumps, strict=True)
-    ]
-
-
-def _has(document: Document, spec: StepSpec) -> bool:
-    return document.root.at(spec.policy_loc) is not None
+    found = [dict(dumped) for dumped in dumps]
+    for spec, dumped in zip(sequence.shot, found, strict=True):
+        if document.root.at(spec.policy_loc) is not None:
+            own = document.validate(StepPolicySettings, spec.policy_loc)
+            dumped["policy"] = own.model_dump(mode="json", exclude_unset=True)
+    return found
 
 
 def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:
-    if not _has(document, spec):
-        return otherwise
     own = document.validate(StepPolicySettings, spec.policy_loc, called=f"the policy of '{spec.kind}'")
-    policy = replace(otherwise, retries=own.retries)
-    if own.timeout is not None:
-        policy = replace(policy, timeout_s=own.timeout)
-    if own.on_failure is not None:
-        policy = replace(policy, on_failure=own.on_failure)
-    return policy if own.over_budget is None else replace(policy, over_budget=own.over_budget)
-
-
-def _is_repeatable(step: Step) -> bool:
-    return bool(getattr(step, "repeatable", False))
+    return StepPolicy(
+        math.inf if own.timeout is None else own.timeout,
+        own.retries,
+        own.on_failure or otherwise.on_failure,
+        own.over_budget or otherwise.over_budget,
+    )
 
 
 class Checks:

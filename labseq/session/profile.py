@@ -234,15 +234,8 @@ PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", 
 """Detector settings that do not change the signals compared with thresholds if sites are calibrated."""
 
 
-@dataclass(frozen=True, slots=True)
-class ActiveCalibrations:
-    """A profile's calibrations in use.
-
-    Attributes:
-        entries: Kind of calibration -> entry.
-        grid: The grid with calibrated tones.
-        warnings: Notes for the user that are not errors.
-    """
+class ActiveCalibrations(NamedTuple):
+    """A profile's calibrations by kind, the grid with calibrated tones, and warnings for the user."""
 
     entries: Mapping[str, CalibrationEntry]
     grid: SiteGrid
@@ -322,26 +315,6 @@ def with_calibrations(motion: MotionSpec, entries: Mapping[str, CalibrationEntry
         return motion
     rows, columns = (tuple(entry.values[f"{axis}_amplitudes"].tolist()) for axis in ("row", "column"))
     return replace(motion, rf=replace(motion.rf, row_amplitudes=rows, column_amplitudes=columns))
-
-
-def with_tones(resolved: dict[str, Any], grid: SiteGrid, own: SiteGrid) -> dict[str, Any]:
-    """The ``grid`` of a profile for the record, with the tones in use if calibrations changed them.
-
-    Args:
-        resolved: The ``grid`` in the profile.
-        grid: The grid in use.
-        own: The profile's own grid.
-    """
-    axes = (
-        ("row_frequency", grid.row_frequency_hz, own.row_frequency_hz),
-        ("column_frequency", grid.column_frequency_hz, own.column_frequency_hz),
-    )
-    changed = {
-        name: {**resolved[name], "table": tones.tolist()}
-        for name, tones, before in axes
-        if tones.tolist() != before.tolist()
-    }
-    return {**resolved, **changed}
 
 
 def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: CalibrationKind) -> Stored | None:
