@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeVar, cast, overload
+from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
 from pydantic import BaseModel
 
@@ -15,7 +15,7 @@ from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector
 from labseq.messages import clean, shown, visible
-from labseq.settings import FORMAT, NoSettings
+from labseq.settings import FORMAT
 from labseq.text_files import beside, decode, is_folder, read_bytes
 
 M = TypeVar("M", bound=BaseModel)
@@ -186,39 +186,18 @@ class Document:
             collected.raise_any()
         return document
 
-    @overload
     def validate(
         self,
         model: type[M],
-        loc: Loc = ...,
-        *,
-        drop: Collection[str] = ...,
-        other_keys: Collection[str] = ...,
-        called: str = ...,
-    ) -> M: ...
-    @overload
-    def validate(
-        self,
-        model: None,
-        loc: Loc = ...,
-        *,
-        drop: Collection[str] = ...,
-        other_keys: Collection[str] = ...,
-        called: str = ...,
-    ) -> None: ...
-    def validate(
-        self,
-        model: type[M] | None,
         loc: Loc = (),
         *,
         drop: Collection[str] = (),
         other_keys: Collection[str] = (),
         called: str = "",
-    ) -> M | None:
+    ) -> M:
         """Validate the mapping at a location against a settings model; an empty or missing one counts as {}.
 
         Args:
-            model: The settings model; None for a plugin that takes no settings.
             loc: Location of the mapping.
             drop: Keys that belong to another model and are left out.
             other_keys: Further known keys, for messages about misspelt ones.
@@ -230,8 +209,7 @@ class Document:
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
         context = ValidationContext(name, called, drop, other_keys, self.path.parent, self.needs_units)
         node = self.root.at(loc) or Node({}, self.root.mark_at(loc))
-        made = validate(model or NoSettings, node, context, self.name)
-        return None if model is None else cast("M", made)
+        return validate(model, node, context, self.name)
 
 
 def check_kind(document: Document, kind: FileKind) -> None:

@@ -40,7 +40,7 @@ from labseq.roles import (
     StaticTweezers,
     Step,
 )
-from labseq.settings import Choice, Settings
+from labseq.settings import Choice, NoSettings, Settings
 
 DryRun = Literal["off", "full", "fast"]
 
@@ -160,15 +160,16 @@ def validate(
     other_keys = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
-        return call_plugin(
+        made = call_plugin(
             entry.owner,
             f"the settings model of {called}",
             lambda: document.validate(
-                entry.settings_model, loc, drop=drop, other_keys=other_keys, called=called
+                entry.settings_model or NoSettings, loc, drop=drop, other_keys=other_keys, called=called
             ),
         )
     except PluginLoadError as error:
         raise document.error(loc, str(error)) from error
+    return None if entry.settings_model is None else made
 
 
 def choose(
