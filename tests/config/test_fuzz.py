@@ -14,7 +14,7 @@ from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import load_profile
 from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError, ProblemCollector
-from labseq.settings import Settings
+from labseq.settings import NoSettings, Settings
 from tests.config.mutations import PIECES, mutated
 
 DATA = Path(__file__).parent / "data"
@@ -72,7 +72,7 @@ def test_profiles(path: Path, data: bytes) -> None:
         document, spec = load_profile(path.name, beside=path.parent)
         spec.grid_model()
         for choice in spec.choices.values():
-            document.validate(None, choice.loc, drop=document.get(choice.loc))
+            document.validate(NoSettings, choice.loc, drop=document.get(choice.loc))
 
     load_or_report(load, data.count(b"\n") + data.count(b"\r"))
 

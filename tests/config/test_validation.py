@@ -15,7 +15,7 @@ from pydantic import Field, field_validator, model_validator
 from labseq.config.document import Document
 from labseq.config.validation import MAX_HINTS, validate_values
 from labseq.errors import ConfigError
-from labseq.settings import Duration, Fraction, Length, Settings
+from labseq.settings import Duration, Fraction, Length, NoSettings, Settings
 
 LENGTH = "a length such as '4.49 um' (m, mm, um, nm)"
 TIME = "a time such as '45 ms' (s, ms, us, ns, min, h)"
@@ -206,9 +206,9 @@ def test_dropped_keys_are_left_out_and_not_offered() -> None:
 
 def test_nothing_to_set() -> None:
     document = Document.parse("camera: {use: x, gain: 3}", "f.yaml")
-    assert document.validate(None, ("camera",), drop={"use", "gain"}) is None
+    document.validate(NoSettings, ("camera",), drop={"use", "gain"})
     with pytest.raises(ConfigError) as caught:
-        document.validate(None, ("camera",), drop={"use"})
+        document.validate(NoSettings, ("camera",), drop={"use"})
     assert str(caught.value) == "f.yaml:1:18: 'camera' takes no settings, but 'gain' is given; remove it"
 
 
