@@ -94,35 +94,32 @@ def named(role: str, identity: str) -> str:
     return role if identity.startswith(f"{role} ") else f"{role} ({identity})"
 
 
-class EndsHolders:
-    """Ends processes that use devices if they hang, or if that was asked for.
+def end_holders(warn: Callable[[str], object], *, end: bool) -> Callable[[str, Holder], bool]:
+    """For ``blocked`` of :func:`lock_devices`: end each process that uses devices once, if it hangs.
 
     Args:
         warn: Receives what is done.
         end: Whether to end processes that do not hang, too.
     """
+    seen = set[Process | None]()
 
-    def __init__(self, warn: Callable[[str], object], *, end: bool) -> None:
-        self._warn = warn
-        self._end = end
-        self._seen: set[Process | None] = set()
-
-    def __call__(self, device: str, holder: Holder) -> bool:
-        """Whether the process has ended; once for each process."""
-        if holder.process in self._seen:
+    def has_ended(device: str, holder: Holder) -> bool:
+        process, text = holder.process, f"{device} is in use by {holder}"
+        if process in seen:
             return False
-        self._seen.add(holder.process)
-        text = f"{device} is in use by {holder}"
-        if holder.process is None or not (holder.hangs or self._end):
-            self._warn(f"{text}; it is made safe all the same ('labseq safe --end' ends that process first)")
+        seen.add(process)
+        if process is None or not (holder.hangs or end):
+            warn(f"{text}; it is made safe all the same ('labseq safe --end' ends that process first)")
             return False
-        silent = f", which has not answered for {holder.silent_s:.0f} s"
-        self._warn(f"{text}{silent if holder.hangs else ''}; that process is ended first")
+        silent = f", which has not answered for {holder.silent_s:.0f} s" if holder.hangs else ""
+        warn(f"{text}{silent}; that process is ended first")
         try:
-            has_ended = holder.process.end(HUNG_END_S if holder.hangs else END_S)
+            ended = process.end(HUNG_END_S if holder.hangs else END_S)
         except OSError as error:
-            self._warn(f"process {holder.process.pid} cannot be ended: {error.strerror}")
+            warn(f"process {process.pid} cannot be ended: {error.strerror}")
             return False
-        if not has_ended:
-            self._warn(f"process {holder.process.pid} did not end")
-        return has_ended
+        if not ended:
+            warn(f"process {process.pid} did not end")
+        return ended
+
+    return has_ended

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,7 @@ class PlanRequest:
     profile: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class PlanInputs:
+class PlanInputs(NamedTuple):
     """Everything that a plan depends on, except the occupancy."""
 
     machine: Machine
@@ -291,16 +290,11 @@ class PlannedMoves:
 
     def as_dict(self) -> dict[str, Any]:
         """Everything, JSON-ready; occupancies as rows of 0 and 1, ejected atoms at sites off the grid."""
-        grid, report, refused = self.grid, self.report, self.refused
+        report, refused = self.report, self.refused
+        about_grid = ("n_rows", "n_cols", "spacing_m", "lattice", "shear")
         return {
             "planner": self.planner,
-            "grid": {
-                "n_rows": grid.n_rows,
-                "n_cols": grid.n_cols,
-                "spacing_m": grid.spacing_m,
-                "lattice": grid.lattice,
-                "shear": grid.shear,
-            },
+            "grid": {name: getattr(self.grid, name) for name in about_grid},
             "degree_of_parallelism": self.degree_of_parallelism,
             "seed": self.seed,
             "occupancy": _bits(self.occupancy),
@@ -415,14 +409,8 @@ def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:
     return sites.astype(int).tolist()
 
 
-_OPTIONS = {
-    "target": "--target",
-    "planner": "--planner",
-    "degree_of_parallelism": "--dop",
-    "seed": "--seed",
-    "origin": "--origin",
-}
-"""Field of a request -> its command line option, which only planning accepts."""
+_OPTIONS = ("target", "planner", "degree_of_parallelism", "seed", "origin")
+"""Fields of a request that only planning accepts."""
 
 
 def read_plan(
@@ -440,14 +428,8 @@ def read_plan(
     machine = _machine(file, name, request)
     with announcing(announce):
         try:
-            report = check_plan(
-                file.plan,
-                file.occupancy,
-                file.target,
-                file.degree_of_parallelism,
-                machine.grid,
-                machine.motion,
-            )
+            dop = file.degree_of_parallelism
+            report = check_plan(file.plan, file.occupancy, file.target, dop, machine.grid, machine.motion)
         except PlanError as error:
             raise ConfigError(Problem(str(error), name)) from error
     return PlannedMoves(
@@ -467,10 +449,10 @@ def read_plan(
 
 def _machine(file: PlanFile, name: str, request: PlanRequest) -> Machine:
     for_planner, for_profile = split_overrides(request.overrides)
-    given = [field.name for field in fields(request) if getattr(request, field.name) != field.default]
-    options = [option for key, option in _OPTIONS.items() if key in given]
-    if options or for_planner:
-        option = for_planner[0].source if for_planner else options[0]
+    default = PlanRequest(request.occupancy)
+    given = [name for name in _OPTIONS if getattr(request, name) != getattr(default, name)]
+    if given or for_planner:
+        option = f"--{given[0]}".replace("degree_of_parallelism", "dop") if given else for_planner[0].source
         what = f"{name} is a plan already: there is nothing to plan"
         raise ConfigError(Problem(what, option, hint="leave the option out, or give an occupancy"))
     if request.profile is None and not for_profile:

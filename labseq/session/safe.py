@@ -27,7 +27,7 @@ from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, attempt, failure_of, in_safe_order, open_device
 from labseq.session.chosen import HARDWARE_KINDS, load_plugins
 from labseq.session.lab import construct, timeouts_of
-from labseq.session.locks import EndsHolders, lock_devices
+from labseq.session.locks import end_holders, lock_devices
 from labseq.session.profile import ResolvedProfile, choose_plugins
 from labseq.watchdog import Watchdog, watchdog_lines
 
@@ -188,7 +188,7 @@ def make_profile_safe(
     found, stop, to_user = ProblemCollector(), StopFlag(), partial(warn, observer)
     hardware = read_devices(profile, overrides, found)
     with ExitStack() as stack:
-        blocked = EndsHolders(to_user, end=end)
+        blocked = end_holders(to_user, end=end)
         stack.enter_context(lock_devices(hardware, "labseq safe", to_user, blocked=blocked))
         stack.enter_context(stop_on_signals(stop))
         secured = make_profile_devices_safe(hardware, stop, observer)

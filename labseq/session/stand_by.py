@@ -17,7 +17,7 @@ from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, lock_file
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import in_safe_order
-from labseq.session.locks import EndsHolders, lock_devices, named
+from labseq.session.locks import end_holders, lock_devices, named
 from labseq.session.profile import ResolvedProfile
 from labseq.session.safe import make_profile_devices_safe, read_devices, report_outcome, warn
 from labseq.watchdog import TRY_AGAIN_S, Hanging
@@ -69,7 +69,7 @@ def _secure(
     """Make one device safe, and try again for a while, unless a process that works has begun to use it."""
     hardware = replace(profile, chosen={role: profile.chosen[role]})
     to_user, deadline_s = partial(warn, observer), time.monotonic() + TRY_AGAIN_S
-    ends = EndsHolders(to_user, end=False)
+    ends = end_holders(to_user, end=False)
 
     def blocked(device: str, holder: Holder) -> bool:
         if not look.is_in_trouble(holder):
