@@ -68,6 +68,9 @@ class Document:
     def read(cls, path: Path, kept: StoredText | None = None) -> Document:
         """Read a file.
 
+        Args:
+            kept: The text to use in place of the file's, which need not exist then.
+
         Raises:
             ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
         """
@@ -171,6 +174,9 @@ class Document:
     ) -> Document:
         """A copy with several values replaced, in order; see :meth:`override`.
 
+        Args:
+            may_add: Addresses of mappings that are added if the file has none.
+
         Raises:
             ConfigError: All the overrides that cannot be applied.
         """
@@ -271,6 +277,10 @@ def load_checked(
     document: Document, model: type[M], called: str, fallbacks: FallbackValues, found: ProblemCollector | None
 ) -> tuple[Document, M]:
     """Validate a whole file; if problems are collected, continue with fallbacks for wrong values.
+
+    Args:
+        model: The settings model of the whole file.
+        fallbacks: Values that replace invalid ones.
 
     Raises:
         ConfigError: The file has errors, and its other values cannot be checked.

@@ -373,6 +373,9 @@ def is_expression(node: Node) -> bool:
 def evaluate(root: Node, name: str, text: str) -> Expressions:
     """Compute all expressions of a file.
 
+    Args:
+        text: Its text, for places within expressions.
+
     Raises:
         ConfigError: All errors in them.
     """

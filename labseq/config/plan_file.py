@@ -150,6 +150,9 @@ class PlanFile:
 def parse_plan(data: bytes, name: str) -> PlanFile:
     """Read the JSON of a plan.
 
+    Args:
+        data: UTF-8.
+
     Raises:
         ConfigError: It is no JSON, no plan, or a value in it is invalid; says what was expected.
     """

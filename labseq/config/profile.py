@@ -702,6 +702,12 @@ def load_profile(
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
 
+    Args:
+        name_or_path: See :func:`find_profile`.
+        beside: Folder of the file that names the profile.
+        overrides: Values that replace those in the file, addresses without "profile.".
+        named_in: The sequence whose key ``profile`` names it, for messages.
+
     Returns:
         The document, overrides included, and its content, with fallbacks for wrong values.
 

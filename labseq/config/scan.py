@@ -290,6 +290,10 @@ class Adaptive:
 def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None:
     """Read ``scan``, ``repeats`` and ``order`` of a sequence.
 
+    Args:
+        fixed: The overrides, those of the profile with their "profile."; an axis that one of
+            them sets is left out, since ``--set`` takes precedence.
+
     Returns:
         The scan, its profile axes not yet bound; None if the sequence has none.
 

@@ -252,6 +252,10 @@ def load_sequence(
 ) -> tuple[Document, SequenceSpec, Scan | None]:
     """Read a sequence file.
 
+    Args:
+        overrides: Values that replace those in the file: (address, value) each.
+        profile_set: Overrides of the profile, with their "profile."; they replace a scan of their address.
+
     Returns:
         The document, with overrides, the default planner and the first point of its scan; its content, with
         fallbacks for wrong values; and the scan, its profile axes not yet bound.

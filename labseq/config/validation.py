@@ -350,7 +350,13 @@ _LENGTHS: Final[Mapping[str, tuple[str, str, str, str]]] = {
 
 
 def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Problem:
-    """Translate an error of pydantic for a physicist."""
+    """Translate an error of pydantic for a physicist.
+
+    Args:
+        error: One of ``ValidationError.errors()``, neither "missing" nor "extra_forbidden".
+        value: Its value in the file.
+        raw: Its value as it is written, or "".
+    """
     kind, details = str(error["type"]), error.get("ctx", {})
     what = f"{name} is {shown(value, raw)}" if name else f"this is {shown(value, raw)}"
     if kind == "setting_error":

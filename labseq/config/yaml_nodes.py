@@ -424,6 +424,10 @@ def explain_syntax_error(
 ) -> Problem:
     """Explain a syntax error, with its place.
 
+    Args:
+        last: The event before the error.
+        opened: The innermost bracket that is open at the error; None outside of brackets.
+
     Returns:
         The problem, with line and column but without a source.
     """

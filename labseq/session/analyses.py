@@ -112,6 +112,9 @@ def results_of(
 
     If the settings of the analysis have changed, all shots are analysed again, so that results never mix.
 
+    Args:
+        again: Whether to analyse all shots again even if the settings are unchanged.
+
     Yields:
         The file of the results, and the shots that already have one.
 
@@ -133,6 +136,9 @@ def analyse(
     failed: Callable[[int, BaseException], None],
 ) -> int:
     """Analyse shots; a failure is recorded and reported, and the next shot follows.
+
+    Args:
+        failed: Receives the index of a failed shot, and the error.
 
     Returns:
         Number of shots that now have a result.

@@ -444,6 +444,10 @@ def make_search(
     """Make and check the scanner of a scan; None if the scan is not adaptive, or if there is a problem.
 
     The scanner is constructed once, to check that its constructor accepts the settings.
+
+    Args:
+        scanned: The scan, its ends checked.
+        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_quantity`.
     """
     adaptive = scanned.scan.adaptive
     if adaptive is None:

@@ -24,6 +24,11 @@ class AwaitedResults:
     The results that were used are in the event log. A resumed run takes them from there: it decides as
     before, even if a result came too late or was computed again since.
 
+    Args:
+        needed: Quantity -> what for, if the run cannot go on without it, else "".
+        analyses: The analyses of the sequence.
+        observers: Receive warnings and the results that are used.
+
     Attributes:
         values: Quantity -> shot -> value; None for a shot without one.
     """

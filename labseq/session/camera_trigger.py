@@ -41,6 +41,9 @@ def unsuitable_exposures(
 ) -> Iterator[tuple[Loc, Problem]]:
     """Exposures of a shot that a line cannot make, or that a camera cannot time by itself.
 
+    Args:
+        bars: The timeline of the shot, each with the place of its step in the sequence.
+
     Returns:
         What is wrong, with its place in the sequence, or in the profile for ("camera", ...).
     """

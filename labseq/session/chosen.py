@@ -137,6 +137,9 @@ def named(
 ) -> Entry:
     """Find the registry entry of a plugin named in a file.
 
+    Args:
+        key: Whether the name is the key there.
+
     Raises:
         ConfigError: No plugin offers it, or the one that does failed to load.
     """

@@ -134,6 +134,12 @@ def check_each_device(
 
     The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
 
+    Args:
+        devices: Name and device, in the order of opening.
+        stop: The request to stop: the current device is made safe and closed, the others are not opened.
+        simulation: The simulation that virtual devices act on: opened before them, closed after them.
+        warn: Receives what goes wrong with the watchdog.
+
     Returns:
         Those that were tried, the simulation first.
     """

@@ -85,6 +85,14 @@ def construct(
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
     """Construct the object of every role; constructors do no I/O, so nothing is open yet.
 
+    Args:
+        chosen: Role -> its plugin.
+        context: Their common context; name and random numbers are added for each, and the simulation if it
+            is among the chosen.
+        truth: Grid and motion without calibrations, for the simulation, in which they are measured; None
+            without calibrations.
+        refused: Receives the errors, role -> error; without it they are raised.
+
     Returns:
         Role -> object, and the random streams that the objects received.
 
@@ -124,6 +132,11 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     tweezers stay open if the motion differs only in what each program contains. A
     simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
     on to the simulation, and that to the motion.
+
+    Args:
+        lab: The lab at the previous point.
+        before: The point that the lab is at.
+        after: The next point.
 
     Returns:
         The lab, and the names of the devices that must be reopened, "simulation" among them.

@@ -33,6 +33,12 @@ def lock_devices(
 
     A lock ends with its process, also if that is killed. Simulated devices are not locked.
 
+    Args:
+        what: The use of the devices, shown to other users while they are locked.
+        warn: Receives a warning if nothing keeps others from a device.
+        blocked: Called with device and holder if another process has locked it; returns whether to try
+            again. Without it that is an error.
+
     Yields:
         A function that changes this description of their use.
 

@@ -148,7 +148,11 @@ Warn = Callable[[str], None]
 
 
 class AnalysisProcesses:
-    """The processes of a run's analyses, one each; they neither stop nor slow the run."""
+    """The processes of a run's analyses, one each; they neither stop nor slow the run.
+
+    Args:
+        analyses: "use" and "finish_within" of each.
+    """
 
     def __init__(self, run_dir: Path, analyses: Sequence[Mapping[str, Any]], warn: Warn) -> None:
         self._run_dir = run_dir
@@ -267,7 +271,11 @@ class _AnalysisProcess:
             self._process.stdin.close()
 
     def wait(self, end_s: float, warn: Warn) -> None:
-        """Wait until the process has ended, and kill it if its time is up."""
+        """Wait until the process has ended, and kill it if its time is up.
+
+        Args:
+            end_s: When the run ended, on this computer's monotonic clock.
+        """
         left_s = end_s + self._finish_within_s + GRACE_S - time.monotonic()
         try:
             self._process.wait(max(0.0, left_s))

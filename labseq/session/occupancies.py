@@ -95,6 +95,9 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
 def parse_text(data: bytes, name: str) -> Occupancy:
     r"""Read rows of 0 and 1 (or "." and "#"), with or without spaces or commas between them.
 
+    Args:
+        data: UTF-8.
+
     Raises:
         ConfigError: With line and column.
 

@@ -318,6 +318,10 @@ def plan_moves(
 ) -> PlannedMoves:
     """Plan once, and check the plan as a run does.
 
+    Args:
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
+        keep_refused: Whether a plan that breaks a rule in one of its batches is returned, too.
+
     Raises:
         ConfigError: The request has an error; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
@@ -365,6 +369,9 @@ def call_planner(
     planner: Planner, name: str, occupancy: Occupancy, target: TargetPattern, guard: Guard | None = None
 ) -> Plan:
     """Call a planner with a copy of the occupancy, in case the planner changes its input.
+
+    Args:
+        guard: Calls it; without one, a new one.
 
     Raises:
         PlanError: The planner raised, or did not return in time; names the planner.
@@ -417,6 +424,12 @@ def read_plan(
     data: bytes, name: str, request: PlanRequest, *, announce: Callable[[float], None] = lambda _: None
 ) -> PlannedMoves:
     """Read the JSON of a plan, and check the plan as a run does.
+
+    Args:
+        data: UTF-8, what ``labseq plan --json`` writes.
+        request: Names the profile with grid and motion; without one the grid is that of
+            the file, and the motion the paper's. Nothing is planned.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
         ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request

@@ -41,6 +41,13 @@ def check_quantity(
 ) -> None:
     """Check that the shots of a sequence can have a quantity.
 
+    Args:
+        place: Place of its name in the file.
+        purpose: Its use: "to optimise".
+        steps: The steps of a shot, or None if some have errors.
+        results: Names of the results of its analyses, "analysis.NAME.KEY"; "analysis.NAME." if its keys are
+            not known.
+
     Raises:
         ConfigError: No shot can have it.
     """
@@ -65,7 +72,13 @@ def check_quantity(
 
 
 def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[str]) -> str:
-    """The warning that a shot lacks a quantity."""
+    """The warning that a shot lacks a quantity.
+
+    Args:
+        name: Name of the quantity.
+        purpose: Its use: "to optimise".
+        quantities: Names of the quantities that it has.
+    """
     known = list(quantities)
     hint = did_you_mean(name, known) or f"it has {listing(known)}"
     return f"shot {shot} has no '{clean(name)}' {purpose} ({hint})"
@@ -129,6 +142,10 @@ def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> S
 
 class Checks:
     """Checks the quantities of the most recent shots against their limits, between two shots.
+
+    Args:
+        rows: The index's lines of earlier shots of a resumed run, in order.
+        values_of: A line of the index -> the value of each check for its shot; nan if it has none.
 
     Attributes:
         left_open: The last of the earlier shots, and why a check would skip the rest of its point, or "".

@@ -152,6 +152,12 @@ def resolve_profile(
 ) -> ResolvedProfile:
     """Read a profile, load the plugins and choose the plugin of each role.
 
+    Args:
+        named_in: The sequence that names the profile, for messages.
+        plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
+        found: Receives the problems of a readable profile; without it they are raised.
+        again: The profile's text and calibrations, if a run is resumed.
+
     Raises:
         ConfigError: The profile has an error.
         PluginLoadError: A plugin that it names failed to load.
@@ -183,7 +189,12 @@ def choose_plugins(
     found: ProblemCollector,
     calibrations: Mapping[str, str] | None = None,
 ) -> ResolvedProfile:
-    """Choose the plugin of each role of a profile."""
+    """Choose the plugin of each role of a profile.
+
+    Args:
+        spec: Its content, with fallbacks for wrong values.
+        calibrations: Kind -> id of the active ones; None for those chosen by profile and store.
+    """
     repaired = bool(found.problems)
     chosen: dict[str, ChosenPlugin] = {}
     warnings: list[str] = []
@@ -245,7 +256,12 @@ class ActiveCalibrations(NamedTuple):
 def store_of(
     document: Document, profile: ProfileSpec, dry_run: Literal["off", "full", "fast"] = "off"
 ) -> Store:
-    """The folder of calibrations of a profile."""
+    """The folder of calibrations of a profile.
+
+    Args:
+        dry_run: "off", "full" or "fast"; a profile with only virtual devices uses
+            the same store in a dry run.
+    """
     folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
     is_other = dry_run != "off" and any(not choice.use.startswith(VIRTUAL_TWIN) for choice in choices)
@@ -270,7 +286,13 @@ def calibrated(
     detector: Mapping[str, Any] | None = None,
     pins: Mapping[str, str] | None = None,
 ) -> ActiveCalibrations:
-    """Read the calibrations that a profile uses, and apply those of the tones."""
+    """Read the calibrations that a profile uses, and apply those of the tones.
+
+    Args:
+        found: Receives the problems; a calibration that has one is not used.
+        detector: Settings of the detector in use, for the record; None if they do not matter.
+        pins: Kind -> id of the only calibrations to use; None for those of profile and store.
+    """
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
     entries: dict[str, CalibrationEntry] = {}
     if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):

@@ -59,6 +59,10 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
 def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
     """Commit of the repository that a folder is in, and how tracked files differ from it.
 
+    Args:
+        of: A file in it that must be tracked by the repository. A package installed in an
+            environment inside a repository is not part of that repository.
+
     Returns:
         ``{"commit": str, "dirty": bool, "code_sha256": str}``, or None outside of a repository or
         where git is not installed. ``dirty`` is whether any tracked file differs; ``code_sha256``
@@ -107,7 +111,13 @@ def _user() -> str:
 def run_record(
     assembly: Assembly, seed: int, changes: Mapping[str, str], scan: Mapping[str, Any], folder: Path
 ) -> RunRecord:
-    """The record of a run before anything is opened."""
+    """The record of a run before anything is opened.
+
+    Args:
+        changes: Changes by options, as they were typed: address -> value.
+        scan: Its scan, see :meth:`labseq.session.scan_run.ScanRun.record`.
+        folder: The working folder, absolute: relative paths in the settings are relative to it.
+    """
     spec, hardware = assembly.sequence, assembly.hardware
     changed = {
         address: Setting(text, "", text) if address in NOT_SET else assembly.setting(address, text)

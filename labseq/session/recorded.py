@@ -38,6 +38,9 @@ def resolved_of(run: Run) -> dict[str, Any]:
 def stored_text(path: Path, sha256: str) -> StoredText:
     """The text of a file in a run's folder.
 
+    Args:
+        sha256: Its SHA-256 when the run was begun.
+
     Raises:
         RecordingError: It is missing or has been changed.
     """

@@ -64,6 +64,9 @@ def make_each_safe(
 
     The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
 
+    Args:
+        devices: Name and device, in the order of the safe state.
+
     Returns:
         Device name -> why it is not safe, or None. A device that is safe but
         cannot be closed is only reported to the observer, as at the end of a run.
@@ -129,6 +132,9 @@ def make_profile_devices_safe(
     """Construct each device of a profile, open it, make it safe and close it.
 
     A device that cannot be constructed does not affect the others; it is reported at the end.
+
+    Args:
+        stop: The request to stop; not obeyed here.
     """
     clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
     made, failures = construct_hardware(hardware, clock)
@@ -146,6 +152,10 @@ def make_safe_after_crash(hardware: ResolvedProfile, key: str, stop: StopFlag, o
     """Make the devices of a profile safe if the process of their last run died, because they may still be on.
 
     This comes first, because constructing and compiling may fail.
+
+    Args:
+        key: The profile's name in the markers of runs.
+        stop: The request to stop; obeyed once every device has been tried.
 
     Raises:
         LabseqError: The first device that is not safe.
@@ -180,6 +190,9 @@ def make_profile_safe(
     It does so even while another process uses them, with a warning that names it: a run in progress fails,
     or switches its devices on again. A process that hangs is ended first. Ctrl-C is obeyed once every device
     has been tried. If all devices are safe, the next run need not make them safe, however the last one ended.
+
+    Args:
+        end: Whether to end any other process that uses the devices first.
 
     Raises:
         ConfigError: The profile cannot be read, or does not exist; no device was touched.

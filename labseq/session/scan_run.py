@@ -39,6 +39,9 @@ class ShotTaker(Protocol):
     def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
         """Take and record a shot.
 
+        Args:
+            skipped: Shots that will not be taken.
+
         Returns:
             The shot and why, if it failed for good.
 
@@ -49,7 +52,13 @@ class ShotTaker(Protocol):
 
 
 class OwnShots:
-    """Takes the shots in this process."""
+    """Takes the shots in this process.
+
+    Args:
+        sequencer: Open, at the point of the first shot.
+        point: That point.
+        changes: Address -> value of what differs from the files in every shot.
+    """
 
     def __init__(self, sequencer: Sequencer, point: Point, changes: Mapping[str, Any], seed: int) -> None:
         self._sequencer = sequencer
@@ -126,6 +135,10 @@ class ScanRun:
 
     def run(self, taker: ShotTaker, writer: RunWriter, checks: Checks, emit: Emit) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
+
+        Args:
+            taker: Takes each of them.
+            checks: Checks each result; may end the run, or skip the other shots of a point.
 
         Raises:
             StopRequested: Another process asked the run to end.
@@ -321,7 +334,11 @@ def scan_run_of(
 
 
 def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
-    """The settings that a recorded shot was taken with."""
+    """The settings that a recorded shot was taken with.
+
+    Args:
+        assembly: The run, assembled from its own recorded files.
+    """
     if assembly.search is None:
         return assembly.at(scan_run.points[shot.index])
     values = {one.address: shot.row["parameters"][one.address] for one in assembly.search.ranges}

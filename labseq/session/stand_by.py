@@ -38,6 +38,9 @@ def stand_by(
 
     The locks of the devices say which process that is; devices that other processes use are left alone.
 
+    Args:
+        tell: Receives the devices at the beginning, then each process that died or hangs.
+
     Raises:
         ConfigError: The profile has an error, or names no device that is locked while it is in use.
     """
