@@ -23,9 +23,6 @@ _PLAIN_DRY_RUN: Final = frozenset({"doctor"})
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line; the console entry point.
 
-    Args:
-        arguments: Without the program's name; those of the process by default.
-
     Raises:
         SystemExit: Always, with the exit code.
     """

@@ -49,8 +49,6 @@ class LiveView:
     waits for the terminal.
 
     Args:
-        console: The terminal.
-        now: Monotonic clock in seconds.
         run_now: Clock of the run in seconds; by default ``now``.
     """
 
@@ -118,11 +116,6 @@ class Picture:
 
     Parts that do not fit are left out: the array is drawn smaller, then dropped, and then the
     latest events are dropped.
-
-    Args:
-        tally: The numbers of the run.
-        recent: The latest events, oldest first.
-        glyphs: The characters to draw with.
     """
 
     def __init__(self, tally: Tally, recent: Sequence[str], glyphs: Glyphs) -> None:
@@ -401,11 +394,7 @@ class PointTally:
 
 
 class ScanTally:
-    """The points of a scan while it runs.
-
-    Args:
-        scan: The scan as the run's record describes it.
-    """
+    """The points of a scan while it runs."""
 
     def __init__(self, scan: Mapping[str, Any]) -> None:
         self._scan = scan
@@ -445,9 +434,6 @@ class ScanTally:
 
 class Tally:
     """Sums up a run's events; unknown events are ignored.
-
-    Args:
-        now: Monotonic time in seconds.
 
     Attributes:
         record: The run, from "run_starting" on.

@@ -21,10 +21,6 @@ _HEADER: Final = ("run", "started", "profile", "shots", "status", "hardware", "s
 def list_runs(data: Path | None, name: str, limit: int, *, as_json: bool) -> None:
     """Print a row for each of the newest runs, the newest last.
 
-    Args:
-        name: Only runs whose name contains this.
-        limit: Maximum number of runs.
-
     Raises:
         ConfigError: There is no such folder.
     """

@@ -67,12 +67,7 @@ def _follow(reader: EventReader, view: Any, wait: Callable[[float], None]) -> No
 
 
 class EventReader:
-    """Reads the events of a run from its files, in the form that the run passes to its live view.
-
-    Args:
-        run: The run, as it was when it was opened.
-        clock: Monotonic clock in seconds.
-    """
+    """Reads the events of a run from its files, in the form that the run passes to its live view."""
 
     def __init__(self, run: Run, clock: Callable[[], float] = time.monotonic) -> None:
         self._folder = run.path

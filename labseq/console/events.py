@@ -38,7 +38,6 @@ class LogLines:
     """Implements ``RunObserver`` by printing a line per event.
 
     Args:
-        stream: Where the lines are printed.
         events: Names of the events that are printed.
     """
 

@@ -68,13 +68,7 @@ def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
 
 
 def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any) -> bytes:
-    """Draw a picture independently of the user's matplotlibrc: the same picture gives the same bytes.
-
-    Args:
-        draw: Makes the figure.
-        kind: One of :data:`ENDINGS`.
-        options: Of matplotlib's ``savefig``.
-    """
+    """Draw a picture independently of the user's matplotlibrc: the same picture gives the same bytes."""
     from matplotlib import style
 
     with style.context(["default", _STYLE]):
@@ -96,8 +90,6 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
 
     Args:
         path: The file; its ending gives its kind, PNG for other endings.
-        draw: Makes the figure.
-        options: Of matplotlib's ``savefig``.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -180,7 +172,6 @@ def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float6
 
     Args:
         sites: (..., 2), row and column.
-        grid: The grid of sites.
 
     Returns:
         float64 (..., 2), x and y in units of the spacing, from the site (0, 0); y down the image.
@@ -208,8 +199,6 @@ def plan_timelines(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) ->
     The sheet is to be somewhat wider than high, with few empty places.
 
     Args:
-        extent: What each panel shows.
-        n_panels: How many there are.
         panel_in: Width of a panel, in inches, unless its sites become too small or too large.
 
     Example:

@@ -28,7 +28,6 @@ def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: floa
 
     Args:
         axes: Where; gets limits that show the whole grid, and no axes.
-        target: The target pattern.
         grid: The grid that it lies on.
         site_in: Distance between neighbours in the finished picture, in inches.
 

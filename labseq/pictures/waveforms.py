@@ -81,10 +81,7 @@ def spectrogram(
     """Find out how strong each frequency is, column by column, without ever holding all samples.
 
     Args:
-        renderer: Makes the samples.
         channel: 0 for the row tones, 1 for the column tones.
-        stretches: What is shown.
-        n_columns: Number of columns.
         band_hz: Lowest and highest frequency of the result.
 
     Returns:

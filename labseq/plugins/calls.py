@@ -33,9 +33,7 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     because a program may read JSON from stdout, and is recorded with the owner.
 
     Args:
-        owner: The plugin.
         what: Name of the code for messages; "" for the loading of the plugin.
-        work: The code.
 
     Returns:
         What the code returned.

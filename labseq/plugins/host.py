@@ -306,8 +306,6 @@ class PluginHost:
         """Find the registry entry of a name in a sequence or profile.
 
         Args:
-            kind: Kind of plugin.
-            name: Its name.
             file: The file that names it, for messages.
 
         Raises:

@@ -28,8 +28,6 @@ def take_frame(
     """Take one frame with a camera, armed for it alone.
 
     Args:
-        camera: The camera.
-        name: Its name, for messages.
         exposure_s: Exposure time, in seconds.
         call: Calls a device: ``call(name, timeout_s, function, *arguments)``.
         max_wait_s: Longest time of a call beyond the exposure, in seconds.
@@ -91,7 +89,6 @@ class CameraSeries:
     through the EM register between exposures as well.
 
     Args:
-        lab: The devices.
         timelines: The timeline of each step of the shot; without one, each image is armed for on its own.
         call: Calls the camera within the time limit of a call.
 

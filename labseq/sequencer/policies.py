@@ -84,7 +84,6 @@ class RunPolicy:
         """The reaction to a failure.
 
         Args:
-            error: The failure.
             step: Index of the step that failed; None outside of all steps.
             attempt: Number of the attempt at the shot, from 0.
         """

@@ -135,11 +135,6 @@ def _raise_first(outcome: Outcome) -> None:
 def plan_timelines(lab: Lab, guard: Guard, steps: Sequence[tuple[str, Step]]) -> list[list[TimelineEntry]]:
     """The timeline of each step.
 
-    Args:
-        lab: The devices.
-        guard: Runs the calls.
-        steps: The steps with their names.
-
     Raises:
         LabseqError: A step fails; the error names it.
     """
@@ -192,12 +187,6 @@ class Sequencer:
     """Runs shots on open devices and makes the devices safe however the run ends.
 
     Args:
-        lab: The devices.
-        steps: The steps of a shot, with their names.
-        stop: The request to stop.
-        sink: Writes the shots.
-        observer: Receives every event.
-        seed: The run's seed.
         policy: Reactions to failures and exceeded budgets.
         parameters: Settings that differ from the files, recorded with each shot: address -> value.
         watchdog: Switches the outputs off if this process dies or hangs; by default one without a log.

@@ -50,7 +50,6 @@ class Events:
     a slow disk or screen, or a search for garbage, would take longer than all the rest.
 
     Args:
-        observer: Receives every event.
         guard: Knows which shot was abandoned; its events are dropped.
     """
 
@@ -97,8 +96,6 @@ class Stages:
 
     Args:
         lab: The clock, and budgets of stages that do not have their own.
-        record: Receives the timings.
-        emit: Receives every event: name and values.
 
     Attributes:
         start_s: Start of the shot, on the session's clock.
@@ -199,11 +196,7 @@ class RunningShot:
     """Implements ``labseq.roles.Shot`` for the steps and fills the shot's record.
 
     Args:
-        lab: The devices.
-        guard: Runs every call into them.
         record: Filled while the shot runs, so that nothing is lost if it fails.
-        events: Receives every event.
-        timelines: The timeline of each step.
     """
 
     def __init__(
@@ -270,9 +263,6 @@ class RunningShot:
         The length of its timeline, if it has one, is its budget.
 
         Args:
-            number: Its index.
-            name: Its name.
-            policy: Its policy.
             images: Beginning of the names of its images; by default its name.
             needs_image: Whether it follows from the image before it.
 
