@@ -57,7 +57,7 @@ def test_sequences(path: Path, data: bytes) -> None:
         found = ProblemCollector()
         for step in spec.shot:
             with found:
-                document.validate(MODELS.get(step.kind), step.loc)
+                document.validate(MODELS.get(step.kind, NoSettings), step.loc)
         found.raise_any()
 
     load_or_report(load, data.count(b"\n") + data.count(b"\r"))
