@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import Field
 
@@ -19,14 +19,16 @@ from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
 from labseq.roles import RunObserver
 from labseq.session.options import Options
-from labseq.session.session import Session
 from labseq.settings import Settings
+
+if TYPE_CHECKING:
+    from labseq.session.session import Session
 
 MAX_POINTS: Final = 10_000
 CAMPAIGN_FILE: Final = "campaign.yaml"
 """The copy of the campaign file in the campaign's folder."""
 
-RunSession = Callable[[Callable[[RunObserver | None], Session]], None]
+RunSession: TypeAlias = "Callable[[Callable[[RunObserver | None], Session]], None]"
 
 
 class CampaignSettings(Settings):
@@ -101,6 +103,8 @@ class Campaign:
         Raises:
             ConfigError: It has an error; at the place of the value in the campaign file, if that is wrong.
         """
+        from labseq.session.session import Session  # results of a campaign are read without it
+
         for point in self.points():
             try:
                 Session.open(self.sequence, **asdict(self.options(point)))
@@ -131,6 +135,8 @@ def run_campaign(run_session: RunSession, campaign: Campaign, folder: Path, work
         ConfigError: The campaign has an error, or the runs in the folder are not its own.
         LabseqError: What ended a run; the campaign is continued by the same command.
     """
+    from labseq.session.session import Session
+
     campaign.check()
     who: dict[str, Any] = {"workers": workers.workers, "scheduler": workers.scheduler, "keys": workers.keys}
     found = _runs_of(campaign, folder)
