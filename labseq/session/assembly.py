@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
-
-from pydantic import BaseModel
 
 from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
@@ -107,31 +105,23 @@ class Assembly:
                 value = value[key]
         except (ConfigError, LookupError, TypeError):  # a setting that is written and not used
             return Setting(written, "", written)
-        unit = next(filter(None, (si_unit_at(*place) for place in self._models(of_profile, loc))), "")
-        return Setting(value, unit or si_unit_of(written), written)
+        return Setting(value, self._unit(of_profile, loc) or si_unit_of(written), written)
 
-    def _models(self, of_profile: bool, loc: Loc) -> list[tuple[type[BaseModel] | None, Loc]]:
-        """The settings models that may know a setting, with its location in each."""
-        top = str(loc[0]) if loc else ""
+    def _unit(self, of_profile: bool, loc: Loc) -> str:
+        """SI unit of a setting of a plugin or of the core; "" if it has none."""
+        registry, top = self.hardware.host.registry, loc[0]
+        entry, core, n = None, type(self.hardware.profile if of_profile else self.sequence), 1
         if of_profile:
-            name, n = (str(loc[1]), 2) if top == "devices" and len(loc) > 1 else (top, 1)
-            own = self.hardware.chosen.get(name)
-            entry, core = own.entry if own else None, type(self.hardware.profile)
-        else:
-            n, core = (3 if top == "shot" else 1), type(self.sequence)
-            kind = {"shot": "step", "target": "pattern"}.get(top, top)
-            names = {
-                "step": str(loc[2]) if len(loc) > 2 else "",
-                "pattern": self.sequence.target.use if self.sequence.target else "",
-            }
-            is_planner = kind == "planner"
-            found = None if is_planner else self.hardware.host.registry.find(kind, names.get(kind, ""))
-            entry = self.planner.entry if is_planner else found
-        return [(entry.settings_model if entry else None, loc[n:]), (core, loc)]
-
-    def units(self, addresses: Iterable[str]) -> dict[str, str]:
-        """The SI units of settings: address -> unit; without those that have none."""
-        return {address: unit for address in addresses if (unit := self.setting(address).unit)}
+            n = 2 if top == "devices" else 1
+            own = self.hardware.chosen.get(str(loc[n - 1])) if len(loc) >= n else None
+            entry = own and own.entry
+        elif top == "planner":
+            entry = self.planner.entry
+        elif top == "target" and self.sequence.target is not None:
+            entry = registry.find("pattern", self.sequence.target.use)
+        elif top == "shot" and len(loc) > 2:
+            entry, n = registry.find("step", str(loc[2])), 3
+        return (entry and si_unit_at(entry.settings_model, loc[n:])) or si_unit_at(core, loc)
 
     @property
     def warnings(self) -> tuple[str, ...]:

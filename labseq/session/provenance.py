@@ -124,6 +124,7 @@ def run_record(
         for address, text in changes.items()
     }
     scanned = () if assembly.scanned is None else assembly.scanned.at(0).parameters
+    at_points = {address: assembly.setting(address) for address in scanned}
     return RunRecord(
         name=spec.name,
         n_shots=spec.shots,
@@ -137,7 +138,7 @@ def run_record(
         profile_path=str(folder / hardware.document.path),
         resolved=assembly.resolved,
         overrides={address: setting._asdict() for address, setting in changed.items()},
-        units={address: one.unit for address, one in changed.items() if one.unit} | assembly.units(scanned),
+        units={address: one.unit for address, one in (changed | at_points).items() if one.unit},
         devices={},
         plugins=plugins_of(assembly),
         provenance=gather_provenance((folder / assembly.document.path).parent) | {"folder": str(folder)},
