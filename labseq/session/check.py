@@ -8,6 +8,7 @@ import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -85,7 +86,6 @@ class _PointCheck:
         self.checks = checks
         self.point = point
         self.lab = lab
-        self.timeline: Timeline = ()
         self.windows = windows_of(point.steps)
         # what is planned; the last windows do not change it
         self.rehearsal_key: tuple[object, ...] = (id(lab), *[*self.windows.values()][:-1])
@@ -116,8 +116,9 @@ class _PointCheck:
                     loc = (*spec.loc, setting) if setting else spec.loc
                     self._add(loc, one.what, one.expected, one.hint)
 
-    def ask_timeline(self) -> None:
-        """Have every step lay out its timeline."""
+    @cached_property
+    def timeline(self) -> Timeline:
+        """Name and bars of each step, without those that cannot lay out theirs."""
         named: list[tuple[str, list[TimelineEntry]]] = []
         for number, (name, step) in enumerate(self.point.steps):
             try:
@@ -125,7 +126,11 @@ class _PointCheck:
             except LimitError as error:
                 self._add(self._shot[number].loc, str(error))
         bars = with_waits([own for _, own in named], self.lab.step_context)
-        self.timeline = [(name, own) for (name, _), own in zip(named, bars, strict=True)]
+        return [(name, own) for (name, _), own in zip(named, bars, strict=True)]
+
+    def ask_timeline(self) -> None:
+        """Have every step lay out its timeline."""
+        _ = self.timeline
 
     def ask_timing(self) -> None:
         """Refuse durations that the computer cannot keep."""
@@ -348,8 +353,8 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
                 ask(one)
             checks.raise_problems()
         _rehearse_all(checks, numbers, runs)
-        checks.raise_problems()
         run_s = _run_s(checks)
+        checks.raise_problems()
         warnings = _warnings(checks, numbers)
     finally:
         guard.end()
