@@ -17,6 +17,8 @@ from labseq.session.check import check
 from labseq.session.lab import _reopened, rebuild_lab
 from labseq.testing.fakes import RecordingObserver
 
+from . import small_runs
+
 ROOT = Path(__file__).parents[2]
 REST = """labseq: 1
 name: s
@@ -174,3 +176,13 @@ def test_the_check_shows_points_and_the_time_of_all_of_them(tmp_path: Path) -> N
     alone = check(open_scan(tmp_path, "shots: 4\n", overrides=["shot.0.load.duration=2 s"]))
     assert alone.n_points is None
     assert report.run_s == pytest.approx(alone.run_s)
+
+
+def test_a_resumed_scan_is_as_long_as_the_whole_one(tmp_path: Path) -> None:
+    path = small_runs.write(tmp_path)
+    text = small_runs.SEQUENCE.replace("SCAN", "scan: {shot.0.load.duration: [100 ms, 900 ms]}")
+    path.write_text(text, "utf-8")
+    run_dir = small_runs.interrupted(path, "shot_started", 2)
+    with labseq.Session.resume(run_dir) as session:
+        assert len(session.scan_run.shots) == 1
+        assert check(session).run_s == check(labseq.Session.open(path)).run_s
