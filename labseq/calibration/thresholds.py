@@ -14,13 +14,23 @@ from labseq.errors import ConfigError, DeviceError, LimitError, Problem
 from labseq.roles import ReportsSignals
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 N_BINS: Final = 1000
 OUTER: Final = 0.5
 """Signals further than this on the outer side of a peak are only counted; in widths of the peak."""
-
 FLATTEST: Final = 1e-5
 """Skewness below which a peak is treated as a Gaussian."""
+MIN_FRAMES: Final = 30
+MIN_IN_PEAK: Final = 5
+APART: Final = 3.0
+"""Minimum distance of two peaks, in their combined widths; a single peak cut in two has 2."""
+FAINT: Final = 0.4
+"""Minimum distance of a site's peaks, relative to the usual distance."""
+MAX_ONE_PEAK: Final = 0.2
+"""Maximum fraction of sites with a single peak; one site is always allowed."""
+N_NEIGHBOURS: Final = 8
+"""Number of sites with two peaks, the nearest ones, from which a site with one takes the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,23 +161,6 @@ def _shapes(x: Floats) -> tuple[Shapes, float]:
     empty = Peak(float(x[0]), float(np.exp(x[1])), float(x[2]))
     full = Peak(float(x[3]), float(np.exp(x[4])), float(x[5]))
     return Shapes(empty, full, float(1 / (1 + np.exp(-x[7])))), float(1 / (1 + np.exp(-x[6])))
-
-
-Bools = NDArray[np.bool_]
-
-MIN_FRAMES: Final = 30
-MIN_IN_PEAK: Final = 5
-APART: Final = 3.0
-"""Minimum distance of two peaks, in their combined widths; a single peak cut in two has 2."""
-
-FAINT: Final = 0.4
-"""Minimum distance of a site's peaks, relative to the usual distance."""
-
-MAX_ONE_PEAK: Final = 0.2
-"""Maximum fraction of sites with a single peak; one site is always allowed."""
-
-N_NEIGHBOURS: Final = 8
-"""Number of sites with two peaks, the nearest ones, from which a site with one takes the other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
