@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -23,7 +21,6 @@ from labseq.analysis.charts import (
     stages_of_a_shot,
     trend,
 )
-from labseq.analysis.overview import RunPicture
 from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
 from labseq.model.estimate import Estimate, Rate, jeffreys
@@ -151,16 +148,3 @@ def test_a_site_of_few_atoms_does_not_take_up_the_range_of_the_colours() -> None
     sites(values, SiteGrid())(axes)
     cells: Any = axes.collections[0]
     assert cells.get_clim() == pytest.approx((98.0, 100.0))
-
-
-@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("PDF", b"%PDF")])
-def test_the_same_picture_has_the_same_bytes(tmp_path: Path, suffix: str, start: bytes) -> None:
-    picture = RunPicture("a $ run", "a $note$", ((trend_of(5),),))
-    path = tmp_path / f"run.{suffix}"
-    picture.save(path)
-    first = path.read_bytes()
-    assert first.startswith(start)
-    picture.save(path)
-    assert path.read_bytes() == first
-    if suffix == "svg":
-        assert ET.parse(path).getroot().tag.endswith("svg")
