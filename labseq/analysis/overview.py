@@ -39,8 +39,7 @@ from labseq.analysis.scanned import (
     shown_unit,
     title_of,
 )
-from labseq.analysis.statistics import Statistics, statistics_of
-from labseq.analysis.survival import Survival, SurvivalCounts
+from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, statistics_of
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
