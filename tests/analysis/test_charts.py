@@ -134,7 +134,8 @@ def test_defects_stand_beside_those_of_independent_sites() -> None:
     panel = defects((4, 0, 0, 2), 6, 6, "at the end")
     assert panel is not None
     panel(axes)
-    assert [bar.get_height() for bar in axes.patches] == pytest.approx([400 / 6, 0, 0, 200 / 6])
+    bars: Any = axes.patches
+    assert [bar.get_height() for bar in bars] == pytest.approx([400 / 6, 0, 0, 200 / 6])
     (line,) = (line for line in axes.get_lines() if line.get_label() == "independent sites")
     independent = [100 * math.comb(6, k) * (1 / 6) ** k * (5 / 6) ** (6 - k) for k in range(7)]
     found: Any = line.get_ydata()
