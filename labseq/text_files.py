@@ -155,6 +155,10 @@ def check_output(path: Path, kind: str, ending: str) -> None:
         raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))
     if what := something_else(path):
         raise ConfigError(Problem(what, name, expected=expected))
+    try:
+        path.exists()
+    except OSError as error:  # for a name that is too long
+        raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", name)) from error
 
 
 def _other_kind(mode: int) -> str:

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
-from labseq.model.estimate import Estimate, Estimated
+from labseq.model.estimate import Estimate, Estimated, Rate, mean
 from labseq.pictures.figures import DARK, LIGHT, ORANGE, RED, cell, outline, place_sites
+from labseq.recording import Run, Shot
+from labseq.recording.images import average_frame, signals_of
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:
@@ -24,6 +26,20 @@ Floats = NDArray[np.float64]
 Panel = Callable[["Axes"], None]
 """A function that draws on axes."""
 
+MIN_WINDOW: Final = 10
+"""Minimum number of shots in a running mean."""
+N_WINDOWS: Final = 10
+"""Number of windows of a running mean in a long run."""
+MAX_POINTS: Final = 200
+"""Maximum number of points of the line of a running mean."""
+MIN_SHARE: Final = 1e-3
+"""Numbers of defects that are less probable than this are not drawn unless they occurred."""
+MAX_BARS: Final = 40
+"""Maximum number of bars in the histogram of defects."""
+N_BINS: Final = 80
+"""Number of bars in the histogram of signals."""
+BRIGHTEST: Final = 0.999
+"""Quantile of the mean counts that is drawn white."""
 COLOURS: Final = "cividis"
 """Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
 NO_VALUE: Final = "0.94"
@@ -100,29 +116,51 @@ def points_of(x: Sequence[float], values: Sequence[Estimated]) -> Floats:
     return np.array(rows, np.float64).reshape(-1, 4).T
 
 
-def draw_trend(
-    axes: Axes, *, title: str, label: str, shots: Floats, values: Floats, running: Floats, is_rate: bool
-) -> None:
-    """Draw a fraction for each shot, and its running mean with the error.
+def trend(name: str, shots: Floats, values: Floats, *, is_rate: bool) -> Panel | None:
+    """A fraction for each shot, and its running mean with the error; None if no shot has a value.
 
     Args:
+        name: The quantity.
         shots: float64 (n,), indices of the shots.
-        values: float64 (n,), a fraction for each.
-        running: The running mean, see :func:`points_of`.
+        values: float64 (n,), a fraction for each; nan if unknown.
         is_rate: Whether each value is 0 or 1; the scale is then 0 to 100 %.
     """
-    is_few = len(shots) <= MANY
-    look: dict[str, Any] = {"marker": "o", "markersize": 3 if is_few else 1, "markeredgewidth": 0}
-    if is_rate:
-        look = {"marker": "|", "markersize": 5 if is_few else 3, "markeredgewidth": 0.8 if is_few else 0.3}
-    axes.plot(shots, 100 * values, color=LIGHT, linestyle="none", rasterized=len(shots) > PIXELS, **look)
-    x, y, low, high = running
-    known = np.isfinite(low) & np.isfinite(high)
-    axes.fill_between(x, 100 * low, 100 * high, where=known, color=DARK, alpha=0.2, linewidth=0, zorder=3)
-    axes.plot(x, 100 * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
-    axes.set(title=title, xlabel="shot", ylabel=label, xlim=(shots[0] - 0.5, shots[-1] + 0.5))
-    axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(100 * values, 0.1, MIN_RANGE_PERCENT)))
-    whole_numbers(axes.xaxis)
+    known = np.isfinite(values)
+    if not known.any():
+        return None
+    shots, values = shots[known], values[known]
+    window, running = running_mean(shots, values, is_rate=is_rate)
+
+    def draw(axes: Axes) -> None:
+        is_few = len(shots) <= MANY
+        look: dict[str, Any] = {"marker": "o", "markersize": 3 if is_few else 1, "markeredgewidth": 0}
+        if is_rate:
+            look = {
+                "marker": "|",
+                "markersize": 5 if is_few else 3,
+                "markeredgewidth": 0.8 if is_few else 0.3,
+            }
+        axes.plot(shots, 100 * values, color=LIGHT, linestyle="none", rasterized=len(shots) > PIXELS, **look)
+        x, y, low, high = running
+        sure = np.isfinite(low) & np.isfinite(high)
+        axes.fill_between(x, 100 * low, 100 * high, where=sure, color=DARK, alpha=0.2, linewidth=0, zorder=3)
+        axes.plot(x, 100 * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
+        of = "1 shot" if window == 1 else f"{window} shots"
+        axes.set(title=f"{name} by shot; line: mean of {of}", xlabel="shot", ylabel=f"{name} (%)")
+        axes.set_xlim(shots[0] - 0.5, shots[-1] + 0.5)
+        axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(100 * values, 0.1, MIN_RANGE_PERCENT)))
+        whole_numbers(axes.xaxis)
+
+    return draw
+
+
+def running_mean(shots: Floats, values: Floats, *, is_rate: bool) -> tuple[int, Floats]:
+    """The number of shots in a running mean of known values, and the mean, see :func:`points_of`."""
+    window = min(len(values), max(MIN_WINDOW, len(values) // N_WINDOWS))
+    starts = np.unique(np.linspace(0, len(values) - window, MAX_POINTS).astype(np.int64))
+    parts = [values[start : start + window].tolist() for start in starts]
+    means = [Rate(round(math.fsum(part)), window) if is_rate else mean(part) for part in parts]
+    return window, points_of(((shots[starts] + shots[starts + window - 1]) / 2).tolist(), means)
 
 
 def draw_curves(
@@ -252,86 +290,179 @@ def draw_sites(
     axes.figure.colorbar(filled, ax=axes, pad=0.02, shrink=0.85, extend=extend, label=label)
 
 
-def draw_defects(
-    axes: Axes, *, title: str, x_label: str, shares: Floats, expected: Floats, width: int = 1
-) -> None:
-    """Draw the share of the shots with each number of defects.
+def defects(counts: Sequence[int], n_sites: int, n_all: int, end: str) -> Panel | None:
+    """The share of the shots with each number of defects, and that of independent sites; None without any.
 
     Args:
-        shares: Share of the shots at each number of defects, see :func:`points_of`.
-        expected: float64 (n,), the shares for independent sites with the same mean filling.
-        width: Number of defects that a bar spans.
+        counts: Number of shots with 0, 1, 2, ... defects.
+        n_sites: Sites of the target.
+        n_all: Number of shots, those without a number of defects included.
+        end: When they were counted: "on the last image".
     """
-    x, y, low, high = shares
-    errors = 100 * np.stack([y - low, high - y]).clip(min=0.0)
-    seen = y > 0 if len(x) > MANY_BARS else np.ones(len(x), np.bool_)
-    axes.bar(x, 100 * y, width=0.8 * width, color=LIGHT, label="shots")
-    axes.errorbar(x[seen], 100 * y[seen], errors[:, seen], linestyle="none", **ERRORS)
-    points: dict[str, Any] = {
-        "marker": "D",
-        "markersize": 4 if len(x) <= MANY_BARS else 0,
-        "linewidth": 0.9,
-        "linestyle": "--",
-        "zorder": 3,
-    }
-    at = x[0] + width * np.arange(len(expected))
-    axes.plot(at, 100 * expected, color=ORANGE, label="independent sites", **points)
-    axes.set(title=title, xlabel=x_label, ylabel="shots (%)")
-    least = x[0] - 0.6 * width
-    axes.set_xlim(least, max(least + MIN_DEFECTS + 1.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
-    axes.set_ylim(0.0, (1.0 + LEGEND) * 100 * float(max(np.nanmax(high), expected.max())))
-    whole_numbers(axes.xaxis)
-    axes.legend()
+    n_shots = sum(counts)
+    if not n_shots or not n_sites:
+        return None
+    number = np.arange(len(counts))
+    independent = binomial(n_sites, float(np.dot(counts, number)) / n_shots / n_sites, len(counts))
+    padded = np.pad(counts, (0, len(independent) - len(counts)))
+    first = int(np.flatnonzero((padded > 0) | (independent > MIN_SHARE))[0])
+    width = -(-(len(independent) - first) // MAX_BARS)  # numbers of defects that a bar spans
+    first = 0 if width == 1 and first < MAX_BARS // 2 else first
+    starts = np.arange(first, len(independent), width)
+    expected = np.add.reduceat(independent, starts)
+    seen = np.add.reduceat(padded, starts)[: np.searchsorted(starts, len(counts))]
+    middles = (starts[: len(seen)] + (width - 1) / 2).tolist()
+    x, y, low, high = points_of(middles, [Rate(int(count), n_shots) for count in seen])
+
+    def draw(axes: Axes) -> None:
+        errors = 100 * np.stack([y - low, high - y]).clip(min=0.0)
+        shown = y > 0 if len(x) > MANY_BARS else np.ones(len(x), np.bool_)
+        axes.bar(x, 100 * y, width=0.8 * width, color=LIGHT, label="shots")
+        axes.errorbar(x[shown], 100 * y[shown], errors[:, shown], linestyle="none", **ERRORS)
+        size = 4 if len(x) <= MANY_BARS else 0
+        look: dict[str, Any] = {"marker": "D", "markersize": size, "linewidth": 0.9, "linestyle": "--"}
+        at = x[0] + width * np.arange(len(expected))
+        axes.plot(at, 100 * expected, color=ORANGE, label="independent sites", zorder=3, **look)
+        each = f", {width} numbers to a bar" if width > 1 else ""
+        average = mean(np.repeat(number, counts))
+        title = f"{average} defects in a shot, {n_shots} of {n_all} shots"
+        axes.set(title=title, xlabel=f"defects {end}{each}", ylabel="shots (%)")
+        least = x[0] - 0.6 * width
+        axes.set_xlim(least, max(least + MIN_DEFECTS + 1.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
+        axes.set_ylim(0.0, (1.0 + LEGEND) * 100 * float(max(np.nanmax(high), expected.max())))
+        whole_numbers(axes.xaxis)
+        axes.legend()
+
+    return draw
 
 
-def draw_loss_causes(axes: Axes, *, title: str, x_label: str, losses: Mapping[str, Estimate]) -> None:
-    """Draw a bar for the atoms lost to each cause."""
-    means, errors = np.array([[loss.value, loss.error] for loss in losses.values()]).T
-    at = np.arange(len(losses))
-    axes.barh(at, means, height=0.65, color=LIGHT, xerr=np.nan_to_num(errors), **BARS)
-    axes.set_yticks(at, list(losses))
-    axes.invert_yaxis()
-    axes.set(title=title, xlabel=x_label)
-    _vertical_grid(axes)
-    axes.set_xlim(left=0.0)
+def binomial(n: int, p: float, n_least: int) -> Floats:
+    """Probabilities of 0, 1, 2, ... of n independent events of probability p.
+
+    The result ends at the last probability above 0.1 %, but has at least ``n_least`` values.
+
+    Example:
+        >>> binomial(2, 0.5, 1).round(6).tolist()
+        [0.25, 0.5, 0.25]
+    """
+    from scipy.special import bdtr
+
+    terms = np.diff(bdtr(np.arange(n + 1.0), n, p), prepend=0.0)
+    seen = np.flatnonzero(terms > MIN_SHARE)
+    return terms[: max(n_least, int(seen[-1]) + 1)]
 
 
-def draw_stages(
-    axes: Axes, *, title: str, stages: Sequence[StageStatistics], clocks: Mapping[str, str]
-) -> None:
-    """Draw the times of a shot's stages below one another, on a logarithmic scale.
+def loss_causes(losses: Mapping[str, Estimate]) -> Panel | None:
+    """A bar for the atoms lost to each cause in a simulation, the worst first; None if nothing was lost."""
+    worst = sorted(losses.items(), key=lambda item: -item[1].value)
+    bars = [(cause.replace("_", " "), loss.value, loss.error) for cause, loss in worst if loss.value > 0]
+    if not bars:
+        return None
+
+    def draw(axes: Axes) -> None:
+        causes, means, errors = zip(*bars, strict=True)
+        at = np.arange(len(bars))
+        axes.barh(at, means, height=0.65, color=LIGHT, xerr=np.nan_to_num(errors), **BARS)
+        axes.set_yticks(at, causes)
+        axes.invert_yaxis()
+        axes.set(title="lost in a shot, by cause", xlabel="atoms (known in the simulation)")
+        _vertical_grid(axes)
+        axes.set_xlim(left=0.0)
+
+    return draw
+
+
+def stages_of_a_shot(title: str, stages: Sequence[StageStatistics], clocks: Mapping[str, str]) -> Panel:
+    """The times of a shot's stages below one another, on a logarithmic scale.
 
     A point shows the median, a line reaches to the 99th percentile, a mark shows the budget.
 
     Args:
+        title: Title.
+        stages: The stages; at least one.
         clocks: "session_s" and perhaps "host_s" -> name of the clock.
     """
-    from matplotlib.ticker import FuncFormatter, NullFormatter
 
-    shown_s: list[float] = []
-    for number, ((clock, name), colour) in enumerate(zip(clocks.items(), (DARK, ORANGE), strict=False)):
-        aside = 0.17 * (2 * number - 1) if len(clocks) > 1 else 0.0
-        times = np.array([getattr(stage, clock) for stage in stages], np.float64)
-        y = np.flatnonzero(times[:, 0] > (HIDDEN_S if clock == "session_s" else 0.0))
-        p50, p99 = times[y, 0], np.fmax(times[y, 0], times[y, 1])
-        axes.hlines(y + aside, p50, p99, color=colour, linewidth=1.6, capstyle="round")
-        axes.plot(p50, y + aside, color=colour, marker="o", markersize=5, linestyle="none", label=name)
-        shown_s += [*p50, *p99]
-    budgets = np.array([stage.budget_s for stage in stages])
-    y = np.flatnonzero(budgets > 0)
-    if len(y):
-        look: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": 13, "markeredgewidth": 1.6}
-        axes.plot(budgets[y], y, color=RED, label="budget", zorder=4, **look)
-        shown_s += [*budgets[y]]
-    low, high = (min(shown_s), max(shown_s)) if shown_s else (1e-3, 1.0)
-    axes.set(title=title, xlabel="time: median, line to the 99th percentile", xscale="log")
-    axes.set_xlim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(1.05 * high)))
-    axes.xaxis.set_major_formatter(FuncFormatter(_time_text))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_yticks(range(len(stages)), [stage.stage for stage in stages])
-    axes.set_ylim(len(stages) - 0.5, -0.5)
-    _vertical_grid(axes)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
+    def draw(axes: Axes) -> None:
+        from matplotlib.ticker import FuncFormatter, NullFormatter
+
+        shown_s: list[float] = []
+        for number, ((clock, name), colour) in enumerate(zip(clocks.items(), (DARK, ORANGE), strict=False)):
+            aside = 0.17 * (2 * number - 1) if len(clocks) > 1 else 0.0
+            times = np.array([getattr(stage, clock) for stage in stages], np.float64)
+            y = np.flatnonzero(times[:, 0] > (HIDDEN_S if clock == "session_s" else 0.0))
+            p50, p99 = times[y, 0], np.fmax(times[y, 0], times[y, 1])
+            axes.hlines(y + aside, p50, p99, color=colour, linewidth=1.6, capstyle="round")
+            axes.plot(p50, y + aside, color=colour, marker="o", markersize=5, linestyle="none", label=name)
+            shown_s += [*p50, *p99]
+        budgets = np.array([stage.budget_s for stage in stages])
+        y = np.flatnonzero(budgets > 0)
+        if len(y):
+            mark: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": 13}
+            axes.plot(budgets[y], y, color=RED, label="budget", zorder=4, markeredgewidth=1.6, **mark)
+            shown_s += [*budgets[y]]
+        low, high = (min(shown_s), max(shown_s)) if shown_s else (1e-3, 1.0)
+        axes.set(title=title, xlabel="time: median, line to the 99th percentile", xscale="log")
+        axes.set_xlim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(1.05 * high)))
+        axes.xaxis.set_major_formatter(FuncFormatter(_time_text))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_yticks(range(len(stages)), [stage.stage for stage in stages])
+        axes.set_ylim(len(stages) - 0.5, -0.5)
+        _vertical_grid(axes)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
+
+    return draw
+
+
+def average_frame_of(run: Run, shots: Sequence[Shot]) -> Panel:
+    """The mean of the first frame that each shot keeps, with the sites."""
+    image = -1 if run.record.get("record_frames") == "last" else 0
+    average, n = average_frame(shots, image)
+    sites_px = next((sites for shot in shots[:1] if (sites := shot.sites_px) is not None), None)
+
+    def draw(axes: Axes) -> None:
+        low, high = np.quantile(average, (0.01, BRIGHTEST))
+        look: dict[str, Any] = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-9)}
+        shown = axes.imshow(average, interpolation="nearest", **look)
+        if sites_px is not None:
+            y, x = sites_px.reshape(-1, 2).T
+            rings: dict[str, Any] = {
+                "markerfacecolor": "none",
+                "markeredgecolor": RED,
+                "markeredgewidth": 0.4,
+            }
+            axes.plot(x, y, "o", markersize=4, **rings)
+            room, (height, width) = 0.08 * max(np.ptp(x), np.ptp(y), 40.0), average.shape
+            axes.set_xlim(max(x.min() - room, -0.5), min(x.max() + room, width - 0.5))
+            axes.set_ylim(min(y.max() + room, height - 0.5), max(y.min() - room, -0.5))
+        title = f"mean of the {'last' if image else 'first'} frames of {n} shots"
+        axes.set(title=title, xlabel="x (px)", ylabel="y (px)")
+        axes.grid(visible=False)
+        axes.figure.colorbar(shown, ax=axes, pad=0.02, shrink=0.85, label="mean counts (adu)")
+
+    return draw
+
+
+def signals_of_sites(shots: Sequence[Shot]) -> Panel:
+    """Histogram of the detector's signals of all sites on the first image, with the thresholds."""
+    signals, thresholds, unit = signals_of(shots)
+
+    def draw(axes: Axes) -> None:
+        axes.hist(signals[np.isfinite(signals)], N_BINS, color=LIGHT, edgecolor="none")
+        low, middle, high = np.quantile(thresholds, (0.0, 0.5, 1.0))
+        label = f"threshold {middle:.4g}"
+        if high > low:
+            label = f"median {label}; thresholds of the sites from {low:.4g} to {high:.4g}"
+            axes.axvspan(low, high, color=RED, alpha=0.15, linewidth=0)
+        axes.axvline(middle, color=RED, linewidth=1.2, label=label)
+        seen = f"{signals.size} signals on the first image of {len(signals)} shots"
+        title = f"{seen}, {int((signals > thresholds).sum())} above threshold"
+        axes.set(title=title, xlabel=f"signal of a site ({unit})" if unit else "signal of a site")
+        axes.set(ylabel="sites", yscale="log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.legend()
+
+    return draw
 
 
 def whole_numbers(axis: Axis) -> None:

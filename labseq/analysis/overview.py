@@ -17,17 +17,18 @@ import numpy as np
 from labseq.analysis.charts import (
     STYLE,
     Panel,
+    average_frame_of,
+    defects,
     draw_curves,
-    draw_defects,
-    draw_loss_causes,
     draw_map,
     draw_sites,
-    draw_stages,
-    draw_trend,
+    loss_causes,
     points_of,
+    signals_of_sites,
+    stages_of_a_shot,
+    trend,
 )
 from labseq.analysis.fits import Fit
-from labseq.analysis.images import average_panel, loading_panel, signals_panel
 from labseq.analysis.scanned import (
     DEFAULT,
     Scanned,
@@ -38,17 +39,17 @@ from labseq.analysis.scanned import (
     shown_unit,
     title_of,
 )
-from labseq.analysis.statistics import Statistics, statistics_of
-from labseq.analysis.survival import Survival, SurvivalCounts
+from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, statistics_of
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, SiteGrid
-from labseq.model.estimate import Estimated, Rate, mean
+from labseq.model.estimate import Estimated, Rate
 from labseq.pictures.figures import make_figure, save_figure
 from labseq.recording import Run, Shot
+from labseq.recording.images import loading_map
 from labseq.recording.quantities import Quantity, steps_that_load
 from labseq.roles import Context
 from labseq.units import factor_of
@@ -59,12 +60,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Row = tuple[Panel, ...]
 
-MIN_WINDOW: Final = 10
-"""Minimum number of shots in a running mean."""
-N_WINDOWS: Final = 10
-"""Number of windows of a running mean in a long run."""
-MAX_POINTS: Final = 200
-"""Maximum number of points of the line of a running mean."""
 OVERVIEW_SHOTS: Final = 60
 """Maximum number of shot files read for the overview, which takes about half a second."""
 PART_SHOTS: Final = 500
@@ -73,10 +68,6 @@ MAX_MAPS: Final = 6
 """Maximum number of maps in a row."""
 MAX_PANELS: Final = 2
 """Maximum number of panels of a scan in a row."""
-MIN_SHARE: Final = 1e-3
-"""Numbers of defects that are less probable than this are not drawn unless they occurred."""
-MAX_BARS: Final = 40
-"""Maximum number of bars in the histogram of defects."""
 PANEL_IN: Final = (3.7, 3.1)
 """Width and height of a panel in inches."""
 SINGLE_IN: Final = (6.4, 4.4)
@@ -137,11 +128,10 @@ def overview(run: Run) -> RunPicture:
     """
     summary = _Summary(_with_shots(run), OVERVIEW_SHOTS)
     filling, success = (_fraction_row(summary, name) for name in DEFAULT)
-    causes, defects = causes_panel(summary.statistics), defects_panel(run, summary.statistics)
     survival, timing = summary.read
     rows = [
-        _present(*filling, defects),
-        _present(*success, causes or lost_by_cycle(run, survival)),
+        _present(*filling, defects_panel(run, summary.statistics)),
+        _present(*success, loss_causes(summary.statistics.losses) or lost_by_cycle(run, survival)),
         _present(*survival_panels(run, survival), stages_panel(run, timing)),
     ]
     if summary.scan is not None and len(maps := scan_panels(summary.scan, summary.quantity(DEFAULT[1]))) > 1:
@@ -167,30 +157,6 @@ def picture_of(run: Run, what: str) -> RunPicture:
     if not any(rows):
         raise cannot_draw(run, f"there is nothing to show of {title}", needed)
     return _picture(run, title, rows)
-
-
-def trend_panel(run: Run, quantity: Quantity) -> Panel | None:
-    """A fraction against the shot, with its running mean; None if no shot has a value."""
-    values = np.array([quantity.of_shot(shot) for shot in run.shots])
-    known = np.isfinite(values)
-    if not known.any():
-        return None
-    x, y = np.array([float(shot.index) for shot in run.shots])[known], values[known]
-    window = min(len(y), max(MIN_WINDOW, len(y) // N_WINDOWS))
-    starts = np.unique(np.linspace(0, len(y) - window, MAX_POINTS).astype(np.int64))
-    parts = [y[start : start + window].tolist() for start in starts]
-    means = [Rate(round(math.fsum(part)), window) if quantity.is_rate else mean(part) for part in parts]
-    middles = ((x[starts] + x[starts + window - 1]) / 2).tolist()
-    shots = "1 shot" if window == 1 else f"{window} shots"
-    return partial(
-        draw_trend,
-        title=f"{title_of(quantity)} by shot; line: mean of {shots}",
-        label=f"{title_of(quantity)} (%)",
-        shots=x,
-        values=y,
-        running=points_of(middles, means),
-        is_rate=quantity.is_rate,
-    )
 
 
 def cycles_panel(quantity: Quantity, statistics: Statistics) -> Panel | None:
@@ -249,61 +215,13 @@ def _lost(rate: Rate) -> Rate:
     return Rate(rate.n_trials - rate.n, rate.n_trials)
 
 
-def causes_panel(statistics: Statistics) -> Panel | None:
-    """The causes of losses in a simulation, worst first; None if they are unknown, or nothing was lost."""
-    worst = sorted(statistics.losses.items(), key=lambda item: -item[1].value)
-    losses = {cause.replace("_", " "): loss for cause, loss in worst if loss.value > 0}
-    if not losses:
-        return None
-    x_label = "atoms (known in the simulation)"
-    return partial(draw_loss_causes, title="lost in a shot, by cause", x_label=x_label, losses=losses)
-
-
 def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
     """Histogram of the defects at the end of the shots, compared with independent sites."""
-    cycles, n_sites = statistics.cycles, run.target.n_atoms
-    counts = statistics.defects or (cycles[-1].defects if cycles else ())
-    end = (
-        "on the last image" if statistics.defects else f"after {len(cycles)} cycle{'s' * (len(cycles) != 1)}"
-    )
-    n_shots = sum(counts)
-    if not n_shots or not n_sites:
-        return None
-    number = np.arange(len(counts))
-    empty = float(np.dot(counts, number)) / n_shots / n_sites
-    expected = binomial(n_sites, empty, len(counts))
-    padded = np.pad(counts, (0, len(expected) - len(counts)))
-    first = int(np.flatnonzero((padded > 0) | (expected > MIN_SHARE))[0])
-    width = -(-(len(expected) - first) // MAX_BARS)
-    first = 0 if width == 1 and first < MAX_BARS // 2 else first
-    starts = np.arange(first, len(expected), width)
-    seen = np.add.reduceat(padded, starts)[: np.searchsorted(starts, len(counts))]
-    shares = [Rate(int(count), n_shots) for count in seen]
-    each = f", {width} numbers to a bar" if width > 1 else ""
-    return partial(
-        draw_defects,
-        title=f"{mean(np.repeat(number, counts))} defects in a shot, {n_shots} of {len(run.shots)} shots",
-        x_label=f"defects {end}{each}",
-        shares=points_of((starts[: len(shares)] + (width - 1) / 2).tolist(), shares),
-        expected=np.add.reduceat(expected, starts),
-        width=width,
-    )
-
-
-def binomial(n: int, p: float, n_least: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Probabilities of 0, 1, 2, ... of n independent events of probability p.
-
-    The result ends at the last probability above 0.1 %, but has at least ``n_least`` values.
-
-    Example:
-        >>> binomial(2, 0.5, 1).round(6).tolist()
-        [0.25, 0.5, 0.25]
-    """
-    from scipy.special import bdtr
-
-    terms = np.diff(bdtr(np.arange(n + 1.0), n, p), prepend=0.0)
-    seen = np.flatnonzero(terms > MIN_SHARE)
-    return terms[: max(n_least, int(seen[-1]) + 1)]
+    cycles = statistics.cycles
+    counts, end = statistics.defects, "on the last image"
+    if not counts and cycles:
+        counts, end = cycles[-1].defects, f"after {len(cycles)} cycle{'s' * (len(cycles) != 1)}"
+    return defects(counts, run.target.n_atoms, len(run.shots), end)
 
 
 def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
@@ -311,13 +229,10 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
     stages = [stage for stage in timing.stages if not stage.stage.startswith(STEP)]
     if not stages:
         return None
-    clocks = {"session_s": "modelled", "host_s": "this computer"}
-    return partial(
-        draw_stages,
-        title=f"stages of a shot{part_text(timing.n_read, run)}",
-        stages=stages,
-        clocks=clocks if run.simulated else {"session_s": "measured"},
+    clocks = (
+        {"session_s": "modelled", "host_s": "this computer"} if run.simulated else {"session_s": "measured"}
     )
+    return stages_of_a_shot(f"stages of a shot{part_text(timing.n_read, run)}", stages, clocks)
 
 
 def scan_panels(found: Scanned, quantity: Quantity, fit: Fit | None = None) -> Row:
@@ -460,18 +375,30 @@ def _fraction_row(summary: _Summary, name: str) -> Row:
     quantity = summary.quantity(name)
     maps = scan_panels(summary.scan, quantity) if summary.scan is not None else ()
     by_cycle = cycles_panel(quantity, summary.statistics)
-    return _present(trend_panel(summary.run, quantity), by_cycle, *(maps if len(maps) == 1 else ()))
+    shots = summary.run.shots
+    values = np.array([quantity.of_shot(shot) for shot in shots])
+    indices = np.array([float(shot.index) for shot in shots])
+    by_shot = trend(title_of(quantity), indices, values, is_rate=quantity.is_rate)
+    return _present(by_shot, by_cycle, *(maps if len(maps) == 1 else ()))
 
 
 def _scan_rows(summary: _Summary) -> list[Row]:
     return [] if summary.scan is None else [*scan_picture(summary.run, ScanRequest()).rows]
 
 
-def _image_rows(summary: _Summary, draw: Callable[[Run, Sequence[Shot]], Panel]) -> list[Row]:
+def _image_rows(summary: _Summary, draw: Callable[[Sequence[Shot]], Panel]) -> list[Row]:
     """The panel of an image; none if no shot has what it needs."""
     with suppress(RecordingError):
-        return [(draw(summary.run, evenly(summary.run.shots, PART_SHOTS)),)]
+        return [(draw(evenly(summary.run.shots, PART_SHOTS)),)]
     return []
+
+
+def loading_panel(run: Run, shots: Sequence[Shot]) -> Panel:
+    """The fraction of the shots with an atom on each site, on the first image."""
+    values, n = loading_map(shots)
+    title = f"loading: {100 * values.mean():.1f} % on the first image of {n} shots"
+    site: dict[str, Any] = {"grid": grid_of(run), "outlined": run.target.fill}
+    return partial(draw_sites, title=title, label="with an atom (%)", values=values, **site)
 
 
 def _present(*panels: Panel | None) -> Row:
@@ -501,17 +428,17 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
     {
         "image": (
             "the average image",
-            lambda s: _image_rows(s, average_panel),
+            lambda s: _image_rows(s, partial(average_frame_of, s.run)),
             _KEPT,
         ),
         "loading": (
             "the loading",
-            lambda s: _image_rows(s, partial(loading_panel, grid_of(s.run))),
+            lambda s: _image_rows(s, partial(loading_panel, s.run)),
             "readable shots with an image",
         ),
         "counts": (
             "the detector's signals",
-            lambda s: _image_rows(s, signals_panel),
+            lambda s: _image_rows(s, signals_of_sites),
             "a detector that reports its signals",
         ),
         "filling": ("filling", lambda s: [_fraction_row(s, "filling")], _IMAGES),
@@ -534,7 +461,7 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
         "scan": ("the scan", _scan_rows, "a run of a sequence with 'scan:'"),
         "losses": (
             "lost atoms",
-            lambda s: [_present(lost_by_cycle(s.run, s.read[0]), causes_panel(s.statistics))],
+            lambda s: [_present(lost_by_cycle(s.run, s.read[0]), loss_causes(s.statistics.losses))],
             "readable shots with a rearrangement",
         ),
     }

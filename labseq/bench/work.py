@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from labseq.config.profile import MotionSettings
 from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
-from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
+from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.roles import Context, NeedsWarmUp, Planner
@@ -179,34 +179,6 @@ _NO_SCANS: Final = (math.nan, math.nan)
 _FAILED: Final = (0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
 
 
-class Scanned(Protocol):
-    """A plan made of scans, in which moving tweezers pick up and drop atoms without stopping.
-
-    Attributes:
-        plan: The equivalent batches.
-        n_scans: Number of scans, which the paper of the algorithm counts as moves.
-    """
-
-    @property
-    def plan(self) -> Plan: ...  # noqa: D102 - see above
-
-    @property
-    def n_scans(self) -> int: ...  # noqa: D102
-
-    def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:
-        """Time that the scans would take, in seconds."""
-        ...
-
-
-@runtime_checkable
-class ScanningPlanner(Protocol):
-    """A planner whose paper counts scans instead of batches; an optional capability."""
-
-    def scan(self, occupancy: Occupancy, target: TargetPattern) -> Scanned:
-        """Plan as ``plan()`` does, and return the scans too."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Job:
     """Loadings ``start`` to ``stop`` (exclusive) of a condition."""
@@ -329,10 +301,12 @@ def prepare(comparison: Comparison) -> Callable[[Job], Done]:
 
 def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> tuple[Any, ...]:
     own = occupancy.copy()  # a planner may change its input
-    scanned: Scanned | None = None
+    # some papers count scans, in which moving tweezers pick up and drop atoms without stopping
+    scan: Any = getattr(runner.planner, "scan", None)
+    scanned: Any = None
     start_s = perf_counter()
-    if isinstance(runner.planner, ScanningPlanner):
-        scanned = runner.planner.scan(own, condition.target)
+    if scan is not None:
+        scanned = scan(own, condition.target)
         plan = scanned.plan
     else:
         plan = runner.planner.plan(own, condition.target)

@@ -17,6 +17,10 @@ from labseq.plain import now
 from labseq.recording.schema import unit_of
 from labseq.units import format_quantity
 
+_DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
+_MAX_SKEW_S: Final = 60.0
+"""The clocks of two computers may differ by so much."""
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -83,13 +87,6 @@ def _of_values(
 def _of_figure(name: str, before: float, after: float) -> Difference:
     change = after - before
     return Difference(name, unit_of(name), before, after, abs(change), abs(change), (change,))
-
-
-_DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
-
-
-_MAX_SKEW_S: Final = 60.0
-"""The clocks of two computers may differ by so much."""
 
 
 def age_s(entry: CalibrationEntry) -> float | None:

@@ -32,6 +32,16 @@ from labseq.recording import Run
 from labseq.session.profile import ResolvedProfile
 from labseq.units import format_quantity
 
+Floats = NDArray[np.float64]
+
+ROUNDS: Final = 30
+SETTLED_M: Final = 0.1e-9
+"""Rounds of the fit of rows and columns, and the step below which it has converged."""
+KNOWN_BEFORE_M: Final = 0.5e-6
+"""Expected distance of a row or column from the common centre, 1 sigma, before the measurement."""
+WORST_ERROR_M: Final = 50e-9
+SLOPE_STEP_M: Final = 1e-9
+
 
 def analyse_sites(data: CalibrationData) -> AnalysisResult:
     """Find the lattice on the mean of the run's frames.
@@ -166,25 +176,6 @@ def _readings(run: Run) -> dict[str, Any]:
 
 def _wrong_run(run: Run, what: str) -> ConfigError:
     return ConfigError(Problem(what, str(run.path), expected="a run with the step 'equalise', on this grid"))
-
-
-Floats = NDArray[np.float64]
-
-
-ROUNDS: Final = 30
-
-
-SETTLED_M: Final = 0.1e-9
-
-
-KNOWN_BEFORE_M: Final = 0.5e-6
-"""Expected distance of a row or column from the common centre, 1 sigma, before the measurement."""
-
-
-WORST_ERROR_M: Final = 50e-9
-
-
-SLOPE_STEP_M: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,13 +14,23 @@ from labseq.errors import ConfigError, DeviceError, LimitError, Problem
 from labseq.roles import ReportsSignals
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 N_BINS: Final = 1000
 OUTER: Final = 0.5
 """Signals further than this on the outer side of a peak are only counted; in widths of the peak."""
-
 FLATTEST: Final = 1e-5
 """Skewness below which a peak is treated as a Gaussian."""
+MIN_FRAMES: Final = 30
+MIN_IN_PEAK: Final = 5
+APART: Final = 3.0
+"""Minimum distance of two peaks, in their combined widths; a single peak cut in two has 2."""
+FAINT: Final = 0.4
+"""Minimum distance of a site's peaks, relative to the usual distance."""
+MAX_ONE_PEAK: Final = 0.2
+"""Maximum fraction of sites with a single peak; one site is always allowed."""
+N_NEIGHBOURS: Final = 8
+"""Number of sites with two peaks, the nearest ones, from which a site with one takes the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,23 +163,6 @@ def _shapes(x: Floats) -> tuple[Shapes, float]:
     return Shapes(empty, full, float(1 / (1 + np.exp(-x[7])))), float(1 / (1 + np.exp(-x[6])))
 
 
-Bools = NDArray[np.bool_]
-
-MIN_FRAMES: Final = 30
-MIN_IN_PEAK: Final = 5
-APART: Final = 3.0
-"""Minimum distance of two peaks, in their combined widths; a single peak cut in two has 2."""
-
-FAINT: Final = 0.4
-"""Minimum distance of a site's peaks, relative to the usual distance."""
-
-MAX_ONE_PEAK: Final = 0.2
-"""Maximum fraction of sites with a single peak; one site is always allowed."""
-
-N_NEIGHBOURS: Final = 8
-"""Number of sites with two peaks, the nearest ones, from which a site with one takes the other."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedThresholds:
     """Thresholds of the sites, and their expected errors.
@@ -213,7 +206,7 @@ class _SitePeaks:
     two: Bools
 
 
-def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "detector") -> FittedThresholds:
+def fit_thresholds(signals: Floats, miss_cost: float = 3.0) -> FittedThresholds:
     """Fit the two peaks of each site and choose the threshold with the lowest cost of errors.
 
     All sites share the shape of the peaks, because the errors are in tails that a site
@@ -226,7 +219,6 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "det
             frames of randomly loaded atoms.
         miss_cost: Cost of a missed atom, relative to a false detection. A second atom is moved onto
             a missed one and both are lost; a false detection leaves a site empty.
-        detector: Name of the detector, for messages.
 
     Raises:
         LimitError: Fewer than 30 frames, or a cost that is not above 0.
@@ -240,9 +232,9 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0, detector: str = "det
         raise LimitError("the cost of a missed atom", miss_cost, "more than 0 imagined ones")
     by_site = np.ascontiguousarray(signals.reshape(n_frames, -1).T, np.float64)
     if not np.isfinite(by_site).all():
-        raise DeviceError(detector, "some of the signals are not finite numbers; no thresholds fitted")
+        raise DeviceError("detector", "some of the signals are not finite numbers; no thresholds fitted")
     peaks = _site_peaks(by_site)
-    _check_enough(peaks.two, by_site, detector)
+    _check_enough(peaks.two, by_site)
     places, never, always = _with_single_peaks(peaks, by_site, (shape[0], shape[1]))
     shapes = _common_shapes(by_site[peaks.two], places, peaks.two)
     steps, widths_empty, widths_full = places.full - places.empty, places.width_empty, places.width_full
@@ -297,14 +289,14 @@ def _moments(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
     return np.where(n > 0, mean, np.nan), np.sqrt(spread / np.maximum(count - 1, 1)), n
 
 
-def _check_enough(two: Bools, by_site: Floats, detector: str) -> None:
+def _check_enough(two: Bools, by_site: Floats) -> None:
     n_one = int((~two).sum())
     if n_one > max(1.0, MAX_ONE_PEAK * len(two)) or not two.any():
         remedy = "check the loading, the light, and that the sites are where the atoms are"
         if np.ptp(by_site) == 0:
             remedy = "all signals are equal: black or saturated frames"
         raise DeviceError(
-            detector,
+            "detector",
             f"{n_one} of {len(two)} sites show one peak in the histogram of the counts, not two; {remedy}",
         )
 

@@ -237,7 +237,7 @@ def run_queue(
 ) -> None:
     """Run the queued entries one after the other; a run that was interrupted is resumed first."""
     from labseq.cli.run import run_session
-    from labseq.queue.terminal import run_entries
+    from labseq.queue.running import run_entries
 
     run = partial(run_session, as_json=False)
     raise typer.Exit(run_entries(run, keep_going=keep_going, watch=watch))

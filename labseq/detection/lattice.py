@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Centre: TypeAlias = tuple[float, float] | None
 
+SATURATED: Final = 65535.0
+"""Counts of a saturated pixel."""
 SHORTEST_PX: Final = 3.5
 LONGEST_PX: Final = 55.0
 ROW_SLANT_RAD: Final = np.deg2rad(17)
@@ -412,9 +414,7 @@ class FoundLattice:
         return int(self.found.sum())
 
 
-def find_lattice(
-    image: NDArray[Any], grid: SiteGrid, *, centre_px: Centre = None, saturated: float = 65535.0
-) -> FoundLattice:
+def find_lattice(image: NDArray[Any], grid: SiteGrid, *, centre_px: Centre = None) -> FoundLattice:
     """Find the positions of a grid's sites on an averaged frame.
 
     Rows run along the image's x axis within 15 degrees, from left to right;
@@ -431,12 +431,11 @@ def find_lattice(
         grid: The grid of sites: its size, lattice and shear; its spacing is not used.
         centre_px: (y, x) of the middle of the grid, to less than half a spacing, for frames that
             show more of the lattice, or more lines or spots, than the grid has.
-        saturated: Counts of a saturated pixel.
 
     Raises:
         DeviceError: No such lattice is on the frame; says why.
     """
-    counts = _checked(image, grid, saturated)
+    counts = _checked(image, grid)
     flat = flattened(counts, grid.n_rows * grid.n_cols)
     noise = pixel_noise(counts)
     index = np.moveaxis(np.indices(grid.shape), 0, -1)
@@ -459,7 +458,7 @@ _DARK: Final = "check the exposure, the light, the loading, the focus, and `grid
 _MORE: Final = "if there are more traps than the grid has, give its centre with `--centre Y,X` in pixels"
 
 
-def _checked(image: NDArray[Any], grid: SiteGrid, saturated: float) -> Floats:
+def _checked(image: NDArray[Any], grid: SiteGrid) -> Floats:
     counts = np.asarray(image, np.float64)
     if counts.ndim != 2 or min(counts.shape) < 16 or not np.isfinite(counts).all():
         _fail(
@@ -467,7 +466,7 @@ def _checked(image: NDArray[Any], grid: SiteGrid, saturated: float) -> Floats:
             "pixels or more",
         )
     highest = counts.max()
-    full = min(saturated, highest) if highest > counts.min() else saturated
+    full = min(SATURATED, highest) if highest > counts.min() else SATURATED
     n_full = int(np.count_nonzero(counts >= full))
     if n_full > max(20, grid.n_rows * grid.n_cols // 20):
         _fail(

@@ -31,6 +31,9 @@ COLUMNS: Final = ("row", "col", "y", "x")
 UNREADABLE: Final = (OSError, ValueError, TypeError, MemoryError, OverflowError)
 """What :func:`read_npy` raises for a file that it cannot read."""
 _MAX_BYTES: Final = 1 << 26
+FURTHEST_PX: Final = 3.0
+N_STEPS: Final = 12
+"""Of the shift on one frame: its largest value along each axis, and the steps in which it is found."""
 
 
 class SiteSettings(Settings):
@@ -308,15 +311,6 @@ def pairs_within(positions: NDArray[np.float64], distance: float) -> NDArray[np.
     pairs = KDTree(positions).query_pairs(distance, output_type="ndarray").astype(np.int64)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     return both[np.lexsort((both[:, 1], both[:, 0]))]
-
-
-Floats = NDArray[np.float64]
-
-
-FURTHEST_PX: Final = 3.0
-
-
-N_STEPS: Final = 12
 
 
 class Shift(NamedTuple):

@@ -57,7 +57,7 @@ def add(
 
     The entry keeps the text of the sequence as it is now: later changes of the file have no effect on it.
     """
-    from labseq.queue.terminal import add_entry
+    from labseq.queue.running import add_entry
     from labseq.session.options import Options
 
     options = Options(
@@ -69,7 +69,7 @@ def add(
 @queue.command(name="list", short_help="List the entries in order.")
 def list_(as_json: Json = False) -> None:
     """List the entries in the order in which they will run, and those whose runs ended early."""
-    from labseq.queue.terminal import list_entries
+    from labseq.queue.running import list_entries
 
     list_entries(as_json=as_json)
 
@@ -102,6 +102,6 @@ def pause(
     off: Annotated[bool, typer.Option("--off", help="Continue with the next entry.")] = False,
 ) -> None:
     """Let `labseq queue run` wait before its next entry; a run in progress is taken to its end."""
-    from labseq.queue.terminal import pause_queue
+    from labseq.queue.running import pause_queue
 
     pause_queue(not off)

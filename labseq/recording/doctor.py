@@ -179,15 +179,18 @@ class _LineFile:
                 damaged.append(number)
             else:
                 self.rows[number] = row
-        for number in damaged[:_MAX_FINDINGS]:
-            self.remove([number], f"line {number + 1} is damaged")
-        self.remove(damaged[_MAX_FINDINGS:], f"{len(damaged) - _MAX_FINDINGS} more lines are damaged")
+        if len(damaged) > _MAX_FINDINGS:
+            self.remove(damaged, f"{len(damaged)} lines are damaged, from line {damaged[0] + 1} on")
+        else:
+            for number in damaged:
+                self.remove([number], f"line {number + 1} is damaged")
 
     def remove(self, numbers: Collection[int], what: str = "") -> None:
         """Remove lines; ``what`` is the reason, unless another finding reports it."""
         self._removed.update(numbers)
-        if what and numbers:
-            self.problems.append((what, self.path, _TO_QUARANTINE))
+        if what:
+            n_findings = len(numbers) if len(numbers) <= _MAX_FINDINGS else 1
+            self.problems += [(what, self.path, _TO_QUARANTINE)] * n_findings
 
     def save(self) -> None:
         """Write the file if it changes.
@@ -241,9 +244,10 @@ class _Check:
             self._check_state()
             self._check_shots(shots, str(record.get("run_id")))
             skipped = _LineFile(self.folder / folders.SKIPPED_FILE)
-            for number, row in skipped.rows.items():
-                if not is_skip_row(row, record["n_shots"]):
-                    skipped.remove([number], "a line names no shots of this run, or no reason")
+            wrong = [
+                number for number, row in skipped.rows.items() if not is_skip_row(row, record["n_shots"])
+            ]
+            skipped.remove(wrong, "a line names no shots of this run, or no reason")
             logs = [results / name for name in names_in(results) if name.endswith(".jsonl")]
             for lines in (skipped, *map(_LineFile, (self.folder / folders.EVENTS_FILE, *logs))):
                 self._save(lines)
@@ -298,12 +302,13 @@ class _Check:
     def _check_shots(self, folder: Path, run_id: str) -> None:
         """Compare the index with the files of the shots."""
         index = _LineFile(self.folder / folders.INDEX_FILE)
-        of_file: dict[str, list[int]] = {}
+        of_file, wrong = dict[str, list[int]](), list[int]()
         for number, row in index.rows.items():
             if is_index_row(row) and _is_name(row):
                 of_file.setdefault(row["file"], []).append(number)
             else:
-                index.remove([number], "a line of the index is not a shot's")
+                wrong.append(number)
+        index.remove(wrong, "a line of the index is not a shot's")
         whole = {file for file, same in of_file.items() if self._check_file(file, same, index)}
         self.n_whole += len(whole)
         known = sorted(number for file in whole for number in of_file[file])
@@ -355,9 +360,8 @@ class _Check:
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
                 index.remove(numbers)
             return False
-        for number in numbers:
-            if number != good[-1]:
-                index.remove([number], f"a second line for {path.name}")
+        second = [number for number in numbers if number != good[-1]]
+        index.remove(second, f"a second line for {path.name}")
         return True
 
     def _row_of_stray(self, path: Path, run_id: str) -> dict[str, Any] | None:

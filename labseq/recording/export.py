@@ -14,7 +14,7 @@ from labseq.files import whole_file
 from labseq.recording.columns import Column, columns_of
 from labseq.recording.reader import Run
 from labseq.recording.tables import check_installed, dataframe_of, dataset_of, facts_of
-from labseq.text_files import check_output
+from labseq.text_files import check_output, is_file
 
 ENDINGS: Final = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc", "archive": ".h5"}
 """Kind of export -> suffix of its file."""
@@ -43,7 +43,7 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
     if frames and kind != "archive":
         raise ConfigError(Problem(f"a {kind} file holds no frames", "--frames", hint="use --to archive"))
     check_output(path, f"a {kind} file", ENDINGS[kind])
-    there = [one for one in files_of(kind, path) if one.exists()]
+    there = [one for one in files_of(kind, path) if is_file(one)]
     if there and not replace:
         hint = "choose another name, or replace it with --force"
         raise ConfigError(Problem("this file already exists", str(there[0]), hint=hint))

@@ -65,7 +65,7 @@ def new(
     A plugin goes into the folder `plugins`, with its settings, the contract tests of its role and a README.
     New sequences and profiles load plugins from there. No existing file is changed, except schemas.
     """
-    from labseq.scaffold.terminal import make_new
+    from labseq.scaffold.new import make_new
 
     make_new(kind, name, folder, package=package, profile=profile)
 
@@ -96,9 +96,9 @@ def schema(
     ] = None,
 ) -> None:
     """Write the JSON schema of sequences or profiles for editors, with the settings of every plugin."""
-    from labseq.scaffold.terminal import write_schema
+    from labseq.scaffold.new import print_schema
 
-    write_schema(kind, output, plugins)
+    print_schema(kind, output, plugins)
 
 
 def explain(

@@ -1,4 +1,4 @@
-"""`labseq new`: plugins, sequences and profiles that run at once.
+"""`labseq new` and `labseq schema`: plugins, sequences and profiles that run at once; schemas for editors.
 
 A template of a plugin consists of sections, each begun by a line ``==> name <==``: ``about`` (what the
 plugin does, in a sentence), the files, and ``use`` (the command that runs a sequence with it).
@@ -11,8 +11,8 @@ import keyword
 import re
 import shutil
 import sys
-from collections.abc import Generator, Iterable, Mapping
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.util import find_spec
@@ -22,12 +22,20 @@ from typing import Final
 
 from labseq import __version__
 from labseq.config.find import find_profile
+from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
 from labseq.files import PLUGINS, packaged_profiles_dir
-from labseq.messages import clean, install_hint, visible
+from labseq.messages import clean, did_you_mean, install_hint, listing, visible
 from labseq.plugins import PluginHost
-from labseq.registry import Registry
-from labseq.scaffold.schemas import KINDS as FILE_KINDS, FileKind, schema_path, write_schema
+from labseq.registry import KINDS, Registry
+from labseq.scaffold.schemas import (
+    KINDS as FILE_KINDS,
+    SCHEMA_FOLDER,
+    FileKind,
+    schema_path,
+    schema_text,
+    write_schema,
+)
 from labseq.session.chosen import load_plugins
 
 MAX_LENGTH: Final = 40
@@ -61,6 +69,38 @@ class CreatedFiles:
     commands: tuple[str, ...]
 
 
+def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
+    """Make a plugin, a sequence or a profile, and print its files and what to do next."""
+    if kind not in (*KINDS, *FILE_KINDS):
+        known = (*KINDS, *FILE_KINDS)
+        what = f"there is no kind '{clean(kind)}'"
+        raise ConfigError(Problem(what, expected=listing(known), hint=did_you_mean(kind, known)))
+    if package and kind in FILE_KINDS:
+        raise ConfigError(Problem(f"--package does not apply to a {kind}", hint="leave it out"))
+    if profile is not None and kind != "sequence":
+        raise ConfigError(Problem(f"--profile does not apply to a {_called(kind)}", hint="leave it out"))
+    if kind in KINDS:
+        made = make_plugin(kind, name, folder, package=package)
+    else:
+        made = make_file(kind, name, folder, profile=profile or "virtual")
+    say(*lines_of(kind, name, made))
+
+
+def lines_of(kind: str, name: str, made: CreatedFiles) -> list[str]:
+    """What is printed about the new files.
+
+    Example:
+        >>> lines_of("sequence", "a", CreatedFiles(Path("a.yaml"), (Path("a.yaml"),), ("labseq run a.yaml",)))
+        ['made the sequence a:', '  a.yaml', '', 'next:', '  labseq run a.yaml']
+    """
+    files = [f"  {path}" for path in made.files]
+    return [f"made the {_called(kind)} {name}:", *files, "", "next:", *(f"  {c}" for c in made.commands)]
+
+
+def _called(kind: str) -> str:
+    return kind.replace("_", " ")
+
+
 def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) -> CreatedFiles:
     """Make a plugin that runs at once: the plugin, its settings, tests of its contract, a README.
 
@@ -81,7 +121,7 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
     words = {
         "name": name,
         "Name": class_prefix(name),
-        "kind": kind.replace("_", " "),
+        "kind": _called(kind),
         "kind_file": kind,
         "about": sections.pop("about").strip(),
         "home": f"{module}." if package else ".",
@@ -173,7 +213,7 @@ def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> N
         (keyword.iskeyword(name) or hasattr(builtins, name), "Python itself uses this word"),
         (name in _RESERVED, "a part of Python or labseq has this name"),
         (name in _WINDOWS, "Windows allows no file of this name"),
-        (entry, f"the plugin '{entry and entry.origin}' offers a {kind.replace('_', ' ')} of that name"),
+        (entry, f"the plugin '{entry and entry.origin}' offers a {_called(kind)} of that name"),
         (taken, f"there is a plugin '{package}' ({taken and taken.origin})"),
         (_is_installed(package), f"there is a Python package '{package}', which the plugin would hide"),
     )
@@ -210,7 +250,7 @@ def _refuse_if(reasons: Iterable[tuple[object, str]], kind: str, name: str) -> N
 
 
 def _refused(kind: str, name: str, why: str, expected: str, guess: str) -> ConfigError:
-    called = kind.replace("_", " ")
+    called = _called(kind)
     what = f"{'an' if called[0] in 'aeiou' else 'a'} {called} cannot be called '{clean(name)}': {why}"
     return ConfigError(Problem(what, expected=expected, hint=f"for example '{guess}'" if guess else ""))
 
@@ -301,3 +341,23 @@ def _reporting(path: Path) -> Generator[None]:
     except OSError as error:
         what = f"it cannot be made: {error.strerror or error}"
         raise ConfigError(Problem(what, visible(str(path)))) from error
+
+
+def print_schema(kind: str, output: Path | None, plugins: Sequence[Path] | None) -> None:
+    """Write the schema to a file, or print it."""
+    if kind not in FILE_KINDS:
+        what = f"there is no schema of a '{clean(kind)}'"
+        raise ConfigError(Problem(what, expected=listing(FILE_KINDS), hint=did_you_mean(kind, FILE_KINDS)))
+    if plugins is None:
+        plugins = [Path(PLUGINS)] if Path(PLUGINS).is_dir() else []
+    host = load_plugins(plugins)
+    host.import_all()
+    text = schema_text(kind, host.registry)
+    if output is None:
+        say(text.rstrip())
+        return
+    if output.parent.name == SCHEMA_FOLDER:  # where new files refer to it
+        with suppress(OSError):  # writing reports the error
+            output.parent.mkdir(exist_ok=True)
+    write_text(output, text)
+    say(f"wrote {output}")

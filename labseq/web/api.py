@@ -269,35 +269,28 @@ class Api:
     def metrics(self) -> str:
         """The state of the newest run in the format of Prometheus."""
         state = self._live.state()
-        lines = [
-            "# HELP labseq_up Whether the data folder can be read.",
-            "# TYPE labseq_up gauge",
-            f"labseq_up {int(not state['error'])}",
+        run, label = state["run"], ""
+        rows: list[tuple[str, str, float | None]] = [
+            ("labseq_up", "Whether the data folder can be read.", not state["error"]),
+            ("labseq_runs_in_progress", "Runs in progress.", len(state.get("running") or ())),
+            ("labseq_alarms", "Alarms of the newest run.", len(state["alarms"])),
+            ("labseq_viewers", "Pages that are open.", self._live.n_viewers),
         ]
-        run, alarms = state["run"], state["alarms"]
-        values: dict[str, tuple[str, float | None]] = {
-            "labseq_runs_in_progress": ("Runs in progress.", float(len(state.get("running") or ()))),
-            "labseq_alarms": ("Alarms of the newest run.", float(len(alarms))),
-            "labseq_viewers": ("Pages that are open.", float(self._live.n_viewers)),
-        }
         if run is not None:
-            figures = state["figures"]
-            values |= {
-                "labseq_run_in_progress": (
-                    "Whether this run is in progress.",
-                    float(run["status"] == "running"),
-                ),
-                "labseq_run_shots": ("Shots of the run so far.", float(run["n_done"])),
-                "labseq_run_shots_planned": ("Shots that the run will have.", float(run["n_shots"])),
-                "labseq_run_failed_attempts": ("Attempts that do not count.", float(run["n_attempts"])),
-                "labseq_run_filling": ("Mean filling of the target.", figures["filling"]),
-                "labseq_run_defect_free": ("Fraction of defect-free shots.", figures["defect_free"]),
-            }
-        label = "" if run is None else f'{{run="{_label(run["id"])}",name="{_label(run["name"])}"}}'
-        for name, (about, value) in values.items():
+            figures, label = state["figures"], f'{{run="{_label(run["id"])}",name="{_label(run["name"])}"}}'
+            rows += [
+                ("labseq_run_in_progress", "Whether this run is in progress.", run["status"] == "running"),
+                ("labseq_run_shots", "Shots of the run so far.", run["n_done"]),
+                ("labseq_run_shots_planned", "Shots that the run will have.", run["n_shots"]),
+                ("labseq_run_failed_attempts", "Attempts that do not count.", run["n_attempts"]),
+                ("labseq_run_filling", "Mean filling of the target.", figures["filling"]),
+                ("labseq_run_defect_free", "Fraction of defect-free shots.", figures["defect_free"]),
+            ]
+        lines: list[str] = []
+        for name, about, value in rows:
             shown = "NaN" if value is None or not math.isfinite(value) else f"{value:.12g}"
-            lines += [f"# HELP {name} {about}", f"# TYPE {name} gauge"]
-            lines.append(f"{name}{label if name.startswith('labseq_run_') else ''} {shown}")
+            labels = label if name.startswith("labseq_run_") else ""
+            lines += [f"# HELP {name} {about}", f"# TYPE {name} gauge", f"{name}{labels} {shown}"]
         return "\n".join(lines) + "\n"
 
 

@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
 from labseq.analysis.charts import (
     Panel,
+    defects,
     draw_curves,
-    draw_defects,
-    draw_loss_causes,
     draw_map,
     draw_sites,
-    draw_stages,
-    draw_trend,
+    loss_causes,
     points_of,
+    running_mean,
+    stages_of_a_shot,
+    trend,
 )
-from labseq.analysis.overview import RunPicture
 from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
-from labseq.model.estimate import Estimate, Rate
+from labseq.model.estimate import Estimate, Rate, jeffreys
 from labseq.pictures.figures import RED, make_figure
 
 NAN = math.nan
@@ -39,13 +37,14 @@ def stage(name: str, session_s: tuple[float, float], host_s: tuple[float, float]
     return StageStatistics(name, 1, 1.0, budget_s, session_s, host_s, 0.5, 0)
 
 
-def trend(n: int, *, is_rate: bool = False) -> Panel:
+def trend_of(n: int, *, is_rate: bool = False) -> Panel:
     shots = np.arange(1.0, n + 1)
     values = shots % 2 if is_rate else 1 - 0.01 * (shots % 3)
-    running = points(min(n, 5))
-    return partial(
-        draw_trend, title="trend", label="%", shots=shots, values=values, running=running, is_rate=is_rate
-    )
+    return trend("a trend", shots, values, is_rate=is_rate) or no_panel
+
+
+def no_panel(_: object) -> None:
+    raise AssertionError
 
 
 def curves(**changes: Any) -> Panel:
@@ -70,29 +69,18 @@ def sites(values: Any, grid: SiteGrid) -> Panel:
 
 CLOCKS = {"session_s": "modelled", "host_s": "this computer"}
 PANELS: dict[str, Panel] = {
-    "shots": trend(30),
-    "many rates": trend(3000, is_rate=True),
+    "shots": trend_of(30),
+    "many rates": trend_of(3000, is_rate=True),
     "text below the axis": curves(curves={"": points(3)}, ticks=("psca", "a" * 30, "x"), from_zero=True),
     "a single count": curves(curves={"": points(1)}, whole=True),
     "ratios": curves(logarithmic=True),
     "map with a gap": map_of(np.array([[0.1, NAN], [0.5, 0.9]]), "12", "34"),
-    "defects": partial(
-        draw_defects, title="d", x_label="defects", shares=points(3), expected=np.array([0.5, 0.3])
-    ),
-    "causes": partial(
-        draw_loss_causes,
-        title="c",
-        x_label="atoms",
-        losses={"imaging": Estimate(3.0, 0.1), "$x$": Estimate(1.0, NAN)},
-    ),
-    "one clock": partial(
-        draw_stages, title="s", stages=[stage("plan", (NAN, NAN), (1e-3, 2e-3), NAN)], clocks=CLOCKS
-    ),
-    "no times": partial(
-        draw_stages,
-        title="s",
-        stages=[stage("plan", (NAN, NAN), (NAN, NAN), NAN)],
-        clocks={"session_s": "measured"},
+    "defects": defects((3, 2, 1), 6, 6, "at the end") or no_panel,
+    "many defects": defects((0,) * 200 + (3, 2), 4000, 5, "at the end") or no_panel,
+    "causes": loss_causes({"imaging": Estimate(3.0, 0.1), "$x$": Estimate(1.0, NAN)}) or no_panel,
+    "one clock": stages_of_a_shot("s", [stage("plan", (NAN, NAN), (1e-3, 2e-3), NAN)], CLOCKS),
+    "no times": stages_of_a_shot(
+        "s", [stage("plan", (NAN, NAN), (NAN, NAN), NAN)], {"session_s": "measured"}
     ),
     "sites": sites(np.where(np.eye(4, 5) > 0, NAN, 0.97), SiteGrid(4, 5)),
     "unknown sites": sites(np.full((2, 2), NAN), SiteGrid(2, 2, lattice="square")),
@@ -125,16 +113,33 @@ def test_curves_are_drawn_in_per_cent_with_error_bars() -> None:
 
 def test_a_stage_has_its_median_and_its_budget() -> None:
     axes = make_figure(3.0, 3.0).add_subplot()
-    draw_stages(
-        axes,
-        title="s",
-        stages=[stage("play", (3e-3, 5e-3), (NAN, NAN), 4e-3)],
-        clocks={"session_s": "measured"},
-    )
+    one = stage("play", (3e-3, 5e-3), (NAN, NAN), 4e-3)
+    stages_of_a_shot("s", [one], {"session_s": "measured"})(axes)
     lines = {line.get_label(): line for line in axes.get_lines()}
     assert lines["measured"].get_xdata() == [3e-3]
     assert lines["budget"].get_xdata() == [4e-3]
     assert lines["budget"].get_color() == RED
+
+
+def test_a_running_rate_has_jeffreys_intervals() -> None:
+    shots = np.arange(30.0)
+    window, points = running_mean(shots, 1.0 - shots % 2, is_rate=True)
+    assert window == 10
+    assert points[0, 0] == 4.5
+    assert tuple(points[2:, 0]) == jeffreys(5, 10)
+
+
+def test_defects_stand_beside_those_of_independent_sites() -> None:
+    axes = make_figure(3.0, 3.0).add_subplot()
+    panel = defects((4, 0, 0, 2), 6, 6, "at the end")
+    assert panel is not None
+    panel(axes)
+    bars: Any = axes.patches
+    assert [bar.get_height() for bar in bars] == pytest.approx([400 / 6, 0, 0, 200 / 6])
+    (line,) = (line for line in axes.get_lines() if line.get_label() == "independent sites")
+    independent = [100 * math.comb(6, k) * (1 / 6) ** k * (5 / 6) ** (6 - k) for k in range(7)]
+    found: Any = line.get_ydata()
+    assert list(found) == pytest.approx(independent[: len(found)])
 
 
 def test_a_site_of_few_atoms_does_not_take_up_the_range_of_the_colours() -> None:
@@ -144,16 +149,3 @@ def test_a_site_of_few_atoms_does_not_take_up_the_range_of_the_colours() -> None
     sites(values, SiteGrid())(axes)
     cells: Any = axes.collections[0]
     assert cells.get_clim() == pytest.approx((98.0, 100.0))
-
-
-@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("PDF", b"%PDF")])
-def test_the_same_picture_has_the_same_bytes(tmp_path: Path, suffix: str, start: bytes) -> None:
-    picture = RunPicture("a $ run", "a $note$", ((trend(5),),))
-    path = tmp_path / f"run.{suffix}"
-    picture.save(path)
-    first = path.read_bytes()
-    assert first.startswith(start)
-    picture.save(path)
-    assert path.read_bytes() == first
-    if suffix == "svg":
-        assert ET.parse(path).getroot().tag.endswith("svg")

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from labseq.analysis.charts import (
-    draw_curves,
-    draw_defects,
-    draw_loss_causes,
-    draw_sites,
-    draw_stages,
-    draw_trend,
-)
 from labseq.analysis.overview import RunPicture, overview, picture_of
 from labseq.errors import ConfigError
-from labseq.model.estimate import jeffreys
+from labseq.pictures.figures import make_figure
 from labseq.recording import Run, open_run
 
 from .records import make_shot
@@ -27,28 +18,37 @@ from .records import make_shot
 Write = Callable[..., Run]
 
 
-def kinds(picture: RunPicture) -> list[list[Any]]:
-    panels: Any = picture.rows
-    return [[panel.func for panel in row] for row in panels]
+def titles(picture: RunPicture) -> list[list[str]]:
+    """The titles of the panels, without numbers."""
+    found: list[list[str]] = []
+    for row in picture.rows:
+        axes = [make_figure(3.0, 3.0).add_subplot() for _ in row]
+        for one, panel in zip(axes, row, strict=True):
+            panel(one)
+        found.append(
+            [re.sub(r"^[\d().]+ |[:;,].*", "", one.get_title(loc="left") or one.get_title()) for one in axes]
+        )
+    return found
 
 
-def drawn(picture: RunPicture, row: int = 0, column: int = 0) -> SimpleNamespace:
-    """What a panel shows: the arguments of the function that draws it."""
-    panel: Any = picture.rows[row][column]
-    return SimpleNamespace(**panel.keywords)
+SITES = ["moved atoms", "atoms that stayed"]
 
 
 def test_a_run_of_the_virtual_lab_fills_the_sheet(compact: Run) -> None:
-    assert kinds(overview(compact)) == [
-        [draw_trend, draw_curves, draw_defects],
-        [draw_trend, draw_curves, draw_loss_causes],
-        [draw_sites, draw_sites, draw_stages],
+    assert titles(overview(compact)) == [
+        ["filling by shot", "filling by cycle", "defects in a shot"],
+        ["defect-free by shot", "defect-free by cycle", "lost in a shot"],
+        [*SITES, "stages of a shot"],
     ]
 
 
 def test_a_run_without_rearrangement_has_the_rest(write: Write) -> None:
     run = write([make_shot(i, n_cycles=0) for i in range(3)], resolved={})
-    assert kinds(overview(run)) == [[draw_trend, draw_defects], [draw_trend], [draw_sites, draw_stages]]
+    assert titles(overview(run)) == [
+        ["filling by shot", "defects in a shot"],
+        ["defect-free by shot"],
+        [SITES[1], "stages of a shot"],
+    ]
     with pytest.raises(
         ConfigError, match=r"nothing to show of lost atoms; expected readable shots with a rear"
     ):
@@ -57,26 +57,10 @@ def test_a_run_without_rearrangement_has_the_rest(write: Write) -> None:
 
 def test_shots_that_are_not_judged_are_shown_by_the_image_that_ended_the_last_cycle(write: Write) -> None:
     drawing = overview(write([make_shot(i, n_defects=i, judged=False) for i in range(3)]))
-    filling, success = drawn(drawing), drawn(drawing, 1)
-    assert filling.values == pytest.approx([1, 5 / 6, 4 / 6])
-    assert success.values.tolist() == [1, 0, 0]
-
-
-def test_a_running_rate_has_jeffreys_intervals(write: Write) -> None:
-    trend = drawn(picture_of(write([make_shot(i, n_defects=i % 2) for i in range(30)]), "success"))
-    x, _, low, high = trend.running[:, 0]
-    assert x == 4.5  # ten shots
-    assert (low, high) == jeffreys(5, 10)
-    assert trend.is_rate
-
-
-def test_defects_stand_beside_those_of_independent_sites(write: Write) -> None:
-    chart = drawn(picture_of(write([make_shot(i, n_defects=(0, 0, 3)[i % 3]) for i in range(6)]), "defects"))
-    _, y, low, high = chart.shares
-    assert y == pytest.approx([4 / 6, 0, 0, 2 / 6])
-    assert (low[1], high[1]) == jeffreys(0, 6)
-    independent = [math.comb(6, k) * (1 / 6) ** k * (5 / 6) ** (6 - k) for k in range(7)]
-    assert chart.expected == pytest.approx(independent[: len(chart.expected)])
+    for row, expected in ((0, [100, 500 / 6, 400 / 6]), (1, [100, 0, 0])):
+        axes = make_figure(3.0, 3.0).add_subplot()
+        drawing.rows[row][0](axes)
+        assert list(axes.get_lines()[0].get_ydata()) == pytest.approx(expected)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_run_without_shots_says_so(write: Write) -> None:
@@ -90,11 +74,10 @@ def test_shots_whose_files_are_gone_are_left_out_of_what_needs_them(write: Write
     run = write([make_shot(i) for i in range(3)])
     for one in run.shots[:2]:
         one.file.unlink()
-    drawing = overview(open_run(run.path))
-    assert kinds(drawing)[2][0] is draw_sites
-    assert drawn(drawing, 2).title.endswith("1 of 3 shots")
+    moved: Any = overview(open_run(run.path)).rows[2][0]
+    assert moved.keywords["title"].endswith("1 of 3 shots")
     run.shots[2].file.write_bytes(b"nothing")
     gone = overview(open_run(run.path))
-    assert draw_trend in kinds(gone)[0]
+    assert titles(gone)[0][0] == "filling by shot"
     with pytest.raises(ConfigError, match="nothing to show of survival by site"):
         picture_of(open_run(run.path), "survival")

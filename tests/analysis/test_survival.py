@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from labseq.analysis.survival import Survival
+from labseq.analysis.statistics import Survival
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport, follow_atoms
 from labseq.model.estimate import Rate

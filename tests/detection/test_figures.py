@@ -25,7 +25,9 @@ IN_SUITE = N_DRAWS == 1
 SHAPE = (512, 512)
 
 
-@pytest.mark.parametrize(("n_frames", "most"), [(50, 0.1)] if IN_SUITE else [(20, 0.2), (50, 0.1), (200, 0.06)])
+@pytest.mark.parametrize(
+    ("n_frames", "most"), [(50, 0.1)] if IN_SUITE else [(20, 0.2), (50, 0.1), (200, 0.06)]
+)
 def test_sites_of_a_hidden_lattice(n_frames: int, most: float) -> None:
     """2 degrees, 10 % stretch, shear, barrel, a hidden offset, hot pixels, dark sites."""
     off = list[np.ndarray]()

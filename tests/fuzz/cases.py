@@ -21,7 +21,7 @@ from labseq.config.plan_file import parse_plan
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
 from labseq.queue.queue import Entry, Queue
-from labseq.queue.terminal import list_entries
+from labseq.queue.running import list_entries
 from labseq.recording import open_run
 from labseq.recording.doctor import examine
 from labseq.recording.run_file import summary_of

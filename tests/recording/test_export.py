@@ -208,6 +208,7 @@ def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> No
             {},
             "this file already exists; choose another name, or replace it with --force",
         ),
+        ("csv", "x" * 300 + ".csv", {}, "not the name of a file: File name too long"),
         ("netcdf", "a.nc", {"frames": True}, "--frames: a netcdf file holds no frames; use --to archive"),
         ("archive", "folder.h5", {"replace": True}, "folder.h5: this is a folder"),
     ],

@@ -16,8 +16,7 @@ from labseq.queue.running import QueueRun
 from labseq.scaffold.schemas import file_schema
 from labseq.session.chosen import load_plugins
 from labseq.session.options import Options
-from labseq.web.acting import Actions
-from labseq.web.form import form_fields
+from labseq.web.acting import Actions, form_fields
 from tests.recording.damages import rewrite_state
 
 from .clients import Client, client_of, path_of, write_run

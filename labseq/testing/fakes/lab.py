@@ -9,7 +9,6 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.errors import DeviceError
 from labseq.guard import StopFlag
 from labseq.model import (
     Frame,
@@ -46,7 +45,6 @@ class ScriptedDetector:
 
     Args:
         occupancies: The occupancies in order; the last one is repeated.
-        frame_shape: The only accepted shape of frames; None accepts any.
 
     Attributes:
         frames: The frames received.
@@ -58,18 +56,14 @@ class ScriptedDetector:
         [[[0, 1]], [[1, 1]], [[1, 1]]]
     """
 
-    def __init__(self, occupancies: Sequence[ArrayLike], frame_shape: tuple[int, int] | None = None) -> None:
+    def __init__(self, occupancies: Sequence[ArrayLike]) -> None:
         if not len(occupancies):
             raise ValueError("a scripted detector needs at least one occupancy")
         self._occupancies = [as_occupancy(occupancy) for occupancy in occupancies]
-        self._frame_shape = frame_shape
         self.frames: list[Frame] = []
 
     def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32]]:
         """Give the next occupancy, with full confidence."""
-        if self._frame_shape not in (None, frame.image.shape):
-            text = f"the frame has shape {frame.image.shape}; expected {self._frame_shape}"
-            raise DeviceError("detector", text)
         occupancy = self._occupancies[min(len(self.frames), len(self._occupancies) - 1)]
         self.frames.append(frame)
         return occupancy.copy(), np.ones(occupancy.shape, np.float32)
