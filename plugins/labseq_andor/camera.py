@@ -349,15 +349,18 @@ class AndorCamera(CameraDriver):
 
     def _end(self) -> None:
         """Abort, gain off; the shutter stays open."""
-        self._attempt(_cancel_wait, _abort, self._turn_gain_off)
+        self._attempt(_abort, self._turn_gain_off)
 
     def _stop(self) -> None:
-        self._attempt(_cancel_wait, _abort, self._turn_gain_off, self._close_shutter)
+        self._attempt(_abort, self._turn_gain_off, self._close_shutter)
 
-    def _attempt(self, *actions: Callable[[Any], None]) -> None:
+    def _attempt(self, *actions: Callable[[Any], object]) -> None:
+        """Make a wait return, then run all actions, even if some fail."""
         sdk, self._n_fetched = self._sdk, None
-        if sdk is not None and sdk.camera is not None and (failure := sdk.attempt(*actions)) is not None:
-            raise failure
+        if sdk is not None and sdk.camera is not None:
+            failure = sdk.attempt(lambda lib: lib.CancelWait(), *actions)
+            if failure is not None:
+                raise failure
 
     def _turn_gain_off(self, lib: Any) -> None:
         if self._reported.get("em_gain_range") is not None:
@@ -373,10 +376,6 @@ class AndorCamera(CameraDriver):
         if self._sdk is None:
             raise DeviceError(self._name, "not open; call open() first")
         return self._sdk
-
-
-def _cancel_wait(lib: Any) -> None:
-    lib.CancelWait()
 
 
 def _abort(lib: Any) -> None:

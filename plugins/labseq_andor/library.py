@@ -7,7 +7,7 @@ import importlib
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib import metadata
 from types import SimpleNamespace
 from typing import Any, Final
@@ -126,6 +126,10 @@ def bind(name: str, andor: Any, key: str, library: Any) -> None:
     pylablib has no option for this, but it uses whatever its loader returns.
     """
     control, declarations = andor.libctl, andor.atmcd32d_lib
+
+    def return_library(*_names: Any, **_options: Any) -> Any:
+        return library
+
     with control.lock:
         if getattr(andor.lib, "labseq_key", None) == key:
             return
@@ -135,7 +139,7 @@ def bind(name: str, andor: Any, key: str, library: Any) -> None:
         loader, fresh = declarations.load_lib, declarations.AndorSDK2Lib()
         if library is not None:
             declarations.load_lib = SimpleNamespace(
-                load_lib=partial(_return_library, library),
+                load_lib=return_library,
                 get_program_files_folder=loader.get_program_files_folder,
                 par_error_message="",
             )
@@ -146,7 +150,3 @@ def bind(name: str, andor: Any, key: str, library: Any) -> None:
         fresh.labseq_key = key
         andor.lib = control.lib = fresh
         control.initialized = True
-
-
-def _return_library(library: Any, *_names: Any, **_options: Any) -> Any:
-    return library

@@ -105,12 +105,7 @@ class SimulatedAndorLibrary(AndorLibrary):
 
 
 def simulated_head(settings: AndorSettings, sensor_shape: tuple[int, int]) -> Head:
-    """The head that the settings describe, with the simulation's sensor.
-
-    Args:
-        settings: Settings of the driver.
-        sensor_shape: (height, width) of the simulation's sensor.
-    """
+    """The head that the settings describe, with the simulation's sensor of (height, width) pixels."""
     head = settings.head
     if head is None:
         heads = sorted(HEADS, key=lambda head: head.sensor_shape != sensor_shape)

@@ -169,12 +169,7 @@ def natural(path: Path) -> tuple[list[str | int], str]:
 
 
 def load(package: str, name: str, path: Path) -> Any:
-    """Import a package that reads a kind of file.
-
-    Args:
-        package: Its name in Python.
-        name: Its name.
-        path: The file that it is needed for, for the message.
+    """Import a package that reads files of a kind, such as ``path``.
 
     Raises:
         BadFramesError: It is not installed.

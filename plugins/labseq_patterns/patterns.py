@@ -165,19 +165,7 @@ def diluted(
         ConfigError: The grid is square.
         LimitError: The block is larger than the grid or sticks out of it.
     """
-    need_triangular(grid, name)
-    mask = as_sheared(keep(*block(settings.rows, settings.cols, grid.shape)), grid)
-    title = f"{name.replace('_', '-')} {settings.rows} x {settings.cols}"
-    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=title)
-
-
-def need_triangular(grid: SiteGrid, name: str) -> None:
-    """Refuse a square grid, on which the pattern would be another lattice.
-
-    Raises:
-        ConfigError: The grid is square.
-    """
-    if grid.lattice != "triangular":
+    if grid.lattice != "triangular":  # on which it would be another lattice
         raise ConfigError(
             Problem(
                 f"the pattern '{name}' dilutes a triangular lattice, and the grid is {grid.lattice}",
@@ -185,14 +173,11 @@ def need_triangular(grid: SiteGrid, name: str) -> None:
                 hint="draw what you mean with the pattern 'bitmap'",
             )
         )
-
-
-def as_sheared(mask: Mask, grid: SiteGrid) -> Mask:
-    """A mask made for ``shear: +1``, mirrored left to right on a grid with ``shear: -1``.
-
-    So the array of atoms is the mirror image too.
-    """
-    return mask if grid.shear > 0 else mask[:, ::-1]
+    mask = keep(*block(settings.rows, settings.cols, grid.shape))
+    if grid.shear < 0:  # the array of atoms is the mirror image then, too
+        mask = mask[:, ::-1]
+    title = f"{name.replace('_', '-')} {settings.rows} x {settings.cols}"
+    return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=title)
 
 
 def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
@@ -204,13 +189,7 @@ def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
     are empty; if that number is 3 n or 3 n + 1, no atom hangs on by a single
     neighbour. In the bulk each atom has 3 nearest neighbours.
 
-    Args:
-        settings: Size and place.
-        grid: A triangular grid.
-
-    Raises:
-        ConfigError: The grid is square.
-        LimitError: The block is larger than the grid or sticks out of it.
+    Arguments and errors are those of :func:`diluted`.
 
     Example:
         >>> honeycomb(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
@@ -226,13 +205,7 @@ def kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
     neighbours. Left out are the odd rows' odd sites, counted from 0 at the top
     left (at the top right with ``shear: -1``): the block's edges are full lines.
 
-    Args:
-        settings: Size and place.
-        grid: A triangular grid.
-
-    Raises:
-        ConfigError: The grid is square.
-        LimitError: The block is larger than the grid or sticks out of it.
+    Arguments and errors are those of :func:`diluted`.
 
     Example:
         >>> kagome(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
@@ -253,13 +226,7 @@ def link_kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
     links at the ends of its link, as in Semeghini et al., "Probing topological
     spin liquids on a programmable quantum simulator", Science 374, 1242 (2021).
 
-    Args:
-        settings: Size and place.
-        grid: A triangular grid.
-
-    Raises:
-        ConfigError: The grid is square.
-        LimitError: The block is larger than the grid or sticks out of it.
+    Arguments and errors are those of :func:`diluted`.
 
     Example:
         >>> target = link_kagome(BlockSettings(rows=3, cols=4), SiteGrid(3, 4))

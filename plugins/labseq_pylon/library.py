@@ -103,13 +103,9 @@ class Nodes:
             return None
 
     def choose(self, name: str, what: str, value: str, *, if_there: bool = False) -> None:
-        """Set a node to one of several values.
+        """Set a node, which errors call ``what``, to one of several values.
 
-        Args:
-            name: Name of the node.
-            what: Its name in errors.
-            value: The value to choose.
-            if_there: Whether to do nothing if the camera does not have it, or does not allow changes.
+        With ``if_there`` nothing happens if the camera does not have it, or does not allow changes.
         """
         if if_there and not self._can_write(self.find(name)):
             return
@@ -130,16 +126,9 @@ class Nodes:
     def set_real(
         self, node: Any, what: str, value: float, say: Callable[[float], str] = "{:g}".format
     ) -> float:
-        """Set a node that holds a real number.
+        """Set a node that holds a real number; returns the value that the camera accepted.
 
-        Args:
-            node: The node.
-            what: Its name in errors.
-            value: In the node's unit.
-            say: Formats a value for errors.
-
-        Returns:
-            The value that the camera accepted.
+        ``what`` is its name in errors, and ``say`` formats its values there.
         """
         with self._sdk.doing(f"set its {what}"):
             low, high = node.Min, node.Max
@@ -152,11 +141,8 @@ class Nodes:
     def set_integer(self, node: Any, what: str, value: int, unit: int = 1) -> None:
         """Set a node that holds an integer.
 
-        Args:
-            node: The node.
-            what: Its name in errors.
-            value: In the node's unit.
-            unit: Of the node, for errors: pixels of the sensor per pixel of a frame.
+        ``what`` is its name in errors, and ``unit`` what counts as 1 there: pixels of the sensor per pixel
+        of a frame.
         """
         with self._sdk.doing(f"set its {what}"):
             bounds = (node.Min, node.Max, node.Inc)

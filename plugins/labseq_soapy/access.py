@@ -90,11 +90,6 @@ def marker_of(device: str) -> Path:
 def end_stale_process(name: str, marker: Path, clock: Clock) -> None:
     """End the process that an earlier labseq left behind with this radio, if there is one; it ramps down.
 
-    Args:
-        name: Name of the device, for the message.
-        marker: See :func:`marker_of`.
-        clock: The session's clock.
-
     Raises:
         DeviceError: It does not end.
     """

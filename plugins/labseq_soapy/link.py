@@ -38,10 +38,8 @@ class Link:
     Args:
         name: Name of the device, for messages.
         clock: The session's clock.
-        setup: The first message to the process.
+        setup: The first message to the process, which also gets the ``environment`` and ``options``.
         log: File for the output of the radio's module.
-        environment: Environment of the process.
-        options: Of its command line.
 
     Attributes:
         pid: Number of the process.

@@ -27,9 +27,6 @@ def can_build() -> bool:
 def build_module(name: str = "static_tweezers") -> Path:
     """Compile the module into labseq's cache, unless it is there; returns its folder.
 
-    Args:
-        name: Name of the device, for messages.
-
     Raises:
         DeviceError: The compiler or the headers are missing, or it does not compile.
     """

@@ -60,13 +60,7 @@ class RealBox:
 
 
 def choose_box(settings: TtlSettings, context: Context, polarity: int) -> RealBox | SimulatedAccess:
-    """The box that the setting ``port`` names.
-
-    Args:
-        settings: Of the driver.
-        context: Name, clock, lines and simulation.
-        polarity: Outputs that are low when they are on: bit n is channel n.
-    """
+    """The box that the setting ``port`` names; ``polarity`` has the outputs that are low when they are on."""
     if not settings.is_simulated:
         return RealBox(settings.port, context.name or "lines")
     from labseq_ttl_sim import SimulatedAccess

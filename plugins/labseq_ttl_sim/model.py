@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from labseq_ttl.protocol import (
@@ -118,13 +119,13 @@ class ModelBox:
 
     def __init__(self) -> None:
         self.on = 0
-        self._commands: dict[str, tuple[Callable[..., str], tuple[int, ...] | None]] = {
+        self._commands: dict[str, tuple[Callable[..., str | None], tuple[int, ...] | None]] = {
             "id": (self._identify, None),
             "state": (self._state, None),
-            "polarity": (self._set_polarity, (OUTPUTS,)),
-            "serial": (self._set_serial, (0xFFFF,)),
-            "set": (self._set_lines, (OUTPUTS,)),
-            "timeout": (self._set_limit, (0xFFFF,)),
+            "polarity": (partial(setattr, self, "_polarity"), (OUTPUTS,)),
+            "serial": (partial(setattr, self, "_serial"), (0xFFFF,)),
+            "set": (partial(setattr, self, "on"), (OUTPUTS,)),
+            "timeout": (partial(setattr, self, "_timeout_ms"), (0xFFFF,)),
             "put": (self._put, None),
             "get": (self._get, (SLOTS - 1, EDGES - 1)),
             "arm": (self._arm, (SLOTS - 1, EDGES)),
@@ -135,7 +136,7 @@ class ModelBox:
             "deaf": (self._end_leading, None),
             "answer": (self._answer_leader, (1,)),
             "leader": (self._report_to_leader, None),
-        }  # with the upper limits of their arguments; None: they are not looked at
+        }  # with the upper limits of their arguments; None: they are not looked at. The model has no clock
         self._out = bytearray()
         self._polarity = self._serial = 0
         self._boots = -1  # as an erased memory counts
@@ -253,7 +254,7 @@ class ModelBox:
             arguments: list[Any] = [] if limits is None else [*numbers(words, *limits)]
             if name == "put":  # as many edges as there are
                 arguments = [words]
-            answer = f"{said[0]} ok {method(*arguments)}".rstrip()
+            answer = f"{said[0]} ok {method(*arguments) or ''}".rstrip()
         except RefusedError as refusal:
             answer = f"{said[0]} no {refusal}"
         self._send(answer)
@@ -271,21 +272,6 @@ class ModelBox:
     def _state(self) -> str:
         doing = "idle" if self._armed is None else "armed"
         return f"{doing} {self._boots:04x} {self._runs:04x} {self.on:04x} {self._polarity:04x}"
-
-    def _set_polarity(self, mask: int) -> str:
-        self._polarity = mask
-        return ""
-
-    def _set_serial(self, number: int) -> str:
-        self._serial = number
-        return ""
-
-    def _set_lines(self, mask: int) -> str:
-        self.on = mask
-        return ""
-
-    def _set_limit(self, _ms: int) -> str:
-        return ""  # the model has no clock
 
     def _put(self, words: list[str]) -> str:
         slot, first = numbers(words[:2], SLOTS - 1, EDGES - 1)
@@ -319,7 +305,7 @@ class ModelBox:
         self._armed = slot
         return f"{self._boots:04x}"
 
-    def _fire(self) -> str:
+    def _fire(self) -> None:
         if self._armed is None:
             raise RefusedError("unarmed")
         edges, self._armed = self._slots[self._armed], None
@@ -329,24 +315,22 @@ class ModelBox:
             tick += ticks
             if until is not None and tick >= until:
                 self._edges.append((until, 0))
-                return ""
+                return
             self._edges.append((tick, mask))
             self.on = mask
         self._runs = (self._runs + 1) & 0xFFFF
-        return ""
 
-    def _await(self) -> str:
+    def _await(self) -> None:
         if self._leader.state != DEAF:
             raise RefusedError("led")
-        return self._fire()
+        self._fire()
 
     def _begin_leading(self, busy: int, ready: int, failed: int, _deadline_ms: int) -> str:
         self._leader.begin(busy, ready, failed)
         return f"{self._leader.level:02x}"
 
-    def _end_leading(self) -> str:
+    def _end_leading(self) -> None:
         self._leader.end()
-        return ""
 
     def _answer_leader(self, is_ready: int) -> str:
         if self._leader.state == DEAF:
@@ -357,6 +341,5 @@ class ModelBox:
         leader = self._leader
         return f"{leader.state:02x} {leader.n_go_signals:04x} {leader.more_came:02x} {leader.level:02x}"
 
-    def _off(self) -> str:
+    def _off(self) -> None:
         self._armed, self.on = None, 0
-        return ""

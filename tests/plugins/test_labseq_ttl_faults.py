@@ -162,9 +162,8 @@ def test_an_end_whose_message_is_lost_is_asked_for(monkeypatch: pytest.MonkeyPat
 class Dies(ModelBox):
     """Plays nothing more, and does not say so."""
 
-    def _fire(self) -> str:
+    def _fire(self) -> None:
         self._armed = None
-        return ""
 
     def _boot(self, cause: int) -> None:
         if not hasattr(self, "_armed"):
