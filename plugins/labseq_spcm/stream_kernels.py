@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import call_c, carray, helper_kernel, kernel, pointer, sleep_ns
+from labseq_spcm.kernels import interleave
 from labseq_spcm.limits import FRAME_BYTES
 
 Words = NDArray[np.int64]
@@ -37,12 +38,14 @@ N_WORDS: Final = 27
 
 LENGTH, ROW_CHANNEL, READY_MADE, N_READY, AXES, N_AXIS, BEGAN = range(7)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples that
-were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop writes the
-place in the stream at which it begins."""
+were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop
+writes where in the stream it begins."""
 N_PROGRAM: Final = 7
 
-CHUNK: Final = 1 << 18
-"""Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
+CHUNK: Final = 1 << 15
+"""Samples rendered at a time, few enough to stay in the processor's cache until they are interleaved."""
+MOST_SAMPLES: Final = 1 << 17
+"""Samples handed over at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
 POLL_NS: Final = 1_000_000
 """Longest time between two looks at the ring while a program plays."""
 
@@ -71,45 +74,39 @@ def hand_over(box: Words, n_samples: int) -> int:
 def copy(source: int, out: int, n_samples: int) -> None:
     """Copy frames from one address to another."""
     frames, copied = carray(pointer(source), n_samples, np.uint32), carray(pointer(out), n_samples, np.uint32)
-    for i in range(n_samples):
+    for i in range(len(copied)):
         copied[i] = frames[i]
 
 
-@helper_kernel("void(int64[::1], int64[::1], int64, int64, int64)")
+@kernel("void(int64[::1], int64[::1], int64, int64, int64)")
 def render_frames(box: Words, program: Words, start: int, out: int, n_samples: int) -> None:
-    """Render samples of a program as the card stores them; after its end there is silence."""
+    """Render samples of a program as the card stores them; after its end there is silence.
+
+    Of ``box`` it needs RENDER and SCRATCH only, so that it can be called beside the loop.
+    """
     axis_bytes = 8 * program[N_AXIS]
-    for channel in range(2):
-        axis = program[AXES] + axis_bytes * (channel if program[ROW_CHANNEL] == 0 else 1 - channel)
-        carray(pointer(axis), 1, np.int64)[0] = n_samples
-        call_c(box[RENDER], axis, start, box[SCRATCH] + 2 * CHUNK * channel)
-    first = carray(pointer(box[SCRATCH]), n_samples, np.uint16)
-    second = carray(pointer(box[SCRATCH] + 2 * CHUNK), n_samples, np.uint16)
-    frames = carray(pointer(out), n_samples, np.uint32)
-    for i in range(n_samples):
-        frames[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
-
-
-@kernel("void(int64[::1], int64[::1], int64, int64)")
-def render_ready(box: Words, program: Words, out: int, n_samples: int) -> None:
-    """Render the first samples of a program, beside the loop: ``box`` needs RENDER and SCRATCH only."""
-    for start in range(0, n_samples, CHUNK):
-        n = min(CHUNK, n_samples - start)
-        render_frames(box, program, start, out + FRAME_BYTES * start, n)
+    for done in range(0, n_samples, CHUNK):
+        n = min(CHUNK, n_samples - done)
+        for channel in range(2):
+            axis = program[AXES] + axis_bytes * (channel if program[ROW_CHANNEL] == 0 else 1 - channel)
+            carray(pointer(axis), 1, np.int64)[0] = n
+            call_c(box[RENDER], axis, start + done, box[SCRATCH] + 2 * CHUNK * channel)
+        first = carray(pointer(box[SCRATCH]), n, np.uint16)
+        second = carray(pointer(box[SCRATCH] + 2 * CHUNK), n, np.uint16)
+        interleave(first, second, carray(pointer(out + FRAME_BYTES * done), n, np.uint32))
 
 
 @helper_kernel("int64(int64[::1], int64)")
 def supply_program(box: Words, room: int) -> int:
     """Copy or render the next part of a program into the ring; returns 0 or FAILED.
 
-    A part is as long as what is ahead of the outputs: each part costs 0.1 ms for the tables of its tones, and
-    a longer one takes less time than it plays.
+    A part is at most a quarter of what is ahead of the outputs, so that it is there long before its time.
     """
     place = box[QUEUE + (box[TAKEN] - 1) % N_QUEUE]
     program = carray(pointer(place), N_PROGRAM, np.int64)
     done, at = box[WRITTEN] - box[START], box[WRITTEN] % box[N_RING]
-    ahead = (box[N_RING] - room + box[ON_CARD]) // box[BLOCK] * box[BLOCK]
-    n = min(room, box[END] - box[WRITTEN], box[N_RING] - at, max(box[BLOCK], min(CHUNK, ahead)))
+    ahead = (box[N_RING] - room + box[ON_CARD]) // (4 * box[BLOCK]) * box[BLOCK]
+    n = min(room, box[END] - box[WRITTEN], box[N_RING] - at, max(box[BLOCK], min(MOST_SAMPLES, ahead)))
     out = box[RING] + FRAME_BYTES * at
     if done < program[N_READY]:
         n = min(n, program[N_READY] - done)
