@@ -43,6 +43,7 @@ from labseq.machine_code import (
     load,
     make_only_bitcode,
     packed,
+    prefer_wide_vectors,
     unpacked,
 )
 
@@ -212,6 +213,7 @@ class _Kernel:
 
         with global_compiler_lock:
             if self._dispatcher is None:
+                prefer_wide_vectors()
                 options = self._options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
                 self._dispatcher = _numba().njit(**options)(self.function)
                 self._dispatcher._cache = _Bitcode(self)  # noqa: SLF001 - numba has no other way
@@ -461,6 +463,7 @@ class _Worker:
 def serve() -> None:
     """Compile the kernels of each module that standard input names, one per line."""
     gc.disable()  # there are no cycles to speak of, and compiling takes a sixth less time
+    prefer_wide_vectors()
     make_only_bitcode()
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # a module may print

@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 """Raised when this module makes other machine code of the same kernel."""
 NDARRAY: Final = "labseq_ndarray"
 """Symbol of the class of arrays in machine code; numba would import all of itself to find it."""
@@ -185,6 +185,20 @@ def unpacked(values: tuple[Any, ...], context: Any) -> Any:
 
     rtsys.initialize(context)
     return cast("Any", CompileResult)._rebuild(context, *values)  # noqa: SLF001
+
+
+def prefer_wide_vectors() -> None:
+    """Let numba use vectors of 512 bits where the processor is fast with them, from Ice Lake on.
+
+    LLVM prefers 256 bits on all of Intel's processors. Rendering takes a quarter less time with 512
+    (Sapphire Rapids).
+    """
+    from llvmlite import binding
+    from numba.core import config
+
+    features, settings = binding.get_host_cpu_features(), cast("Any", config)
+    if features.get("avx512vbmi2") and settings.ENABLE_AVX and settings.CPU_FEATURES is None:
+        settings.CPU_FEATURES = f"{features.flatten()},-prefer-256-bit"
 
 
 def make_only_bitcode() -> None:

@@ -45,7 +45,7 @@ from labseq.errors import (
 from labseq.files import cache_root, state_root
 from labseq.geometry import block, check_size, from_the_centre, nearest_to_centre, pattern
 from labseq.hookspecs import LABSEQ_API, hookimpl
-from labseq.kernel import c_address, const, helper_kernel, kernel
+from labseq.kernel import c_address, const, helper_kernel, kernel, n_cores
 from labseq.messages import clean, closest, install_hint, missing_package, visible
 from labseq.model import (
     COMPUTER,
@@ -94,6 +94,7 @@ from labseq.motion import (
     Renderer,
     check_plan,
     choose_plan,
+    comb_sample_rate,
     fitting_batches,
     render,
     render_address,
@@ -286,6 +287,7 @@ __all__ = [
     "choose_plan",
     "clean",
     "closest",
+    "comb_sample_rate",
     "const",
     "empty_is",
     "expected",
@@ -302,6 +304,7 @@ __all__ = [
     "is_write_timeout",
     "kernel",
     "missing_package",
+    "n_cores",
     "nearest",
     "nearest_to_centre",
     "new_timer",

@@ -19,12 +19,16 @@ SWITCH_S: Final = 0.2e-3
 """How long a thread may keep Python to itself while another waits; Python's own default is 5 ms."""
 LOCK_FLAGS: Final = 1 | 2 | 4
 """MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT: what is used stays in memory, what is only reserved takes none."""
-LIMITS: Final = "'@GROUP - rtprio 20' and '@GROUP - memlock unlimited' in a file in /etc/security/limits.d"
+LIMITS: Final = "'@GROUP - rtprio 22' and '@GROUP - memlock unlimited' in a file in /etc/security/limits.d"
 
 
-def raise_priority() -> bool:
-    """Give this thread priority over all ordinary programs; returns whether the system allows it."""
-    return _set_scheduler("SCHED_FIFO", PRIORITY)
+def raise_priority(above: int = 0) -> bool:
+    """Give this thread priority over all ordinary programs; returns whether the system allows it.
+
+    Args:
+        above: How far above the thread of a shot's steps; it must not keep others from feeding a device.
+    """
+    return any(_set_scheduler("SCHED_FIFO", PRIORITY + more) for more in dict.fromkeys((above, 0)))
 
 
 def restore_priority() -> None:

@@ -94,6 +94,7 @@ class RearrangeStep(Step):
         self.windows_s = tuple(settings.window_of(cycle) for cycle in range(settings.cycles))
         self.judges_shot = settings.stop_when == "never"
         self._measured = deque[tuple[float, float]](maxlen=7)  # times to play and to prepare a program
+        self._preparing = 0.0, 0.0
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """Two entries per cycle, the moves at their window."""
@@ -159,17 +160,19 @@ class RearrangeStep(Step):
             if shot.clock.now() + duration_s <= end_s + OVERSHOOT_S:
                 break
             moves_s = float(report.batch_end_s[n_batches - 1]) - shot.motion.overhead_per_cycle_s
+            self._preparing = preparing_time(self._measured)
             n_batches = self._n_fitting(shot, plan, report, start_s, end_s - (duration_s - moves_s))
         if n_batches < plan.n_batches:
             values = {"n_batches": plan.n_batches, "n_batches_played": n_batches}
             shot.log("window_too_short", cycle=cycle, **values, before_moves_s=shot.clock.now() - start_s)
         if n_batches:
             play_prepared(shot, duration_s, cycle, rest_of(shot, plan, n_first, n_batches))
+        self._preparing = preparing_time(self._measured)  # now, because the next frame must not wait for it
         return n_batches
 
     def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
         """How many batches end in time if preparing takes as long as before, or as the profile says."""
-        fixed_s, part = preparing_time(self._measured)
+        fixed_s, part = self._preparing
         left_s = max(0.0, end_s - shot.clock.now() - fixed_s)
         window_s = shot.motion.overhead_per_cycle_s + left_s / (1 + part)
         if shot.clock.virtual or not self._measured:

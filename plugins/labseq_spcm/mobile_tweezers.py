@@ -22,9 +22,11 @@ from labseq.plugin import (
     DeviceTimeoutError,
     Emergency,
     LabseqError,
+    LimitError,
     MobileTweezers,
     ToneProgram,
     TransientError,
+    comb_sample_rate,
     format_quantity,
     trigger_line,
     warm_rendering,
@@ -152,6 +154,7 @@ class SpcmMobileTweezers(MobileTweezers):
         self._mode: PlayMode | None = None
         self._facts: dict[str, Any] = {}
         self._timings: dict[str, float] = {}
+        self._is_settled = False
         self._duration_s: float | None = None
         self._due_s: float | None = None
 
@@ -174,7 +177,9 @@ class SpcmMobileTweezers(MobileTweezers):
         return f"keep-warm tones off the atoms: {' and '.join(each)}{dark}"
 
     def warnings(self) -> list[str]:
-        """A curved course that the commands of the mode ``dds`` cannot follow closely enough."""
+        """A course that the mode ``dds`` cannot follow closely enough, a rate that is slow to render."""
+        if self._settings.mode == "stream":
+            return self._slow_rendering()
         motion = self._context.motion
         worst_m = 0.0 if self._cores is None else worst_distance_m(self._context.grid, motion)
         if worst_m <= limits.FOLLOWS_M:
@@ -185,6 +190,20 @@ class SpcmMobileTweezers(MobileTweezers):
         why = f"as the card takes {limits.DDS_COMMANDS_PER_S / 1e6:g} million commands per second"
         remedy = "allow fewer tones, lower the speed, or use the mode replay"
         return [f"{what} follow it within {worst} only, not {aim}, {why}; {remedy}"]
+
+    def _slow_rendering(self) -> list[str]:
+        """The sample rate of a stream, if another one is rendered several times faster."""
+        rate_hz = self._settings.sample_rate
+        try:
+            best_hz = comb_sample_rate(self._context.grid, rate_hz)
+        except LimitError:
+            best_hz = rate_hz
+        if best_hz == rate_hz:
+            return []
+        rate, best = (format_quantity(hz, "frequency") for hz in (rate_hz, best_hz))
+        what = f"profile.{self._name}.sample_rate is {rate}; its samples take three times as long to render"
+        why = f"as those at {best}, a whole number per tone spacing: too long for most computers"
+        return [f"{what} {why}; set sample_rate: {best}, or use another mode than stream"]
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
@@ -244,6 +263,7 @@ class SpcmMobileTweezers(MobileTweezers):
         if close_relays(card):
             self._clock.sleep(limits.RELAY_S)
         self._play_idle(card, mode)
+        self._is_settled = True
 
     def _play_idle(self, card: AwgCard, mode: PlayMode) -> None:
         """Have the keep-warm tones play, or the stream."""
@@ -305,7 +325,8 @@ class SpcmMobileTweezers(MobileTweezers):
         start_s = time.perf_counter()
         limits.check_program(self._name, program, self._rf)
         took_s = time.perf_counter() - start_s
-        self.settle()
+        if not self._is_settled:
+            self.settle()
         start_s = time.perf_counter()
         playing_s = mode.prepare(program, continues=continues)
         took_s += time.perf_counter() - start_s
@@ -405,6 +426,7 @@ class SpcmMobileTweezers(MobileTweezers):
             DeviceError: The card refused a step; all other steps were done.
         """
         self._duration_s = self._due_s = None
+        self._is_settled = False
         card, mode = self._card, self._mode
         if card is None:
             return
@@ -449,7 +471,7 @@ class SpcmMobileTweezers(MobileTweezers):
         """
         card, mode = self._opened()
         self._check_idle("self_test()")
-        self._duration_s = None
+        self._duration_s, self._is_settled = None, False
         mode.halt()
         card.stop()
         spcm = card.spcm

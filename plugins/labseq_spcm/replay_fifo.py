@@ -32,22 +32,15 @@ class InterleavedRenderer:
         program: The program.
         sample_rate_hz: The rate that the card's clock really makes.
         row_channel: The output of the row axis, 0 or 1.
-        chunk: Memory to use instead of new memory, int16 (2, CHUNK).
 
     Attributes:
         n_samples: Samples per channel, with silence up to the card's granularity.
     """
 
-    def __init__(
-        self,
-        program: ToneProgram,
-        sample_rate_hz: float,
-        row_channel: int,
-        chunk: NDArray[np.int16] | None = None,
-    ) -> None:
+    def __init__(self, program: ToneProgram, sample_rate_hz: float, row_channel: int) -> None:
         self._renderer = Renderer(program, sample_rate_hz)
         self._channels = (row_channel, 1 - row_channel)
-        self._chunk = np.empty((2, CHUNK), np.int16) if chunk is None else chunk
+        self._chunk = np.empty((2, CHUNK), np.int16)
         self.n_samples = max(1, math.ceil(self._renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
 
     def write(self, start: int, out: NDArray[np.int16]) -> None:

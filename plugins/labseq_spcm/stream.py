@@ -20,6 +20,7 @@ from labseq.plugin import (
     ToneProgram,
     TransientError,
     format_quantity,
+    n_cores,
     new_timer,
     raise_priority,
     render_address,
@@ -29,11 +30,10 @@ from labseq_spcm import stream_kernels as k
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples
 from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES, SAMPLE_STEP
-from labseq_spcm.replay_fifo import InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 
-FIRST: Final = 1 << 16
-"""Samples of a program that are rendered before it starts: 0.1 ms at 625 MS/s, behind 0.25 ms of silence."""
+FIRST: Final = 1 << 15
+"""Samples of a program that are rendered before it starts: 52 us at 625 MS/s, behind 0.24 ms of silence."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 LOCK_RETRY_S: Final = 10e-6
@@ -44,6 +44,8 @@ HALT_S: Final = 0.1
 """Longest time that the loop may take to end; it looks for that after each part that it renders."""
 PLAYING_POLL_S: Final = 1e-3
 """Longest time between two looks at the ring while a program plays."""
+MOST_LOAD: Final = 0.9
+"""Largest part of the playing time that rendering may take."""
 BUS_SAMPLES: Final = 1 << 22
 """Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
 
@@ -63,16 +65,19 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
     there = here.copy()
     there[:, along] += grid.shape[along] > 1
     moves = Plan.from_batches([(here, there), (there, here)] * 5)
-    renderer = InterleavedRenderer(tone_program(moves, grid, motion), sample_rate_hz, row_channel)
-    out = np.empty((renderer.n_samples, 2), np.int16)
+    workspaces: dict[tuple[int, int], Any] = {}
+    program = made_of(tone_program(moves, grid, motion), sample_rate_hz, row_channel, 1, workspaces)
+    n_samples = int(program.words[k.LENGTH])
+    box, scratch, out = np.zeros(k.N_WORDS, np.int64), new_scratch(), np.zeros((n_samples, 2), np.int16)
+    box[k.RENDER], box[k.SCRATCH] = render_address(), scratch.ctypes.data
     took_s = math.inf
     for _ in range(3):
         start_s = time.perf_counter()
-        renderer.write(0, out)
+        k.render_frames(box, program.words, 0, out.ctypes.data, n_samples)
         took_s = min(took_s, time.perf_counter() - start_s)
-        if took_s < len(out) / sample_rate_hz:
+        if took_s < MOST_LOAD * n_samples / sample_rate_hz:
             return
-    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, len(out) / took_s))
+    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, n_samples / took_s))
     text = f"mode: stream at {wanted}, but this computer renders {n_tones} moving tones at {made}"
     hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: replay"
     raise DeviceError(name, f"{text}; {hint}")
@@ -93,6 +98,34 @@ class Program:
     axes: NDArray[np.int64]
     renderer: Renderer
     playing_s: float
+
+
+def made_of(
+    program: ToneProgram,
+    sample_rate_hz: float,
+    row_channel: int,
+    block: int,
+    workspaces: dict[tuple[int, int], Any],
+) -> Program:
+    """Make a program for the loop, whole blocks of samples long; the workspaces must live as long."""
+    renderer = Renderer(program, sample_rate_hz)
+    axes, words = renderer.words(workspaces), np.zeros(k.N_PROGRAM, np.int64)
+    n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
+    words[k.LENGTH], words[k.ROW_CHANNEL] = -(-n_samples // block) * block, row_channel
+    words[k.AXES], words[k.N_AXIS] = axes.ctypes.data, axes.shape[1]
+    return Program(words, axes, renderer, n_samples / sample_rate_hz)
+
+
+def _assist(box: NDArray[np.int64]) -> None:
+    """The thread that renders one of the two axes; from now on it is reckoned with."""
+    raise_priority(above=1)
+    box[k.HAS_HELPER] = 1
+    k.assist(box, new_timer())
+
+
+def new_scratch() -> NDArray[np.int16]:
+    """Room for the samples of both axes before they are interleaved."""
+    return np.zeros((2, k.CHUNK), np.int16)
 
 
 class Stream:
@@ -137,7 +170,7 @@ class Stream:
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
         self._first = np.zeros((max(FIRST, block), 2), np.int16)
-        self._scratch = np.zeros((2, k.CHUNK), np.int16)
+        self._scratch = new_scratch()
         self._workspaces: dict[tuple[int, int], Any] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
@@ -197,6 +230,8 @@ class Stream:
         if self._has_thread:
             arguments = self._box, self._stop
             threading.Thread(target=self._run, args=arguments, name="spcm stream", daemon=True).start()
+            if n_cores() > 1:
+                threading.Thread(target=_assist, args=[self._box], name="spcm helper", daemon=True).start()
 
     def halt(self) -> None:
         """End the supply and drop the programs; the card is stopped by the caller."""
@@ -214,7 +249,7 @@ class Stream:
         start_s = time.perf_counter()
         made = self._made(program)
         n_ready = min(len(self._first), int(made.words[k.LENGTH]))
-        k.render_ready(self._box, made.words, self._first.ctypes.data, n_ready)
+        k.render_frames(self._box, made.words, 0, self._first.ctypes.data, n_ready)
         made.words[k.READY_MADE], made.words[k.N_READY] = self._first.ctypes.data, n_ready
         self._prepared = made
         self.render_s = time.perf_counter() - start_s
@@ -222,12 +257,7 @@ class Stream:
         return made.playing_s
 
     def _made(self, program: ToneProgram) -> Program:
-        renderer = Renderer(program, self._rate_hz)
-        axes, words = renderer.words(self._workspaces), np.zeros(k.N_PROGRAM, np.int64)
-        n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
-        words[k.LENGTH], words[k.ROW_CHANNEL] = self._whole_blocks(n_samples), self._row_channel
-        words[k.AXES], words[k.N_AXIS] = axes.ctypes.data, axes.shape[1]
-        return Program(words, axes, renderer, n_samples / self._rate_hz)
+        return made_of(program, self._rate_hz, self._row_channel, self._block, self._workspaces)
 
     def start(self, command: int) -> None:  # noqa: ARG002 - the card runs already
         """Have the prepared program follow what was handed over."""
@@ -273,7 +303,7 @@ class Stream:
 
     def _run(self, box: NDArray[np.int64], stop: threading.Event) -> None:
         """The thread."""
-        raise_priority()  # so that the card does not run dry because other programs are busy
+        raise_priority(above=2)  # so that the card does not run dry because other threads are busy
         timer, rate_hz, code = new_timer(), int(self._rate_hz), 0
         while (pause_s := self._step(box, code)) is not None:
             if pause_s:

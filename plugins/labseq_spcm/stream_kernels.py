@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import call_c, carray, helper_kernel, kernel, pointer, sleep_ns
+from labseq.plugin import call_c, carray, helper_kernel, kernel, now_ns, pointer, sleep_ns, swap
+from labseq_spcm.kernels import interleave
 from labseq_spcm.limits import FRAME_BYTES
 
 Words = NDArray[np.int64]
@@ -33,18 +34,27 @@ N_QUEUE: Final = 4
 (TAKEN, WRITTEN, FETCHED, START, END, SILENT_FROM, ERROR, IS_FEEDING) = range(19, 27)
 """Written by the loop: programs begun, samples handed over and fetched, where the last program starts and
 ends, from where on the ring holds silence again, error code of the library, and whether the loop runs."""
-N_WORDS: Final = 27
+(HAS_HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(27, 33)
+"""Whether :func:`assist` runs in another thread; a part of the column axis that waits to be rendered and one
+that was, and which: the arguments of RENDER."""
+N_WORDS: Final = 33
 
 LENGTH, ROW_CHANNEL, READY_MADE, N_READY, AXES, N_AXIS, BEGAN = range(7)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples that
-were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop writes the
-place in the stream at which it begins."""
+were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop
+writes where in the stream it begins."""
 N_PROGRAM: Final = 7
 
-CHUNK: Final = 1 << 18
-"""Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
+CHUNK: Final = 1 << 15
+"""Samples rendered at a time, few enough to stay in the processor's cache until they are interleaved."""
+MOST_SAMPLES: Final = 1 << 17
+"""Samples handed over at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
 POLL_NS: Final = 1_000_000
 """Longest time between two looks at the ring while a program plays."""
+SPIN_NS: Final = 50_000
+"""How long the helping thread waits for the next part without sleeping."""
+HELP_POLL_NS: Final = 100_000
+"""Time between two looks for a part after that."""
 
 STOPPED, DRY, FAILED = -1, -2, -3
 """The driver asked for the end; the card has stopped; the library reports an error."""
@@ -71,45 +81,59 @@ def hand_over(box: Words, n_samples: int) -> int:
 def copy(source: int, out: int, n_samples: int) -> None:
     """Copy frames from one address to another."""
     frames, copied = carray(pointer(source), n_samples, np.uint32), carray(pointer(out), n_samples, np.uint32)
-    for i in range(n_samples):
+    for i in range(len(copied)):
         copied[i] = frames[i]
 
 
-@helper_kernel("void(int64[::1], int64[::1], int64, int64, int64)")
+@kernel("void(int64[::1], int64[::1], int64, int64, int64)")
 def render_frames(box: Words, program: Words, start: int, out: int, n_samples: int) -> None:
-    """Render samples of a program as the card stores them; after its end there is silence."""
-    axis_bytes = 8 * program[N_AXIS]
-    for channel in range(2):
-        axis = program[AXES] + axis_bytes * (channel if program[ROW_CHANNEL] == 0 else 1 - channel)
-        carray(pointer(axis), 1, np.int64)[0] = n_samples
-        call_c(box[RENDER], axis, start, box[SCRATCH] + 2 * CHUNK * channel)
-    first = carray(pointer(box[SCRATCH]), n_samples, np.uint16)
-    second = carray(pointer(box[SCRATCH] + 2 * CHUNK), n_samples, np.uint16)
-    frames = carray(pointer(out), n_samples, np.uint32)
-    for i in range(n_samples):
-        frames[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
+    """Render samples of a program as the card stores them; after its end there is silence.
+
+    Of ``box`` it needs RENDER and SCRATCH only, so that it can be called while the loop hands silence over.
+    """
+    for done in range(0, n_samples, CHUNK):
+        n = min(CHUNK, n_samples - done)
+        rows, columns = program[AXES], program[AXES] + 8 * program[N_AXIS]
+        carray(pointer(rows), 1, np.int64)[0] = carray(pointer(columns), 1, np.int64)[0] = n
+        box[HELP_AXIS], box[HELP_START] = columns, start + done
+        box[HELP_OUT] = box[SCRATCH] + 2 * CHUNK * (1 - program[ROW_CHANNEL])
+        is_shared = box[HAS_HELPER]
+        swap(box[POSTED:].ctypes.data, is_shared)
+        call_c(box[RENDER], rows, start + done, box[SCRATCH] + 2 * CHUNK * program[ROW_CHANNEL])
+        if not is_shared or swap(box[POSTED:].ctypes.data, 0):  # the helper sleeps
+            call_c(box[RENDER], columns, start + done, box[HELP_OUT])
+        else:
+            while swap(box[DONE:].ctypes.data, 0) == 0:
+                pass
+        first = carray(pointer(box[SCRATCH]), n, np.uint16)
+        second = carray(pointer(box[SCRATCH] + 2 * CHUNK), n, np.uint16)
+        interleave(first, second, carray(pointer(out + FRAME_BYTES * done), n, np.uint32))
 
 
-@kernel("void(int64[::1], int64[::1], int64, int64)")
-def render_ready(box: Words, program: Words, out: int, n_samples: int) -> None:
-    """Render the first samples of a program, beside the loop: ``box`` needs RENDER and SCRATCH only."""
-    for start in range(0, n_samples, CHUNK):
-        n = min(CHUNK, n_samples - start)
-        render_frames(box, program, start, out + FRAME_BYTES * start, n)
+@kernel("void(int64[::1], int64[::1])")
+def assist(box: Words, timer: Words) -> None:
+    """Render the column axis of each part while :func:`feed` renders the row axis, until STOP is set."""
+    last_ns = now_ns(timer)
+    while box[STOP] == 0:
+        if box[POSTED] and swap(box[POSTED:].ctypes.data, 0):
+            call_c(box[RENDER], box[HELP_AXIS], box[HELP_START], box[HELP_OUT])
+            swap(box[DONE:].ctypes.data, 1)
+            last_ns = now_ns(timer)
+        elif now_ns(timer) - last_ns > SPIN_NS:
+            sleep_ns(timer, HELP_POLL_NS)
 
 
 @helper_kernel("int64(int64[::1], int64)")
 def supply_program(box: Words, room: int) -> int:
     """Copy or render the next part of a program into the ring; returns 0 or FAILED.
 
-    A part is as long as what is ahead of the outputs: each part costs 0.1 ms for the tables of its tones, and
-    a longer one takes less time than it plays.
+    A part is at most a quarter of what is ahead of the outputs, so that it is there long before its time.
     """
     place = box[QUEUE + (box[TAKEN] - 1) % N_QUEUE]
     program = carray(pointer(place), N_PROGRAM, np.int64)
     done, at = box[WRITTEN] - box[START], box[WRITTEN] % box[N_RING]
-    ahead = (box[N_RING] - room + box[ON_CARD]) // box[BLOCK] * box[BLOCK]
-    n = min(room, box[END] - box[WRITTEN], box[N_RING] - at, max(box[BLOCK], min(CHUNK, ahead)))
+    ahead = (box[N_RING] - room + box[ON_CARD]) // (4 * box[BLOCK]) * box[BLOCK]
+    n = min(room, box[END] - box[WRITTEN], box[N_RING] - at, max(box[BLOCK], min(MOST_SAMPLES, ahead)))
     out = box[RING] + FRAME_BYTES * at
     if done < program[N_READY]:
         n = min(n, program[N_READY] - done)
@@ -161,6 +185,10 @@ def supply(box: Words, rate_hz: int) -> int:
     if in_ring < 0:
         return in_ring
     if box[WRITTEN] >= box[END] and box[TAKEN] < box[QUEUED]:
+        if in_ring < box[AHEAD] // 2 and box[WRITTEN] >= box[END] + box[ON_CARD]:  # it came late in silence
+            if supply_silence(box, box[AHEAD] - in_ring):
+                return FAILED
+            in_ring = max(in_ring, box[AHEAD])
         program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), N_PROGRAM, np.int64)
         program[BEGAN] = box[WRITTEN]
         box[START], box[END] = box[WRITTEN], box[WRITTEN] + program[LENGTH]

@@ -91,9 +91,7 @@ class Rearrangement:
         fill[2:17, 2:17] = True
         self.target = TargetPattern(fill, np.zeros_like(fill))
         self.dop = dop
-        self.planner = PscaPlanner(
-            PscaSettings(degree_of_parallelism=dop), Context(grid=GRID, motion=MOTION)
-        )
+        self.planner = PscaPlanner(PscaSettings(degree_of_parallelism=dop), Context(grid=GRID, motion=MOTION))
         self.detector = ThresholdDetector(ThresholdSettings(), Context("detector", GRID))
         self.tweezers = tweezers
         self.card = card

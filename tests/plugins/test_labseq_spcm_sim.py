@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_spcm_sim import M4I6631, SampleSpan, SimulatedCard, install, registers as r
+from labseq_spcm_sim.fifo_kernels import N_WORDS
 from labseq_spcm_sim.library import CardOutputs
 from labseq_spcm_sim.modes import Buffer, Fifo
 from numpy.typing import NDArray
@@ -430,7 +431,7 @@ def test_looking_more_often_changes_nothing(pauses_s: list[float], n_frames: int
     address = np.frombuffer(ring, np.int16).ctypes.data
 
     def stream() -> Fifo:
-        fifo = Fifo(Buffer(address, 8192, 0), 4, 625e6, room_bytes, BUS)
+        fifo = Fifo(np.zeros(N_WORDS, np.int64), Buffer(address, 8192, 0), 4, 625e6, room_bytes, BUS)
         fifo.hand_over(n_frames * 128)
         fifo.switch_dma(on=True, now_s=0.0)
         fifo.trigger(1e-6)
