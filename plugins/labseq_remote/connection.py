@@ -265,7 +265,8 @@ class Connection:
                 except zmq.Again:  # after POLL_S
                     frames = []
                 if frames:
-                    reply = _read([frame.buffer for frame in frames])
+                    if not (reply := _read([frame.buffer for frame in frames])):
+                        self._lose(f"the reply to {name}() cannot be read")
                     if reply.get("n") in (self._number, 0):
                         return reply
                     continue

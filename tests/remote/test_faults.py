@@ -349,6 +349,8 @@ def test_shapes_are_checked_before_arrays_are_made() -> None:
         return [packb(msgpack.ExtType(1, packb([index, dtype, shape, {}]))), bytes(16)]
 
     assert np.array_equal(wire.unpack(message(1, "<f8", [2])), np.zeros(2))
+    (empty,) = wire.unpack(wire.pack([np.zeros((0, 3))]))
+    assert empty.shape == (0, 3)
     for wrong in (
         (1, "<f8", [3]),
         (1, "<f8", [-2]),
