@@ -141,6 +141,8 @@ class Session:
         peer: The client's public key; "" without keys.
         who: What the client calls itself, for other users.
         run: See :class:`Run`.
+        connection: Number of the connection that its signs of life come from, in this process.
+        is_suspect: Whether a connection of this number has ended since the last one.
         token: Names the session in each message.
         beat_s: When it last gave a sign of life.
         ended: Why it is over; "" while it is not.
@@ -156,6 +158,8 @@ class Session:
     peer: str
     who: str
     run: Run
+    connection: int
+    is_suspect: bool = False
     token: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     beat_s: float = field(default_factory=time.monotonic)
     ended: str = ""

@@ -30,6 +30,7 @@ from labseq.session.locks import lock_devices
 from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.safe import construct_hardware
 from labseq.wire import (
+    BEAT_S,
     LOST_S,
     PATIENT_S,
     PROTOCOL,
@@ -48,6 +49,8 @@ from labseq.wire import (
 
 LOOK_AT_KEYS_S: Final = 0.2
 """How often the server looks which keys are known."""
+CLOSED_S: Final = 2 * BEAT_S
+"""How long after the end of its connection a client may still give a sign of life."""
 MAX_SESSIONS: Final = 64
 """Connections at a time; of a client that makes more, something is wrong."""
 END_S: Final = 10.0
@@ -262,6 +265,7 @@ class Server:
         import zmq
 
         self._control.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
+        events = self._control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         looked_s = keys_s = time.monotonic()
         try:
             while not self._ended.is_set():
@@ -275,12 +279,26 @@ class Server:
                 if (now_s := time.monotonic()) - keys_s > LOOK_AT_KEYS_S and self._keys is not None:
                     self._known, keys_s = known_keys(keys_root()), now_s
                 if now_s - looked_s > LOOK_S:
+                    self._suspect(_ended_connections(events), now_s)
                     self._look(now_s, now_s - looked_s)
                     looked_s = time.monotonic()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
             self._failure = error
         finally:
+            self._control.disable_monitor()
+            events.close()
             self._control.close()
+
+    def _suspect(self, connections: set[int], now_s: float) -> None:
+        """Wait for further signs of life for a shorter time after a connection has ended.
+
+        Its number may already be that of a new one, which gives such signs.
+        """
+        for device in self.devices.values():
+            for session in list(device.sessions.values()):
+                if session.connection in connections:
+                    session.beat_s = min(session.beat_s, now_s + CLOSED_S - _patience(device))
+                    session.is_suspect = True
 
     def _look(self, now_s: float, passed_s: float) -> None:
         """End the sessions of clients that are gone, or no longer known."""
@@ -290,15 +308,18 @@ class Server:
                 live.add(id(session.run))
                 if passed_s > LOST_S / 2:  # this computer stood still, not the client
                     session.beat_s += passed_s
-                lost_s = PATIENT_S if device.kind == "simulation" else LOST_S
+                lost_s = _patience(device)
                 if now_s - session.beat_s > lost_s:
-                    device.end_session(session, f"no sign of life for {lost_s:g} s")
+                    silent = f"no sign of life for {lost_s:g} s"
+                    device.end_session(session, "its process has ended" if session.is_suspect else silent)
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
                 device.rescue_if_stuck(session)
         self._runs = {key: run for key, run in self._runs.items() if id(run) in live}
 
     def _answer(self, frames: list[Any]) -> list[Any]:
+        import zmq
+
         peer = str(frames[-1].get("User-Id")) if self._keys is not None else ""
         number = 0
         try:
@@ -308,7 +329,10 @@ class Server:
                 raise MessageError("it has no number")
             if not self.is_known(peer):
                 raise DeviceError("server", "the key was withdrawn")
-            act = {"hello": self._hello, "beat": self._beat, "bye": self._bye, "abort": self._abort}
+            if what == "hello":
+                connection = int(frames[-1].get(zmq.SRCFD))
+                return pack({"n": number, "value": self._hello(message, peer, connection)})
+            act = {"beat": self._beat, "bye": self._bye, "abort": self._abort}
             if what == "status":
                 return pack({"n": number, "value": self._status()})
             if what not in act:
@@ -320,7 +344,7 @@ class Server:
             failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
             return pack({"n": number if type(number) is int else 0, "error": report_error(failure)})
 
-    def _hello(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
+    def _hello(self, message: Mapping[str, Any], peer: str, connection: int) -> dict[str, Any]:
         about = {"protocol": PROTOCOL, "labseq": labseq.__version__, "host": platform.node()}
         if message["protocol"] != PROTOCOL:
             theirs = (
@@ -342,7 +366,7 @@ class Server:
             raise MessageError("it names no run")
         name = self._known.get(peer.encode(), "this computer")
         run = self._runs.setdefault(message["run"], Run(message["run"]))
-        session = Session(peer, f"{name} ({clean(str(message['who']))})", run)
+        session = Session(peer, f"{name} ({clean(str(message['who']))})", run, connection)
         device.sessions[session.token] = session
         return {**about, "session": session.token, "port": self._ports[device.name]}
 
@@ -361,7 +385,7 @@ class Server:
 
     def _beat(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
         device, session = self._of(message, peer)
-        session.beat_s = time.monotonic()
+        session.beat_s, session.is_suspect = time.monotonic(), False
         running = session.is_running or device.is_busy
         return {"number": session.number, "running": running, "rescue": session.rescue}
 
@@ -383,6 +407,21 @@ class Server:
             who = "" if owner is None else owner.who
             rows.append({"device": device.name, "owner": who, "call": call, "for_s": since_s})
         return rows
+
+
+def _patience(device: ServedDevice) -> float:
+    """How long a client may give no sign of life, in seconds."""
+    return PATIENT_S if device.kind == "simulation" else LOST_S
+
+
+def _ended_connections(events: Any) -> set[int]:
+    """The numbers of connections that have ended, from the events of a socket."""
+    from zmq.utils.monitor import recv_monitor_message
+
+    ended: set[int] = set()
+    while events.poll(0):
+        ended.add(int(recv_monitor_message(events)["value"]))
+    return ended
 
 
 class _Credentials:

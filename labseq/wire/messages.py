@@ -125,7 +125,7 @@ def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> lis
         array = np.ascontiguousarray(array, dtype).reshape(array.shape)
     if array.nbytes <= SMALL:
         place: Any = [len(small)]
-        small.extend(array.tobytes() + bytes(-array.nbytes % ALIGNMENT))
+        small.extend(array.tobytes() + bytes(ALIGNMENT - array.nbytes % ALIGNMENT))  # never nothing
     else:
         arrays.append(array.reshape(-1).view(np.uint8).data)
         place = len(arrays) + 1

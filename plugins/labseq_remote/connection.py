@@ -9,7 +9,7 @@ import threading
 import time
 import weakref
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any, Final
 
@@ -28,8 +28,22 @@ BYE_S: Final = 0.1
 SAFE_S: Final = 4.0
 """How long making a device safe beside a call that hangs may take."""
 
-_runs: weakref.WeakKeyDictionary[Clock, bytes] = weakref.WeakKeyDictionary()
-"""The session's clock -> what names the run at the servers: its devices there share one simulation."""
+
+@dataclass(eq=False)
+class Run:
+    """What the connections of a run have in common.
+
+    Attributes:
+        key: Names the run at the servers, where its devices share one simulation.
+        lost: Connections that are lost and not closed yet; calls over the others are aborted.
+    """
+
+    key: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    lost: set[Connection] = field(default_factory=set["Connection"])
+
+
+_runs: weakref.WeakKeyDictionary[Clock, Run] = weakref.WeakKeyDictionary()
+"""The session's clock -> its run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +57,6 @@ class Joins:
 
     run: bytes
     seen_by: str = ""
-
-
-class _NoAnswer(DeviceError):  # noqa: N818 - it may be explained
-    """The control of the server did not answer."""
 
 
 class Connection:
@@ -72,6 +82,7 @@ class Connection:
         self._clock = context.clock
         self._random = context.random
         self._joins = joins
+        self._run = run_of(context.clock)
         self._calling = threading.Lock()
         self._controlling = threading.Lock()
         self._number = self._question = 0
@@ -84,12 +95,14 @@ class Connection:
         self.state: dict[str, Any] = {}
         keys, server = _keys(settings)
         self._control = wire.client_socket(keys, server)
+        self._monitor = Monitor(self._control)
         try:
             self.about = self._hello(settings, kind)
             self._token = self.about["session"]
             self._calls = wire.client_socket(keys, server, timeout_s=POLL_S)
             self._calls.connect(wire.endpoint(settings.host, int(self.about["port"])))
         except BaseException:
+            self._monitor.close()
             self._control.close()
             raise
         threading.Thread(target=self._beats, name=f"labseq beats {self._name}", daemon=True).start()
@@ -113,7 +126,7 @@ class Connection:
         """
         with self._calling:
             if self._lost or self._ended.is_set():
-                raise self._failure(self._lost or "the connection is closed")
+                raise self.failure(self._lost or "the connection is closed")
             self._number += 1
             message = {
                 "session": self._token,
@@ -154,8 +167,8 @@ class Connection:
             if rescue == "safe":
                 return
             if rescue not in ("", "under way"):
-                raise self._failure(f"a call hangs, and safe_state() beside it failed: {rescue}")
-        raise self._failure(self._lost or "a call hangs, and the device could not be made safe")
+                raise self.failure(f"a call hangs, and safe_state() beside it failed: {rescue}")
+        raise self.failure(self._lost or "a call hangs, and the device could not be made safe")
 
     def close(self) -> None:
         """End the connection; the server makes the device safe if that was not done."""
@@ -163,8 +176,7 @@ class Connection:
             with suppress(LabseqError):
                 self.ask("bye", BYE_S if self._lost else self._lost_s)
             self._ended.set()
-            with self._controlling:
-                self._control.close()
+            self._run.lost.discard(self)
             if self._calling.acquire(timeout=2 * POLL_S):
                 self._calls.close()
                 self._calling.release()
@@ -174,16 +186,8 @@ class Connection:
         self._is_abandoned = True
         self._ended.set()
 
-    def ask(
-        self, what: str, timeout_s: float | None = None, monitor: Monitor | None = None, **about: Any
-    ) -> Any:
+    def ask(self, what: str, timeout_s: float | None = None, **about: Any) -> Any:
         """Ask the control of the server; also while a call is out.
-
-        Args:
-            what: The question.
-            timeout_s: How long the answer may take; by default as long as a heartbeat.
-            monitor: Ends the waiting if the connection cannot be made.
-            **about: What belongs to it.
 
         Raises:
             DeviceError: It refuses, or does not answer in time.
@@ -192,7 +196,7 @@ class Connection:
 
         with self._controlling:
             if self._ended.is_set():
-                raise self._failure("the connection is closed")
+                raise self.failure("the connection is closed")
             self._question += 1
             about |= {"n": self._question, "op": what}
             if "session" not in about and what != "hello":
@@ -200,7 +204,8 @@ class Connection:
             timeout_s = self._lost_s if timeout_s is None else timeout_s
             try:
                 self._control.send_multipart(wire.pack(about))
-                while self._has_answer(time.monotonic() + timeout_s, monitor):
+                deadline_s = time.monotonic() + timeout_s
+                while self._monitor.wait(deadline_s - time.monotonic()):
                     answer = _read(self._control.recv_multipart())
                     if answer.get("n") in (self._question, 0):
                         if "error" in answer:
@@ -209,33 +214,18 @@ class Connection:
             except zmq.Again:
                 pass  # it cannot be sent: the connection was refused or has ended
             except zmq.ZMQError as error:
-                raise self._failure(f"{error.strerror}") from error
-        raise _NoAnswer(self._name, f"the server did not answer within {timeout_s:.3g} s (at {self.address})")
-
-    def _has_answer(self, deadline_s: float, monitor: Monitor | None) -> bool:
-        """Wait for an answer of the control; one that is there counts, even if this computer stood still."""
-        if monitor is None:
-            return bool(self._control.poll(int(1e3 * max(0.0, deadline_s - time.monotonic()))))
-        while not self._control.poll(0):
-            if time.monotonic() > deadline_s or monitor.has_failed(POLL_S):
-                return False
-        return True
+                raise self.failure(f"{error.strerror}") from error
+            raise self.failure(self._monitor.reason or f"the server did not answer within {timeout_s:.3g} s")
 
     def _hello(self, settings: RemoteSettings, kind: str) -> dict[str, Any]:
         """Begin the session; if that fails, the events of the socket say why."""
-        monitor = Monitor(self._control)
         self._control.connect(wire.endpoint(settings.host, settings.port))
-        run = run_of(self._clock) if self._joins is None else self._joins.run
+        run = self._run.key if self._joins is None else self._joins.run
         me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": run}
         who = f"{platform.node()}, process {os.getpid()}"
-        try:
-            about = self.ask("hello", CONNECT_S, monitor, device=settings.device, kind=kind, who=who, **me)
-        except _NoAnswer as error:
-            raise self._failure(monitor.reason) if monitor.reason else error from None
-        finally:
-            monitor.close()
+        about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
-            raise self._failure("it is no server of this version of labseq")
+            raise self.failure("it is no server of this version of labseq")
         return about
 
     def _about(self, context: Context) -> dict[str, Any]:
@@ -265,23 +255,32 @@ class Connection:
                 except zmq.Again:  # after POLL_S
                     frames = []
                 if frames:
-                    reply = _read([frame.buffer for frame in frames])
+                    if not (reply := _read([frame.buffer for frame in frames])):
+                        self._lose(f"the reply to {name}() cannot be read")
                     if reply.get("n") in (self._number, 0):
                         return reply
                     continue
                 if self._is_missing(sent_s):
                     self._lose(f"{name}() got no reply although the server has none under way")
-                if stoppable and stopped_s is None:
-                    try:
-                        self._clock.check()
-                    except StopRequested:
-                        stopped_s = time.monotonic()
+                why = self._reason_to_stop() if stoppable else None
+                if why is not None and stopped_s is None:
+                    stopped_s = time.monotonic()
+                    with suppress(DeviceError):  # else the connection is lost, too
                         self.ask("abort", number=self._number)
-                if stopped_s is not None and time.monotonic() > stopped_s + GRACE_S:
-                    self._clock.check()
+                elif why is not None and stopped_s is not None and time.monotonic() > stopped_s + GRACE_S:
+                    raise why
         except zmq.ZMQError as error:
             self._lose(str(error.strerror))
-        raise self._failure(self._lost or "the connection is closed")
+        raise self.failure(self._lost or "the connection is closed")
+
+    def _reason_to_stop(self) -> LabseqError | None:
+        """Why a call is aborted: a request to stop, or another connection of the run that is lost."""
+        try:
+            self._clock.check()
+        except StopRequested as error:
+            return error
+        others = [one for one in tuple(self._run.lost) if one is not self]
+        return others[0].failure() if others else None
 
     def _is_missing(self, sent_s: float) -> bool:
         """Whether the server has not got the call, or its reply was lost on the way."""
@@ -295,8 +294,7 @@ class Connection:
         if "error" in reply:
             error = wire.error_of(reply["error"], self._name, self.address)
             if isinstance(error, StopRequested):
-                self._clock.check()
-                raise DeviceError(self._name, f"the call was aborted (at {self.address})")
+                raise self._reason_to_stop() or self.failure("the call was aborted")
             raise error
         self.state |= reply.get("state", {})
         value = reply["value"]
@@ -318,15 +316,20 @@ class Connection:
                 text = str(error).removeprefix(f"{self._name}: ").removesuffix(f" (at {self.address})")
                 self._lose(text)
                 self._ended.wait()
-        if self._is_abandoned:
+        with self._controlling:
+            self._monitor.close()
             self._control.close()
+        if self._is_abandoned:
             self._calls.close()
 
     def _lose(self, why: str) -> None:
         if not self._ended.is_set():
             self._lost = self._lost or f"the connection is lost: {why}; the server makes the device safe"
+            self._run.lost.add(self)
 
-    def _failure(self, text: str) -> DeviceError:
+    def failure(self, text: str = "") -> DeviceError:
+        """An error of this device, by default that its connection is lost."""
+        text = text or self._lost
         return DeviceError(self._name, f"{text} (at {self.address})")
 
 
@@ -339,9 +342,9 @@ def _read(parts: Any) -> dict[str, Any]:
     return message if isinstance(message, dict) else {}
 
 
-def run_of(clock: Clock) -> bytes:
-    """What names the run of a session's clock at the servers."""
-    return _runs.setdefault(clock, secrets.token_bytes(16))
+def run_of(clock: Clock) -> Run:
+    """The run of a session's clock."""
+    return _runs.setdefault(clock, Run())
 
 
 def _keys(settings: RemoteSettings) -> tuple[Any, bytes | None]:

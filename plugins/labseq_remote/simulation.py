@@ -91,7 +91,7 @@ class RemoteSimulation(Simulation):
     def seen_by(self, camera: str) -> RemoteSimulation:
         """What a camera receives that is not the camera of the atoms."""
         view = RemoteSimulation(self._settings, self._context)
-        run = run_of(self._context.clock) if self._link.joins is None else self._link.joins.run
+        run = run_of(self._context.clock).key if self._link.joins is None else self._link.joins.run
         view._first = self.connect
         view._link = Link(self._settings, self._context, "simulation", self.connect)
         view._link.joins = Joins(run, camera)
@@ -138,7 +138,7 @@ class RemoteSimulation(Simulation):
         asked = self._asked.get((what, role))
         if asked is not None:
             asked.connection.close()
-        joins = self._link.joins or Joins(run_of(self._context.clock))
+        joins = self._link.joins or Joins(run_of(self._context.clock).key)
         connection = self._link.another(joins)
         connection.call(what, role)
         self._asked[what, role] = _Asked(connection, function, self._catch_up)

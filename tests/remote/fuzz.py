@@ -7,59 +7,124 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import zmq
 
 from labseq import wire
+from labseq.plugin import MotionSpec, SiteGrid
+from labseq.remote.served import METHODS
+from labseq.remote.server import Server
+from labseq.remote.simulation import METHODS as SIMULATION
+
+LAST = 1 << 40
+"""Number of the message that is sent last; its reply shows that all before were read."""
 
 
-def fuzz(port: int, n_ports: int, n_messages: int, seed: int) -> int:
-    """Send damaged messages, and return the number of replies.
+def fuzz(server: Server, port: int, n_messages: int, seed: int) -> int:
+    """Send damaged and wrong messages, with and without a session, and return the number of replies.
 
     Args:
-        port: The first port of a server without keys.
-        n_ports: Number of its ports.
+        server: A server without keys.
+        port: Its first port.
         n_messages: Number of messages, to all ports in turn.
         seed: Of the damage.
     """
     random_ = random.Random(seed)
-    call = {
-        "session": bytes(16),
-        "n": 1,
-        "call": "read",
-        "args": ["x"],
-        "named": {},
-        "now": 0.0,
-        "shot": (0, 0),
-    }
-    hello = {"n": 1, "op": "hello", "protocol": 1, "labseq": "x", "run": bytes(16), "device": "camera"}
-    valid = [[bytes(part) for part in wire.pack(one)] for one in (call, hello, {"n": 2, "op": "status"})]
-    context = zmq.Context()
-    sockets = [context.socket(zmq.DEALER) for _ in range(n_ports)]
     n_replies = 0
-    for number, socket in enumerate(sockets):
-        socket.connect(f"tcp://127.0.0.1:{port + number}")
-    for number in range(n_messages):
-        socket = sockets[number % n_ports]
-        parts = [bytearray(part) for part in random_.choice(valid)]
-        for _ in range(random_.randrange(1, 6)):
-            part = random_.choice(parts)
-            if part:
-                part[random_.randrange(len(part))] = random_.randrange(256)
-        if random_.random() < 0.2:
-            parts.insert(random_.randrange(2), bytearray(random_.randbytes(random_.randrange(200))))
-        socket.send_multipart(parts)
-        while socket.poll(0):
-            socket.recv_multipart()
-            n_replies += 1
-    deadline_s = time.monotonic() + 1.0
-    while time.monotonic() < deadline_s:
-        for socket in sockets:
-            while socket.poll(5):
-                socket.recv_multipart()
+    with zmq.Context() as context:
+        sockets = [context.socket(zmq.DEALER) for _ in range(1 + len(server.devices))]
+        for number, socket in enumerate(sockets):
+            socket.linger = 0
+            socket.connect(f"tcp://127.0.0.1:{port + number}")
+        tokens = [b""] * len(sockets)
+        for number in range(n_messages):
+            which = number % len(sockets)
+            kind, n = "control", number
+            if which:
+                device = [*server.devices.values()][which - 1]
+                session = device.sessions.get(tokens[which])
+                if session is None or session.ended:
+                    tokens[which] = _begin(sockets[0], device.name, device.kind)
+                kind, n = device.kind, 1 if session is None else session.number + 1
+            token = tokens[which] if which else random_.choice(tokens)
+            parts = [bytearray(part) for part in wire.pack(_message(random_, kind, token, n))]
+            _damage(random_, parts)
+            sockets[which].send_multipart(parts)
+            n_replies += _received(sockets[which])
+        for which, socket in enumerate(sockets):
+            last: dict[str, Any] = {"n": LAST, "op": "status", "session": bytes(16)} | _call("read", [])
+            socket.send_multipart(wire.pack({**last, "n": LAST}))
+            deadline_s = time.monotonic() + 10.0
+            while not _is_last(socket):
                 n_replies += 1
-    context.destroy(linger=0)
+                assert time.monotonic() < deadline_s, f"the socket {which} does not answer"
+        for socket in sockets:
+            socket.close()
     return n_replies
+
+
+def _begin(control: Any, name: str, kind: str) -> bytes:
+    """Begin a session; returns its token."""
+    hello = {
+        "n": LAST,
+        "op": "hello",
+        "protocol": wire.PROTOCOL,
+        "labseq": "x",
+        "run": bytes(16),
+        "who": "fuzz",
+    }
+    control.send_multipart(wire.pack({**hello, "device": name, "kind": kind}))
+    while True:
+        assert control.poll(5000), "the control does not answer"
+        reply = wire.unpack(control.recv_multipart())
+        if reply["n"] == LAST:
+            return reply["value"]["session"]
+
+
+def _call(name: str, args: list[Any]) -> dict[str, Any]:
+    return {"call": name, "args": args, "named": {}, "now": 0.0, "shot": (0, 0)}
+
+
+def _message(random_: random.Random, kind: str, token: bytes, number: int) -> dict[str, Any]:
+    if kind == "control":
+        what = random_.choice(["hello", "beat", "abort", "status", "nonsense"])
+        about = {"protocol": 1, "labseq": "x", "run": bytes(16), "device": "camera", "kind": "camera"}
+        return {"n": number, "op": what, "session": token, "number": 1, **about}
+    attach = {"name": kind, "grid": SiteGrid(6, 7), "motion": MotionSpec(), "lines": [], "calibrations": {}}
+    attach |= {"seed": 1, "virtual": True, "joins": random_.choice([None, "", "other"])}
+    names = sorted(SIMULATION | {"next"} if kind == "simulation" else METHODS[kind])
+    name = random_.choice(["attach", "open", "close", *names])
+    values = [0, -1.5, "x", b"y", None, [1], {"a": 1}, "camera", "mobile_tweezers", SiteGrid(6, 7)]
+    args = [attach] if name == "attach" else random_.choices(values, k=random_.randrange(4))
+    session = token if random_.random() < 0.8 else bytes(16)
+    return {"session": session, "n": number if random_.random() < 0.95 else 3, **_call(name, args)}
+
+
+def _damage(random_: random.Random, parts: list[bytearray]) -> None:
+    if random_.random() < 0.5:
+        return  # what is wrong is in the values
+    for _ in range(random_.randrange(1, 6)):
+        part = random_.choice(parts)
+        if part:
+            part[random_.randrange(len(part))] = random_.randrange(256)
+    if random_.random() < 0.2:
+        parts.insert(random_.randrange(2), bytearray(random_.randbytes(random_.randrange(200))))
+
+
+def _received(socket: Any) -> int:
+    n = 0
+    while socket.poll(2):
+        socket.recv_multipart()
+        n += 1
+    return n
+
+
+def _is_last(socket: Any) -> bool:
+    if not socket.poll(100):
+        return False
+    reply = wire.unpack(socket.recv_multipart())
+    return isinstance(reply, dict) and reply.get("n") == LAST
 
 
 if __name__ == "__main__":
@@ -67,7 +132,7 @@ if __name__ == "__main__":
 
     n = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
     with served(Path(tempfile.mkdtemp())) as one:
-        n_ports = 1 + len(one.server.devices)
         for seed in range(n // 1000):
-            print(f"{1000 * (seed + 1)} messages, {fuzz(one.port, n_ports, 1000, seed)} replies")
+            n_replies = fuzz(one.server, one.port, 1000, seed)
+            print(f"{1000 * (seed + 1)} messages, {n_replies} replies", flush=True)
         print(*one.told, sep="\n")

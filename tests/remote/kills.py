@@ -134,11 +134,10 @@ def _times(victim: str) -> dict[str, float]:
 
 
 def _until_off(devices: Outputs, begun_s: float) -> dict[str, float]:
-    while time.monotonic() < begun_s + 20.0:
-        off_s = devices.off_since()
-        if None not in off_s.values():
-            break
+    off_s = devices.off_since()
+    while None in off_s.values() and time.monotonic() < begun_s + 20.0:
         time.sleep(0.05)
+        off_s = devices.off_since()
     return {name: since_s - begun_s for name, since_s in off_s.items() if since_s is not None}
 
 
