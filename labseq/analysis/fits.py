@@ -124,6 +124,19 @@ def _guess_step(x: Floats, y: Floats) -> dict[str, float]:
     return {"before": float(y[0]), "after": float(y[-1]), "centre": centre, "width": float(np.ptp(x)) / 8}
 
 
+def _plateau(x: Floats, amplitude: float, centre: float, half_width: float, edge: float) -> Floats:
+    from scipy.special import ndtr
+
+    return amplitude * ndtr((half_width - np.abs(x - centre)) / edge)
+
+
+def _guess_plateau(x: Floats, y: Floats) -> dict[str, float]:
+    high = x[y > y.max() / 2]
+    centre, half_width = float(np.ptp(high)) / 2 + float(high.min()), float(np.ptp(high)) / 2
+    half_width = max(half_width, float(np.ptp(x)) / (len(x) - 1))
+    return {"amplitude": float(y.max()), "centre": centre, "half_width": half_width, "edge": half_width / 4}
+
+
 def _rising(y: Floats, x: Floats) -> tuple[Floats, Floats]:
     order = np.argsort(y)
     return y[order], x[order]
@@ -250,6 +263,14 @@ MODELS: Final[Mapping[str, FitModel]] = {
         _guess_step,
         {},
         {"width": 1e-12},
+    ),
+    "plateau": FitModel(
+        "amplitude within half_width of centre, falling to 0 as the integral of a Gaussian of s.d. edge",
+        {"amplitude": "y", "centre": "x", "half_width": "x", "edge": "x"},
+        _plateau,
+        _guess_plateau,
+        {},
+        {"half_width": 0.0, "edge": 1e-12},
     ),
     "lowering": FitModel(
         "atoms that stay when the depth is slowly reduced to a fraction x",

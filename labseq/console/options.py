@@ -221,7 +221,7 @@ FitModel = Annotated[
         "--fit",
         metavar="MODEL",
         help="Fit the quantity against the scanned value: exponential, gaussian, lorentzian, linear, "
-        "saturation, step, lowering or release_recapture.",
+        "saturation, step, plateau, lowering or release_recapture.",
     ),
 ]
 FitSettings = Annotated[

@@ -165,6 +165,7 @@ TRUTH = {
     "linear": {"slope": -3.0, "intercept": 0.7},
     "saturation": {"level": 0.8, "time": 0.03},
     "step": {"before": 0.95, "after": 0.1, "centre": 0.04, "width": 0.01},
+    "plateau": {"amplitude": 0.9, "centre": 0.04, "half_width": 0.02, "edge": 0.005},
     "lowering": {"temperature": 15e-6, "amplitude": 0.98},
     "release_recapture": {"temperature": 25e-6, "amplitude": 0.98},
 }

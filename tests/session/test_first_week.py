@@ -33,7 +33,7 @@ IMAGE_HZ = -math.log1p(-0.00314) / 45e-3 + 1 / 33
             1.5e-6,
         ),  # the law is a simple one
         ("transport_speed", "analysis.survival.survival", "step", "centre", 0.35, 0.03),
-        ("parking", SURVIVAL, "gaussian", "centre", 0.0, 0.05e-6),
+        ("parking", SURVIVAL, "plateau", "centre", 0.0, 0.01e-6),
         # the same fit to the losses in the tables of pick-up and drop-off, 0.9 um beside a site, at 15 uK
         ("hand_over_ramp", SURVIVAL, "exponential", "decay", 32.5e-6, 2e-6),
     ],
@@ -44,7 +44,7 @@ def test_the_fitted_value_is_that_of_the_simulation(
     sequence = ROOT / "sequences" / f"{name}.yaml"
     with labseq.Session.open(sequence, seed=3, output=tmp_path, overrides=["repeats=2"]) as session:
         run = session.run()
-    given = {"parking": ("offset=0",), "hand_over_ramp": ("offset=free",)}.get(name, ())
+    given = ("offset=free",) if name == "hand_over_ramp" else ()
     (found,) = scan_report(run, ScanRequest((quantity,), fit=fit, fit_settings=given)).fits
     value: Estimate = found.values[parameter]
     assert abs(value.value - true) < 3 * value.error + tolerance
