@@ -119,7 +119,7 @@ def test_a_timeout_says_whether_a_leader_is_connected() -> None:
     with listening() as device, pytest.raises(DeviceTimeoutError, match=nobody):
         device.wait_for("go", 0.01)
     with led() as (device, _):
-        with pytest.raises(DeviceTimeoutError, match="the leader is connected"):
+        with pytest.raises(DeviceTimeoutError, match="the leader has connected"):
             device.wait_for("go", 0.01)
         with pytest.raises(DeviceError, match="unknown signal 'start'; expected 'go'"):
             device.wait_for("start", 0.01)
