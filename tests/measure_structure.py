@@ -13,7 +13,7 @@ from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
-SIMULATORS = ("_sim", "counterpart", "simulator", "simulated", "emulation", "capture")
+SIMULATORS = ("_sim", "simulator", "simulated", "emulation", "capture")
 """Marks in the path of a module that belongs to a simulated device."""
 
 Graph = dict[str, set[str]]

@@ -35,7 +35,7 @@ NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
     "docs/how-to/cameras-genicam.md": (load_library, build_module, lambda: runner("lines")),
     "docs/how-to/rehearse.md": (build_module,),
 }
-"""Page -> what loads the libraries of the system that its simulated counterparts need."""
+"""Page -> what loads the libraries of the system that its simulated simulators need."""
 SHOTS: Final = {
     "compact-225": ("sequences/compact_225.yaml", 9),
     "scan-dop": ("sequences/scan_dop.yaml", 8),

@@ -62,7 +62,7 @@ class Reader:
     def read(self, block: Block) -> None:
         """Do what a block says."""
         if block.language not in KINDS:
-            raise PageError(block, f"nobody runs '{block.language}'; expected one of {', '.join(KINDS)}")
+            raise PageError(block, f"'{block.language}' is not run; expected one of {', '.join(KINDS)}")
         if not block.is_run:
             return
         if "file" in block.comments:

@@ -13,7 +13,7 @@ script = load_script("make_paper_figures")
 AtomLosses, max_defect_free = script.AtomLosses, script.max_defect_free
 
 PAPER = AtomLosses(lifetime_s=33.0, imaging_loss=0.00314, imaging_loss_exposure_s=0.045)
-TOLD: dict[str, Any] = {"lifetime": 33.0, "imaging_loss": 0.00314, "imaging_loss_exposure": 0.045}
+GIVEN: dict[str, Any] = {"lifetime": 33.0, "imaging_loss": 0.00314, "imaging_loss_exposure": 0.045}
 
 
 def perfect_rearrangement(
@@ -45,7 +45,7 @@ def test_perfect_rearrangement_reaches_it(period_s: float, missed: float | None)
 
 
 def test_the_losses_are_those_that_the_simulation_tells() -> None:
-    assert AtomLosses.of({"simulation": TOLD}) == PAPER
-    assert AtomLosses.of({"simulation": {**TOLD, "false_negative": 6e-5}}) == PAPER._replace(
+    assert AtomLosses.of({"simulation": GIVEN}) == PAPER
+    assert AtomLosses.of({"simulation": {**GIVEN, "false_negative": 6e-5}}) == PAPER._replace(
         false_negative=6e-5
     )

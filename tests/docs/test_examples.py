@@ -130,7 +130,7 @@ NOT_RUN = {
     ]
     * 3,
 }
-"""Page -> why blocks on it, or parts of them, are not run: whoever adds one says so here, too."""
+"""Page -> why blocks on it, or parts of them, are not run: add new ones here, too."""
 
 
 def of(*languages: str) -> list[Block]:

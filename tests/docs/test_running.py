@@ -36,7 +36,7 @@ def read(*blocks: Block) -> Reader:
         (block("console", "make everything\n"), "'make' is not labseq's"),
         (block("console", "labseq run a.yaml | mail\n", run_with=""), "'mail' is not labseq's|exits with"),
         (block("text", "shown\n"), "say above it"),
-        (block("bash", "labseq --version\n"), "nobody runs 'bash'"),
+        (block("bash", "labseq --version\n"), "'bash' is not run"),
     ],
     ids=lambda value: value.text.strip() if isinstance(value, Block) else "",
 )

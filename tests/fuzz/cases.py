@@ -30,7 +30,7 @@ from labseq.session.assembly import assemble
 from labseq.session.options import Options
 from labseq.testing.fakes import fake_calibration
 from tests.config.mutations import PIECES
-from tests.recording.damages import LOST, MENDED, lost_line, write_whole_run
+from tests.recording.damages import LOST, REPAIRABLE, lost_line, write_whole_run
 
 ROOT: Final = Path(__file__).parents[2]
 KINDS: Final = ("sequence", "profile", "calibration", "plan", "queue", "run.json", "index", "shot", "run")
@@ -140,7 +140,7 @@ def _run_case(kind: str, rng: random.Random, templates: Templates, folder: Path)
 
 def damage_run(rng: random.Random, run_dir: Path) -> None:
     """Damage a run in up to six places; one run of a hundred gets files of an absurd size."""
-    for plant in rng.sample([*MENDED, *LOST], rng.randint(1, 3)) + [
+    for plant in rng.sample([*REPAIRABLE, *LOST], rng.randint(1, 3)) + [
         rng.choice([swollen, swollen_document])
     ] * (rng.random() < 0.01):
         with suppress(OSError, IndexError, KeyError, ValueError):  # nothing is left to damage

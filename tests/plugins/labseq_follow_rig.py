@@ -78,7 +78,7 @@ class PtyPeer:
             assert select.select([self.fd], [], [], end_s - time.monotonic())[0], "labseq said nothing"
             try:
                 self._came += os.read(self.fd, 4096)
-            except OSError:  # nobody has the port open yet
+            except OSError:  # the port is not open yet
                 assert time.monotonic() < end_s
         line, _, self._came = self._came.partition(b"\n")
         return line.decode().strip()

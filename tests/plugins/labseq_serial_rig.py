@@ -1,4 +1,4 @@
-"""The driver of serial instruments, and the counterpart that it speaks to."""
+"""The driver of serial instruments, and the simulator that it speaks to."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ PROFILE = r"""
       interlock: {min: 15 degC, max: 25 degC, message: look at the chiller}
   safe_state: [{do: set, arguments: {frequency: 1 MHz}}, close]
 """
-"""The description of the counterpart."""
+"""The description of the simulator."""
 
 
 def settings(text: str = PROFILE, **more: Any) -> SerialSettings:
@@ -58,12 +58,12 @@ def settings(text: str = PROFILE, **more: Any) -> SerialSettings:
     return Document.parse(text, "profile.yaml").validate(SerialSettings, ("device",))
 
 
-class Counterpart:
+class Simulator:
     """An instrument on a pty, in a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.port = str(folder / "port")
-        program = str(Path(__file__).with_name("labseq_serial_counterpart.py"))
+        program = str(Path(__file__).with_name("labseq_serial_simulator.py"))
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", program, self.port],
             stdin=subprocess.PIPE,

@@ -113,7 +113,7 @@ class Firmware:
         return unframed(came[:-1])
 
     def ask(self, question: str) -> str:
-        """Say something and read the answer, past what nobody asked for."""
+        """Say something and read the answer, past what was not asked for."""
         self.write(framed(question))
         while True:
             said = self.line()

@@ -16,7 +16,7 @@ from labseq_soapy_sim import read_trace
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.emergency import ADDRESS, Connection
 
-from .labseq_serial_rig import Counterpart
+from .labseq_serial_rig import Simulator
 
 DRIVING = """
 import ctypes, fcntl, os, resource, signal, sys, termios, threading, time
@@ -127,12 +127,12 @@ CARDS: Final = ("dds", "fifo", "stream", "replay")
 """Simulated cards, by mode; replay comes last, because it plays for less than a second."""
 
 
-class TtlCounterpart(Counterpart):
+class TtlSimulator(Simulator):
     """A timing box on a pty, in a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("labseq_ttl_counterpart.py")), str(folder / "box")],
+            [sys.executable, str(Path(__file__).with_name("labseq_ttl_simulator.py")), str(folder / "box")],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -144,7 +144,7 @@ class Outputs:
     """Devices, and a process that has a child drive them."""
 
     def __init__(
-        self, folder: Path, shutter: Counterpart, lines: Counterpart, names: Sequence[str], *, driven: bool
+        self, folder: Path, shutter: Simulator, lines: Simulator, names: Sequence[str], *, driven: bool
     ) -> None:
         self._folder, self._shutter, self._lines, self._names = folder, shutter, lines, names
         self._repeat = -1
@@ -221,7 +221,7 @@ def outputs(
     folder: Path, names: Sequence[str] = ("shutter", "lines"), *, driven: bool = True
 ) -> Generator[Outputs]:
     """Devices, driven by a process unless somebody else does."""
-    with Counterpart(folder) as shutter, TtlCounterpart(folder) as lines:
+    with Simulator(folder) as shutter, TtlSimulator(folder) as lines:
         devices = Outputs(folder, shutter, lines, names, driven=driven)
         try:
             yield devices

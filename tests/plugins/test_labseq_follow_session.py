@@ -24,7 +24,7 @@ ANY_PORT = "profile.devices.leader.port=0"
 PATIENT = "profile.devices.leader.deadline=60 s"
 LOST = "profile.camera={use: virtual, readout: 5 ms, faults: {transient: 1.0}}"
 SMALL = "target={pattern: compact, rows: 3, cols: 3}"
-NOBODY = "follow.yaml:12:17: the profile has no device through which another control system leads"
+NO_LEADER = "follow.yaml:12:17: the profile has no device through which another control system leads"
 GUIDE = (ROOT / "docs" / "how-to" / "follow.md").read_text()
 
 
@@ -160,7 +160,7 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
         (
             ["profile.devices={shutter: {use: virtual}}"],
             "off",
-            f"{NOBODY}; add one to its `devices`: `leader: {{use: tcp_leader}}`",
+            f"{NO_LEADER}; add one to its `devices`: `leader: {{use: tcp_leader}}`",
         ),
         ([], "fast", "in a full dry run it says `go` itself, in a fast one it is missing"),
         (["shot.0.wait.device=shutter"], "off", "no other control system leads through 'shutter'"),

@@ -27,16 +27,16 @@ from labseq.session.devices import check_devices
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 
-from .labseq_serial_rig import PROFILE, Counterpart, opened, settings
+from .labseq_serial_rig import PROFILE, Simulator, opened, settings
 
 Factory = Callable[..., Any]
 on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
 
 
 @pytest.fixture(scope="module")
-def counterpart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Counterpart]:
-    with Counterpart(tmp_path_factory.mktemp("serial")) as counterpart:
-        yield counterpart
+def simulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Simulator]:
+    with Simulator(tmp_path_factory.mktemp("serial")) as simulator:
+        yield simulator
 
 
 class Declared(DeviceContract):
@@ -60,35 +60,35 @@ class TestSimulatedInstrument(Declared):
 @on_a_pty
 class TestInstrumentOnAPty(Declared):
     @pytest.fixture
-    def factory(self, counterpart: Counterpart) -> Factory:
-        return partial(SerialDevice, settings(port=counterpart.port))
+    def factory(self, simulator: Simulator) -> Factory:
+        return partial(SerialDevice, settings(port=simulator.port))
 
 
 @on_a_pty
-def test_commands_and_values_cross_the_line_in_the_units_of_the_instrument(counterpart: Counterpart) -> None:
-    with opened(counterpart.port) as synth:
+def test_commands_and_values_cross_the_line_in_the_units_of_the_instrument(simulator: Simulator) -> None:
+    with opened(simulator.port) as synth:
         synth.command("set", frequency="80.5 MHz")
         assert synth.read("frequency") == 80.5e6
-        assert counterpart.log[-2:] == ["FREQ 80.500000", "FREQ?"]
+        assert simulator.log[-2:] == ["FREQ 80.500000", "FREQ?"]
         synth.command("close")
         assert synth.poll() == {"is_open": False, "frequency": 80.5e6}
         assert synth.read("temperature") == pytest.approx(273.15 + 21.5)
-        n_sent = counterpart.log.count("TOGGLE")
+        n_sent = simulator.log.count("TOGGLE")
         for _ in range(2):  # sent only where it brings about what is asked for
             synth.command("toggle_on")
             assert synth.read("is_open") is True
-        assert counterpart.log.count("TOGGLE") == n_sent + 1
+        assert simulator.log.count("TOGGLE") == n_sent + 1
         text = "synth: never: 'OPEN' was sent, .* is_open is true; expected false"
         with pytest.raises(DeviceError, match=text):
             synth.command("never")
 
 
 @on_a_pty
-def test_what_fails_on_open_is_taken_back(counterpart: Counterpart) -> None:
-    device = SerialDevice(settings(port=counterpart.port, on_open=["open", "nonsense"]), Context("synth"))
+def test_what_fails_on_open_is_taken_back(simulator: Simulator) -> None:
+    device = SerialDevice(settings(port=simulator.port, on_open=["open", "nonsense"]), Context("synth"))
     with pytest.raises(DeviceError, match="'NONSENSE' was refused"):
         device.open()
-    assert counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"]
+    assert simulator.log[-2:] == ["FREQ 1.000000", "CLOSE"]
     with pytest.raises(DeviceError, match="not open"):
         device.command("open")
 
@@ -121,10 +121,10 @@ def test_commands_can_be_checked_before_anything_is_open(
 
 
 @on_a_pty
-def test_a_value_beyond_its_limits_or_unreadable_stops_everything(counterpart: Counterpart) -> None:
-    with opened(counterpart.port) as synth:
+def test_a_value_beyond_its_limits_or_unreadable_stops_everything(simulator: Simulator) -> None:
+    with opened(simulator.port) as synth:
         synth.check_interlocks()
-        counterpart.order("fault", "other", 2)
+        simulator.order("fault", "other", 2)
         with pytest.raises(DeviceError, match=r"synth: temperature: 'TEMP\?' was answered by 'WHAT'"):
             synth.check_interlocks()
         for value, text in (
@@ -134,12 +134,12 @@ def test_a_value_beyond_its_limits_or_unreadable_stops_everything(counterpart: C
             ),
             ("9.9e37", "implausible; expected -50 degC to 100 degC"),
         ):
-            counterpart.order("set", "temperature", value)
+            simulator.order("set", "temperature", value)
             try:
                 with pytest.raises(DeviceError, match=text):
                     synth.check_interlocks()
             finally:
-                counterpart.order("set", "temperature", "21.50")
+                simulator.order("set", "temperature", "21.50")
 
 
 def test_a_reading_may_be_as_old_as_the_interlock_lets_it() -> None:
@@ -228,9 +228,9 @@ shot:
 
 
 @pytest.fixture
-def session_counterpart(tmp_path: Path) -> Iterator[Counterpart]:
-    with Counterpart(tmp_path) as session_counterpart:
-        yield session_counterpart
+def session_simulator(tmp_path: Path) -> Iterator[Simulator]:
+    with Simulator(tmp_path) as session_simulator:
+        yield session_simulator
 
 
 def lab(folder: Path, port: str, **more: Any) -> Path:
@@ -253,7 +253,7 @@ def run(sequence: Path, **options: Any) -> Run:
 class Observer:
     """Notes how each attempt at a shot ends; unplugs an instrument when the first one begins."""
 
-    def __init__(self, unplugged: Counterpart | None = None) -> None:
+    def __init__(self, unplugged: Simulator | None = None) -> None:
         self.ends: list[tuple[str, str]] = []
         self._unplugged = unplugged
 
@@ -274,42 +274,42 @@ def test_a_dry_run_speaks_to_an_instrument_made_of_the_description(tmp_path: Pat
 
 @on_a_pty
 def test_a_run_tests_the_instrument_keeps_its_values_and_leaves_it_safe(
-    tmp_path: Path, session_counterpart: Counterpart
+    tmp_path: Path, session_simulator: Simulator
 ) -> None:
-    sequence = lab(tmp_path, session_counterpart.port)
+    sequence = lab(tmp_path, session_simulator.port)
     report = check_devices(str(sequence.with_name("lab.yaml")))
     (synth,) = [found for found in report.devices if found.name == "synth"]
     assert synth.ok
     assert synth.tested
     assert synth.described["serial_number"] == "0042"
     assert synth.latency_s
-    session_counterpart.order("set", "frequency", "100")
+    session_simulator.order("set", "frequency", "100")
     done = run(sequence)
     assert [shot.readings["synth.frequency"] for shot in done.shots] == [100e6, 80e6]
-    assert session_counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"]
+    assert session_simulator.log[-2:] == ["FREQ 1.000000", "CLOSE"]
 
 
 @on_a_pty
 def test_a_value_past_its_interlock_ends_the_run_before_anything_is_done(
-    tmp_path: Path, session_counterpart: Counterpart
+    tmp_path: Path, session_simulator: Simulator
 ) -> None:
-    session_counterpart.order("set", "temperature", "25.60")
+    session_simulator.order("set", "temperature", "25.60")
     observer = Observer()
     text = "synth: temperature is 25.6 degC; the interlock expects 15 degC to 25 degC; look at the chiller"
     with pytest.raises(DeviceError, match=re.escape(text)):
-        run(lab(tmp_path, session_counterpart.port), observer=observer)
-    assert "TOGGLE" not in session_counterpart.log
-    assert session_counterpart.log[-1] == "CLOSE"
+        run(lab(tmp_path, session_simulator.port), observer=observer)
+    assert "TOGGLE" not in session_simulator.log
+    assert session_simulator.log[-1] == "CLOSE"
     assert observer.ends == [("failed", f"InterlockError: {text}")]
 
 
 @on_a_pty
 def test_a_shot_in_which_the_line_breaks_is_repeated_and_ends_the_run_if_it_stays_broken(
-    tmp_path: Path, session_counterpart: Counterpart
+    tmp_path: Path, session_simulator: Simulator
 ) -> None:
-    observer = Observer(unplugged=session_counterpart)
+    observer = Observer(unplugged=session_simulator)
     with pytest.raises(DeviceError, match="synth: the line broke and could not be opened again"):
-        run(lab(tmp_path, session_counterpart.port), observer=observer)
+        run(lab(tmp_path, session_simulator.port), observer=observer)
     (first, first_error), (second, second_error) = observer.ends
     assert (first, second) == ("failed", "failed")
     assert first_error.startswith("TransientError: synth: the line broke at 'STATE?'")

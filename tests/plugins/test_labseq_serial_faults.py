@@ -18,20 +18,20 @@ from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError,
 from labseq.sequencer.clock import RealClock
 
 from .emergency import outsider
-from .labseq_serial_rig import Counterpart, opened, settings
+from .labseq_serial_rig import Simulator, opened, settings
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
 
 
 @pytest.fixture
-def counterpart(tmp_path: Path) -> Iterator[Counterpart]:
-    with Counterpart(tmp_path) as counterpart:
-        yield counterpart
+def simulator(tmp_path: Path) -> Iterator[Simulator]:
+    with Simulator(tmp_path) as simulator:
+        yield simulator
 
 
 @pytest.fixture
-def synth(counterpart: Counterpart) -> Iterator[SerialDevice]:
-    with opened(counterpart.port) as synth:
+def synth(simulator: Simulator) -> Iterator[SerialDevice]:
+    with opened(simulator.port) as synth:
         yield synth
 
 
@@ -59,75 +59,71 @@ def synth(counterpart: Counterpart) -> Iterator[SerialDevice]:
     ],
 )
 def test_a_bad_reply_is_asked_for_twice_and_then_named(
-    counterpart: Counterpart, synth: SerialDevice, fault: str, kind: type[Exception], text: str
+    simulator: Simulator, synth: SerialDevice, fault: str, kind: type[Exception], text: str
 ) -> None:
-    counterpart.order("fault", fault, 2)
+    simulator.order("fault", fault, 2)
     with pytest.raises(kind, match=f"synth: .*{text}"):
         synth.read("temperature")
-    assert counterpart.log.count("TEMP?") == 2
+    assert simulator.log.count("TEMP?") == 2
     assert synth.read("temperature") == pytest.approx(294.65), "nothing of it is left"
 
 
-def test_a_reply_that_comes_in_bits_is_put_together(counterpart: Counterpart, synth: SerialDevice) -> None:
-    counterpart.order("fault", "slow", 1)
+def test_a_reply_that_comes_in_bits_is_put_together(simulator: Simulator, synth: SerialDevice) -> None:
+    simulator.order("fault", "slow", 1)
     assert synth.read("temperature") == pytest.approx(294.65)
-    assert counterpart.log.count("TEMP?") == 1
+    assert simulator.log.count("TEMP?") == 1
 
 
-def test_what_comes_unasked_is_dropped(counterpart: Counterpart, synth: SerialDevice) -> None:
-    counterpart.order("fault", "two", 1)
+def test_what_comes_unasked_is_dropped(simulator: Simulator, synth: SerialDevice) -> None:
+    simulator.order("fault", "two", 1)
     assert synth.read("temperature") == pytest.approx(294.65)
-    counterpart.order("say", b"LATER\n".hex())
+    simulator.order("say", b"LATER\n".hex())
     assert synth.read("is_open") is False
-    assert counterpart.log.count("STATE?") == 1
+    assert simulator.log.count("STATE?") == 1
 
 
 def test_a_command_is_sent_again_only_if_the_profile_allows_it(
-    counterpart: Counterpart, synth: SerialDevice
+    simulator: Simulator, synth: SerialDevice
 ) -> None:
-    counterpart.order("fault", "other", 1)
+    simulator.order("fault", "other", 1)
     synth.command("open")
-    assert counterpart.log.count("OPEN") == 2
-    counterpart.order("fault", "silent", 1)
+    assert simulator.log.count("OPEN") == 2
+    simulator.order("fault", "silent", 1)
     with pytest.raises(DeviceTimeoutError, match="no reply to 'OPEN'"):
         synth.command("once")
-    assert counterpart.log.count("OPEN") == 3
+    assert simulator.log.count("OPEN") == 3
 
 
 def test_an_error_of_the_instrument_is_reported_and_not_repeated(
-    counterpart: Counterpart, synth: SerialDevice
+    simulator: Simulator, synth: SerialDevice
 ) -> None:
     with pytest.raises(DeviceError, match="synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"):
         synth.command("nonsense")
-    assert counterpart.log.count("NONSENSE") == 1
+    assert simulator.log.count("NONSENSE") == 1
 
 
-def test_a_wrong_baud_rate_is_suspected(counterpart: Counterpart) -> None:
-    device = SerialDevice(
-        settings(port=counterpart.port, baud_rate=19200, timeout="250 ms"), Context("synth")
-    )
+def test_a_wrong_baud_rate_is_suspected(simulator: Simulator) -> None:
+    device = SerialDevice(settings(port=simulator.port, baud_rate=19200, timeout="250 ms"), Context("synth"))
     with pytest.raises(DeviceError, match=r"synth: .*'\*IDN\?'.*check .*'baud_rate'"):
         device.open()
-    counterpart.order("speed", 19200)
+    simulator.order("speed", 19200)
     device.open()
     device.close()
 
 
-def test_another_instrument_is_refused(counterpart: Counterpart) -> None:
+def test_another_instrument_is_refused(simulator: Simulator) -> None:
     identify = {"ask": "*IDN?", "reply": "THORLABS SC10.*"}
-    device = SerialDevice(settings(port=counterpart.port, identify=identify), Context("synth"))
-    text = "reports that it is 'LAB,COUNTERPART,0042,1.7'; expected 'THORLABS SC10.*'; is it the right port"
+    device = SerialDevice(settings(port=simulator.port, identify=identify), Context("synth"))
+    text = "reports that it is 'LAB,SIMULATOR,0042,1.7'; expected 'THORLABS SC10.*'; is it the right port"
     with pytest.raises(DeviceError, match=text):
         device.open()
-    assert {*counterpart.log} == {"*IDN?"}, "it was sent nothing else"
+    assert {*simulator.log} == {"*IDN?"}, "it was sent nothing else"
 
 
-def test_a_second_user_is_reported_that_the_port_is_taken(
-    counterpart: Counterpart, synth: SerialDevice
-) -> None:
+def test_a_second_user_is_reported_that_the_port_is_taken(simulator: Simulator, synth: SerialDevice) -> None:
     del synth
-    second = SerialDevice(settings(port=counterpart.port), Context("laser"))
-    text = f"laser: cannot open {counterpart.port}: another program has it open, or another device"
+    second = SerialDevice(settings(port=simulator.port), Context("laser"))
+    text = f"laser: cannot open {simulator.port}: another program has it open, or another device"
     with pytest.raises(DeviceError, match=text):
         second.open()
 
@@ -149,10 +145,8 @@ def test_a_port_that_is_not_there_is_named(port: dict[str, Any], text: str) -> N
         SerialDevice(settings(**port), Context("synth")).open()
 
 
-def test_an_adapter_is_found_by_its_numbers(
-    counterpart: Counterpart, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    adapters = [adapter(counterpart.port, "A1"), adapter("/dev/ttyUSB7", "A2")]
+def test_an_adapter_is_found_by_its_numbers(simulator: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    adapters = [adapter(simulator.port, "A1"), adapter("/dev/ttyUSB7", "A2")]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: adapters)
     with opened(None, usb={"vid": 0x0403, "serial": "A1"}) as synth:
         assert synth.read("is_open") is False
@@ -172,46 +166,46 @@ def adapter(port: str, serial_number: str) -> Any:
 
 @pytest.mark.parametrize("instant", ["before", "during"])
 def test_an_unplugged_instrument_fails_the_shot_and_is_opened_again_in_the_next(
-    counterpart: Counterpart, synth: SerialDevice, instant: str
+    simulator: Simulator, synth: SerialDevice, instant: str
 ) -> None:
     if instant == "before":
-        counterpart.order("unplug")
+        simulator.order("unplug")
     else:
-        counterpart.order("fault", "unplug", 1)
+        simulator.order("fault", "unplug", 1)
     with pytest.raises(TransientError, match=r"synth: the line broke at 'OPEN' \(.*\); unplugged\?"):
         synth.command("open")
     with pytest.raises(DeviceError, match="synth: the line broke and could not be opened again: cannot open"):
         synth.command("open")
     with pytest.raises(DeviceError, match="could not be opened again"):
         synth.safe_state()
-    counterpart.order("plug")
+    simulator.order("plug")
     synth.command("open")
     assert synth.read("is_open") is True
-    assert counterpart.log.count("*IDN?") == 2, "it was asked again who it is"
+    assert simulator.log.count("*IDN?") == 2, "it was asked again who it is"
 
 
-def test_a_broken_line_is_opened_again_for_the_safe_state_but_not_set_up(counterpart: Counterpart) -> None:
-    with opened(counterpart.port, on_open=["open"]) as synth:
-        counterpart.order("unplug")
+def test_a_broken_line_is_opened_again_for_the_safe_state_but_not_set_up(simulator: Simulator) -> None:
+    with opened(simulator.port, on_open=["open"]) as synth:
+        simulator.order("unplug")
         with pytest.raises(TransientError):
             synth.read("temperature")
-        counterpart.order("plug")
+        simulator.order("plug")
         synth.safe_state()
-        assert counterpart.log[-3:] == ["*IDN?", "FREQ 1.000000", "CLOSE"]
+        assert simulator.log[-3:] == ["*IDN?", "FREQ 1.000000", "CLOSE"]
 
 
-def test_the_safe_state_goes_on_after_a_command_that_fails(counterpart: Counterpart) -> None:
-    with opened(counterpart.port, safe_state=["nonsense", "once", "close"]) as synth:
+def test_the_safe_state_goes_on_after_a_command_that_fails(simulator: Simulator) -> None:
+    with opened(simulator.port, safe_state=["nonsense", "once", "close"]) as synth:
         with pytest.raises(DeviceError) as caught:
             synth.safe_state()
         assert str(caught.value) == "synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"
-        assert counterpart.log[-3:] == ["NONSENSE", "OPEN", "CLOSE"]
+        assert simulator.log[-3:] == ["NONSENSE", "OPEN", "CLOSE"]
 
 
-def test_an_instrument_that_takes_nothing_is_a_timeout(counterpart: Counterpart) -> None:
+def test_an_instrument_that_takes_nothing_is_a_timeout(simulator: Simulator) -> None:
     more: dict[str, Any] = {"flow_control": "xon_xoff", "timeout": "250 ms", "retries": 0}
-    with opened(counterpart.port, **more) as synth:
-        counterpart.order("answer", b"\x131\n".hex())  # XOFF, which holds from now or from the next on
+    with opened(simulator.port, **more) as synth:
+        simulator.order("answer", b"\x131\n".hex())  # XOFF, which holds from now or from the next on
         text = r"synth: 'STATE\?' could not be sent within 250 ms; see 'flow_control'"
         with pytest.raises(DeviceTimeoutError, match=text):
             read_twice(synth)
@@ -222,23 +216,23 @@ def read_twice(synth: SerialDevice) -> None:
         synth.read("is_open")
 
 
-def test_a_stop_request_ends_the_wait_for_a_reply(counterpart: Counterpart) -> None:
+def test_a_stop_request_ends_the_wait_for_a_reply(simulator: Simulator) -> None:
     stop = StopFlag()
-    with opened(counterpart.port, RealClock(stop), timeout="60 s") as synth:
-        counterpart.order("fault", "silent", 1)
+    with opened(simulator.port, RealClock(stop), timeout="60 s") as synth:
+        simulator.order("fault", "silent", 1)
         asking = Asking(synth)
         stop.request()
         assert isinstance(asking.outcome(), StopRequested)
 
 
-def test_the_safe_state_does_not_wait_for_somebody_elses_reply(counterpart: Counterpart) -> None:
-    with opened(counterpart.port, RealClock(StopFlag()), timeout="60 s") as synth:
-        counterpart.order("fault", "silent", 1)
+def test_the_safe_state_does_not_wait_for_somebody_elses_reply(simulator: Simulator) -> None:
+    with opened(simulator.port, RealClock(StopFlag()), timeout="60 s") as synth:
+        simulator.order("fault", "silent", 1)
         asking = Asking(synth)
-        asking.has_begun(counterpart)
+        asking.has_begun(simulator)
         synth.safe_state()
         assert "aborted by the safe state" in str(asking.outcome())
-        assert counterpart.log[-2:] == ["FREQ 1.000000", "CLOSE"]
+        assert simulator.log[-2:] == ["FREQ 1.000000", "CLOSE"]
 
 
 class Asking:
@@ -250,8 +244,8 @@ class Asking:
         self._thread = threading.Thread(target=self._ask)
         self._thread.start()
 
-    def has_begun(self, counterpart: Counterpart) -> None:
-        while "TEMP?" not in counterpart.log:
+    def has_begun(self, simulator: Simulator) -> None:
+        while "TEMP?" not in simulator.log:
             pass
 
     def outcome(self) -> BaseException | None:
@@ -268,34 +262,34 @@ class Asking:
 
 @hypothesis_settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=40))
-def test_whatever_comes_is_a_value_or_an_error(counterpart: Counterpart, noise: bytes) -> None:
-    with opened(counterpart.port, retries=0, identify=None) as synth:
-        counterpart.order("answer", (noise + b"\n").hex())
+def test_whatever_comes_is_a_value_or_an_error(simulator: Simulator, noise: bytes) -> None:
+    with opened(simulator.port, retries=0, identify=None) as synth:
+        simulator.order("answer", (noise + b"\n").hex())
         try:
             assert isinstance(synth.read("temperature"), float)
         except DeviceError as error:
             assert str(error).isprintable()
 
 
-def test_another_process_sends_the_commands_of_the_safe_state(counterpart: Counterpart) -> None:
-    with opened(counterpart.port, timeout="500 ms") as synth:
+def test_another_process_sends_the_commands_of_the_safe_state(simulator: Simulator) -> None:
+    with opened(simulator.port, timeout="500 ms") as synth:
         synth.command("open")
         emergency = synth.emergency()
     assert emergency is not None
-    n_before = len(counterpart.log)
+    n_before = len(simulator.log)
     with outsider({"synth": (str(emergency.script), emergency.arguments)}) as other:
         assert (other.prepared, other.heavy_modules) == ({"synth": None}, [])
         done = other.off()["synth"].text
-        assert done == f"sent 'FREQ 1.000000', 'CLOSE' to {counterpart.port}"
-        assert counterpart.log[n_before:] == ["FREQ 1.000000", "CLOSE"]
-        counterpart.order("fault", "silent", 2)
+        assert done == f"sent 'FREQ 1.000000', 'CLOSE' to {simulator.port}"
+        assert simulator.log[n_before:] == ["FREQ 1.000000", "CLOSE"]
+        simulator.order("fault", "silent", 2)
         assert "no answer to 'CLOSE'" in other.off()["synth"].text
-        counterpart.order("unplug")
+        simulator.order("unplug")
         assert other.off()["synth"].text.startswith("SerialException: ")
 
 
-def test_without_a_safe_state_or_a_port_there_is_nothing_to_send(counterpart: Counterpart) -> None:
-    with opened(counterpart.port, safe_state=[]) as synth:
+def test_without_a_safe_state_or_a_port_there_is_nothing_to_send(simulator: Simulator) -> None:
+    with opened(simulator.port, safe_state=[]) as synth:
         assert synth.emergency() is None
     with opened("simulated") as synth:
         assert synth.emergency() is None

@@ -556,7 +556,7 @@ def test_data_that_is_withheld_is_an_underrun_and_ends_in_the_safe_state(driver:
     with driver("fifo", fill=1e-3) as lab:
         lab.tweezers.prepare(lab.program(60))
         lab.tweezers.play()
-        lab.clock.sleep(0.1)  # nobody feeds the card
+        lab.clock.sleep(0.1)  # nothing feeds the card
         with pytest.raises(TransientError, match="underrun"):
             lab.tweezers.wait(1.0)
         assert lab.card.outputs_on == (False, False)

@@ -233,7 +233,7 @@ print("done")
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for the vendor's library is for cdll")
+@pytest.mark.skipif(sys.platform == "win32", reason="the substitute for the vendor's library is for cdll")
 def test_real_and_simulated_cards_work_in_one_process() -> None:
     command = [sys.executable, "-c", SIDE_BY_SIDE]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

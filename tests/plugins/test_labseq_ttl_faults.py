@@ -144,7 +144,7 @@ def test_the_safe_state_waits_until_the_box_has_stopped(monkeypatch: pytest.Monk
 
 
 class KeepsQuiet(ModelBox):
-    """Nobody hears that its program is over."""
+    """The end of its program is not reported."""
 
     def _send(self, text: str) -> None:
         if not text.startswith("!done"):
@@ -213,7 +213,7 @@ class Babble(ModelBox):
 
 
 class Mute(ModelBox):
-    """Nobody is there."""
+    """No box answers."""
 
     def _answer(self) -> None:
         pass

@@ -236,7 +236,7 @@ def test_a_shot_that_is_late_is_reported_once(rig: Led) -> None:
 
 
 class NoLeader(Led):
-    """A box like a real one: nobody raises `go` but the test."""
+    """A box like a real one: only the test raises `go`."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -16,7 +16,7 @@ import pytest
 
 from labseq.drivers import serial_emergency as script
 
-from .labseq_serial_rig import PROFILE as INSTRUMENT, Counterpart, opened
+from .labseq_serial_rig import PROFILE as INSTRUMENT, Simulator, opened
 from .labseq_soapy_rig import until
 from .outputs_rig import log_rows, outputs
 from .small_run import PROFILE, SEQUENCE
@@ -65,26 +65,26 @@ def test_a_run_that_is_killed_leaves_instrument_and_lines_off(tmp_path: Path) ->
 
 
 @pytest.fixture
-def instrument(tmp_path: Path) -> Generator[Counterpart]:
-    with Counterpart(tmp_path) as counterpart:
-        yield counterpart
+def instrument(tmp_path: Path) -> Generator[Simulator]:
+    with Simulator(tmp_path) as simulator:
+        yield simulator
 
 
-def off_for(counterpart: Counterpart, *safe_state: object) -> Callable[[], str]:
+def off_for(simulator: Simulator, *safe_state: object) -> Callable[[], str]:
     """What the watchdog calls for a driver with this safe state."""
     reload(script)
-    with opened(counterpart.port, safe_state=[*safe_state]) as synth:
+    with opened(simulator.port, safe_state=[*safe_state]) as synth:
         found = synth.emergency()
     assert found is not None
     arguments = json.loads(json.dumps(dict(found.arguments)))
     return lambda: script.off(**arguments)
 
 
-def commands(counterpart: Counterpart) -> list[str]:
-    return [text for text in counterpart.log if "?" not in text]
+def commands(simulator: Simulator) -> list[str]:
+    return [text for text in simulator.log if "?" not in text]
 
 
-def test_a_toggle_is_sent_only_to_what_is_on(instrument: Counterpart) -> None:
+def test_a_toggle_is_sent_only_to_what_is_on(instrument: Simulator) -> None:
     off = off_for(instrument, "toggle_off")
     off()
     assert commands(instrument) == []
@@ -102,7 +102,7 @@ def test_a_toggle_is_sent_only_to_what_is_on(instrument: Counterpart) -> None:
     assert commands(instrument) == ["TOGGLE", "TOGGLE"]
 
 
-def test_only_what_may_be_repeated_is_repeated_and_all_is_tried(instrument: Counterpart) -> None:
+def test_only_what_may_be_repeated_is_repeated_and_all_is_tried(instrument: Simulator) -> None:
     off = off_for(instrument, "once", "nonsense", "close")
     instrument.order("fault", "other", 1)
     failed = "'OPEN' was answered by 'WHAT'; 'NONSENSE' was answered by 'ERR -113,undefined header'"

@@ -21,7 +21,7 @@ from .queued import PROFILE, SEQUENCE
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("LABSEQ_DATA", raising=False)
-    monkeypatch.setenv("GIT_DIR", "/dev/null")  # nobody's edits while the tests run are a change here
+    monkeypatch.setenv("GIT_DIR", "/dev/null")  # edits while the tests run are no change here
     Path("s.yaml").write_text(SEQUENCE, encoding="utf-8")
     Path("p.yaml").write_text(PROFILE, encoding="utf-8")
 

@@ -180,7 +180,7 @@ def edit_index(run_dir: Path, change: Callable[[list[bytes]], list[bytes]]) -> N
     path.write_bytes(b"".join(line + b"\n" for line in lines))
 
 
-MENDED = [
+REPAIRABLE = [
     torn_index, unended_line, doubled_line, two_lines_for_a_file, lost_line, lost_index, part_left,
     torn_events, no_state, damaged_state, dead_run, damaged_line, line_of_no_shot, stop_left,
     alien_file, alien_hdf5, foreign_skip,

@@ -23,8 +23,8 @@ from tests.locking import held_elsewhere
 
 from .damages import (
     LOST,
-    MENDED,
     N_SHOTS,
+    REPAIRABLE,
     contents,
     copied,
     damaged_line,
@@ -46,7 +46,7 @@ from .damages import (
 from .records import make_run, make_shot
 
 
-@pytest.mark.parametrize("plant", [*MENDED, *LOST], ids=lambda plant: plant.__name__)
+@pytest.mark.parametrize("plant", [*REPAIRABLE, *LOST], ids=lambda plant: plant.__name__)
 def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable[[Path], None]) -> None:
     root = run_dir.parents[1]
     rows = open_run(run_dir).to_dataframe()
@@ -64,7 +64,7 @@ def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable
     assert {*lines} <= {*lines_of(root)}
     assert examine(root).findings == []  # all is well now
     run = open_run(run_dir)
-    whole = list(range(N_SHOTS)) if plant in MENDED else [0, 2, 3]
+    whole = list(range(N_SHOTS)) if plant in REPAIRABLE else [0, 2, 3]
     assert [shot.index for shot in run.shots] == whole
     table = run.to_dataframe()
     assert table.equals(rows.loc[whole, [*table.columns]])
@@ -156,7 +156,7 @@ def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> 
     assert not open_run(run_dir).shots[1].success, "of two takes without a line the later counts"
 
 
-damages = st.lists(st.sampled_from([*MENDED, *LOST]), max_size=4, unique=True)
+damages = st.lists(st.sampled_from([*REPAIRABLE, *LOST]), max_size=4, unique=True)
 cuts = st.tuples(
     st.sampled_from(["index.jsonl", "events.jsonl", "STATE", "shots/shot_000003.h5"]), st.floats(0, 1)
 )
@@ -164,7 +164,7 @@ cuts = st.tuples(
 
 @settings(max_examples=8, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture])
 @given(damages, st.lists(cuts, max_size=2))
-def test_any_damages_together_are_mended_in_one_round(
+def test_any_damages_together_are_repaired_in_one_round(
     template: Path, tmp_path_factory: pytest.TempPathFactory, plants: list[Any], cut: list[tuple[str, float]]
 ) -> None:
     run_dir = copied(template, tmp_path_factory.mktemp("data"))
@@ -262,7 +262,7 @@ def test_a_run_in_progress_is_not_touched(run_dir: Path) -> None:
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     report = examine(root)
     assert (report.findings, report.in_progress) == ([], [run_dir])
-    rewrite_state(run_dir, state="running", pid=2**22 + 1, host="another")  # nobody here can tell
+    rewrite_state(run_dir, state="running", pid=2**22 + 1, host="another")  # it cannot be known here
     assert examine(run_dir).in_progress == [run_dir]
     rewrite_state(run_dir, state="complete")
     before[run_dir / "STATE"] = (run_dir / "STATE").read_bytes()

@@ -32,7 +32,7 @@ class Mean:
 
 class Fails(Mean):
     def shot(self, shot):
-        if shot.index == 1 and not os.path.exists("mended"):
+        if shot.index == 1 and not os.path.exists("repaired"):
             raise ValueError("too dark")
         return super().shot(shot)
 
@@ -127,7 +127,7 @@ def test_analyses_that_fail_leave_the_run_alone(tmp_path, monkeypatch):
     assert 'raise ValueError("too dark")' in log
 
     monkeypatch.chdir(tmp_path)
-    Path("mended").touch()
+    Path("repaired").touch()
     made = analyse_missing(done, {"use": "fails"})
     assert (made.n_done, made.n_before, made.failures) == (1, 2, {})
     assert [set(row) for row in done.analysis("fails")] == [{"shot", "filling"}] * 3

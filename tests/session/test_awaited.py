@@ -35,7 +35,7 @@ class Trouble(Named):
             raise ValueError("too dark")
         while shot.index == 2 and not os.path.exists("go"):
             time.sleep(0.01)
-        if shot.index == 4 and not os.path.exists("mended"):
+        if shot.index == 4 and not os.path.exists("repaired"):
             os._exit(7)
         return super().shot(shot)
 
@@ -133,7 +133,7 @@ def test_a_result_that_does_not_come_is_no_value_and_an_analysis_that_dies_ends_
     assert "shot 1 has no 'analysis.trouble.filling': the analysis failed: ValueError: too dark" in texts
     assert "shot 2 has no 'analysis.trouble.filling': the analysis gave no result within 5 s" in texts
 
-    Path("mended").touch()
+    Path("repaired").touch()
     again = resumed(run_dir)
     assert (again.status, len(again.shots)) == ("complete", 6)
     used = [event["values"] for event in again.events if event["event"] == "results_used"]

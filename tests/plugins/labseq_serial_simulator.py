@@ -126,7 +126,7 @@ class Instrument:
         """What a good instrument says."""
         asked = {"STATE?": "open", "FREQ?": "frequency", "TEMP?": "temperature"}
         if text == "*IDN?":
-            return b"LAB,COUNTERPART,0042,1.7"
+            return b"LAB,SIMULATOR,0042,1.7"
         if text in asked:
             return self.state[asked[text]].encode()
         if text in ("OPEN", "CLOSE"):
