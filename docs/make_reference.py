@@ -138,7 +138,7 @@ def command(*names: str) -> list[Block]:
 
 
 def contract(kind: str) -> list[Block]:
-    """A suite: what it is told by a plugin's test, and a row for each promise of its own."""
+    """A suite: what a plugin's test passes to it, and a row for each promise of its own."""
     suite = {**SUITES, "hardware": HardwareContract}[kind]
     own = [one for one in _members(suite) if one.__name__ not in _inherited(suite)]
     hooks = [one for one in own if not hasattr(one, "promise") and {*signature(one).parameters} <= _GIVEN]

@@ -22,7 +22,7 @@ from labseq import __version__
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, error_text, format_error, install_hint
 from labseq.processes import is_loopback
-from labseq.workers import Do, Make, ProcessWorkers, Workers, finished
+from labseq.workers import Do, Make, finished
 
 CA_FILE: Final = "ca.pem"
 CLIENT_FILE: Final = "client.pem"
@@ -44,8 +44,6 @@ class ClusterWorkers:
     Args:
         address: Address of its scheduler: "tls://lab-pc:8786", or "tcp://127.0.0.1:8786" on this computer.
         keys: Folder of the certificates, as `labseq campaign keys` writes it; only for tls.
-        make: Prepares each worker.
-        recipe: The argument of ``make``, pickled.
         what: What a task is, in messages: "shot".
 
     Raises:
@@ -53,12 +51,12 @@ class ClusterWorkers:
             worker joins, or the extra is not installed.
     """
 
-    def __init__(self, address: str, keys: Path | None, make: Make, recipe: Any, what: str) -> None:
+    def __init__(self, address: str, keys: Path | None, what: str) -> None:
         check_address(address)
         self._client = connect(address, keys)
         self._address, self._what = address, what
         self._run = uuid.uuid4().hex
-        self._pack = pickle.dumps((make, recipe))
+        self._pack = b""
         self._arguments: dict[int, Any] = {}
         self._futures: dict[int, Any] = {}
         self._done = queue.SimpleQueue[tuple[int, Any]]()
@@ -88,6 +86,10 @@ class ClusterWorkers:
             elif now_s - self._seen_s > _JOIN_S:
                 raise LabseqError(f"the cluster of {self._address} has had no worker for {_JOIN_S:g} s")
         return max(1, self._n)
+
+    def prepare(self, make: Make, recipe: Any) -> None:
+        """Keep it for workers that have not been prepared."""
+        self._pack = pickle.dumps((make, recipe))
 
     def submit(self, task: int, argument: Any) -> None:
         """Hand out a task; earlier ones come first."""
@@ -144,19 +146,6 @@ class ClusterWorkers:
                 act()
             except Exception as error:  # noqa: BLE001 - the scheduler may be gone
                 logging.getLogger(__name__).debug("%s", error)
-
-
-def open_workers(
-    n_workers: int, scheduler: str | None, keys: Path | None, make: Make, recipe: Any, what: str
-) -> Workers:
-    """Workers of a cluster, or, without a scheduler, so many processes on this computer.
-
-    Raises:
-        ConfigError: As :class:`ClusterWorkers`.
-    """
-    if scheduler is None:
-        return ProcessWorkers(n_workers, make, recipe, what)
-    return ClusterWorkers(scheduler, keys, make, recipe, what)
 
 
 def check_workers(n_workers: int | None, scheduler: str | None) -> None:

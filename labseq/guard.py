@@ -179,7 +179,7 @@ class GuardedCall:
         own_error: The same if it is one of labseq's own errors, else None.
         text: Kind and text of the error, or "".
         has_steps: Whether it is the steps of a shot.
-        is_abandoned: Whether nobody waits for it any longer; it must call nothing any more.
+        is_abandoned: Whether nothing waits for it any longer; it must call nothing any more.
     """
 
     def __init__(self, work: partial[Any], *, has_steps: bool = False) -> None:

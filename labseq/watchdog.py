@@ -199,7 +199,7 @@ class _Process:
                 self._report(cause, name, "", "switching it off hangs", time.monotonic() - since_s)
 
     def _report(self, cause: str, name: str, done: str, failure: str, after_s: float) -> None:
-        """Write down what was done, first to the log, then for whoever looks at the terminal."""
+        """Write down what was done, first to the log, then to the terminal."""
         row = {
             "t_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),  # noqa: TID251 - no other module here
             "cause": cause,
@@ -341,7 +341,7 @@ class Watchdog:
                 with suppress(OSError, ValueError):
                     process.stdin.close()
                 if self._devices:  # it is at work, and needs the ports that this process still holds
-                    process.returncode = 0  # nobody waits for it
+                    process.returncode = 0  # nothing waits for it
                 else:
                     with suppress(subprocess.TimeoutExpired):
                         process.wait(END_S)

@@ -16,6 +16,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import ModuleType
@@ -46,6 +47,15 @@ class Workers(Protocol):
     @property
     def n_workers(self) -> int:
         """Number of workers now; at least 1."""
+        ...
+
+    def prepare(self, make: Make, recipe: Any) -> None:
+        """Say what the tasks are; called once, before the first.
+
+        Args:
+            make: Prepares each worker.
+            recipe: The argument of ``make``, pickled.
+        """
         ...
 
     def submit(self, task: int, argument: Any) -> None:
@@ -141,26 +151,23 @@ class ProcessWorkers:
 
     Args:
         n_workers: Their number.
-        make: Prepares each of them.
-        recipe: The argument of ``make``, pickled.
         what: What a task is, in messages: "shot".
+
+    Attributes:
+        n_workers: Their number.
     """
 
-    def __init__(self, n_workers: int, make: Make, recipe: Any, what: str) -> None:
-        self._make, self._recipe, self._what = make, recipe, what
+    def __init__(self, n_workers: int, what: str) -> None:
+        self.n_workers = n_workers
+        self._what = what
         self._n_lost = Counter[int]()
         self._workers: list[_Worker] = []
-        try:
-            for _ in range(n_workers):
-                self._workers.append(_Worker.start(make, recipe))
-        except BaseException:
-            self.close()
-            raise
 
-    @property
-    def n_workers(self) -> int:
-        """Number of workers."""
-        return len(self._workers)
+    def prepare(self, make: Make, recipe: Any) -> None:
+        """Start the processes."""
+        self._start = partial(_Worker.start, make, recipe)
+        for _ in range(self.n_workers):
+            self._workers.append(self._start())
 
     def submit(self, task: int, argument: Any) -> None:
         """Give a task to the worker that has the fewest."""
@@ -201,13 +208,12 @@ class ProcessWorkers:
         if lost.at is not None:
             self._n_lost[lost.at] += 1
             if self._n_lost[lost.at] >= MAX_LOST:
-                what = "starting" if lost.at == _START else f"{self._what} {lost.at}"
-                code = lost.process.exitcode
+                what = "a start" if lost.at == _START else f"{self._what} {lost.at}"
                 raise LabseqError(
-                    f"{what} has ended {MAX_LOST} worker processes (exit code {code}); perhaps the memory "
-                    "was used up: try again with fewer --workers"
+                    f"{MAX_LOST} worker processes have died of {what} (exit code {lost.process.exitcode}); "
+                    "perhaps the memory was used up: try again with fewer --workers"
                 )
-        new = _Worker.start(self._make, self._recipe)
+        new = self._start()
         for task, argument in lost.tasks.items():
             new.send(task, argument)
         return new

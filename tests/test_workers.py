@@ -39,18 +39,20 @@ def finished(workers: ProcessWorkers, n_tasks: int) -> dict[int, int]:
 def test_tasks_of_a_lost_worker_are_done_by_others_and_a_task_that_ends_all_ends_the_work(
     tmp_path: Path,
 ) -> None:
-    with closing(ProcessWorkers(1, make, tmp_path, "job")) as workers:
+    with closing(ProcessWorkers(1, "job")) as workers:
+        workers.prepare(make, tmp_path)
         for number in range(3):
             workers.submit(number, number)
         assert finished(workers, 3) == {0: 0, 1: 1, 2: 4}
         workers.submit(3, 3)
-        with pytest.raises(LabseqError, match=f"job 3 has ended {MAX_LOST} worker processes .exit code 7"):
+        with pytest.raises(LabseqError, match=f"{MAX_LOST} worker processes have died of job 3 .exit code 7"):
             finished(workers, 1)
     assert (tmp_path / "3").read_text() == "x" * MAX_LOST
 
 
 def test_a_worker_that_cannot_be_prepared_is_an_error_of_its_own_kind() -> None:
-    with closing(ProcessWorkers(1, make, None, "job")) as workers:
+    with closing(ProcessWorkers(1, "job")) as workers:
+        workers.prepare(make, None)
         workers.submit(0, 0)
         with pytest.raises(ConfigError, match="this worker lacks a plugin"):
             finished(workers, 1)

@@ -16,10 +16,10 @@ from typing import Any, Final
 from labseq.bench.comparison import Comparison
 from labseq.bench.report import Report, make_rows
 from labseq.bench.work import Done, Job, prepare, set_up, warm
-from labseq.cluster import open_workers
+from labseq.cluster import ClusterWorkers
 from labseq.errors import LabseqError, StopRequested
 from labseq.kernel import announcing, n_cores
-from labseq.workers import POLL_S, QUEUED
+from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Workers
 
 
 @contextmanager
@@ -77,10 +77,11 @@ def compare(
         progress: Called with the numbers of loadings that are done and wanted.
 
     Raises:
-        ConfigError: The comparison has an error; says what was expected.
+        ConfigError: The comparison has an error, or there is no such cluster; says what was expected.
         PluginLoadError: A named plugin failed to load.
     """
     start_s = time.perf_counter()
+    cluster = None if where.scheduler is None else ClusterWorkers(where.scheduler, where.keys, "part")
     prepared = set_up(comparison)
     all_done: list[Done] = []
     n_done = 0
@@ -97,7 +98,7 @@ def compare(
             with announcing(announce):
                 warm(prepared)
             progress(0, wanted)
-            with closing(_results(comparison, where)) as results:
+            with closing(_results(comparison, where, cluster)) as results:
                 for done in results:
                     all_done.append(done)
                     n_done += len(done.loadings)
@@ -111,19 +112,20 @@ def compare(
     return Report(comparison, rows, n_done, duration_s, ended_by)
 
 
-def _results(comparison: Comparison, where: Where) -> Generator[Done]:
+def _results(comparison: Comparison, where: Where, cluster: Workers | None) -> Generator[Done]:
     """The results of all loadings, in any order; closed early, it ends its processes at once."""
     n_workers = where.n_workers or n_cores()
     todo = _jobs(comparison, n_workers)
-    if where.scheduler is None and n_workers > 1 and where.n_workers is None:
+    if cluster is None and n_workers > 1 and where.n_workers is None:
         todo = yield from _begun(comparison, todo)
         n_workers = min(n_workers, len(todo))
-    if where.scheduler is None and n_workers <= 1:
+    if cluster is None and n_workers <= 1:
         yield from map(prepare(comparison), todo) if todo else ()
         return
     left = iter(enumerate(todo))
-    workers = open_workers(n_workers, where.scheduler, where.keys, prepare, comparison, "part")
+    workers = cluster or ProcessWorkers(n_workers, "part")
     with closing(workers):
+        workers.prepare(prepare, comparison)
         n_out = 0
         while True:
             for number, job in islice(left, max(0, QUEUED * workers.n_workers - n_out)):

@@ -100,7 +100,7 @@ class SpotPowers:
 
 
 def without_losses(take: Callable[[], Frame]) -> Frame:
-    """Take a frame, and again if it was lost on its way: there are no atoms that a shot must load anew."""
+    """Take a frame, and again if it was lost on its way: no atoms have to be loaded again."""
     for _ in range(N_LOST):
         try:
             return take()

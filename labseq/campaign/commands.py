@@ -24,7 +24,7 @@ def keys(
 ) -> None:
     """Make the certificates with which scheduler, workers and clients of a dask cluster know one another.
 
-    Whoever has one of the files can have the cluster run any code: copy them only to its machines.
+    Anyone who has one of the files can have the cluster run any code: copy them only to its machines.
     """
     from labseq.campaign.keys import DAYS, make_keys
     from labseq.console.output import say

@@ -122,7 +122,7 @@ class RandomStream:
     Shot k in its attempt-th try draws from ``SeedSequence(seed, spawn_key=(k,
     attempt))``, whatever happened before; the machine's own disorder comes from
     the seed alone. Consumers other than the simulation get streams of their own,
-    told apart by name, so that adding one does not change the others' draws.
+    distinguished by name, so that adding one does not change the others' draws.
 
     Args:
         seed: The run's seed.

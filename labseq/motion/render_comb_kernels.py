@@ -38,6 +38,7 @@ from labseq.motion.render_kernels import (
     END_AMPLITUDE,
     F32,
     F64,
+    FINE,
     FULL_SCALE,
     LANES,
     N_COEFFICIENTS,
@@ -67,6 +68,7 @@ from labseq.motion.render_kernels import (
     repeat,
     store,
     strip_samples,
+    take_tones,
     times,
     turn,
 )
@@ -419,6 +421,39 @@ def common_spacing(tones_hz: Floats) -> float:
             if n > most or (n == most and candidate > tried):
                 most, tried, best = n, candidate, spacing
     return best
+
+
+@kernel(
+    f"UniTuple(int64, 2)({CONST}, {CONST}, {CONST}, {CONST}, {CONST}, {const('int32', 1)}, float64,"
+    " float64[:, ::1], float64[::1])"
+)
+def survey(
+    start_hz: Floats,
+    end_hz: Floats,
+    start_amplitude: Floats,
+    end_amplitude: Floats,
+    phase_rad: Floats,
+    offsets: Ints,
+    sample_rate_hz: float,
+    tones: Floats,
+    comb_hz: Floats,
+) -> tuple[int, int]:
+    """Convert the tones of an axis as :func:`take_tones` does, with its result, and look for a comb.
+
+    ``comb_hz``, float64 (3,), is its spacing (see :func:`common_spacing`), its first tooth, and the distance
+    of the last one.
+    """
+    fault, where = take_tones(
+        start_hz, end_hz, start_amplitude, end_amplitude, phase_rad, offsets, sample_rate_hz, tones
+    )
+    comb_hz[0] = -1.0
+    if fault == FINE:
+        distinct_hz = np.empty(MAX_TONES)
+        n = distinct_tones(start_hz, distinct_hz)
+        if n > 0:
+            comb_hz[0] = common_spacing(distinct_hz[:n])
+            comb_hz[1], comb_hz[2] = start_hz.min(), distinct_hz[n - 1] - distinct_hz[0]
+    return fault, where
 
 
 @kernel(f"void({CONST}, {CONST}, int64, float64[:, ::1])")

@@ -505,6 +505,34 @@ ROUNDING: Final = 1e-9
 VALUES: Final = const("float64", 1)
 
 
+@kernel(f"boolean({VALUES}, float64, float64, int64[::1], float64[::1], float64[::1])")
+def place_segments(
+    duration_s: Floats,
+    sample_rate_hz: float,
+    most_samples: float,
+    first_sample: NDArray[np.int64],
+    delta: Floats,
+    length: Floats,
+) -> bool:
+    """Fill in the first sample of each segment and the end, int64 (n + 1,), and its times, float64 (n,).
+
+    These are, in samples, the time from its start to its first sample, and its length. Returns whether all
+    durations are finite and not negative, and there are less than ``most_samples``.
+    """
+    start_s = 0.0
+    for i in range(len(duration_s)):
+        if not 0.0 <= duration_s[i] < np.inf:
+            return False
+        at = start_s * sample_rate_hz
+        first_sample[i] = int(np.rint(at))
+        delta[i], length[i] = first_sample[i] - at, duration_s[i] * sample_rate_hz
+        start_s += duration_s[i]
+        if not start_s * sample_rate_hz < most_samples:
+            return False
+    first_sample[len(duration_s)] = int(np.rint(start_s * sample_rate_hz))
+    return True
+
+
 @kernel(
     f"UniTuple(int64, 2)({VALUES}, {VALUES}, {VALUES}, {VALUES}, {VALUES}, {const('int32', 1)}, float64,"
     " float64[:, ::1])"

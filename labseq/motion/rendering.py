@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import LimitError
 from labseq.kernel import c_address
-from labseq.model import AxisTones, SiteGrid, ToneProgram, Waveform
+from labseq.model import SiteGrid, ToneProgram, Waveform
 
 if TYPE_CHECKING:
     from labseq.motion.render_kernels import Axis, Workspace
@@ -116,27 +116,25 @@ def comb_sample_rate(
     )
 
 
-def find_comb(axis: AxisTones, sample_rate_hz: float) -> Comb:
-    """Find the comb that contains most tones of an axis, if one matches the sample rate."""
-    from labseq.motion.render_comb_kernels import (
-        MAX_TEETH,
-        MAX_TONES,
-        TOLERANCE_HZ,
-        common_spacing,
-        distinct_tones,
-    )
+def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: float) -> Comb:
+    """The comb that contains most tones of an axis, if one matches the sample rate.
 
-    tones_hz = np.empty(MAX_TONES)
-    n_tones = distinct_tones(axis.start_hz, tones_hz)
-    spacing = common_spacing(tones_hz[:n_tones]) if n_tones > 0 else -1.0
+    Args:
+        spacing: The one that most gaps between the tones are multiples of, in Hz; see ``common_spacing``.
+        lowest_hz: Frequency of the first tone.
+        span_hz: Distance of the last one.
+        sample_rate_hz: Sample rate.
+    """
+    from labseq.motion.render_comb_kernels import MAX_TEETH, TOLERANCE_HZ
+
     if spacing < 0.0:
         return NO_COMB
-    origin = float(axis.start_hz.min()) / sample_rate_hz
+    origin = lowest_hz / sample_rate_hz
     if spacing == 0.0:  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
         spacing = sample_rate_hz / _ratio(origin).denominator
     ratio = _ratio(spacing / sample_rate_hz)
     period, step = ratio.denominator, float(ratio)
-    span = (tones_hz[n_tones - 1] - tones_hz[0]) / sample_rate_hz
+    span = span_hz / sample_rate_hz
     near = abs(step * sample_rate_hz - spacing) <= TOLERANCE_HZ
     if step <= 0.0 or not near or round(span / step) >= MAX_TEETH:
         return NO_COMB
@@ -237,16 +235,17 @@ class Renderer:
         """
         if not 0 < sample_rate_hz < np.inf:
             raise LimitError("the sample rate", f"{sample_rate_hz} Hz", "more than 0 and finite")
-        _check_durations(program, sample_rate_hz)
-        starts = np.concatenate([[0.0], np.cumsum(program.duration_s)]) * sample_rate_hz
+        from labseq.motion.render_kernels import place_segments
+
+        n = len(program.duration_s)
         self.sample_rate_hz = float(sample_rate_hz)
-        self.first_sample = np.rint(starts).astype(np.int64)
+        self.first_sample, delta, length = np.empty(n + 1, np.int64), np.empty(n), np.empty(n)
+        times = self.first_sample, delta, length
+        if not place_segments(program.duration_s, self.sample_rate_hz, MAX_SAMPLES, *times):
+            _refuse_durations(program, sample_rate_hz)
         self.n_samples = int(self.first_sample[-1])
-        delta = (self.first_sample - starts)[:-1].copy()
-        length = program.duration_s * sample_rate_hz
         for array in (self.first_sample, delta, length):
             array.flags.writeable = False
-        times = self.first_sample, delta, length
         axes = [_prepare(program, channel, times, self.sample_rate_hz) for channel in range(N_CHANNELS)]
         self._axes: list[Axis] = axes
         self.path = np.stack([axis[3] for axis in axes])
@@ -378,12 +377,13 @@ def _prepare(
     Raises:
         LimitError: See :class:`Renderer`.
     """
-    from labseq.motion.render_kernels import FINE, N_FIELDS, choose_paths, take_tones
+    from labseq.motion.render_comb_kernels import survey
+    from labseq.motion.render_kernels import FINE, N_FIELDS, choose_paths
 
     axis, (first_sample, delta, length) = (program.row, program.column)[channel], times
     n_tones = len(axis.start_hz)
-    tones = np.empty((N_FIELDS, n_tones))
-    fault, where = take_tones(
+    tones, comb_hz = np.empty((N_FIELDS, n_tones)), np.zeros(3)
+    fault, where = survey(
         axis.start_hz,
         axis.end_hz,
         axis.start_amplitude,
@@ -392,10 +392,12 @@ def _prepare(
         axis.offsets,
         sample_rate_hz,
         tones,
+        comb_hz,
     )
     if fault != FINE:
         _refuse(fault, where, program, channel, sample_rate_hz)
-    comb = find_comb(axis, sample_rate_hz)
+    spacing, lowest_hz, span_hz = comb_hz.tolist()
+    comb = find_comb(spacing, lowest_hz, span_hz, sample_rate_hz)
     path, group = np.empty(len(length), np.int8), np.zeros(n_tones, np.int8)
     tooth = np.zeros(n_tones, np.int32)
     choose_paths(
@@ -409,15 +411,14 @@ def _prepare(
     )  # fmt: skip
 
 
-def _check_durations(program: ToneProgram, sample_rate_hz: float) -> None:
+def _refuse_durations(program: ToneProgram, sample_rate_hz: float) -> NoReturn:
     wrong = np.flatnonzero(~((program.duration_s >= 0) & (program.duration_s < np.inf)))
     if len(wrong):
         which = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]]}"
         raise LimitError(which, f"{program.duration_s[wrong[0]]} s", "0 or more and finite")
     with np.errstate(over="ignore"):
         n_samples = float(program.duration_s.sum()) * sample_rate_hz
-    if not n_samples < MAX_SAMPLES:
-        raise LimitError("the number of samples", f"{n_samples:.3g}", f"less than {MAX_SAMPLES:.3g}")
+    raise LimitError("the number of samples", f"{n_samples:.3g}", f"less than {MAX_SAMPLES:.3g}")
 
 
 def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:

@@ -404,6 +404,46 @@ def start_sites(of: Batch, n_sites: int, tones: Ints) -> None:
         tones[0, k] = int(min(max(place, 0.0), n_sites - 1.0))
 
 
+NOT_ON_GRID: Final = -1
+
+
+@kernel(
+    f"UniTuple(int64, 3)({MOVES}, {const('int32', 1)}, {const('int32', 2)}, int64, boolean, int64, int64)"
+)
+def room_for(
+    moves: NDArray[np.int16],
+    batch_offsets: NDArray[np.int32],
+    path_shapes: NDArray[np.int32],
+    n_batches: int,
+    is_uneven: bool,
+    n_rows: int,
+    n_cols: int,
+) -> tuple[int, int, int]:
+    """The most segments that a plan's batches can need, and the most tones in them on each axis.
+
+    The first is NOT_ON_GRID if a source is not.
+    """
+    for k in range(batch_offsets[n_batches]):
+        if not (0 <= moves[k, 0] < n_rows and 0 <= moves[k, 1] < n_cols):
+            return NOT_ON_GRID, 0, 0
+    widest = 0
+    if is_uneven:
+        for k in range(len(moves)):
+            widest = max(widest, abs(moves[k, 2] - moves[k, 0]), abs(moves[k, 3] - moves[k, 1]))
+    n_segments, n_lines, n_rows_on_paths, n_cols_on_paths = 5 * n_batches, 0, 0, 0
+    for i in range(n_batches):
+        size = batch_offsets[i + 1] - batch_offsets[i]
+        n_cuts = widest if is_uneven else 2 * size  # a tone may arrive on either axis
+        n_segments += n_cuts
+        n_lines += (n_cuts + 4) * size
+    for i in range(min(n_batches, len(path_shapes))):
+        n_path_segments = 2 * path_shapes[i, 0] + 4
+        n_segments += n_path_segments
+        n_rows_on_paths += n_path_segments * path_shapes[i, 1]
+        n_cols_on_paths += n_path_segments * path_shapes[i, 2]
+    return n_segments, n_lines + n_rows_on_paths, n_lines + n_cols_on_paths
+
+
 @kernel(
     f"UniTuple(int64, 2)({MOVES}, {const('int32', 1)}, {const('bool_', 1)}, {PATHS}, float64, int64, int64,"
     f" int64, {SITES_OF_AXIS}, {SITES}, {SITES}, boolean, int64, boolean, {SITES}, {SEGMENTS},"

@@ -88,6 +88,14 @@ def path_geometry(grid: SiteGrid, motion: MotionSpec) -> NDArray[np.float64]:
     return geometry
 
 
+@lru_cache(maxsize=16)
+def _times_s(grid: SiteGrid, motion: MotionSpec) -> NDArray[np.float64]:
+    """The times that ``build_axis`` needs."""
+    ramps_s, site_s = (motion.pick_up_s, motion.drop_off_s), site_time_s(grid, motion)
+    times_s = [motion.overhead_per_batch_s, ramps_s[0], site_s, ramps_s[1], *map(keyed_time_s, ramps_s)]
+    return np.array(times_s)
+
+
 def tone_program(
     plan: Plan,
     grid: SiteGrid | None = None,
@@ -134,21 +142,23 @@ def tone_program(
             amplitudes, peak voltage, mean power), the amplitudes are not one per site, or the
             speed profile does not exist.
     """
-    from labseq.motion.tone_kernels import N_FIELDS, PHASE, build_axis
+    from labseq.motion.tone_kernels import N_FIELDS, NOT_ON_GRID, PHASE, build_axis, room_for
 
     grid = grid or default_grid(20, 20)
     motion = motion or MotionSpec()
     n_batches = plan.n_batches if n_batches is None else n_batches
-    _check_size(plan, grid, n_batches)
-    site_s = site_time_s(grid, motion)
-    ramps_s = motion.pick_up_s, motion.drop_off_s
-    times_s = np.array(
-        [motion.overhead_per_batch_s, ramps_s[0], site_s, ramps_s[1], *map(keyed_time_s, ramps_s)]
-    )
+    if not 0 <= n_batches <= plan.n_batches:
+        raise PlanError(f"the plan has {plan.n_batches} batches; {n_batches} cannot be played")
+    times_s = _times_s(grid, motion)
     course = SPEED_PROFILES.index(motion.speed_profile)
     drives = [drive(grid, motion, axis) for axis in AXIS_INDICES]
     is_uneven = any(driven.is_uneven for driven in drives)
-    n_segments, n_values = _capacity(plan, n_batches, is_uneven)
+    n_segments, *n_values = room_for(
+        plan.moves, plan.batch_offsets, plan.path_shapes, n_batches, is_uneven, *grid.shape
+    )
+    if n_segments == NOT_ON_GRID:
+        size = f"{grid.n_rows} x {grid.n_cols} sites"
+        raise PlanError(f"the plan does not fit onto the grid of {size}; check it first")
     cosine = float(path_geometry(grid, motion)[1])
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
@@ -189,29 +199,6 @@ def tone_program(
         array.flags.writeable = False
     kind, courses = labels[:, :n]
     return ToneProgram(axes[0], axes[1], duration_s[:n], kind, batch[:n], courses)
-
-
-def _capacity(plan: Plan, n_batches: int, is_uneven: bool) -> tuple[int, list[int]]:
-    """The most segments that a plan's batches can need, and the most tones in them on each axis."""
-    sizes = (plan.batch_offsets[1 : n_batches + 1] - plan.batch_offsets[:n_batches]).astype(np.int64)
-    n_cuts = 2 * sizes  # a tone may arrive on either axis
-    if is_uneven:
-        n_cuts[:] = np.abs(plan.moves[:, 2:] - plan.moves[:, :2]).max(initial=0)
-    shapes = plan.path_shapes[:n_batches].astype(np.int64)
-    n_path_segments = 2 * shapes[:, 0] + 4
-    n_line_values = int(((n_cuts + 4) * sizes).sum())
-    n_values = [n_line_values + int((n_path_segments * shapes[:, 1 + axis]).sum()) for axis in AXIS_INDICES]
-    return 5 * n_batches + int(n_cuts.sum() + n_path_segments.sum()), n_values
-
-
-def _check_size(plan: Plan, grid: SiteGrid, n_batches: int) -> None:
-    if not 0 <= n_batches <= plan.n_batches:
-        raise PlanError(f"the plan has {plan.n_batches} batches; {n_batches} cannot be played")
-    sources = plan.moves[: plan.batch_offsets[n_batches], :2]
-    if len(sources) and (sources.min() < 0 or (sources.max(axis=0) >= grid.shape).any()):
-        raise PlanError(
-            f"the plan does not fit onto the grid of {grid.n_rows} x {grid.n_cols} sites; check it first"
-        )
 
 
 def check_limits(

@@ -147,7 +147,7 @@ class Camera(Hardware):
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once.
 
-        With "bulb" ``exposure_s`` is how long the line will be on, which the camera is not told.
+        With "bulb" ``exposure_s`` is how long the line will be on, which is not sent to the camera.
 
         A shot arms once for all its images with the same exposure time, as many as it may need at most.
         """

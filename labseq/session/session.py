@@ -42,6 +42,7 @@ from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
     from labseq.session.resume import ResumableRun
+    from labseq.workers import Workers
 
 
 P = ParamSpec("P")
@@ -80,6 +81,7 @@ class Session:
         self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._awaited)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
+        self._workers: Workers | None = None
 
     @classmethod
     def open(
@@ -215,13 +217,17 @@ class Session:
                 _, writer = self._begin(root)
                 writer.finish("complete")
                 return open_run(writer.run_dir)
-            warnings = [str(problem) for problem in check(self, runs=True).warnings]
-            labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
-            lab = next(labs)
             if self.options.has_workers:
                 from labseq.session.workers import refuse_workers  # most runs have none
 
-                refuse_workers(self.assembly, self.options, lab)
+                refuse_workers(self.assembly, self.options, self.build_lab())
+            warnings = [str(problem) for problem in check(self, runs=True).warnings]
+            if self.options.has_workers:
+                from labseq.session.workers import open_workers
+
+                self._workers = stack.enter_context(closing(open_workers(self.options)))
+            labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
+            lab = next(labs)
             for one in itertools.chain([lab], labs):
                 self.warm(one)
             if gc.get_freeze_count():  # by an earlier run in this process
@@ -305,13 +311,15 @@ class Session:
 
         checks = Checks(settings, before, self._warn, values_of)
         emit = self._observers.event
-        if not self.options.has_workers:
+        if self._workers is None:
             own = OwnShots(sequencer, first, changes, record.seed)
             self.scan_run.run(own, writer, checks, emit)
             return
         from labseq.session.workers import WorkersShots
 
-        shots = WorkersShots(self.scan_run, self.options, writer, self._observers, self.stop_flag)
+        shots = WorkersShots(
+            self._workers, self.scan_run, self.options, writer, self._observers, self.stop_flag
+        )
         with closing(shots):
             self.scan_run.run(shots, writer, checks, emit)
 

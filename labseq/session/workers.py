@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.cluster import check_workers, open_workers
+from labseq.cluster import ClusterWorkers, check_workers
 from labseq.config.document import StoredText
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.files import write_file
@@ -42,7 +42,7 @@ from labseq.session.provenance import run_record
 from labseq.session.resume import changes_between, plain_record
 from labseq.session.scan import Point
 from labseq.session.scan_run import OwnShots, ScanRun
-from labseq.workers import POLL_S, QUEUED, Unfinished, portable
+from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Unfinished, Workers, portable
 
 _AHEAD: Final = 1
 """Shots per worker that may wait to be recorded, besides those that are handed out."""
@@ -52,6 +52,17 @@ _UNSEEN: Final = "state"
 
 Place = int | Mapping[str, float]
 """The index of a point, or the values of one that a scanner has chosen."""
+
+
+def open_workers(options: Options) -> Workers:
+    """The workers that take the shots of a run.
+
+    Raises:
+        ConfigError: There is no such cluster, or it has no workers.
+    """
+    if options.scheduler is None:
+        return ProcessWorkers(options.workers, "shot")
+    return ClusterWorkers(options.scheduler, options.keys, "shot")
 
 
 def refuse_workers(assembly: Assembly, options: Options, lab: Lab) -> None:
@@ -268,6 +279,7 @@ class WorkersShots:
     """Has the shots of a run taken by workers, a bounded number ahead, and records them in order.
 
     Args:
+        workers: The workers.
         scan_run: The run's shots and points.
         options: Its options.
         writer: Its folder.
@@ -279,8 +291,15 @@ class WorkersShots:
     """
 
     def __init__(
-        self, scan_run: ScanRun, options: Options, writer: RunWriter, observers: Observers, stop: StopFlag
+        self,
+        workers: Workers,
+        scan_run: ScanRun,
+        options: Options,
+        writer: RunWriter,
+        observers: Observers,
+        stop: StopFlag,
     ) -> None:
+        self._workers = workers
         self._scan_run = scan_run
         self._writer = writer
         self._observers = observers
@@ -294,9 +313,7 @@ class WorkersShots:
         for_worker = replace(options, output=None, keys=None)
         run_id, needs_frames = run_id_of(writer.run_dir), observers.need_frames
         recipe = Recipe(writer.run, run_id, for_worker, str(self._folder), mark, needs_frames)
-        self._workers = open_workers(
-            options.workers, options.scheduler, options.keys, ShotWorker, recipe, "shot"
-        )
+        workers.prepare(ShotWorker, recipe)
 
     def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
         """Wait for a shot, and record it; see :class:`labseq.session.scan_run.ShotTaker`."""

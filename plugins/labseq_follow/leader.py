@@ -148,8 +148,8 @@ class LeaderDevice(Device):
             self._dialogue.is_waiting = False
         if text is None:
             what = f"no '{GO}' within {format_quantity(timeout_s, 'time')} on {self._link.address}"
-            connected = "the leader is connected" if self._dialogue.is_connected else "nobody has connected"
-            text = f"{what}; {connected}; see 'timeout' of the wait"
+            connected = "the" if self._dialogue.is_connected else "no"
+            text = f"{what}; {connected} leader has connected; see 'timeout' of the wait"
             raise DeviceTimeoutError(self._name, text, timeout_s)
         if self._settings.loads and not simulated:
             load_atoms(self._context, LOADING_S)

@@ -256,7 +256,7 @@ class TcpLink(Link):
         with suppress(OSError):
             peer.send(answer)
             peer.shutdown(socket.SHUT_WR)
-            peer.recv(4096)  # what it sent and nobody read could make its side drop our line
+            peer.recv(4096)  # unread data could make its side drop our line
         self._forget(peer)
         self._n_refused += 1
         if self._n_refused & (self._n_refused - 1):

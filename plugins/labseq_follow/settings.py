@@ -66,7 +66,7 @@ class TcpLeaderSettings(LeaderSettings):
     def _check_host(self) -> Self:
         if not self.allow_remote and not wire.is_loopback(self.host):
             what = f"host is '{clean(self.host)}', which other computers can reach"
-            hint = "or set 'allow_remote: true' in a network in which nobody listens"
+            hint = "or set 'allow_remote: true' in a network in which nobody else listens"
             raise setting_error(
                 what, "an address that only this computer can reach, such as 127.0.0.1", hint, at=("host",)
             )

@@ -6,7 +6,7 @@ for row i. An atom is *carried* if its column is chosen; so a source column with
 column with the vacancies b if a is part of b.
 
 In all kernels ``source``, uint8 (n_rows, n_cols), is EMPTY, SPARE or STAYS; ``vacant``, uint8 of the same
-shape, is 1 where an atom may be put down. ``spare``, int64 (2**n, n_cols + 1), is for each pattern and
+shape, is 1 where an atom may be dropped off. ``spare``, int64 (2**n, n_cols + 1), is for each pattern and
 column the first column from there on that has exactly this pattern, or NOWHERE.
 """
 

@@ -85,7 +85,7 @@ def max_knots(n_rows: int, n_cols: int) -> int:
     """More than the number of knots of any batch on a grid, lines outside of it included.
 
     Each site of the way along rows and columns takes PARTS, half a site more where tweezers go both ways,
-    and each row that is put down on its own 4.
+    and each row that is dropped off on its own 4.
     """
     return PARTS * (n_rows + n_cols + 2) + 24
 
@@ -226,11 +226,11 @@ def add_half_site(
 
 @helper_kernel("void(bool_[:, ::1], int64[::1], int64, int64, bool_[::1], bool_[::1])")
 def next_to_put_down(free: Bools, goes_off: Ints, n: int, m: int, together: Bools, used: Bools) -> None:
-    """Choose the rows that are put down together: those that leave no empty tweezer on an atom.
+    """Choose the rows that are dropped off together: those that leave no empty tweezer on an atom.
 
     Args:
-        free: bool (2 n, m): which crossings carry atoms, then which may be put down.
-        goes_off: int64 (n,), the knot at which each row is put down, 0 if it is still on.
+        free: bool (2 n, m): which crossings carry atoms, then which may be dropped off.
+        goes_off: int64 (n,), the knot at which each row is dropped off, 0 if it is still on.
         n: Number of rows.
         m: Number of columns.
         together: Result, bool (n,), the rows.
@@ -280,11 +280,11 @@ def find_paths(
         to_row: int64 (n,), where they end.
         column: int64 (m,), where the column tones start.
         to_column: int64 (m,), where they end.
-        free: bool (2 n, m): which crossings carry atoms, then which may be put down.
+        free: bool (2 n, m): which crossings carry atoms, then which may be dropped off.
         n_rows: Rows of the grid.
         n_cols: Columns of the grid.
         slots: Lines beyond the grid that the tones reach.
-        stages: Whether rows are put down in stages, so that only free crossings are put down.
+        stages: Whether rows are dropped off in stages, so that only free crossings are dropped off.
         weave: How far lanes swing, see :func:`add_travel`; 0 for straight ones.
         rows: Result, float64 (max_knots, n), positions of the row tones at each knot.
         columns: Result, float64 (max_knots, m), of the column tones.

@@ -1,7 +1,7 @@
 """Points by a sampler of Optuna, as a pure function of the visited points.
 
 Optuna's own samplers go on drawing from where they stand. Here each point has a sampler of its
-own, seeded by the run's seed and the number of points before it, and a study that is told
+own, seeded by the run's seed and the number of points before it, and a study that is given
 everything from the start; so a run that is resumed asks for the same points.
 """
 

@@ -324,7 +324,7 @@ class Connection:
 
     def _lose(self, why: str) -> None:
         if not self._ended.is_set():
-            self._lost = self._lost or f"the connection is lost: {why}; the server makes the device safe"
+            self._lost = self._lost or f"the connection is lost: {why}; its computer makes the device safe"
             self._run.lost.add(self)
 
     def failure(self, text: str = "") -> DeviceError:

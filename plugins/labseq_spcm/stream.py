@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -116,13 +117,6 @@ def made_of(
     return Program(words, axes, renderer, n_samples / sample_rate_hz)
 
 
-def _assist(box: NDArray[np.int64]) -> None:
-    """The thread that renders one of the two axes; from now on it is reckoned with."""
-    raise_priority(above=1)
-    box[k.HAS_HELPER] = 1
-    k.assist(box, new_timer())
-
-
 def new_scratch() -> NDArray[np.int16]:
     """Room for the samples of both axes before they are interleaved."""
     return np.zeros((2, k.CHUNK), np.int16)
@@ -177,7 +171,7 @@ class Stream:
         self._is_on = self._is_filling = self._has_thread = False
         self._failure: LabseqError | None = None
         self._prepared: Program | None = None
-        self._queued: list[Program] = []
+        self._queued = deque[Program](maxlen=k.N_QUEUE)
         self._box = self._new_box()
         self.n_underruns = 0
         self._check_bus()
@@ -223,15 +217,15 @@ class Stream:
         with self._lock:
             if self._is_on:
                 return
-            self._box, self._queued = self._new_box(), []
+            self._box, self._queued = self._new_box(), deque(maxlen=k.N_QUEUE)
             self._begin()
             self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
-            arguments = self._box, self._stop
+            arguments = self._box, self._stop, self._queued
             threading.Thread(target=self._run, args=arguments, name="spcm stream", daemon=True).start()
             if n_cores() > 1:
-                threading.Thread(target=_assist, args=[self._box], name="spcm helper", daemon=True).start()
+                threading.Thread(target=self._help, args=arguments, name="spcm helper", daemon=True).start()
 
     def halt(self) -> None:
         """End the supply and drop the programs; the card is stopped by the caller."""
@@ -277,7 +271,7 @@ class Stream:
 
     def _queue(self, program: Program) -> None:
         box, n = self._box, int(self._box[k.QUEUED])
-        self._queued = [*self._queued[1 - k.N_QUEUE :], program]  # the loop may still use the ones before
+        self._queued.append(program)  # the loop may still use the ones before
         box[k.QUEUE + n % k.N_QUEUE] = program.words.ctypes.data
         box[k.QUEUED] = n + 1
 
@@ -301,8 +295,16 @@ class Stream:
         if failure is not None:
             raise failure
 
-    def _run(self, box: NDArray[np.int64], stop: threading.Event) -> None:
-        """The thread."""
+    # Both threads keep alive what their loops know the addresses of.
+
+    def _help(self, box: NDArray[np.int64], _stop: threading.Event, _programs: deque[Program]) -> None:
+        """The thread that renders one of the two axes; from now on it is reckoned with."""
+        raise_priority(above=1)
+        box[k.HAS_HELPER] = 1
+        k.assist(box, new_timer())
+
+    def _run(self, box: NDArray[np.int64], stop: threading.Event, _programs: deque[Program]) -> None:
+        """The thread that supplies the card."""
         raise_priority(above=2)  # so that the card does not run dry because other threads are busy
         timer, rate_hz, code = new_timer(), int(self._rate_hz), 0
         while (pause_s := self._step(box, code)) is not None:

@@ -27,7 +27,7 @@ LOG_SIZE: Final = 100_000
 KEPT_S: Final = 1.0
 """How long a stream is kept where nothing receives it."""
 KEPT_BYTES: Final = 1 << 27
-"""Memory for what a stream has played in real time and nobody has read yet: 50 ms at 625 MS/s."""
+"""Memory for what a stream has played in real time and that has not been read yet: 50 ms at 625 MS/s."""
 EDGE_V: Final = 3.3
 """Height of a pulse at Ext0, of LVTTL."""
 

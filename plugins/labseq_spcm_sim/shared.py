@@ -254,7 +254,7 @@ class _Computer:
         self._off = threading.Event()
 
     def serve(self) -> None:
-        """Take connections until nobody has needed the cards for some time."""
+        """Take connections until the cards have not been needed for some time."""
         key = secrets.token_bytes(16)
         place = tempfile.mkdtemp(prefix="labseq-") if os.name != "nt" else ""
         with Listener(f"{place}/cards" if place else None, authkey=key) as listener:

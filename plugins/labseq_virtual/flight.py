@@ -299,7 +299,7 @@ class RfTransport:
     def find_tones(self, pulse: RfPulse) -> Iterator[tuple[tuple[Floats, ...], Floats]]:
         """Positions (in sites) and depth factors of row and column tones, and the times of the frames.
 
-        Those of one batch after the other: batches without a pause are told apart by the dark between them.
+        Those of one batch after the other: batches without a pause are separated by the dark between them.
         """
         found: list[Tracks] = []
         for axis, spans in enumerate((pulse.rows, pulse.columns)):

@@ -53,7 +53,7 @@ def test_arrays_that_are_no_plan_are_refused(moves, offsets, message):
 
 
 def grid_batch(n_knots: int = 3) -> Batch:
-    """Two rows of two tweezers; the first row is put down one knot before the second."""
+    """Two rows of two tweezers; the first row is dropped off one knot before the second."""
     steps = np.arange(n_knots)[:, None] * 0.5
     row_off = np.array([n_knots - 2, n_knots - 1])
     paths = TonePaths(np.add(steps, [0.0, 2.0]), np.subtract([1.0, 4.0], steps), row_off)

@@ -115,11 +115,11 @@ def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
 
 
 def test_a_timeout_says_whether_a_leader_is_connected() -> None:
-    nobody = r"no 'go' within 10 ms on 127.0.0.1:\d+; nobody has connected"
+    nobody = r"no 'go' within 10 ms on 127.0.0.1:\d+; no leader has connected"
     with listening() as device, pytest.raises(DeviceTimeoutError, match=nobody):
         device.wait_for("go", 0.01)
     with led() as (device, _):
-        with pytest.raises(DeviceTimeoutError, match="the leader is connected"):
+        with pytest.raises(DeviceTimeoutError, match="the leader has connected"):
             device.wait_for("go", 0.01)
         with pytest.raises(DeviceError, match="unknown signal 'start'; expected 'go'"):
             device.wait_for("start", 0.01)

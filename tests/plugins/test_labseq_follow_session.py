@@ -126,7 +126,7 @@ def test_a_go_that_never_comes_ends_the_run_in_the_safe_state(tmp_path: Path) ->
     overrides = [ANY_PORT, "shot.0.wait.timeout=50 ms"]
     with Session.open(FOLLOW, output=tmp_path, overrides=overrides) as session:
         with pytest.raises(
-            DeviceTimeoutError, match=r"no 'go' within 50 ms on .*; nobody has connected"
+            DeviceTimeoutError, match=r"no 'go' within 50 ms on .*; no leader has connected"
         ) as caught:
             session.run()
         assert caught.value.exit_code == 3

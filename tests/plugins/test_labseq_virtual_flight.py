@@ -330,7 +330,7 @@ def test_near_a_tweezer_are_the_sites_around_it(rows: Floats, cols: Floats) -> N
 
 
 def test_rows_are_put_down_one_after_the_other() -> None:
-    """While the second row is put down, the column that it does not use waits half a site beside it."""
+    """While the second row is dropped off, the column that it does not use waits half a site beside it."""
     row = np.array([[0.0, 2], [0.5, 2.5], [1, 2.5], [1, 2.5], [1, 3]])
     column = np.array([[2.0, 3]] * 3 + [[2.5, 3]] * 2)
     tones = TonePaths(row, column, np.array([2, 4]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -19,13 +21,14 @@ from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
 from labseq_remote.simulation import RemoteSimulation
 from labseq_virtual.devices import VirtualDevice
 
+import labseq.remote.server
 from labseq import wire
 from labseq.guard import StopFlag
 from labseq.plugin import ConfigError, Context, DeviceError, LimitError, SiteGrid, StopRequested
 from labseq.remote.server import Serving, serving
 from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock
-from tests.remote.conftest import PROFILE, Served, served
+from tests.remote.conftest import PROFILE, Served, free_port, served
 from tests.remote.test_contracts import with_simulation
 
 Fault = Callable[[list[bytes]], list[list[bytes]]]
@@ -192,7 +195,7 @@ def test_a_message_that_cannot_be_read_is_an_error_of_the_device(server: Served,
 
 def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
     def delay(message: list[bytes]) -> list[list[bytes]]:
-        time.sleep(0.2)
+        time.sleep(0.1)
         return [message]
 
     with instrument(server, PROXY) as device:
@@ -201,13 +204,16 @@ def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
         assert device.read("power") == 0.5
 
 
-def test_both_sides_notice_a_cut(server: Served, faulty: Proxy) -> None:
+def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
     with instrument(server, PROXY) as device:
         n_told = len(server.told)
         faulty.is_cut = True
+        device._link.connect()._lost_s = 0.3
+        monkeypatch.setattr(labseq.remote.server, "LOST_S", 0.3)
         with pytest.raises(DeviceError, match=r"^laser: the connection is lost.*127\.0\.0\.2"):
             [device.read("power") for _ in range(1000)]
         until(lambda: any("made safe" in text for text in server.told[n_told:]))
+        monkeypatch.undo()
         with pytest.raises(DeviceError):
             device.safe_state()
     with instrument(server) as again:
@@ -216,6 +222,7 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy) -> None:
 
 def test_a_lost_reply_ends_the_connection(server: Served, faulty: Proxy) -> None:
     with instrument(server, PROXY) as device:
+        device._link.connect()._lost_s = 0.5
         faulty.reply_fault = lambda message: [] if b"waits" in message[0] else [message]
         with pytest.raises(DeviceError, match="no reply"):
             device.command("open")
@@ -326,7 +333,7 @@ def test_no_message_ends_the_server(server: Served) -> None:
     from tests.remote.fuzz import fuzz
 
     with instrument(server) as device:
-        assert fuzz(server.server, server.port, 300, seed=1) > 0
+        assert fuzz(server.server, server.port, 200, seed=1) > 0
         device.command("set", power=0.25)
         assert device.read("power") == 0.25
 
@@ -426,6 +433,63 @@ def test_a_server_does_not_start_with_a_device_that_fails(tmp_path: Path) -> Non
         served(tmp_path, f"{profile}plugin_folders: [.]\n"),
     ):
         pass
+
+
+OUTLIVING = """
+import sys
+from pathlib import Path
+from labseq.plugin import Device, Emergency, hookimpl
+LABSEQ_API = 1
+
+class Outliving(Device):
+    def __init__(self, settings, context): pass
+    def open(self): pass
+    def close(self): pass
+    def safe_state(self): pass
+    def describe(self): return {}
+    def command(self, name, **arguments): pass
+    def read(self, name): return 1.0
+    def emergency(self): return Emergency(Path(__file__).with_name("off.py"), {})
+
+@hookimpl
+def labseq_register(registry):
+    registry.device("outliving", Outliving)
+"""
+OFF = """
+from pathlib import Path
+def off(): return Path(__file__).with_name("off").write_text("off") and "off"
+"""
+
+
+def test_a_device_has_one_server_and_is_switched_off_when_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "outliving.py").write_text(OUTLIVING, encoding="utf-8")
+    (tmp_path / "off.py").write_text(OFF, encoding="utf-8")
+    devices = PROFILE.replace(
+        "{use: virtual, commands: [open, set], values: {power: 1.0}}", "{use: outliving}"
+    )
+    path = tmp_path / "served.yaml"
+    path.write_text(f"{devices}plugin_folders: [.]\n", encoding="utf-8")
+    port = free_port(4)
+    serve = [sys.executable, "-m", "labseq", "serve-devices", str(path), "--plain"]
+    with subprocess.Popen(
+        [*serve, "--bind", f"tcp://127.0.0.1:{port}"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert any("serves instrument" in line for line in process.stdout)
+            another = Serving(f"tcp://127.0.0.1:{free_port(4)}", plain=True)
+            with pytest.raises(DeviceError, match="serve-devices"), serving(str(path), (), another, print):
+                pass
+            settings = RemoteSettings(device="instrument", address=f"tcp://127.0.0.1:{port}")
+            device = RemoteDevice(settings, Context("laser", clock=RealClock(StopFlag())))
+            device.open()
+            assert device.read("power") == 1.0
+        finally:
+            process.kill()
+    with pytest.raises(DeviceError, match=r"^laser: the connection is lost: the server has ended"):
+        [device.read("power") for _ in range(1000)]
+    until((tmp_path / "off").exists)
+    device._link.end()
 
 
 def test_a_port_that_is_taken_is_named(server: Served, tmp_path: Path) -> None:

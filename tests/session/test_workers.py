@@ -149,4 +149,4 @@ def test_a_cluster_that_cannot_be_used(
     pytest.importorskip("distributed")
     monkeypatch.setattr("labseq.cluster._ANSWER_S", 0.5)
     with pytest.raises(ConfigError, match=message):
-        ClusterWorkers(address, keys, ShotWorker, None, "shot")
+        ClusterWorkers(address, keys, "shot")
