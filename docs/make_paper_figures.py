@@ -18,7 +18,6 @@ import io
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,15 +66,19 @@ UNTUNED = (
     "profile.simulation.imaging_loss=0.314 %",
 )
 """Overrides of the profile `paper`, after which only the loss of a moved atom is fitted."""
+GRID = ("planner={use: grid, degree_of_parallelism: 7, lanes: weaving}",)
+"""Overrides for the planner `grid`; the profile `paper` does not bear shallower tweezers on the way."""
 SERIES_5: dict[str, tuple[str, tuple[str, ...]]] = {
     "figure5": ("profile `paper`", ()),
     "figure5_no_repair": ("the same, repair off", ("planner.repair_below=0",)),
     "figure5_untuned": ("only the loss per atom fitted", UNTUNED),
     "figure5_variant": ("`variant: paper`", ("planner.variant=paper",)),
+    "figure5_grid": ("`grid`", GRID),
+    "figure5_pairs": ("pairs leave one atom", ("profile.simulation.pair_survival=66.7 %",)),
 }
 """Table of each series of figure 5 -> its name and its overrides."""
 DRAWN_5 = ("figure5", "figure5_untuned")
-SEED_5, PART_5 = 51, 250
+SEED_5, PART_5, PART_4 = 51, 250, 250
 
 
 @dataclass
@@ -92,6 +95,32 @@ class Tally:
         played = [list(cycle.plan.batches)[: cycle.n_batches_played] for cycle in shot.cycles]
         self.n_atom_moves.append([sum(len(b) for b in batches if not b.linked) for batches in played])
         shot.images.clear()
+
+
+SUMS = ("filling", "filling_squared")
+"""Columns of a table of figure 4: means over the shots."""
+
+
+class Filled(NamedTuple):
+    """Shots of a point of figure 4: their number, the mean filling and the mean of its square."""
+
+    shots: int
+    filling: float
+    squared: float
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean filling."""
+        return math.sqrt(max(self.squared - self.filling**2, 0.0) / self.shots)
+
+    def with_shots(self, filling: NDArray[np.float64]) -> Filled:
+        """These shots and more, of which the filling is given."""
+        n = self.shots + len(filling)
+        means = (
+            (self.shots * mean + more.sum()) / n
+            for mean, more in ((self.filling, filling), (self.squared, filling**2))
+        )
+        return Filled(n, *(float(mean) for mean in means))
 
 
 class NoObserver:
@@ -126,24 +155,6 @@ def take(sequence: str, shots: Sequence[int], overrides: Sequence[str], seed: in
     return tally
 
 
-def point(dop: int, window_ms: int, n_shots: int, seed: int) -> dict[str, Any]:
-    """One point of figure 4."""
-    overrides = [
-        f"scan={{planner.degree_of_parallelism: [{dop}]}}",
-        f"repeats={n_shots}",
-        f"shot.2.rearrange.window={window_ms} ms",
-    ]
-    filling = 1 - np.array(take(FIGURE_4, range(n_shots), overrides, seed).defects)[:, 0] / 225
-    error = filling.std(ddof=1) / math.sqrt(n_shots)
-    return {
-        "dop": dop,
-        "window_ms": window_ms,
-        "shots": n_shots,
-        "filling": f"{filling.mean():.6f}",
-        "error": f"{error:.6f}",
-    }
-
-
 def rows_of(path: Path) -> list[dict[str, str]]:
     """The rows of a table; none if there is no such file."""
     if not path.is_file():
@@ -152,25 +163,50 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def append(path: Path, row: Mapping[str, Any]) -> None:
-    """Add a row to a table."""
-    is_new = not path.is_file()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row), lineterminator="\n")
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a table."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_file(path, text.getvalue().encode())
 
 
-def simulate_4(n_shots: int, n_processes: int, points: Iterable[tuple[int, int]]) -> None:
-    """Take the points of figure 4 that are missing in its table."""
-    path = FIGURES / "figure4.csv"
-    done = {(int(row["dop"]), int(row["window_ms"])) for row in rows_of(path)}
-    with ProcessPoolExecutor(n_processes) as pool:
-        left = [key for key in points if key not in done]
-        tasks = [pool.submit(point, *key, n_shots, 1000 * key[0] + key[1]) for key in left]
-        for task in as_completed(tasks):
-            append(path, task.result())
+def table_4() -> dict[tuple[int, int], Filled]:
+    """Degree of parallelism and window in ms -> the shots of that point of figure 4."""
+    return {
+        (int(row["dop"]), int(row["window_ms"])): Filled(int(row["shots"]), *(float(row[k]) for k in SUMS))
+        for row in rows_of(FIGURES / "figure4.csv")
+    }
+
+
+def simulate_4(n_shots: int) -> None:
+    """Add shots to the points of figure 4 until all have so many, in parts."""
+    while True:
+        table = {key: Filled(0, 0.0, 0.0) for key in POINTS} | table_4()
+        key = min(POINTS, key=lambda key: table[key].shots)
+        if table[key].shots >= n_shots:
+            return
+        part = range(table[key].shots, min(table[key].shots + PART_4, n_shots))
+        table[key] = table[key].with_shots(take_4(*key, part))
+        rows = [
+            {"dop": dop, "window_ms": window_ms, "shots": one.shots}
+            | {name: f"{value:.9f}" for name, value in zip(SUMS, one[1:], strict=True)}
+            for (dop, window_ms), one in table.items()
+            if one.shots
+        ]
+        write_rows(FIGURES / "figure4.csv", rows)
+
+
+def take_4(dop: int, window_ms: int, shots: range) -> NDArray[np.float64]:
+    """Filling in each of some shots of a point of figure 4."""
+    overrides = [
+        f"scan={{planner.degree_of_parallelism: [{dop}]}}",
+        f"repeats={shots.stop}",
+        f"shot.2.rearrange.window={window_ms} ms",
+    ]
+    tally = take(FIGURE_4, shots, overrides, 1000 * dop + window_ms)
+    return 1 - np.array(tally.defects)[:, 0] / PAPER_ATOMS
 
 
 def simulate_5(n_shots: int) -> None:
@@ -212,11 +248,7 @@ def add_5(name: str, tally: Tally) -> None:
                 "atom_moves": f"{n_moves / n:.6f}",
             }
         )
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_file(FIGURES / f"{name}.csv", text.getvalue().encode())
+    write_rows(FIGURES / f"{name}.csv", rows)
 
 
 def difference(value: float, error: float, paper: float, paper_error: float) -> str:
@@ -265,21 +297,20 @@ def lines_5() -> list[str]:
 
 def lines_4() -> list[str]:
     """The table of figure 4."""
-    rows = rows_of(FIGURES / "figure4.csv")
-    by_key = {(int(row["dop"]), int(row["window_ms"])): float(row["filling"]) for row in rows}
+    table = table_4()
     header = ["DOP", *map(str, range(2, 16))]
     lines = ["| " + " | ".join(row) + " |" for row in (header, ["---"] * 15)]
     for label, keys in (("window 200 ms", POINTS[:14]), ("own window, 60 to 94 ms", POINTS[14:])):
-        cells = [f"{100 * by_key[key]:.2f}" if key in by_key else "" for key in keys]
+        cells = [f"{100 * table[key].filling:.2f}" if key in table else "" for key in keys]
         lines.append("| " + " | ".join([label, *cells]) + " |")
-    for row in rows:
-        if (row["dop"], row["window_ms"]) == ("7", "60"):
-            value, error = float(row["filling"]), float(row["error"])
-            away = difference(value, error, *PAPER_FILLING[0][1:])
-            lines += [
-                "",
-                f"At DOP 7: {percent(value, error)}, {away} standard errors from the paper's 97.66(4) %.",
-            ]
+    shots, errors = [one.shots for one in table.values()], [100 * one.error for one in table.values()]
+    least, most = (f"{end(errors):.3f}" for end in (min, max))
+    lines += ["", f"{min(shots)} shots or more for each point; standard errors {least} to {most} %."]
+    if (7, 60) in table:
+        one = table[7, 60]
+        away = difference(one.filling, one.error, *PAPER_FILLING[0][1:])
+        value = percent(one.filling, one.error)
+        lines += [f"At DOP 7: {value}, {away} standard errors from the paper's 97.66(4) %."]
     return lines
 
 
@@ -637,26 +668,16 @@ def window_text(rows: Sequence[Filling]) -> str:
 
 def draw_4(path: Path) -> None:
     """Draw figure 4 from its table."""
-    rows = rows_of(FIGURES / "figure4.csv")
-    by_key = {(int(row["dop"]), int(row["window_ms"])): row for row in rows}
-    series = [
-        Points.of(
-            label,
-            [
-                (dop, y, y - error, y + error)
-                for dop, window in keys
-                if (dop, window) in by_key
-                for y, error in [(float(by_key[dop, window]["filling"]), float(by_key[dop, window]["error"]))]
-            ],
-        )
-        for label, keys in (("window 200 ms", POINTS[:14]), ("windows 60 to 94 ms", POINTS[14:]))
-    ]
+    table = table_4()
+    series: list[Points] = []
+    for label, keys in (("window 200 ms", POINTS[:14]), ("windows 60 to 94 ms", POINTS[14:])):
+        found = [(key[0], table[key].filling, table[key].error) for key in keys if key in table]
+        series.append(Points.of(label, [(dop, y, y - error, y + error) for dop, y, error in found]))
     left = [
         (dop, p, p, p) for dop, window in POINTS[14:] for p in (survival(window / 1e3, PAPER_LIFETIME_S),)
     ]
     windows = Points.of("survival of the windows 60 to 94 ms (lifetime 33 s)", left)
-    shots = min(int(row["shots"]) for row in rows)
-    note = f"profile paper, {shots} shots for each point"
+    note = f"profile paper, {min(one.shots for one in table.values())} shots for each point"
     draw_figure_4(path, note, series[:1], series[1:], windows, paper_points(PAPER_FILLING))
 
 
@@ -684,7 +705,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--shots-4", type=int, default=0, help="shots of each point of figure 4; 0: draw only"
     )
     parser.add_argument("--shots-5", type=int, default=0, help="shots of figure 5; 0: draw only")
-    parser.add_argument("--processes", type=int, default=1, help="of figure 4")
     given = parser.parse_args(arguments)
     if given.figure is not None:
         if not 1 <= len(given.runs) <= 2:
@@ -695,7 +715,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     FIGURES.mkdir(parents=True, exist_ok=True)
     if given.shots_4:
-        simulate_4(given.shots_4, given.processes, POINTS)
+        simulate_4(given.shots_4)
     if given.shots_5:
         simulate_5(given.shots_5)
     write_page()
