@@ -235,13 +235,15 @@ def draw_map(
     from matplotlib import colormaps
 
     low, high = limits
+    if high <= low:  # all values are the same
+        low = high - (0.01 * abs(high) or 1.0)
     image = axes.imshow(
         np.ma.masked_invalid(values),
         origin="lower",
         aspect="auto",
         cmap=colormaps[COLOURS].with_extremes(bad=NO_VALUE),
         vmin=low,
-        vmax=high if high > low else low + 1e-9 * max(1.0, abs(low)),
+        vmax=high,
     )
     axes.set(title=title, xlabel=x_label, ylabel=y_label)
     axes.grid(visible=False)

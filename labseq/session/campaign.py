@@ -14,7 +14,7 @@ from pydantic import Field
 from labseq.config.document import Document
 from labseq.errors import ConfigError, Problem
 from labseq.files import explained, write_file
-from labseq.messages import visible
+from labseq.messages import clean, visible
 from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
 from labseq.roles import RunObserver
@@ -112,6 +112,11 @@ class Campaign:
                 raise ConfigError([self._placed(problem, point) for problem in error.problems]) from error
 
     def _placed(self, problem: Problem, point: Sequence[int]) -> Problem:
+        for name in ("sequence", "profile"):  # one that does not exist
+            if problem.source == getattr(self.settings, name) and not problem.line:
+                line, column = self.document.locate((name,))
+                what = f"{name} is '{clean(problem.source)}': {problem.what}"
+                return replace(problem, what=what, source=self.document.name, line=line, column=column)
         for address, i in zip(self.axes, point, strict=True):
             if problem.source.startswith(f"--set {address}="):
                 line, column = self.document.locate(("axes", address, i))

@@ -42,6 +42,7 @@ from labseq.session.provenance import run_record
 from labseq.session.resume import changes_between, plain_record
 from labseq.session.scan import Point
 from labseq.session.scan_run import OwnShots, ScanRun
+from labseq.watchdog import Watchdog
 from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Unfinished, Workers, portable
 
 _AHEAD: Final = 1
@@ -139,16 +140,11 @@ class TakenShot:
     error: LabseqError | None
 
 
-class _WithoutFrames(pickle.Pickler):
-    """Leaves out frames, by far the largest part of a shot: they are in its file."""
+class _NoWatchdog(Watchdog):
+    """Simulated devices end with their process: nothing is left on."""
 
-    def reducer_override(self, obj: Any) -> Any:
-        """None in place of a frame."""
-        return (_nothing, ()) if isinstance(obj, Frame) else NotImplemented
-
-
-def _nothing() -> None:
-    return None
+    def add(self, name: str, order: int, script: Path, arguments: object) -> None:
+        """Do nothing."""
 
 
 class ShotWorker:
@@ -166,10 +162,10 @@ class ShotWorker:
         self._assembly = _assembled_again(recipe)
         self._encoder = ShotEncoder(recipe.record, recipe.run_id)
         self._stop = StopFlag()
-        self._warmed: set[tuple[int, int]] = set()
         self._place: Place | None = None
         self._point: Point | None = None
         self._own: OwnShots | None = None
+        self._error: LabseqError | None = None
         self._events: list[tuple[Any, Any]] = []
         self._name = secrets.token_hex(4)
         folder = Path(recipe.folder)
@@ -179,23 +175,25 @@ class ShotWorker:
     def __call__(self, task: tuple[int, Place]) -> Unfinished:
         """Take a shot; its files are written, and its :class:`TakenShot` pickled, when it is finished."""
         shot, place = task
-        point = self._point_at(place)
-        if self._own is None:
-            self._own = self._open(point)
-        self._events = []
-        given_up, error = dict[int, str](), None
-        try:
-            given_up = dict(self._own.take(shot, point))
-        except LabseqError as failure:
-            error = portable(failure)
-        return Unfinished(partial(self._finish, TakenShot(self._events, given_up, error)))
+        self._events, given_up = [], dict[int, str]()
+        if self._error is None:
+            point = self._point_at(place)
+            if self._own is None:
+                self._own = self._open(point)
+            try:
+                given_up = dict(self._own.take(shot, point))
+            except LabseqError as error:
+                self._error = portable(error)  # it ends the run before the shots that this worker still has
+        return Unfinished(partial(self._finish, TakenShot(self._events, given_up, self._error)))
 
     def _finish(self, taken: TakenShot) -> bytes:
         if self._folder is not None:
             taken = self._written(taken, self._folder)
         buffer = io.BytesIO()
-        pickler = pickle.Pickler if self._recipe.keeps_frames else _WithoutFrames
-        pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(taken)
+        pickler = pickle.Pickler(buffer, pickle.HIGHEST_PROTOCOL)
+        if not self._recipe.keeps_frames:  # by far the largest part of a shot; they are in its file
+            pickler.dispatch_table = {Frame: lambda _: (_nothing, ())}
+        pickler.dump(taken)
         return buffer.getvalue()
 
     def _written(self, taken: TakenShot, folder: Path) -> TakenShot:
@@ -238,6 +236,7 @@ class ShotWorker:
             seed=self._record.seed,
             policy=self._assembly.policy,
             parameters={**changes, **point.parameters},
+            watchdog=_NoWatchdog(),
         )
         gc.freeze()
         sequencer.open()
@@ -252,6 +251,10 @@ class ShotWorker:
         """Keep the file of an attempt at a shot."""
         row, data = encoded(self._encoder, self._record, shot)
         self._events.append((row, data if self._folder is not None else bytes(data)))
+
+
+def _nothing() -> None:
+    """What is sent in place of a frame."""
 
 
 def _assembled_again(recipe: Recipe) -> Assembly:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,12 @@ import pytest
 import labseq
 from labseq.campaign.keys import make_keys
 from labseq.cluster import ClusterWorkers
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, DeviceError
 from labseq.session.options import Options
-from labseq.session.workers import Recipe, ShotWorker
+from labseq.session.workers import Recipe, ShotWorker, TakenShot
 from labseq.testing.fakes import RecordingObserver
 
+from . import test_policies
 from .small_runs import OWN_DEVICE, PROFILE, interrupted, resumed, table, write
 
 TIMES = {"t_start_utc", "t_end_utc", "stage_s", "sha256", "bytes"}
@@ -112,7 +114,7 @@ def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
         ShotWorker(Recipe(other, "x", Options(shots=1), "", "", keeps_frames=False))
 
 
-def test_a_cluster_takes_the_same_shots(tmp_path: Path) -> None:
+def test_a_cluster_takes_the_same_shots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
     sequence, keys = write(tmp_path, "planner"), tmp_path / "keys"
     ca, scheduler, worker, _ = map(str, make_keys(keys))
@@ -124,9 +126,33 @@ def test_a_cluster_takes_the_same_shots(tmp_path: Path) -> None:
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, **about) as cluster:
         options: dict[str, Any] = {"scheduler": cluster.scheduler_address, "keys": keys}
         options["output"] = tmp_path / "data"
-        with labseq.Session.open(sequence, seed=5, **options) as session:
-            run = session.run()
-    assert index(run) == index(alone(sequence))
+        runs = list[labseq.Run]()
+        for _ in range(2):
+            with labseq.Session.open(sequence, seed=5, **options) as session:
+                runs.append(session.run())
+            # now as on another computer, which does not see the run's folder
+            monkeypatch.setattr("labseq.session.workers.write_file", lambda *_: None)
+    expected = index(alone(sequence))
+    for run in runs:
+        assert index(run) == expected
+        for shot in run.shots:
+            shot.verify()
+
+
+def test_a_worker_that_an_error_has_ended_takes_none_of_its_other_shots(tmp_path: Path) -> None:
+    observer = RecordingObserver()
+    with (
+        labseq.Session.open(
+            test_policies.sequence(tmp_path, step="{at: [1]}"), output=tmp_path / "data", observer=observer
+        ) as session,
+        pytest.raises(DeviceError, match="went out of lock"),
+    ):
+        session.run()
+    record = observer.of("run_started")[0]["record"]
+    worker = ShotWorker(Recipe(record, "x", Options(), "", "", keeps_frames=False))
+    taken: list[TakenShot] = [pickle.loads(worker((shot, 0)).finish()) for shot in (1, 2)]
+    assert [str(one.error) for one in taken] == ["laser: went out of lock"] * 2
+    assert [len(one.events) > 1 for one in taken] == [True, False]
 
 
 @pytest.mark.parametrize(
