@@ -154,14 +154,19 @@ def _test(
     clock = VirtualClock(StopFlag()) if is_virtual else RealClock(StopFlag())
     made, refused = construct_hardware(hardware, clock)
     made_simulation = made.pop("simulation", None)
+    virtual = [name for name in refused if hardware.chosen[name].virtual_time]
+    if made_simulation is None and hardware.profile.simulation is not None and virtual:
+        what = f"'{virtual[0]}' is simulated, and acts on the simulation, which is not served here"
+        hint = "add --device simulation, or name its server: `simulation: {use: remote, address: ...}`"
+        raise ConfigError(Problem(what, hint=hint))
     failures: list[LabseqError] = [*refused.values()]
     if made_simulation is not None or not is_virtual:
         for found in check_each_device(
             made.items(), timeouts_of(hardware.profile), StopFlag(), made_simulation, report
         ):
+            if found.name == "simulation" and found.failure is not None:
+                raise found.failure  # the others act on it
             failures += [one for one in (found.failure, found.unsafe, found.unclosed) if one is not None]
-            if found.name == "simulation" and failures:
-                break  # the others act on it
     for failure in failures[1:]:
         report(f"error: {failure}")
     if failures:
