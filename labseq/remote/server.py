@@ -18,10 +18,12 @@ import labseq
 from labseq.config.addresses import profile_overrides
 from labseq.errors import ConfigError, DeviceError, LabseqError, Problem, StopRequested, one_of
 from labseq.guard import StopFlag, stop_on_signals
+from labseq.kernel import load_kernels
 from labseq.messages import clean, format_error
 from labseq.plain import now
 from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
 from labseq.remote.simulation import ServedSimulation
+from labseq.roles import offers
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin
 from labseq.session.devices import check_each_device
@@ -119,6 +121,8 @@ def serving(
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
         report(f"tests {', '.join(hardware.chosen)}")
         _test(hardware, simulation, report)
+        if "simulation" in how.devices:
+            _warm_simulation(hardware)
         server = Server(hardware, simulation, host, port, keys, report)
         stack.callback(server.end)
         server.start()
@@ -154,18 +158,32 @@ def _test(
     clock = VirtualClock(StopFlag()) if is_virtual else RealClock(StopFlag())
     made, refused = construct_hardware(hardware, clock)
     made_simulation = made.pop("simulation", None)
+    virtual = [name for name in refused if hardware.chosen[name].virtual_time]
+    if made_simulation is None and hardware.profile.simulation is not None and virtual:
+        what = f"'{virtual[0]}' is simulated, and acts on the simulation, which is not served here"
+        hint = "add --device simulation, or name its server: `simulation: {use: remote, address: ...}`"
+        raise ConfigError(Problem(what, hint=hint))
     failures: list[LabseqError] = [*refused.values()]
     if made_simulation is not None or not is_virtual:
         for found in check_each_device(
             made.items(), timeouts_of(hardware.profile), StopFlag(), made_simulation, report
         ):
+            if found.name == "simulation" and found.failure is not None:
+                raise found.failure  # the others act on it
             failures += [one for one in (found.failure, found.unsafe, found.unclosed) if one is not None]
-            if found.name == "simulation" and failures:
-                break  # the others act on it
     for failure in failures[1:]:
         report(f"error: {failure}")
     if failures:
         raise failures[0]
+
+
+def _warm_simulation(hardware: ResolvedProfile) -> None:
+    """Compile its kernels before devices of other servers, which it would keep waiting, act on it."""
+    only = replace(hardware, chosen={"simulation": hardware.chosen["simulation"]})
+    made, _ = construct_hardware(only, VirtualClock(StopFlag()))
+    if offers(made.get("simulation"), "warm"):
+        made["simulation"].warm()
+    load_kernels()
 
 
 class Server:

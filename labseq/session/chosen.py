@@ -187,10 +187,15 @@ def choose(
     Returns:
         The choice, and a warning for the user or "".
     """
-    if dry_run == "off" or kind not in HARDWARE_KINDS or choice.use == VIRTUAL_TWIN:
+    has_twin = kind in HARDWARE_KINDS or kind == "simulation"
+    if dry_run == "off" or not has_twin or choice.use == VIRTUAL_TWIN:
         return resolve(host, document, kind, choice), ""
     entry = host.registry.get(kind, VIRTUAL_TWIN)
     twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
+    if kind == "simulation":  # one at another computer has an identity, as hardware has
+        chosen = resolve(host, document, kind, choice)
+        elsewhere = chosen.settings is not None and chosen.settings.identities()
+        return (twin if elsewhere else chosen), ""
     if dry_run == "fast":
         return twin, ""
     if absence := _absence(host, kind, choice.use):

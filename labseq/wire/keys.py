@@ -122,8 +122,10 @@ def known_keys(folder: Path) -> dict[bytes, str]:
 
 
 def _read(path: Path) -> dict[bytes, bytes]:
+    if path.parent.name == KNOWN and not path.exists():
+        what, hint = f"there is no key of {path.stem}", "copy the public key of that computer there"
+        raise ConfigError(Problem(what, str(path), hint=hint))
     try:
         return dict(_LINE.findall(read_file(path, 4096)))
     except RecordingError as error:
-        hint = "copy the public key of that computer there" if path.parent.name == KNOWN else ""
-        raise ConfigError(Problem(str(error), hint=hint)) from error
+        raise ConfigError(str(error)) from error

@@ -99,3 +99,12 @@ def test_devices_of_several_servers_share_a_simulation(tmp_path: Path) -> None:
             apart = run(tmp_path / "apart", filled(there))
     together = run(tmp_path / "together", filled(HERE))
     assert table(apart) == table(together)
+
+
+def test_a_dry_run_makes_no_connection(tmp_path: Path) -> None:
+    about = "use: remote, address: 'tcp://127.0.0.1:1', device:"
+    texts = {key: f"{{{about} {name}, simulated: true}}" for key, name in DEVICES.items()}
+    (tmp_path / "lab.yaml").write_text(filled({**texts, "SIMULATION": f"{{{about} simulation}}"}), "utf-8")
+    (tmp_path / "small.yaml").write_text(SEQUENCE, "utf-8")
+    with labseq.Session.open(tmp_path / "small.yaml", output=tmp_path / "runs", dry_run="full") as session:
+        assert len(session.run().shots) == 2
