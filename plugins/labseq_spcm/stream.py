@@ -39,8 +39,6 @@ BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 LOCK_RETRY_S: Final = 10e-6
 """After that time the thread tries again if a call of the driver is at work."""
-FILLING_POLL_S: Final = 20e-6
-"""Time between two looks at a card that is filled before its start."""
 HALT_S: Final = 0.1
 """Longest time that the loop may take to end; it looks for that after each part that it renders."""
 PLAYING_POLL_S: Final = 1e-3
@@ -134,7 +132,7 @@ class Stream:
     look-ahead before it is played. A program follows the last silence that was handed over; it is
     rendered faster than it is played, so the ring is soon full. A compiled loop does that in a thread
     of its own, without Python's lock (:mod:`labseq_spcm.stream_kernels`); on a virtual clock the simulated
-    card calls its steps in its time. Python starts the card, also after it ran dry.
+    card calls its steps in its time. Python fills the card before its start, also after it ran dry.
 
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
@@ -172,7 +170,7 @@ class Stream:
         self._workspaces: dict[tuple[int, int], Any] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
-        self._is_on = self._is_filling = self._has_thread = False
+        self._is_on = self._has_thread = False
         self._failure: LabseqError | None = None
         self._prepared: Program | None = None
         self._queued = deque[Program](maxlen=k.N_QUEUE)
@@ -190,6 +188,9 @@ class Stream:
         box[k.BLOCK], box[k.ON_CARD], box[k.AHEAD] = self._block, self._on_card, self._ahead
         box[k.SILENCE], box[k.SCRATCH] = self._silence.ctypes.data, self._scratch.ctypes.data
         box[k.VALUE] = box[k.FOUND :].ctypes.data
+        spcm, box[k.TO_START] = self._card.spcm, self._to_start
+        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
+        box[k.START_COMMAND] = start
         return box
 
     def _check_bus(self) -> None:
@@ -327,7 +328,7 @@ class Stream:
         return self._step(self._box, code) if code < 0 else 1e-9 * code
 
     def _step(self, box: NDArray[np.int64], code: int) -> float | None:
-        """Do what is left to Python: the start of the card, and what follows a code of the loop.
+        """Do what is left to Python: what follows a code of the loop.
 
         Returns:
             Time to wait, in seconds; 0: the loop can go on; None: it is over.
@@ -339,24 +340,12 @@ class Stream:
                 return None
             if code:
                 self._recover(code)
-            return self._start() if self._is_filling else 0.0
+            return 0.0
         except LabseqError as failure:
             self._is_on, self._failure = False, failure
             return None
         finally:
             self._lock.release()
-
-    def _start(self) -> float:
-        """Start the card as soon as it has samples; returns how long to wait, in seconds."""
-        card, spcm = self._card, self._card.spcm
-        if k.look(self._box) == k.FAILED:
-            raise self._error()
-        if self._box[k.FETCHED] < self._to_start:
-            return FILLING_POLL_S
-        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
-        card.command(start, "start of the stream")
-        self._is_filling = False
-        return 0.0
 
     def _begin(self) -> None:
         """Fill the card with silence; it is started when it has some."""
@@ -368,7 +357,7 @@ class Stream:
         if k.supply_silence(box, self._ahead + self._on_card):
             raise self._error()
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
-        self._is_filling = True
+        box[k.IS_FILLING] = 1
 
     def _error(self) -> DeviceError:
         """The error that the library reported to the loop."""
