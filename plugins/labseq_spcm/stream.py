@@ -161,10 +161,10 @@ class Stream:
         least = 2 * self._whole_blocks(self._ahead + self._on_card)
         n_samples = max(self._whole_blocks(math.ceil(settings.fill_s * sample_rate_hz)), least)
         self._ring = Buffer().reserve(n_samples)
-        self._ring[:] = 0  # so that the memory is there
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
+        self._ring.reshape(-1, block, 2)[:] = self._silence
         self._first = np.zeros((max(FIRST, block), 2), np.int16)
         self._scratch = new_scratch()
         self._workspaces: dict[tuple[int, int], Any] = {}
@@ -222,8 +222,9 @@ class Stream:
         with self._lock:
             if self._is_on:
                 return
+            is_silent = self._ring_is_silent()
             self._box, self._queued = self._new_box(), deque(maxlen=k.N_QUEUE)
-            self._begin()
+            self._begin(is_silent=is_silent)
             self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
@@ -347,12 +348,15 @@ class Stream:
         finally:
             self._lock.release()
 
-    def _begin(self) -> None:
-        """Fill the card with silence; it is started when it has some."""
+    def _ring_is_silent(self) -> bool:
+        return bool(self._box[k.WRITTEN] >= self._box[k.SILENT_FROM])
+
+    def _begin(self, *, is_silent: bool) -> None:
+        """Fill the card with silence, which the ring has already or not; it is started when it has some."""
         card, spcm, box = self._card, self._card.spcm, self._box
         card.stop()
         box[k.WRITTEN] = box[k.FETCHED] = box[k.START] = box[k.END] = 0
-        box[k.SILENT_FROM] = len(self._ring)
+        box[k.SILENT_FROM] = 0 if is_silent else len(self._ring)
         card.define_transfer(self._ring, self._block * FRAME_BYTES)
         if k.supply_silence(box, self._ahead + self._on_card):
             raise self._error()
@@ -387,7 +391,7 @@ class Stream:
         self.n_underruns += 1
         if fetched < end:
             box[k.TAKEN] -= 1
-        self._begin()
+        self._begin(is_silent=self._ring_is_silent())
 
     def _whole_blocks(self, n_samples: int) -> int:
         return -(-n_samples // self._block) * self._block
