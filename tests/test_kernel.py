@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import importlib
 import os
@@ -21,7 +22,8 @@ from numba.core import event
 
 import labseq
 import labseq.kernel
-from labseq.kernel import announcing, const, kernel, load_kernels
+from labseq.kernel import announcing, c_address, const, kernel, load_kernels
+from labseq.native import call_c, carray, new_timer, now_ns, pointer, sleep_ns, swap
 
 MAX_LACK = 3
 
@@ -404,3 +406,32 @@ def test_kernels_are_plain_python_without_the_compiler() -> None:
     plain = run_python(textwrap.dedent(code) + "print(result)", NUMBA_DISABLE_JIT="1")
     assert plain == scope["result"]
     assert plain.startswith("[True")
+
+
+@kernel("int64(int64, int64, int64)", for_c=True)
+def add_to_word(address: int, value: int, factor: int) -> int:
+    word = carray(pointer(address), 1, np.int64)
+    word[0] += factor * value
+    return word[0]  # type: ignore[no-any-return]
+
+
+@kernel("int64(int64, int64)")
+def call_and_swap(function: int, address: int) -> int:
+    return call_c(function, address, 20, 2) + swap(address, 7)  # type: ignore[no-any-return]
+
+
+def test_kernels_call_c_and_are_called_by_it() -> None:
+    word = np.array([1], np.int64)
+    address = word.ctypes.data
+    function = ctypes.CFUNCTYPE(*[ctypes.c_int64] * 4)(c_address(add_to_word))
+    assert (function(address, 5, 3), word[0]) == (16, 16)
+    assert (call_and_swap(c_address(add_to_word), address), word[0]) == (2 * 56, 7)
+
+
+def test_kernels_tell_the_time_and_sleep() -> None:
+    timer = new_timer()
+    start_ns = time.perf_counter_ns()
+    sleep_ns(timer, 2_000_000)
+    took_ns, later_ns = now_ns(timer) - start_ns, time.perf_counter_ns() - start_ns
+    assert 0 <= took_ns <= later_ns
+    assert took_ns >= 2_000_000 or sys.platform == "win32"

@@ -39,20 +39,19 @@ BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 LOCK_RETRY_S: Final = 10e-6
 """After that time the thread tries again if a call of the driver is at work."""
-FILLING_POLL_S: Final = 20e-6
-"""Time between two looks at a card that is filled before its start."""
 HALT_S: Final = 0.1
 """Longest time that the loop may take to end; it looks for that after each part that it renders."""
 PLAYING_POLL_S: Final = 1e-3
 """Longest time between two looks at the ring while a program plays."""
-MOST_LOAD: Final = 0.9
-"""Largest part of the playing time that rendering may take."""
+TRIES: Final = 5
+MOST_LOAD: Final = 1.0
+"""Largest part of the playing time that rendering may take on one core; two share it."""
 BUS_SAMPLES: Final = 1 << 22
 """Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
 
 
 def check_rendering(name: str, context: Context, sample_rate_hz: float, row_channel: int) -> None:
-    """Render programs with as many tones as the profile allows; the fastest of three tries counts.
+    """Render programs with as many tones as the profile allows; of each part the fastest try counts.
 
     Raises:
         DeviceError: This computer renders more slowly than the card plays.
@@ -71,14 +70,17 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
     n_samples = int(program.words[k.LENGTH])
     box, scratch, out = np.zeros(k.N_WORDS, np.int64), new_scratch(), np.zeros((n_samples, 2), np.int16)
     box[k.RENDER], box[k.SCRATCH] = render_address(), scratch.ctypes.data
-    took_s = math.inf
-    for _ in range(3):
-        start_s = time.perf_counter()
-        k.render_frames(box, program.words, 0, out.ctypes.data, n_samples)
-        took_s = min(took_s, time.perf_counter() - start_s)
-        if took_s < MOST_LOAD * n_samples / sample_rate_hz:
+    parts = range(0, n_samples, k.MOST_SAMPLES)
+    took_s = np.full(len(parts), np.inf)
+    for _ in range(TRIES):
+        for number, start in enumerate(parts):
+            place, n_part = out[start:].ctypes.data, min(k.MOST_SAMPLES, n_samples - start)
+            start_s = time.perf_counter()
+            k.render_frames(box, program.words, start, place, n_part)
+            took_s[number] = min(took_s[number], time.perf_counter() - start_s)
+        if took_s.sum() < MOST_LOAD * n_samples / sample_rate_hz:
             return
-    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, n_samples / took_s))
+    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, n_samples / took_s.sum()))
     text = f"mode: stream at {wanted}, but this computer renders {n_tones} moving tones at {made}"
     hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: replay"
     raise DeviceError(name, f"{text}; {hint}")
@@ -130,7 +132,7 @@ class Stream:
     look-ahead before it is played. A program follows the last silence that was handed over; it is
     rendered faster than it is played, so the ring is soon full. A compiled loop does that in a thread
     of its own, without Python's lock (:mod:`labseq_spcm.stream_kernels`); on a virtual clock the simulated
-    card calls its steps in its time. Python starts the card, also after it ran dry.
+    card calls its steps in its time. Python fills the card before its start, also after it ran dry.
 
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
@@ -159,16 +161,16 @@ class Stream:
         least = 2 * self._whole_blocks(self._ahead + self._on_card)
         n_samples = max(self._whole_blocks(math.ceil(settings.fill_s * sample_rate_hz)), least)
         self._ring = Buffer().reserve(n_samples)
-        self._ring[:] = 0  # so that the memory is there
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
+        self._ring.reshape(-1, block, 2)[:] = self._silence
         self._first = np.zeros((max(FIRST, block), 2), np.int16)
         self._scratch = new_scratch()
         self._workspaces: dict[tuple[int, int], Any] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
-        self._is_on = self._is_filling = self._has_thread = False
+        self._is_on = self._has_thread = False
         self._failure: LabseqError | None = None
         self._prepared: Program | None = None
         self._queued = deque[Program](maxlen=k.N_QUEUE)
@@ -186,6 +188,9 @@ class Stream:
         box[k.BLOCK], box[k.ON_CARD], box[k.AHEAD] = self._block, self._on_card, self._ahead
         box[k.SILENCE], box[k.SCRATCH] = self._silence.ctypes.data, self._scratch.ctypes.data
         box[k.VALUE] = box[k.FOUND :].ctypes.data
+        spcm, box[k.TO_START] = self._card.spcm, self._to_start
+        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
+        box[k.START_COMMAND] = start
         return box
 
     def _check_bus(self) -> None:
@@ -217,8 +222,9 @@ class Stream:
         with self._lock:
             if self._is_on:
                 return
+            is_silent = self._ring_is_silent()
             self._box, self._queued = self._new_box(), deque(maxlen=k.N_QUEUE)
-            self._begin()
+            self._begin(is_silent=is_silent)
             self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
@@ -323,7 +329,7 @@ class Stream:
         return self._step(self._box, code) if code < 0 else 1e-9 * code
 
     def _step(self, box: NDArray[np.int64], code: int) -> float | None:
-        """Do what is left to Python: the start of the card, and what follows a code of the loop.
+        """Do what is left to Python: what follows a code of the loop.
 
         Returns:
             Time to wait, in seconds; 0: the loop can go on; None: it is over.
@@ -335,36 +341,27 @@ class Stream:
                 return None
             if code:
                 self._recover(code)
-            return self._start() if self._is_filling else 0.0
+            return 0.0
         except LabseqError as failure:
             self._is_on, self._failure = False, failure
             return None
         finally:
             self._lock.release()
 
-    def _start(self) -> float:
-        """Start the card as soon as it has samples; returns how long to wait, in seconds."""
-        card, spcm = self._card, self._card.spcm
-        if k.look(self._box) == k.FAILED:
-            raise self._error()
-        if self._box[k.FETCHED] < self._to_start:
-            return FILLING_POLL_S
-        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
-        card.command(start, "start of the stream")
-        self._is_filling = False
-        return 0.0
+    def _ring_is_silent(self) -> bool:
+        return bool(self._box[k.WRITTEN] >= self._box[k.SILENT_FROM])
 
-    def _begin(self) -> None:
-        """Fill the card with silence; it is started when it has some."""
+    def _begin(self, *, is_silent: bool) -> None:
+        """Fill the card with silence, which the ring has already or not; it is started when it has some."""
         card, spcm, box = self._card, self._card.spcm, self._box
         card.stop()
         box[k.WRITTEN] = box[k.FETCHED] = box[k.START] = box[k.END] = 0
-        box[k.SILENT_FROM] = len(self._ring)
+        box[k.SILENT_FROM] = 0 if is_silent else len(self._ring)
         card.define_transfer(self._ring, self._block * FRAME_BYTES)
         if k.supply_silence(box, self._ahead + self._on_card):
             raise self._error()
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
-        self._is_filling = True
+        box[k.IS_FILLING] = 1
 
     def _error(self) -> DeviceError:
         """The error that the library reported to the loop."""
@@ -394,7 +391,7 @@ class Stream:
         self.n_underruns += 1
         if fetched < end:
             box[k.TAKEN] -= 1
-        self._begin()
+        self._begin(is_silent=self._ring_is_silent())
 
     def _whole_blocks(self, n_samples: int) -> int:
         return -(-n_samples // self._block) * self._block

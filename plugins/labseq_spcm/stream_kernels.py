@@ -18,8 +18,8 @@ from labseq_spcm.limits import FRAME_BYTES
 
 Words = NDArray[np.int64]
 
-STATUS, USER_LEN, CARD_LEN = 110, 200, 202
-"""M2STATUS, DATA_AVAIL_USER_LEN and DATA_AVAIL_CARD_LEN, as in the vendor's header files."""
+COMMAND, STATUS, USER_LEN, CARD_LEN = 100, 110, 200, 202
+"""M2CMD, M2STATUS, DATA_AVAIL_USER_LEN and DATA_AVAIL_CARD_LEN, as in the vendor's header files."""
 READY: Final = 0x4
 """M2STAT_CARD_READY: it does not run."""
 
@@ -37,7 +37,10 @@ ends, from where on the ring holds silence again, error code of the library, and
 (HAS_HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(27, 33)
 """Whether :func:`assist` runs in another thread; a part of the column axis that waits to be rendered and one
 that was, and which: the arguments of RENDER."""
-N_WORDS: Final = 33
+(IS_FILLING, TO_START, START_COMMAND, N_QUICK) = range(33, 37)
+"""Whether the card is filled before its start, the samples that it must have fetched then, the M2CMD, and how
+many looks are still to follow one another quickly."""
+N_WORDS: Final = 37
 
 LENGTH, ROW_CHANNEL, READY_MADE, N_READY, AXES, N_AXIS, BEGAN = range(7)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples that
@@ -49,6 +52,10 @@ CHUNK: Final = 1 << 15
 """Samples rendered at a time, few enough to stay in the processor's cache until they are interleaved."""
 MOST_SAMPLES: Final = 1 << 17
 """Samples handed over at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
+FILLING_POLL_NS: Final = 20_000
+"""Time between two looks at a card that is filled before its start, and until its own FIFO is full."""
+QUICK_LOOKS: Final = 100
+"""After the start the bus fills the card's FIFO; at a tenth more than what is played that takes 1 ms."""
 POLL_NS: Final = 1_000_000
 """Longest time between two looks at the ring while a program plays."""
 SPIN_NS: Final = 50_000
@@ -182,6 +189,12 @@ def look(box: Words) -> int:
 def supply(box: Words, rate_hz: int) -> int:
     """One step: hand over what there is room for; returns after how many ns that is due again, or a code."""
     in_ring = look(box)
+    if box[IS_FILLING] and in_ring != FAILED:
+        if box[FETCHED] < box[TO_START]:
+            return FILLING_POLL_NS
+        box[IS_FILLING], box[N_QUICK] = 0, QUICK_LOOKS
+        box[ERROR] = call_c(box[SET], box[HANDLE], COMMAND, box[START_COMMAND])
+        return FAILED if box[ERROR] else 0
     if in_ring < 0:
         return in_ring
     if box[WRITTEN] >= box[END] and box[TAKEN] < box[QUEUED]:
@@ -199,6 +212,9 @@ def supply(box: Words, rate_hz: int) -> int:
             return supply_program(box, room)
         return min(POLL_NS, box[N_RING] * 125_000_000 // rate_hz)  # an eighth of the ring
     failed = supply_silence(box, box[AHEAD] - in_ring)
+    if box[N_QUICK]:
+        box[N_QUICK] -= 1
+        return failed or FILLING_POLL_NS
     return failed or box[AHEAD] * 500_000_000 // rate_hz  # half of it
 
 

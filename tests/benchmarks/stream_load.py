@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import math
 import multiprocessing
 import os
 import time
@@ -23,13 +24,17 @@ from labseq_psca.planner import PscaPlanner, PscaSettings
 from labseq_spcm import stream_kernels as words
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.stream import Stream
 from labseq_spcm_sim import SimulatedCard, installed
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
+from numpy.typing import NDArray
 
+from labseq.bench.latency import draw_times
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
-from labseq.kernel import load_kernels
+from labseq.kernel import kernel, load_kernels
 from labseq.motion import check_plan, tone_program, warm, warm_rendering
+from labseq.native import new_timer, now_ns, sleep_ns
 from labseq.plugin import (
     Context,
     DepthRamp,
@@ -41,6 +46,8 @@ from labseq.plugin import (
     TransientError,
 )
 from labseq.realtime import prepare_process, raise_priority, restore_priority
+
+Words = NDArray[np.int64]
 
 N_FIRST = 5
 N_FRAMES = 50
@@ -56,11 +63,22 @@ class Counts:
         stages_s: Of each program, the times of the stages, in order.
         n_in_motion: Underruns while a program played.
         n_in_silence: Underruns between programs.
+        woken_ns: How long sleeps of 50 us took before.
     """
 
     stages_s: list[list[float]] = field(default_factory=list[list[float]])
     n_in_motion: int = 0
     n_in_silence: int = 0
+    woken_ns: Words = field(default_factory=lambda: np.zeros(20_000, np.int64))
+
+
+@kernel("void(int64[::1], int64[::1], int64)")
+def time_sleeps(timer: Words, took_ns: Words, duration_ns: int) -> None:
+    """How long each of some sleeps takes: a thread with priority, as that which feeds the card."""
+    for i in range(len(took_ns)):
+        start_ns = now_ns(timer)
+        sleep_ns(timer, duration_ns)
+        took_ns[i] = now_ns(timer) - start_ns
 
 
 def compute() -> None:
@@ -112,6 +130,7 @@ class Rearrangement:
         self.tweezers.play()
         ticks.append(time.perf_counter())
         stream = self.tweezers._mode
+        assert isinstance(stream, Stream)
         began = stream._queued[-1].words
         if plan.n_batches > N_FIRST:
             rest = tone_program(plan.part(N_FIRST, plan.n_batches), GRID, MOTION)
@@ -120,7 +139,7 @@ class Rearrangement:
         restore_priority()
         self.tweezers.wait(duration_s + 1.0)
         fifo = self.card._machine.fifo
-        if fifo is not None:  # else it ran dry just now
+        if fifo is not None and math.isfinite(fifo.play_s):  # else it ran dry just now
             ticks.append(fifo.play_s + int(began[words.BEGAN]) / stream._rate_hz)
         return np.diff(ticks).tolist()
 
@@ -145,6 +164,7 @@ def stream(given: argparse.Namespace) -> Counts:
         warm_rendering()
         load_kernels()
         raise_priority()
+        time_sleeps(new_timer(), counts.woken_ns, 50_000)
         tweezers.open()
         tweezers.settle()
         path = Rearrangement(given.dop, tweezers, card)
@@ -192,6 +212,10 @@ def main() -> None:
     finally:
         for process in busy:
             process.terminate()
+    late_us = 1e-3 * np.quantile(counts.woken_ns, (0.5, 0.99, 0.999, 1.0))
+    print(
+        "a sleep of 50 us takes, us: median {:.0f}, 99 % {:.0f}, 99.9 % {:.0f}, most {:.0f}".format(*late_us)
+    )
     print(f"{given.programs} programs, {given.load} busy processes, load {os.getloadavg()[0]:.1f}")
     times_us = 1e6 * np.array(counts.stages_s).reshape(-1, len(STAGES))
     rows = [*zip(STAGES, times_us.T, strict=True), ("frame to light", times_us.sum(axis=1))]
@@ -200,6 +224,9 @@ def main() -> None:
         numbers = np.quantile(stage_us, (0.5, 0.99, 0.999, 1.0))
         print(f"{name:16}", *(f"{number:8.0f}" for number in numbers))
     print(f"underruns: {counts.n_in_motion} in motion, {counts.n_in_silence} in silence")
+    if given.picture:
+        title = f"mode stream, {len(times_us)} programs, {given.load} busy processes"
+        draw_times((1e-6 * times_us.sum(axis=1)).tolist(), title, given.picture)
 
 
 if __name__ == "__main__":
