@@ -21,6 +21,8 @@ from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording.points import scan_points
 from labseq.recording.quantities import OF_IMAGES, select_shots
 
+from .records import Write, make_shot
+
 
 def at_points(run: labseq.Run, name: str) -> list[Estimated]:
     quantity = run.quantity(name)
@@ -34,6 +36,12 @@ def test_survival_between_named_images_is_counted_atom_by_atom(lifetime: labseq.
     assert quantity.over([shot]) == Rate(int((before & after).sum()), int(before.sum()))
     assert lifetime.quantity("survival:0,1").over([shot]) == quantity.over([shot])
     assert lifetime.quantity("survival").over([shot]) == quantity.over([shot])
+
+
+def test_atoms_are_followed_up_to_the_image_of_a_cycle_through_its_moves(write: Write) -> None:
+    run = write([make_shot(0, n_cycles=2)])
+    assert run.quantity("survival:0,1").over(run.shots) == Rate(6, 6)
+    assert run.quantity("survival:1,2").over(run.shots) == Rate(6, 6)
 
 
 def test_atoms_are_followed_through_the_batches_that_were_played() -> None:

@@ -153,6 +153,12 @@ def test_what_depends_on_an_override_is_worked_out_again() -> None:
     assert document.data["it"] == "0.04 s"
 
 
+def test_what_follows_from_a_value_through_another_one_is_known() -> None:
+    document = Document.parse("a: 2\nb: = 2 * a\nc: = b + 1\nd: = 2 * e\ne: 5\n", "s.yaml").evaluated()
+    assert document.expressions is not None
+    assert document.expressions.following(("a",)) == [("b",), ("c",)]
+
+
 def test_a_field_checks_the_result(tmp_path: Path) -> None:
     text = (
         "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot:\n  - image: {}\nattempts: = 7 / 2\n"

@@ -91,9 +91,9 @@ LANDS = {"empty_tweezers_may_land": True}
         ("path", r"closer than 1.9 um to .* on \(0, 1\)", "##.", [(0, 0, 0, 2)], along([0], [2]), {}),
         ("path", r"an atom ends on the atom on \(0, 3\)", "#..#", [(0, 0, 0, 1)], along([0, 2], [1, 3]), {}),
         ("path", r"stands on \(0, 2\)", "#.#.", [(0, 0, 0, 1)], along([0, 1], [1, 3]), LANDS),
-        # the atom of row 0 is dropped off, and the tweezer of row 1 comes by
-        ("path", r"stands on \(0, 0\)", "#. .. .. #.", [(0, 0, 0, 0), (3, 0, 1, 1)],
-         paths([[0, 3], [0, 3], [0, 0.25], [0, 1]], [[0], [0], [0], [1]], [1, 3]), {}),
+        # the atom of row 0 is dropped off, and in the leg that follows the tweezer of row 3 passes over it
+        ("path", r"stands on \(0, 0\)", "# . . #", [(0, 0, 0, 0), (3, 0, -1, 0)],
+         paths([[0, 3], [0, 3], [0, -1]], [[0], [0], [0]], [1, 2]), {}),
     ],
 )  # fmt: skip
 def test_each_rule(rule: str, words: str, atoms: str, moves: Any, tones: TonePaths, options: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels_fewest, kernels_lines
+from labseq_psca import kernels_fewest, kernels_lines, kernels_repair
 from labseq_psca.planner import PscaPlanner, PscaSettings, ToneLimits
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -49,6 +49,15 @@ def test_the_papers_variant_sorts_rows_in_the_order_that_is_set(order: Any, row:
     planner = PscaPlanner(PscaSettings(variant="paper", row_order=order), Context())
     plan = planner.plan(atoms, TargetPattern(fill, np.zeros_like(fill)))
     assert plan.moves[0, 0] == row
+
+
+def test_the_papers_variant_repairs_nothing() -> None:
+    atoms = np.random.default_rng(2).random((20, 20)) > np.where(COMPACT.fill, 0.02, 0.5)
+    moves = [
+        psca(variant="paper", repair_below=share)(Context(), 7).plan(atoms, COMPACT).moves.tolist()
+        for share in (0.1, 0.0)
+    ]
+    assert moves[0] == moves[1]
 
 
 def test_few_defects_are_repaired_with_few_atom_moves() -> None:
@@ -264,6 +273,28 @@ def test_repair_is_chosen_by_expected_survival() -> None:
             assert chances[0] >= chances[1]
             n_moves[-1] += n_picked_up(plans[0])
     assert n_moves[0] < 0.9 * n_moves[1]
+
+
+def test_a_repair_costs_the_time_that_the_check_predicts(monkeypatch: pytest.MonkeyPatch) -> None:
+    motion = MotionSpec(losses=LossSpec(move=0.01, lifetime_s=10.0), overhead_per_batch_s=1e-3)
+    found: list[tuple[float, float, float]] = []
+
+    def repair(*arguments: Any) -> Any:
+        found.append(arguments[-1])
+        return plan_repair(*arguments)
+
+    plan_repair = kernels_repair.plan_repair
+    monkeypatch.setattr(kernels_repair, "plan_repair", repair)
+    atoms = COMPACT.fill.copy()
+    atoms[10, 10], atoms[0, 0] = False, True
+    PscaPlanner(PscaSettings(), Context(motion=motion)).plan(atoms, COMPACT)
+    ((move, batch, site),) = found
+    for n_sites in (1, 3):
+        plan = Plan.from_batches([([(0, 0)], [(0, n_sites)])])
+        report = check_plan(plan, atoms, COMPACT, 1, SiteGrid(), motion)
+        lost = COMPACT.n_atoms * (report.duration_s - motion.overhead_per_cycle_s) / 10.0
+        assert batch + n_sites * site == pytest.approx(lost)
+    assert move == pytest.approx(-np.log(0.99))
 
 
 def n_picked_up(plan: Plan) -> int:

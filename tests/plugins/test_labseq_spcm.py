@@ -569,6 +569,16 @@ def test_data_that_is_withheld_is_an_underrun_and_ends_in_the_safe_state(driver:
         assert np.array_equal(lab.samples(0)[: rendered.shape[1]], rendered[0])
 
 
+def test_a_card_that_something_else_stops_has_not_played_to_the_end(driver: Any) -> None:
+    with driver("fifo", fill=1e-3) as lab:
+        lab.tweezers.prepare(lab.program(60))
+        lab.tweezers.play()
+        lab.tweezers._card.stop()
+        with pytest.raises(TransientError, match="underrun"):
+            lab.tweezers.wait(1.0)
+        assert lab.card.outputs_on == (False, False)
+
+
 def test_a_slot_that_is_slower_than_the_output_is_an_underrun_also_at_the_end(
     driver: Any,
 ) -> None:

@@ -144,7 +144,13 @@ class TestSettings:
 
     @pytest.mark.parametrize(
         ("full_scale_v", "max_peak_v", "text"),
-        [(2.1, 3.0, "2000 mV"), (0.05, 2.0, "80 mV"), (0.45, 2.0, "relay"), (1.0, 0.5, "max_peak")],
+        [
+            (2.1, 3.0, "2000 mV"),
+            (0.05, 2.0, "80 mV"),
+            (0.42, 2.0, "relay"),
+            (0.48, 2.0, "relay"),
+            (1.0, 0.5, "max_peak"),
+        ],
     )
     def test_amplitudes_that_card_or_amplifiers_cannot_do_are_refused(
         self, full_scale_v: float, max_peak_v: float, text: str
