@@ -63,6 +63,8 @@ def test_everything_in_it() -> None:
 def test_defaults(tmp_path: Path) -> None:
     spec = load(tmp_path, SMALL)
     assert (spec.profile, spec.seed, spec.record_frames, spec.attempts) == ("virtual", None, "all", 3)
+    policy = spec.policy
+    assert (policy.on_failure, policy.when_exhausted, policy.over_budget) == (None, "stop", "record")
     assert spec.plugin_folders == []
     assert spec.planner.use == "psca"
 

@@ -87,7 +87,7 @@ def test_number_of_values_up_to_the_limit() -> None:
 
 def test_alias_bomb() -> None:
     lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
-    for old, new in zip("abcdefgh", "bcdefghi", strict=True):
+    for old, new in zip("abcd", "bcde", strict=True):  # so few that a failing check ends
         lines.append(f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]")
     (message,) = problems("\n".join(lines))
     assert f"more than {MAX_VALUES} values" in message

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labseq_spcm import stream_kernels as k
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import check_rendering
@@ -106,6 +107,16 @@ def test_an_underrun_in_silence_is_counted_and_the_stream_begins_again(driver: A
             lab.clock.sleep(2e-3)
             assert lab.tweezers.describe()["silent_underruns"] == n + 1
             assert lab.card.running
+
+
+def test_a_program_of_which_a_part_may_have_been_played_is_not_played_again(driver: Any) -> None:
+    with driver("stream") as lab:
+        stream: Any = lab.tweezers._mode
+        box, block = stream._box, stream._block
+        box[k.START] = box[k.FETCHED]  # of the block that is being fetched the card reports nothing
+        box[k.WRITTEN], box[k.END] = box[k.START] + block, box[k.START] + 9 * block
+        with pytest.raises(TransientError, match=r"underrun: .* \(0% of the program was played\)"):
+            stream._recover(k.DRY)
 
 
 @pytest.mark.parametrize(("held_s", "is_survived"), [(6e-3, True), (12e-3, False)])
