@@ -185,7 +185,10 @@ def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> No
     paths = [writer.write_shot(make_shot(index)) for index in range(3)]
     writer.write_shot(make_shot(3, status="failed"))
     paths[0].unlink()
-    paths[1].write_bytes(paths[1].read_bytes()[:-1])
+    text = make_run().sequence_text.encode()
+    whole = paths[1].read_bytes()
+    paths[1].write_bytes(whole.replace(text, text.swapcase()))  # only the checksum shows it
+    assert paths[1].read_bytes() != whole
     left_out = export_run(open_run(writer.run_dir), "archive", tmp_path / "a.h5")
     assert [line.partition(": ")[0] for line in left_out] == [str(path) for path in paths[:2]]
     with h5py.File(tmp_path / "a.h5") as archive:
