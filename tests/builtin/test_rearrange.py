@@ -50,7 +50,7 @@ def test_seen_defect_free_is_no_success():
 
 
 def test_an_image_before_the_last_rearrangement_judges_nothing():
-    rig = rearranging([DONE, HALF, DONE], after=(), stop_when="never", cycles=2)
+    rig = rearranging([DONE, HALF, DONE, DONE], after=(), stop_when="never", cycles=3)
     rig.run()
     record = rig.record()
     assert (record.status, record.success, record.seen_defect_free_cycle) == ("complete", False, 1)

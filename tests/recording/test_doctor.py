@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from labseq.recording import RunWriter, mark_active, open_run
+from labseq.recording import RunWriter, doctor, mark_active, open_run
 from labseq.recording.doctor import examine
 from tests.locking import held_elsewhere
 
@@ -123,6 +123,14 @@ def test_what_is_quarantined_says_where_it_came_from(run_dir: Path) -> None:
     first = json.loads((place / "doctor.jsonl").read_text("utf-8").splitlines()[0])
     assert first["from"] == str(run_dir / "shots" / "shot_000001.h5")
     assert first["what"].startswith("the checksum does not hold")
+
+
+def test_what_is_moved_to_quarantine_is_on_the_disk(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(doctor, "sync_folder", synced.append)
+    (run_dir / "shots" / "half.part").write_bytes(b"")
+    examine(run_dir)
+    assert synced == [run_dir / "shots", run_dir / "quarantine"]
 
 
 def test_two_files_of_a_name_are_both_kept(run_dir: Path) -> None:

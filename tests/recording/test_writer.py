@@ -224,6 +224,12 @@ def test_a_file_that_was_made_elsewhere_is_on_the_disk_before_its_line(
     assert not made.exists()
 
 
+def test_shots_that_are_skipped_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = RunWriter.create(tmp_path, make_run())
+    n_calls = n_disk_calls(lambda: writer.skip([0], "no light"), monkeypatch)
+    assert n_calls == 3  # write, fsync; fsync of the folder, to which the file is new
+
+
 def test_devices_are_added_once_they_are_open(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
     writer.set_devices({"camera": {"model": "iXon", "serial_number": "X-1"}})
