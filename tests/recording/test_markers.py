@@ -9,7 +9,7 @@ import pytest
 
 from labseq.errors import RecordingError
 from labseq.files import devices_root
-from labseq.recording import clear_active, find_dead_run, mark_active, runs_in_progress
+from labseq.recording import clear_active, find_dead_run, mark_active, markers, runs_in_progress
 
 MARK = """
 import sys
@@ -36,6 +36,15 @@ def test_a_run_whose_process_is_gone_has_died_for_its_profile_and_for_its_hardwa
     assert find_dead_run("/copy/lab.yaml", ["radio"]) == run_dir  # which may still be on
     clear_active("/copy/lab.yaml", ["radio"])
     assert find_dead_run(key, ["card", "radio"]) is None
+
+
+def test_a_marker_is_on_the_disk_before_the_run_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(markers, "sync_folder", synced.append)
+    mark_active("lab", [], tmp_path / "run")
+    assert synced == [devices_root()]
 
 
 def test_clearing_leaves_what_belongs_to_others(tmp_path: Path) -> None:

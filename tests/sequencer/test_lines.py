@@ -179,7 +179,7 @@ def test_a_line_that_triggers_the_camera_takes_the_place_of_the_software() -> No
 
 
 def test_a_blinding_line_refuses_an_exposure_with_em_gain() -> None:
-    blinding = LineSpec("mot", 3, frozenset({"load", "image"}), blinding=True)
+    blinding = LineSpec("mot", 3, frozenset({"image"}), blinding=True)
 
     class Multiplying(RecordingCamera):
         facts = CameraFacts(em_gain=300.0)
