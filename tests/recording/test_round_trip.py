@@ -29,6 +29,7 @@ from labseq.model import (
     TargetPattern,
 )
 from labseq.recording import RunWriter, open_run
+from labseq.recording.images import average_frame
 
 from .records import assert_same, make_run, make_shot, write
 
@@ -229,3 +230,13 @@ def test_frames_of_several_sizes_are_given_one_by_one(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="several sizes"):
         _ = found.frames
     assert_same(found.record(), shot)
+
+
+def test_frames_of_another_size_are_left_out_of_an_average(tmp_path: Path) -> None:
+    other = Frame(np.ones((2, 3), np.uint16), 0.1, 0.2)
+    shots = [make_shot(index, n_images=1) for index in range(3)]
+    shots[1].images[0] = dataclasses.replace(shots[1].images[0], frame=other)
+    average, n = average_frame(write(tmp_path, *shots).shots)
+    frames = [shot.images[0].frame for shot in (shots[0], shots[2])]
+    assert n == 2
+    assert np.array_equal(average, np.mean([frame.image for frame in frames if frame], axis=0))
