@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from labseq.errors import RecordingError
+from labseq.model import ScanRange
 from labseq.recording import RunWriter, open_run
+from labseq.recording.best import best_point
 from labseq.recording.points import scan_points
 
 from .records import make_run, make_shot
@@ -45,6 +48,27 @@ def test_a_point_knows_its_values_and_its_shots(tmp_path: Path) -> None:
     assert [shot.index for shot in first.shots] == [1, 3]
     assert [shot.filling_fraction for shot in first.shots] == [1.0, 0.75]
     assert [shot.index for shot in second.shots] == [0, 4]
+
+
+@pytest.mark.parametrize(("maximise", "window"), [(True, "30 ms"), (False, "10 ms")])
+def test_the_best_point_has_the_highest_mean_or_the_lowest(
+    tmp_path: Path, maximise: bool, window: str
+) -> None:
+    scan = {
+        "scanner": {"use": "climb"},
+        "addresses": ["shot.sort.window"],
+        "written_units": ["ms"],
+        "ranges": [asdict(ScanRange("shot.sort.window", 0.01, 0.05))],
+        "figure": "filling_fraction",
+        "maximise": maximise,
+    }
+    writer = RunWriter.create(tmp_path, make_run(n_shots=3, scan=scan))
+    for index, (window_s, filling) in enumerate([(0.02, 0.5), (0.03, 0.9), (0.01, 0.2)]):
+        parameters = {"shot.sort.window": window_s}
+        writer.write_shot(make_shot(index, filling_fraction=filling, parameters=parameters))
+    best = best_point(open_run(writer.run_dir))
+    assert best is not None
+    assert best.point.written == {"shot.sort.window": window}
 
 
 def test_a_run_without_a_scan_has_no_points(tmp_path: Path) -> None:
