@@ -528,3 +528,11 @@ def test_nothing_is_reported_between_a_frame_and_the_start_of_the_moves(monkeypa
     later = [name for name, n_calls in seen if n_calls >= play]
     assert later.index("image") < later.index("cycle")
     assert gc.isenabled()
+
+
+def test_the_watchdog_keeps_a_device_that_is_not_safe(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, forgotten = Rig(fail_on={"camera.safe_state": OSError("cable")}), list[str]()
+    monkeypatch.setattr(rig.sequencer._watchdog, "forget", forgotten.extend)
+    rig.run()
+    assert set(rig.unsafe) == {"camera"}
+    assert set(forgotten) == {*SAFE_ORDER} - {"camera"}
