@@ -17,6 +17,7 @@ from labseq.config.profile import (
     CalibrationSettings,
     ChannelSettings,
     GridSettings,
+    LinesChoice,
     LossSettings,
     MotionSettings,
     ProfileSpec,
@@ -276,3 +277,22 @@ def test_calibrations_are_chosen_by_file_and_option(
 def test_a_wrong_choice_of_calibrations_has_its_place(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=rf"bench.yaml:26:\d+: {message}"):
         calibrations(tmp_path, text)
+
+
+PULSE = {"channel": 0, "on": ["load"], "pulse": "1 ms"}
+TRIGGER = {"channel": 0, "on": ["image"], "triggers": "camera"}
+
+
+@pytest.mark.parametrize(
+    ("channels", "message"),
+    [
+        ({"a": PULSE, "b": PULSE}, "'a' and 'b' are both on channel 0"),
+        ({"a": TRIGGER, "b": TRIGGER | {"channel": 1}}, "'a' and 'b' both trigger the camera"),
+        ({"a": TRIGGER | {"lead": "1 ms"}}, "lead is set for a trigger"),
+        ({"a": PULSE | {"lag": "1 ms"}}, "lag is set beside pulse"),
+        ({"a": PULSE | {"on": ["load", "idle"]}}, "a pulse has 'idle' among its steps"),
+    ],
+)
+def test_lines_that_contradict_themselves_are_refused(channels: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LinesChoice.model_validate({"use": "box", "channels": channels})
