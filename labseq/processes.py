@@ -9,7 +9,6 @@ import platform
 import signal
 import sys
 import time
-import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -197,21 +196,17 @@ class Lock:
         Raises:
             OSError: The file cannot be made; or its folder has no locks, see :func:`knows_no_locks`.
         """
-        from filelock import FileLock, SoftFileLock, Timeout  # takes 0.05 s to import
+        from filelock import FileLock, Timeout  # takes 0.05 s to import
 
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        lock: Any = FileLock(self.path, timeout=0, mode=FOR_ALL, thread_local=False)
+        # without fallback_to_soft=False it would use a lock file, which outlives its holder
+        lock = FileLock(self.path, timeout=0, mode=FOR_ALL, thread_local=False, fallback_to_soft=False)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # filelock warns where it falls back to a lock file
-                lock.acquire()
+            lock.acquire()
         except Timeout:
             return self.holder() or Holder()
         except NotImplementedError as error:
             raise OSError(errno.ENOSYS, str(error)) from error
-        if isinstance(lock, SoftFileLock):  # a lock file would outlive its holder
-            lock.release()
-            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
         self._lock = lock
         self.describe(self._holder.what)
         return None

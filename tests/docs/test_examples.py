@@ -60,7 +60,10 @@ NOT_RUN = {
     "docs/explanation/run-statistics.md": ["a formula"],
     "docs/explanation/scale.md": ["takes minutes"],
     "docs/explanation/survival.md": ["takes minutes"],
-    "docs/explanation/virtual-lab.md": ["takes ten minutes of a core for each series", "takes minutes"],
+    "docs/explanation/virtual-lab.md": [
+        "takes ten minutes of a core for each series of 10,000 shots",
+        "takes minutes",
+    ],
     "docs/how-to/remote-devices.md": [
         "makes the keys of two computers",
         "a server does not end by itself",
