@@ -166,7 +166,7 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
         raise ConfigError(Problem(what, name, error.lineno, error.colno, _EXPECTED)) from error
     except (RecursionError, ValueError) as error:  # nested too deeply, or a number of thousands of digits
         raise ConfigError(Problem(f"this is not a plan: {error}", name, expected=_EXPECTED)) from error
-    if not isinstance(values, dict) or "batches" not in values:
+    if not isinstance(values, dict) or not {"planner", "batches"} & values.keys():
         raise ConfigError(Problem("this is not a plan", name, expected=_EXPECTED))
     file = validate_values(_File, cast("Mapping[str, Any]", values), name)
     grid = file.grid.model()

@@ -60,6 +60,7 @@ NOT_RUN = {
     "docs/explanation/run-statistics.md": ["a formula"],
     "docs/explanation/scale.md": ["takes minutes"],
     "docs/explanation/survival.md": ["takes minutes"],
+    "docs/explanation/timing-budget.md": ["plays programs for minutes"],
     "docs/explanation/virtual-lab.md": [
         "takes ten minutes of a core for each series of 10,000 shots",
         "takes minutes",
