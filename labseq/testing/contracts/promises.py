@@ -269,8 +269,8 @@ class _Watcher:
         finally:
             self._local.seen = None
 
-    def _hook(self, event: str, args: tuple[Any, ...]) -> None:
-        if event not in _EVENTS:
+    def _hook(self, event: str, args: tuple[Any, ...], events: frozenset[str] = _EVENTS) -> None:
+        if event not in events:  # not _EVENTS, which is gone while Python shuts down
             return
         seen: list[str] | None = getattr(self._local, "seen", None)
         if seen is not None and not _is_importing():
