@@ -66,6 +66,12 @@ def pytest_xdist_auto_num_workers() -> int:
     return n_cores + (n_cores + 1) // 2
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Leave out doctests of the web pages without their packages; the hooks below see `tests` only."""
+    if "starlette" in _MISSING:
+        config.option.ignore = [*(config.option.ignore or []), str(_REPOSITORY / "labseq" / "web")]
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile all kernels before the whole suite begins: its processes would each compile the same ones."""
     config = session.config
