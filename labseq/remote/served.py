@@ -21,6 +21,7 @@ from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import RandomStream
 from labseq.roles import Clock, Context, offers
+from labseq.roles.simulation import JoinsRun
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.session.chosen import ChosenPlugin
 from labseq.session.lab import construct
@@ -439,7 +440,8 @@ class ServedDevice:
         if simulation is None and self._simulation is not None:
             made, _ = construct({"simulation": self._simulation}, context, seed)
             session.simulation = simulation = made["simulation"]
-            simulation.join(run.key, run.catch_up)
+            joined: JoinsRun = simulation
+            joined.join(run.key, run.catch_up)
         made, streams = construct({context.name: self._chosen}, replace(context, simulation=simulation), seed)
         run.streams += streams
         if run.place is not None:

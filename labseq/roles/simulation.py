@@ -181,7 +181,6 @@ class ReceivesOutput(Protocol):
         ...
 
 
-@runtime_checkable
 class JoinsRun(Protocol):
     """A simulation at another server of devices, which a server joins for simulated devices of its own."""
 

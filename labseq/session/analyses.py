@@ -238,7 +238,13 @@ class _End:
 
 
 def main(run_dir: Path, name: str, finish_within_s: float) -> None:
-    """Analyse the shots of a run as they come, until it is over."""
+    """Analyse the shots of a run as they come, until it is over.
+
+    Args:
+        run_dir: The run's folder.
+        name: One of the analyses of its sequence.
+        finish_within_s: Time allowed after the end of the run, in seconds.
+    """
     end = _End(finish_within_s)
     if hasattr(os, "nice"):
         os.nice(10)  # the run comes first

@@ -362,7 +362,12 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
 
 
 def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
-    """The reason why runs ignore a calibration although it is in use; "" if they do not."""
+    """The reason why runs ignore a calibration although it is in use; "" if they do not.
+
+    Args:
+        entry: The calibration.
+        entries: Kind -> the other calibrations in use.
+    """
     if entry.kind != "overlay" or _has_basis(entry, entries):
         return ""
     return "it was measured with other frequencies of the mobile tweezers"

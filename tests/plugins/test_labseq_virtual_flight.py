@@ -51,7 +51,6 @@ WAIST, STATIC_Z, MOBILE_Z = 0.98e-6, math.pi * 0.98e-6**2 / 808e-9, math.pi * 0.
 BEAMS = np.array([WAIST, STATIC_Z, WAIST, MOBILE_Z])
 STATIC, MOBILE = 300e-6 * KELVIN, 2.1e-3 * KELVIN
 HOP_S = 2.5e-6
-NO_ATOMS = np.zeros(9)
 
 
 def plane() -> Floats:
