@@ -19,14 +19,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 from _pytest.doctest import DoctestModule
 from hypothesis import settings
 
 from labseq.files import cache_root
 
 # A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
-settings.register_profile("labseq", deadline=None, derandomize=True)
-settings.register_profile("search", deadline=None)
+settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=50)
+settings.register_profile("search", deadline=None, max_examples=500)
 settings.load_profile("labseq")
 
 for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not reach the tests
@@ -90,10 +91,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collect_file(file_path: Path) -> Generator[None, list[Any], list[Any]]:
-    """Tests have no examples in their docstrings: not to look for them is a tenth of the collection."""
+    """To look for examples where there are none would be a quarter of the collection."""
     found = yield
-    within = file_path.is_relative_to(_REPOSITORY / "tests")
-    return [one for one in found if not (within and isinstance(one, DoctestModule))]
+    is_test = file_path.is_relative_to(_REPOSITORY / "tests")
+    if is_test or (found and ">>>" not in file_path.read_text("utf-8")):
+        return [one for one in found if not isinstance(one, DoctestModule)]
+    return found
 
 
 def pytest_collection_finish() -> None:
@@ -102,8 +105,8 @@ def pytest_collection_finish() -> None:
     Each session goes through all objects before its first shot, and keeps those out of later rounds: here
     it would be a fifth of the time of all runs, for pytest's own and those of other tests. And what is
     written need not outlive the machine; a process that is killed loses nothing of what it wrote. What is
-    installed, and the state of this repository, stay the same: each run would read a hundred files for the
-    one and start five processes for the other.
+    installed, the state of this repository and the command line stay the same: each run would read a hundred
+    files for the first, start five processes for the second, and build the last anew.
     """
     from labseq.session import provenance, session
 
@@ -116,6 +119,7 @@ def pytest_collection_finish() -> None:
     patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
     patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))
     patch.setattr(importlib.metadata.PathDistribution, "read_text", cache(_READ_TEXT))
+    patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
     patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"]))
 
 

@@ -36,7 +36,7 @@ from labseq.recording.hdf5 import (
 )
 from labseq.recording.reader import Run
 from labseq.recording.shot import Shot
-from labseq.recording.shot_file import opened, read_content
+from labseq.recording.shot_file import open_finished, opened, read_content
 from labseq.recording.tables import facts_of
 
 FORMAT: Final = "labseq-archive"
@@ -133,7 +133,7 @@ class _Shots:
         read_content(shot.file)  # refuses what would lead out of the file
         with opened(shot.file) as entry:
             check_attributes(entry.file)
-        with h5py.File(shot.file, "r", locking=False) as source:
+        with open_finished(shot.file) as source:
             entry: Any = source["entry"]
             for camera in entry.get("camera", {}).values() if self._frames else ():
                 load_filter(shot.file, camera["frames"])

@@ -276,13 +276,22 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
         raise RecordingError(path, f"cannot be read: {what}; restore it from a backup")
     if not path.is_file():
         raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
-    # A finished file never changes, and locks fail on network folders.
-    with damage_reported(path), h5py.File(path, "r", locking=False) as file:
+    with damage_reported(path), open_finished(path) as file:
         if read_attribute(file, "format") != schema.FORMAT:
             raise RecordingError(path, "is not a shot's file of labseq")
         check_version(path, str(read_attribute(file, "format_version")), schema.FORMAT_VERSION)
         check_contents(file, path.stat().st_size, only)
         yield cast("Any", file["entry"])
+
+
+def open_finished(path: Path) -> h5py.File:
+    """Open a file that never changes again without a lock, as locks fail on network folders."""
+    try:
+        return h5py.File(path, "r", locking=False)
+    except OSError as error:
+        if "locking flag" not in str(error):
+            raise
+        return h5py.File(path, "r")  # this process has opened it by h5py itself, with a lock
 
 
 @contextlib.contextmanager

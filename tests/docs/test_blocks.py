@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Final
 
 import pytest
-import typer
 from matplotlib.figure import Figure
 
 from .blocks import PAGES, ROOT, blocks_of
@@ -25,7 +23,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What each command does once for its process is not done a hundred times in this one."""
-    monkeypatch.setattr("typer.main.get_command", get_command)
     monkeypatch.setattr("labseq.bench.latency.N_WARM", 1)
     monkeypatch.setattr("labseq.calibration.measure.encode_figure", lambda *_, **__: b"")
     monkeypatch.setattr("labseq.pictures.figures.encode_figure", composed)
@@ -36,9 +33,6 @@ def composed(draw: Callable[[], Figure], *_: object, **__: object) -> bytes:
     """Compose a picture, but do not render it: other tests do."""
     draw()
     return b""
-
-
-get_command = cache(typer.main.get_command)
 
 
 BY_OTHERS: Final = ("docs/tutorials/planner.md", "docs/tutorials/camera-driver.md")

@@ -151,3 +151,9 @@ def test_average_image_loading_map_and_counts_of_any_run(
     mean, n = average_frame(kept.shots, image=1)
     np.testing.assert_array_equal(mean, np.mean([shot.frames[1] for shot in kept.shots], axis=0))
     picture_of(kept, "image").save(tmp_path / "image.png")
+
+
+def test_a_file_that_is_open_in_h5py_can_be_read(run: labseq.Run) -> None:
+    shot = labseq.open_run(run.path).shots[0]
+    with h5py.File(shot.file) as file:
+        assert np.array_equal(shot.occupancies, file["entry/detection/occupancy"][()])
