@@ -326,7 +326,12 @@ class SimulatedCard:
             return r.ERR_OK
 
     def invalidate(self) -> int:
-        """Forget the transfer buffer."""
+        """Forget the transfer buffer; the manual wants the transfer stopped by a command before."""
         with self._lock:
+            if self._error.code:
+                return r.ERR_LASTERR
+            self._advance()
+            if self._machine.is_transferring:
+                return self._refused(Refusal(r.ERR_SEQUENCE, "the buffer is in use"), r.SPC_M2CMD, 0)
             self._machine.buffer = None
-            return r.ERR_LASTERR if self._error.code else r.ERR_OK
+            return r.ERR_OK

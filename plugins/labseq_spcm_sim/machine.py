@@ -274,6 +274,11 @@ class Machine:
         self.memory.send(now_s, self.buffer.fetch(0, self.buffer.n_bytes).copy())
         self.buffer = None  # it is used only once
 
+    @property
+    def is_transferring(self) -> bool:
+        """Whether the bus fetches samples from the transfer buffer."""
+        return bool(self.memory.uploads) or (self.fifo is not None and self.fifo.is_transferring)
+
     def stop_dma(self, now_s: float) -> None:
         """What has not arrived is lost."""
         self.memory.uploads.clear()

@@ -308,6 +308,11 @@ class Fifo:
         self._words[k.DMA] = on
 
     @property
+    def is_transferring(self) -> bool:
+        """Whether the bus fetches what is handed over."""
+        return bool(self._words[k.DMA])
+
+    @property
     def user_bytes(self) -> int:
         """Bytes that are free for the user, in whole notify sizes."""
         return int(k.user_bytes(self._words))
