@@ -82,12 +82,15 @@ SIGNATURES: Final[dict[str, str]] = {
     # GLib and GObject
     "g_clear_error": "v p",
     "g_free": "v p",
-    "g_object_set": "v ps",  # and a value of the property's type, and None
+    "g_object_set_property": "v psp",
     "g_object_unref": "v p",
     "g_quark_to_string": "s u",
     "g_random_set_seed": "v u",
     "g_signal_connect_data": "g pspppi",
     "g_signal_handler_disconnect": "v pg",
+    "g_value_init": "p pz",
+    "g_value_set_double": "v pd",
+    "g_value_set_int": "v pi",
     # discovery
     "arv_device_error_quark": "u ",
     "arv_gc_error_quark": "u ",
@@ -209,6 +212,16 @@ class GError(ctypes.Structure):
     _fields_ = (("domain", ctypes.c_uint32), ("code", ctypes.c_int), ("message", ctypes.c_char_p))
 
 
+class GValue(ctypes.Structure):
+    """GObject's value of any type."""
+
+    _fields_ = (("type", ctypes.c_size_t), ("data", ctypes.c_int64 * 2))
+
+
+INT, DOUBLE = 6 << 2, 15 << 2
+"""GObject's G_TYPE_INT and G_TYPE_DOUBLE."""
+
+
 class Library:
     """The functions of Aravis, GObject and GLib in :data:`SIGNATURES`, as typed attributes.
 
@@ -253,9 +266,13 @@ class Library:
         finally:
             self.g_free(array)
 
-    def set_property(self, instance: int, name: str, value: Any) -> None:
-        """Set a property of an object to a value of a C type."""
-        self.g_object_set(instance, name.encode(), value, None)
+    def set_property(self, instance: int, name: str, value: float) -> None:
+        """Set a property of an object that is a number or an enumeration; GObject converts the type."""
+        place = GValue()
+        is_int = isinstance(value, int)
+        self.g_value_init(ctypes.byref(place), INT if is_int else DOUBLE)
+        (self.g_value_set_int if is_int else self.g_value_set_double)(ctypes.byref(place), value)
+        self.g_object_set_property(instance, name.encode(), ctypes.byref(place))
 
     def _name_of(self, domain: int, code: int) -> str:
         for quark, names in ERRORS.items():

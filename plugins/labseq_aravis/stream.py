@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from labseq_aravis.library import AravisError, Library, PixelFormatError
 
@@ -121,15 +121,15 @@ class Stream:
         """Set the options, for frames of ``payload`` bytes."""
         if not self._is_ethernet:
             return
-        self._set("packet-resend", ctypes.c_int(options.resend))
+        self._set("packet-resend", int(options.resend))
         for name, time_s in (
             ("packet-timeout", options.packet_timeout_s),
             ("frame-retention", options.frame_retention_s),
         ):
             if time_s is not None:
-                self._set(name, ctypes.c_uint(round(time_s * 1e6)))
-        self._set("socket-buffer", ctypes.c_int(0))  # fixed
-        self._set("socket-buffer-size", ctypes.c_int(max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER)))
+                self._set(name, round(time_s * 1e6))
+        self._set("socket-buffer", 0)  # fixed
+        self._set("socket-buffer-size", max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER))
 
     def allocate(self, n_buffers: int, payload: int) -> None:
         """Add buffers of ``payload`` bytes each."""
@@ -181,7 +181,7 @@ class Stream:
         pixel_format = lib.arv_buffer_get_image_pixel_format(buffer)
         return unpacked(address, n_bytes.value, pixel_format, shape, x_padding.value)
 
-    def _set(self, name: str, value: Any) -> None:
+    def _set(self, name: str, value: int) -> None:
         self._library.set_property(self._open_handle(), name, value)
 
     def _open_handle(self) -> int:

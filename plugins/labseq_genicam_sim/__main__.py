@@ -122,7 +122,7 @@ class SimulatedCamera:
     def _lose(self, fraction: float, n: int) -> None:
         """Lose this fraction of the next frame's packets, the same ones each time."""
         self._library.g_random_set_seed(n)
-        self._library.set_property(self._camera, "gvsp-lost-ratio", ctypes.c_double(fraction))
+        self._library.set_property(self._camera, "gvsp-lost-ratio", float(fraction))
 
     def _register(self, address: int) -> int:
         value = ctypes.c_uint32()
