@@ -26,8 +26,8 @@ from hypothesis import settings
 from labseq.files import cache_root
 
 # A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
-settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=50)
-settings.register_profile("search", deadline=None, max_examples=500)
+settings.register_profile("labseq", deadline=None, derandomize=True)
+settings.register_profile("search", deadline=None)
 settings.load_profile("labseq")
 
 for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not reach the tests
