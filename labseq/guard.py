@@ -294,6 +294,23 @@ class Guard:
         """The same, even if the run is asked to stop; for opening, safe states and closing."""
         return self._named(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
 
+    def begin_despite_stop(
+        self, owner: str, timeout_s: float, function: Callable[[], T]
+    ) -> tuple[threading.Event, Callable[[], T]]:
+        """Begin such a call.
+
+        Returns:
+            What is set when it has ended; and what waits for that, as :meth:`call_despite_stop` does.
+        """
+        limit, call = _limit(owner, timeout_s, partial(function)), GuardedCall(partial(function))
+        is_out = self._submit(owner, call)
+
+        def result() -> T:
+            ended = self._wait(call, limit.deadline_s, math.inf) if is_out else call
+            return self._result(limit, ended)
+
+        return call.done, result
+
     def check(self) -> None:
         """Raise ``StopRequested`` if the run was asked to stop, or if the calling shot was abandoned."""
         if self._stop.is_set or self.is_abandoned:
@@ -359,16 +376,22 @@ class Guard:
             LabseqError: A limit within the call was reached.
         """
         call = GuardedCall(work, has_steps=has_steps)
+        if not self._submit(owner, call):
+            return call
+        return self._wait(call, time.monotonic() + timeout_s, grace_s)
+
+    def _submit(self, owner: str, call: GuardedCall) -> bool:
+        """Hand a call to the owner's thread; False if it was carried out here instead."""
         try:
             worker = self._worker(owner)
-        except (
-            RuntimeError,
-            MemoryError,
-        ):  # no thread can be started: better without a limit than not at all
+        except (RuntimeError, MemoryError):  # no thread can be started: better no limit than no call
             call.run()
-            return call
+            return False
         worker.submit(call)
-        deadline_s = time.monotonic() + timeout_s
+        return True
+
+    def _wait(self, call: GuardedCall, deadline_s: float, grace_s: float) -> GuardedCall | None:
+        """Wait for the end of a call; see :meth:`run`."""
         try:
             while not call.done.wait(min(POLL_S, max(0.0, deadline_s - time.monotonic()))):
                 if grace_s < math.inf and self._stop.is_set:
@@ -405,21 +428,23 @@ class Guard:
         self, owner: str, timeout_s: float, grace_s: float, work: partial[T], *, has_steps: bool = False
     ) -> T:
         """Run a call; name owner and function in whatever is not one of labseq's own errors."""
-        name = getattr(work.func, "__name__", "")
-        name = f"{name}() " if name.isidentifier() else ""  # a lambda has none
-        limit = Limit(owner, name, timeout_s, time.monotonic() + timeout_s)
+        limit = _limit(owner, timeout_s, work)
         shot = current_call()
         if owner in self.direct and grace_s < math.inf and shot is not None and shot.has_steps:
             call = self._directly(shot, limit, work)
         else:
             call = self.run(owner, timeout_s, work, grace_s, has_steps=has_steps)
+        return self._result(limit, call)
+
+    def _result(self, limit: Limit, call: GuardedCall | None) -> Any:
+        """The result of a call that has ended, or None if it was abandoned."""
         if call is None:
             raise _hung(limit)
         if call.error is None:
             return call.result
-        if call.own_error is not None or has_steps:
+        if call.own_error is not None or call.has_steps:
             raise call.own_error or call.error
-        text = f"{name}raised {call.text}"
+        owner, text = limit.owner, f"{limit.what}raised {call.text}"
         raise (PlanError(text) if owner == "planner" else DeviceError(owner, text)) from call.error
 
     def _directly(self, shot: GuardedCall, limit: Limit, work: partial[Any]) -> GuardedCall:
@@ -431,6 +456,12 @@ class Guard:
         if shot.is_abandoned:
             raise StopRequested(self._stop.signal_number)
         return call
+
+
+def _limit(owner: str, timeout_s: float, work: partial[Any]) -> Limit:
+    name = getattr(work.func, "__name__", "")
+    name = f"{name}() " if name.isidentifier() else ""  # a lambda has none
+    return Limit(owner, name, timeout_s, time.monotonic() + timeout_s)
 
 
 def _hung(limit: Limit) -> LabseqError:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from labseq.errors import ConfigError, DeviceError, LabseqError
+from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
 from labseq.guard import StopFlag
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
@@ -102,6 +102,23 @@ class SharedTime(VirtualClock):
         self._now_s = max(self._now_s, now_s)
 
 
+class DeviceTime(VirtualClock):
+    """The virtual time of a run for one device: an abort of its call ends a wait in it, and no other's."""
+
+    def __init__(self, shared: SharedTime, abort: Abort) -> None:
+        super().__init__(abort)
+        self._shared = shared
+
+    def now(self) -> float:
+        """The time of the run."""
+        return self._shared.now()
+
+    def sleep(self, duration_s: float) -> None:
+        """Advance it."""
+        self.check()
+        self._shared.sleep(duration_s)
+
+
 @dataclass(eq=False)
 class Run:
     """What the sessions of one run of a client share: virtual time, random numbers and the simulation.
@@ -142,8 +159,7 @@ class Session:
         peer: The client's public key; "" without keys.
         who: What the client calls itself, for other users.
         run: See :class:`Run`.
-        connection: Number of the connection that its signs of life come from, in this process.
-        is_suspect: Whether a connection of this number has ended since the last one.
+        connection: The connection that its signs of life come from; see :class:`Connections`.
         token: Names the session in each message.
         beat_s: When it last gave a sign of life.
         ended: Why it is over; "" while it is not.
@@ -153,14 +169,16 @@ class Session:
         running_s: When it began; nan while none is carried out.
         aborted_s: When it was aborted, to be made safe beside it; inf if it was not.
         rescue: The outcome of that: "", "under way", "safe", or why it failed.
+        is_rescued: Set unless that is under way.
+        changing: Held where a call ends, and where it is decided to make the device safe beside it.
+        joins: Whether it uses a simulation that another session has begun.
         simulation: The simulation of another server that its device acts on, or None.
     """
 
     peer: str
     who: str
     run: Run
-    connection: int
-    is_suspect: bool = False
+    connection: tuple[int, int]
     token: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     beat_s: float = field(default_factory=time.monotonic)
     ended: str = ""
@@ -171,12 +189,18 @@ class Session:
     running_s: float = float("nan")
     aborted_s: float = float("inf")
     rescue: str = ""
+    is_rescued: threading.Event = field(default_factory=threading.Event)
+    changing: threading.Lock = field(default_factory=threading.Lock)
     abort: Abort = field(default_factory=Abort)
     clock: Clock | None = None
     device: Any = None
+    joins: bool = False
     simulation: Any = None
     is_open: bool = False
     watchdog: Watchdog | None = None
+
+    def __post_init__(self) -> None:
+        self.is_rescued.set()
 
     @property
     def is_running(self) -> bool:
@@ -257,9 +281,11 @@ class ServedDevice:
 
     def rescue_if_stuck(self, session: Session) -> None:
         """Make the device safe in another thread if a call does not end after it was aborted."""
-        if session.rescue or not session.is_running or time.monotonic() < session.aborted_s + GRACE_S:
-            return
-        session.rescue = "under way"
+        with session.changing:
+            if session.rescue or not session.is_running or time.monotonic() < session.aborted_s + GRACE_S:
+                return
+            session.rescue = "under way"
+            session.is_rescued.clear()
         threading.Thread(target=self._rescue, args=[session], daemon=True).start()
 
     def _rescue(self, session: Session) -> None:
@@ -280,6 +306,7 @@ class ServedDevice:
         self._report(f"{self.name}: {session.call}() does not return; made safe beside it: {session.rescue}")
         if outcome[0] and session.watchdog is not None:
             session.watchdog.end()  # it switches off what it was not asked to forget
+        session.is_rescued.set()
 
     def _serve(self) -> None:
         import zmq
@@ -351,7 +378,9 @@ class ServedDevice:
         session.aborted_s, session.rescue, session.running_s = float("inf"), "", time.monotonic()
         session.reply = self._reply(session, args, named, now_s, place)
         if session.reply:  # else it comes later
-            session.running_s = float("nan")
+            with session.changing:
+                session.running_s = float("nan")
+            session.is_rescued.wait()  # a driver need not bear further calls beside safe_state()
         return session.reply
 
     def _refusal(self, number: int, text: str) -> list[Any]:
@@ -368,6 +397,8 @@ class ServedDevice:
             answer["value"] = self._carry_out(session, args, named)
             answer["state"] = self._state(session)
         except BaseException as error:  # noqa: BLE001 - of the driver's class; it goes to the client
+            if session.ended and isinstance(error, StopRequested):
+                error = DeviceError(self.name, f"the server has ended the connection: {session.ended}")
             answer["error"] = report_error(error)
         answer["now"] = time.monotonic()
         answer["waits"] = waits_s
@@ -418,7 +449,8 @@ class ServedDevice:
         if about["virtual"] and not self._chosen.virtual_time:
             text = f"'{self.name}' is a real device, and the profile says `simulated: true`"
             raise ConfigError(text)
-        session.clock = session.run.clock if about["virtual"] else RealClock(session.abort)
+        abort = session.abort
+        session.clock = DeviceTime(session.run.clock, abort) if about["virtual"] else RealClock(abort)
         context = Context(
             about["name"],
             about["grid"],

@@ -9,6 +9,7 @@ from __future__ import annotations
 import platform
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -32,7 +33,6 @@ from labseq.session.locks import lock_devices
 from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.safe import construct_hardware
 from labseq.wire import (
-    BEAT_S,
     LOST_S,
     PATIENT_S,
     PROTOCOL,
@@ -51,8 +51,6 @@ from labseq.wire import (
 
 LOOK_AT_KEYS_S: Final = 0.2
 """How often the server looks which keys are known."""
-CLOSED_S: Final = 2 * BEAT_S
-"""How long after the end of its connection a client may still give a sign of life."""
 MAX_SESSIONS: Final = 64
 """Connections at a time; of a client that makes more, something is wrong."""
 END_S: Final = 10.0
@@ -283,7 +281,7 @@ class Server:
         import zmq
 
         self._control.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
-        events = self._control.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        self._connections = Connections(self._control)
         looked_s = keys_s = time.monotonic()
         try:
             while not self._ended.is_set():
@@ -297,28 +295,15 @@ class Server:
                 if (now_s := time.monotonic()) - keys_s > LOOK_AT_KEYS_S and self._keys is not None:
                     self._known, keys_s = known_keys(keys_root()), now_s
                 if now_s - looked_s > LOOK_S:
-                    self._suspect(_ended_connections(events), now_s)
-                    self._look(now_s, now_s - looked_s)
+                    self._look(now_s, now_s - looked_s, self._connections.ended())
                     looked_s = time.monotonic()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
             self._failure = error
         finally:
-            self._control.disable_monitor()
-            events.close()
+            self._connections.close()
             self._control.close()
 
-    def _suspect(self, connections: set[int], now_s: float) -> None:
-        """Wait for further signs of life for a shorter time after a connection has ended.
-
-        Its number may already be that of a new one, which gives such signs.
-        """
-        for device in self.devices.values():
-            for session in list(device.sessions.values()):
-                if session.connection in connections:
-                    session.beat_s = min(session.beat_s, now_s + CLOSED_S - _patience(device))
-                    session.is_suspect = True
-
-    def _look(self, now_s: float, passed_s: float) -> None:
+    def _look(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
         """End the sessions of clients that are gone, or no longer known."""
         live: set[int] = set()
         for device in self.devices.values():
@@ -326,10 +311,11 @@ class Server:
                 live.add(id(session.run))
                 if passed_s > LOST_S / 2:  # this computer stood still, not the client
                     session.beat_s += passed_s
-                lost_s = _patience(device)
-                if now_s - session.beat_s > lost_s:
-                    silent = f"no sign of life for {lost_s:g} s"
-                    device.end_session(session, "its process has ended" if session.is_suspect else silent)
+                lost_s = PATIENT_S if device.kind == "simulation" else LOST_S
+                if session.connection in ended:
+                    device.end_session(session, "its process has ended")
+                elif now_s - session.beat_s > lost_s:
+                    device.end_session(session, f"no sign of life for {lost_s:g} s")
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
                 device.rescue_if_stuck(session)
@@ -348,7 +334,7 @@ class Server:
             if not self.is_known(peer):
                 raise DeviceError("server", "the key was withdrawn")
             if what == "hello":
-                connection = int(frames[-1].get(zmq.SRCFD))
+                connection = self._connections.named(frames[-1].get(zmq.SRCFD))
                 return pack({"n": number, "value": self._hello(message, peer, connection)})
             act = {"beat": self._beat, "bye": self._bye, "abort": self._abort}
             if what == "status":
@@ -362,7 +348,7 @@ class Server:
             failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
             return pack({"n": number if type(number) is int else 0, "error": report_error(failure)})
 
-    def _hello(self, message: Mapping[str, Any], peer: str, connection: int) -> dict[str, Any]:
+    def _hello(self, message: Mapping[str, Any], peer: str, connection: tuple[int, int]) -> dict[str, Any]:
         about = {"protocol": PROTOCOL, "labseq": labseq.__version__, "host": platform.node()}
         if message["protocol"] != PROTOCOL:
             theirs = (
@@ -403,7 +389,7 @@ class Server:
 
     def _beat(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
         device, session = self._of(message, peer)
-        session.beat_s, session.is_suspect = time.monotonic(), False
+        session.beat_s = time.monotonic()
         running = session.is_running or device.is_busy
         return {"number": session.number, "running": running, "rescue": session.rescue}
 
@@ -427,19 +413,48 @@ class Server:
         return rows
 
 
-def _patience(device: ServedDevice) -> float:
-    """How long a client may give no sign of life, in seconds."""
-    return PATIENT_S if device.kind == "simulation" else LOST_S
+class Connections:
+    """The connections at a socket: the end of one shows that its process has died before heartbeats do.
 
+    The operating system gives the number of one that has ended to a new one. So a connection has two: that
+    one, and how many there were before with the same.
+    """
 
-def _ended_connections(events: Any) -> set[int]:
-    """The numbers of connections that have ended, from the events of a socket."""
-    from zmq.utils.monitor import recv_monitor_message
+    def __init__(self, socket: Any) -> None:
+        import zmq
 
-    ended: set[int] = set()
-    while events.poll(0):
-        ended.add(int(recv_monitor_message(events)["value"]))
-    return ended
+        self._socket = socket
+        self._events = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        self._n_before: Counter[int] = Counter()
+        self._ended: set[tuple[int, int]] = set()
+
+    def named(self, number: int) -> tuple[int, int]:
+        """The connection that has a number now."""
+        self._read()
+        return number, self._n_before[number]
+
+    def ended(self) -> set[tuple[int, int]]:
+        """Those that have ended since the last call."""
+        self._read()
+        ended, self._ended = self._ended, set()
+        return ended
+
+    def _read(self) -> None:
+        import zmq
+        from zmq.utils.monitor import recv_monitor_message
+
+        while self._events.poll(0):
+            event = recv_monitor_message(self._events)
+            number = int(event["value"])
+            if event["event"] == zmq.EVENT_DISCONNECTED:
+                self._ended.add((number, self._n_before[number]))
+            else:
+                self._n_before[number] += 1
+
+    def close(self) -> None:
+        """End it, before the socket is closed."""
+        self._socket.disable_monitor()
+        self._events.close()
 
 
 class _Credentials:

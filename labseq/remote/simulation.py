@@ -41,7 +41,8 @@ class ServedSimulation(ServedDevice):
 
     def _construct(self, session: Session, context: Context, about: Mapping[str, Any]) -> Any:
         run = session.run
-        if about["joins"] is None:
+        session.joins = about["joins"] is not None
+        if not session.joins:
             made, streams = construct({"simulation": self._chosen}, context, about["seed"])
             run.streams += streams
             run.simulation, run.begun_by = made["simulation"], session
@@ -74,15 +75,25 @@ class ServedSimulation(ServedDevice):
 
     def _close_device(self, session: Session) -> None:
         if session.run.begun_by is session:
-            session.device.close()
+            session.run.begun_by = None
+            self._close_if_unused(session.run)
 
     def _close(self, session: Session) -> None:
         super()._close(session)
         self._answers.pop(session, None)
-        run = session.run
-        if run.begun_by is session:
+        if session.run.begun_by is session:
+            session.run.begun_by = None
+        self._close_if_unused(session.run)
+
+    def _close_if_unused(self, run: Run) -> None:
+        """Close the simulation of a run that has ended, once no device that it used acts on it any more.
+
+        Servers make simulated devices safe when their client is gone, which may be later than here.
+        """
+        others = [one for one in self.sessions.values() if one.run is run and one.joins]
+        if run.begun_by is None and not others and run.simulation is not None:
             run.simulation.close()
-            run.simulation = run.begun_by = None
+            run.simulation = None
 
     def _step(self) -> None:
         while self._later and self._asking is None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from labseq.errors import DeviceError, LabseqError
 from labseq.guard import Guard
@@ -175,6 +176,35 @@ def in_safe_order(devices: Mapping[str, T]) -> Iterator[tuple[str, T]]:
 
 Outcome = dict[str, LabseqError | None]
 """Device name -> its failure, or None; in the order of the calls."""
+
+
+NEXT_S: Final = 0.2
+"""How long a device may delay the safe state of the next one at the end of a run."""
+
+
+def end_safely(lab: Lab, guard: Guard) -> tuple[Outcome, dict[str, float]]:
+    """Bring every device to its safe state; one that takes long does not delay the others.
+
+    They begin in the order of the safe state. This is for the end of a run: devices that act at the same time
+    need not give the same data as in turn.
+
+    Returns:
+        The outcome; and after how many seconds each device was safe.
+    """
+    begun_s = time.monotonic()
+    results: dict[str, Callable[[], object]] = {}
+    after_s: dict[str, float] = {}
+
+    def safe_state(name: str, part: Hardware) -> None:
+        part.safe_state()
+        after_s[name] = time.monotonic() - begun_s
+
+    for name, part in lab.safe_order():
+        has_ended, results[name] = guard.begin_despite_stop(
+            name, lab.timeouts.safe_state_s, partial(safe_state, name, part)
+        )
+        failure_of(name, "", partial(has_ended.wait, NEXT_S))  # Ctrl-C
+    return {name: failure_of(name, "safe_state()", result) for name, result in results.items()}, after_s
 
 
 def make_safe(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Outcome:

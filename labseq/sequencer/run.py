@@ -22,7 +22,15 @@ from labseq.model.records import ShotStatus, unique_names
 from labseq.plain import now_utc
 from labseq.roles import RunObserver, Step, offers
 from labseq.sequencer.images import with_waits
-from labseq.sequencer.lab import Lab, Outcome, close_all, make_safe, method_of, open_device
+from labseq.sequencer.lab import (
+    Lab,
+    Outcome,
+    close_all,
+    end_safely,
+    make_safe,
+    method_of,
+    open_device,
+)
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.sequencer.shot import Events, RunningShot, Stages
@@ -315,14 +323,18 @@ class Sequencer:
     def _secure(self, *, ended_well: bool = False) -> None:
         self._states.to(State.MAKING_SAFE, announce=False)
         with self._stop.held():
-            others = {name for name, _ in self.lab.hardware()} - {"static_tweezers"}
-            outcome = make_safe(self.lab, self.guard, others)
-            event = self._leave_on() if ended_well and not any(outcome.values()) else None
-            outcome |= make_safe(self.lab, self.guard, {"static_tweezers"})
+            event, after_s = None, dict[str, float]()
+            if ended_well:
+                others = {name for name, _ in self.lab.hardware()} - {"static_tweezers"}
+                outcome = make_safe(self.lab, self.guard, others)
+                event = self._leave_on() if not any(outcome.values()) else None
+                outcome |= make_safe(self.lab, self.guard, {"static_tweezers"})
+            else:
+                outcome, after_s = end_safely(self.lab, self.guard)
         self._unsafe = {name: error for name, error in outcome.items() if error is not None}
         self._states.to(State.SAFE, announce=False)
         self._announce(State.MAKING_SAFE)  # only now: neither a screen nor a disk may delay the devices
-        self._report("safe_state", outcome)
+        self._report("safe_state", outcome, after_s)
         if event is not None:
             self._emit(*event)
         self._announce(State.SAFE)
@@ -454,9 +466,10 @@ class Sequencer:
         record.error = "" if error is None else format_error(error)
         record.t_end_utc = now_utc()
 
-    def _report(self, event: str, outcome: Outcome) -> None:
+    def _report(self, event: str, outcome: Outcome, after_s: Mapping[str, float] | None = None) -> None:
         for name, error in outcome.items():
-            self._emit(event, {"device": name, "ok": error is None, "error": str(error or "")})
+            times = {"after_s": after_s[name]} if after_s and name in after_s else {}
+            self._emit(event, {"device": name, "ok": error is None, "error": str(error or ""), **times})
 
     def _announce(self, state: State) -> None:
         self._emit("state", {"state": state.value})

@@ -107,11 +107,11 @@ class SimulatedConnection(CameraConnection):
         Its image is made before the trigger is sent: the camera answers nothing while it waits for an image,
         and on a busy computer it would seem to be gone.
         """
-        n = self._fake.n_made
+        n, n_stops = self._fake.n_made, self._fake.n_stops
         if not self._ignores_triggers:
             self._made.append(self._sensor.expose(self._late_s, self._edge_s, self._width_s))
         acquisition.fire()
-        if not self._fake.wait_for_image(n, MAX_WAIT_S):
+        if not self._fake.wait_for_image(n, MAX_WAIT_S, n_stops):
             self._made.clear()  # its frame will be missing
         self._fake.raise_pending()
 
@@ -123,7 +123,8 @@ class SimulatedConnection(CameraConnection):
         return None if taken is None else replace(taken, t_start_s=self._start_s(taken.number))
 
     def clear(self) -> None:
-        """Forget the series."""
+        """Forget the series; a trigger in another thread waits no longer."""
+        self._fake.note_stop()
         self._sensor.clear()
         self._made.clear()
         self._series = self._edge_s = self._width_s = self._due = None

@@ -66,6 +66,7 @@ class FakeCamera:
         self._faults = faults
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: list[Exception] = []
+        self.n_stops = 0
         self._changed = threading.Condition()
         self._n_made = 0
         self._is_ready = self._has_ended = False
@@ -136,9 +137,23 @@ class FakeCamera:
         with self._changed:
             return self._n_made
 
-    def wait_for_image(self, n: int, timeout_s: float) -> bool:
-        """Wait until the image of exposure ``n`` was made; returns whether it was."""
-        return self._wait(lambda: n < self._n_made, timeout_s)
+    def wait_for_image(self, n: int, timeout_s: float, n_stops: int | None = None) -> bool:
+        """Wait until the image of exposure ``n`` was made, or the camera stopped; returns whether it was.
+
+        Args:
+            n: Number of the exposure.
+            timeout_s: How long to wait.
+            n_stops: How often it had been stopped before the trigger; None: as often as now.
+        """
+        n_stops = self.n_stops if n_stops is None else n_stops
+        self._wait(lambda: n < self._n_made or n_stops < self.n_stops, timeout_s)
+        return n < self.n_made
+
+    def note_stop(self) -> None:
+        """It is stopped: an image that was not made by then is not made any more."""
+        with self._changed:
+            self.n_stops += 1
+            self._changed.notify_all()
 
     def unplug(self) -> None:
         """Kill the camera, whatever it is doing; :meth:`start` plugs it in again, at its address."""

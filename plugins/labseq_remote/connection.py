@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import secrets
@@ -21,8 +22,8 @@ POLL_S: Final = 0.05
 """How often a call that waits looks for a stop request."""
 CONNECT_S: Final = 5.0
 """How long connecting may take; a connection that is refused fails at once."""
-GRACE_S: Final = 1.0
-"""How long a call may take to end after it was aborted."""
+GRACE_S: Final = 0.4
+"""How long a call may take to end after it was aborted; then its device is made safe beside it."""
 BYE_S: Final = 0.1
 """How long a server may take to answer the end of a connection that is lost."""
 SAFE_S: Final = 4.0
@@ -85,7 +86,7 @@ class Connection:
         self._run = run_of(context.clock)
         self._calling = threading.Lock()
         self._controlling = threading.Lock()
-        self._number = self._question = 0
+        self._number = self._question = self._given_up = 0
         self._lost = ""
         self._lost_s = wire.PATIENT_S if kind == "simulation" else wire.LOST_S
         self._is_abandoned = False
@@ -151,24 +152,29 @@ class Connection:
         Raises:
             DeviceError: It could not be made safe, or the connection is lost.
         """
-        if self._calling.acquire(blocking=False):
-            self._calling.release()
-            self.call("safe_state", stoppable=False)
-            return
-        number = self._number
-        self.ask("abort", number=number)
+        if self.is_hanging:
+            self.ask("abort", number=self._number)
         deadline_s = time.monotonic() + SAFE_S
-        while time.monotonic() < deadline_s and not self._lost:
-            if self._calling.acquire(timeout=POLL_S):
-                self._calling.release()
-                self.call("safe_state", stoppable=False)
-                return
-            rescue = self._beat["rescue"]
+        while self.is_hanging:
+            rescue = self.ask("beat")["rescue"]
             if rescue == "safe":
                 return
             if rescue not in ("", "under way"):
                 raise self.failure(f"a call hangs, and safe_state() beside it failed: {rescue}")
-        raise self.failure(self._lost or "a call hangs, and the device could not be made safe")
+            if time.monotonic() > deadline_s:
+                raise self.failure("a call hangs, and the device could not be made safe")
+            self._ended.wait(POLL_S)
+        self.call("safe_state", stoppable=False)
+
+    @property
+    def is_hanging(self) -> bool:
+        """Whether the server is still carrying out a call, which others would have to wait for."""
+        if self._calling.locked():
+            return True
+        if self._given_up == self._number and not self._lost:
+            self._given_up = self._number if self.ask("beat")["running"] else 0
+            return bool(self._given_up)
+        return False
 
     def close(self) -> None:
         """End the connection; the server makes the device safe if that was not done."""
@@ -223,6 +229,7 @@ class Connection:
         run = self._run.key if self._joins is None else self._joins.run
         me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": run}
         who = f"{platform.node()}, process {os.getpid()}"
+        who = who if self._joins is None else f"'{self._name}' at {who}"
         about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
             raise self.failure("it is no server of this version of labseq")
@@ -246,7 +253,7 @@ class Connection:
         import zmq
 
         sent_s = time.monotonic()
-        stopped_s: float | None = None
+        stopped_s, why = math.inf, None
         try:
             self._calls.send_multipart(parts, copy=False)
             while not self._lost and not self._ended.is_set():
@@ -258,16 +265,18 @@ class Connection:
                     if not (reply := _read([frame.buffer for frame in frames])):
                         self._lose(f"the reply to {name}() cannot be read")
                     if reply.get("n") in (self._number, 0):
+                        if why is not None and "error" in reply:
+                            raise why  # of which that error is only a consequence
                         return reply
                     continue
                 if self._is_missing(sent_s):
                     self._lose(f"{name}() got no reply although the server has none under way")
-                why = self._reason_to_stop() if stoppable else None
-                if why is not None and stopped_s is None:
+                if why is None and stoppable and (why := self._reason_to_stop()) is not None:
                     stopped_s = time.monotonic()
                     with suppress(DeviceError):  # else the connection is lost, too
-                        self.ask("abort", number=self._number)
-                elif why is not None and stopped_s is not None and time.monotonic() > stopped_s + GRACE_S:
+                        self.ask("abort", min(GRACE_S, self._lost_s), number=self._number)
+                if why is not None and time.monotonic() > stopped_s + GRACE_S:
+                    self._given_up = self._number
                     raise why
         except zmq.ZMQError as error:
             self._lose(str(error.strerror))

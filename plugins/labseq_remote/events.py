@@ -30,7 +30,8 @@ class Monitor:
         """
         until_s = time.monotonic() + timeout_s
         while True:
-            ready = dict(self._poller.poll(int(1e3 * max(0.0, until_s - time.monotonic()))))
+            left_s = 0.0 if self._has_ended else until_s - time.monotonic()
+            ready = dict(self._poller.poll(int(1e3 * max(0.0, left_s))))
             if self._socket in ready:
                 return True
             self._read_events()

@@ -109,8 +109,10 @@ class Link:
         if not self.is_open:
             return self.end()
         self.is_open = False
+        connection = self.connect()
         try:
-            self.connect().call("close", stoppable=False)
+            if not connection.is_hanging:  # else the server closes it when the call ends
+                connection.call("close", stoppable=False)
         finally:
             self.end()
 

@@ -64,14 +64,14 @@ def cluster(n_workers: int) -> Generator[tuple[str, list[subprocess.Popen[bytes]
                 process.wait()
 
 
-def speed(n_shots: int, data: Path) -> None:
-    """Time whole commands: one process, two workers, a cluster of two workers; twice each, in turn."""
+def speed(n_shots: int, n_repeats: int, data: Path) -> None:
+    """Time whole commands, in turn: one process, two workers, a cluster of two workers."""
     command = [sys.executable, "-m", "labseq", "run", "compact_225", "--seed", "1", "--output", str(data)]
     command += ["--set", "shot.2.rearrange.stop_when=never"]
     times: dict[str, list[float]] = {"1 process": [], "2 workers": [], "dask, 2 workers": []}
     with cluster(2) as (address, _):
         options = ["--workers=1"], ["--workers=2"], [f"--scheduler={address}"]
-        for n, is_timed in ((4, False), (n_shots, True), (n_shots, True)):
+        for n, is_timed in ((4, False), *[(n_shots, True)] * n_repeats):
             for name, option in zip(times, options, strict=True):
                 start_s = time.perf_counter()
                 subprocess.run([*command, f"--shots={n}", *option], check=True, stdout=subprocess.DEVNULL)
@@ -232,13 +232,14 @@ def main() -> None:
     )
     parser.add_argument("what", choices=("speed", "memory", "kills"))
     parser.add_argument("--shots", type=int, default=60)
+    parser.add_argument("--repeats", type=int, default=2, help="of `speed`; the fastest counts")
     parser.add_argument("--folder", type=Path, help="where the data are written for a while")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         data = Path(folder, "data")
         data.mkdir()
         if arguments.what == "speed":
-            speed(arguments.shots, data)
+            speed(arguments.shots, arguments.repeats, data)
         elif arguments.what == "memory":
             memory(arguments.shots, data)
         else:

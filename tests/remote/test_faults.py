@@ -256,6 +256,82 @@ def test_a_device_is_made_safe_beside_a_call_that_hangs(
         caller.join(5.0)
 
 
+def test_a_call_that_was_given_up_delays_neither_the_safe_state_nor_the_end(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released, entered = threading.Event(), threading.Semaphore(0)
+    inside, together = 0, 0
+
+    def make_safe(*_: object) -> None:
+        nonlocal inside, together
+        inside += 1
+        together = max(together, inside)
+        released.set()  # the call returns now; the device's thread goes on
+        entered.acquire(timeout=0.1)  # only if another thread comes
+        inside -= 1
+
+    monkeypatch.setattr(VirtualDevice, "command", lambda *_, **__: released.wait(20.0))
+    monkeypatch.setattr(VirtualDevice, "safe_state", make_safe)
+    monkeypatch.setattr(VirtualDevice, "close", make_safe)
+    stop = StopFlag()
+    context = Context("laser", SiteGrid(6, 7), clock=RealClock(stop))
+    device = RemoteDevice(server.settings("instrument", simulated=False), context)
+    device.open()
+    threading.Timer(0.05, stop.request).start()
+    begun_s = time.monotonic()
+    with pytest.raises(StopRequested):
+        device.command("open")
+    with stop.held():
+        device.safe_state()
+        device.close()
+    assert time.monotonic() < begun_s + 5.0  # the call would have taken 20 s
+    until(lambda: server.server.devices["instrument"].owner is None)
+    assert together == 1
+
+
+def test_the_next_connection_is_not_taken_for_one_that_has_ended(server: Served) -> None:
+    """The operating system gives it the same number."""
+    from tests.remote.fuzz import _begin
+
+    with zmq.Context() as context:
+        first = context.socket(zmq.DEALER)
+        first.connect(f"tcp://127.0.0.1:{server.port}")
+        token = _begin(first, "instrument", "device")
+        first.close(linger=0)
+        with instrument(server) as device:
+            sessions = server.server.devices["instrument"].sessions
+            until(lambda: token not in sessions)
+            device.command("open")
+
+
+def test_a_server_that_has_ended_is_not_waited_for_again(tmp_path: Path) -> None:
+    with served(tmp_path) as one:
+        context = Context("simulation", SiteGrid(6, 7), clock=FakeClock())
+        about = {"address": f"tcp://127.0.0.1:{one.port}"}
+        simulation = RemoteSimulation(RemoteSimulationSettings(**about), context)
+        simulation.open()
+        connection = simulation._link.connect()
+    until(lambda: bool(connection.lost))
+    begun_s = time.monotonic()
+    with pytest.raises(DeviceError, match="the server has ended"):
+        connection.ask("beat")
+    assert time.monotonic() < begun_s + 1.0  # a simulation may be silent for 5 s
+
+
+def test_a_simulation_ends_after_the_devices_that_act_on_it(server: Served) -> None:
+    context = Context("simulation", SiteGrid(6, 7), clock=FakeClock())
+    settings = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{server.port}")
+    simulation, of_a_device = (RemoteSimulation(settings, context) for _ in range(2))
+    simulation.open()
+    simulation.begin_shot()
+    of_a_device.join(connection.run_of(context.clock).key, lambda *_: None)
+    of_a_device.connect()
+    simulation.close()  # while another server still makes a simulated device safe
+    of_a_device.load(0.0, 0.1)
+    of_a_device.close()
+    until(lambda: not server.server.devices["simulation"].sessions)
+
+
 def test_errors_keep_their_class_and_values(server: Served) -> None:
     with camera(server) as device, pytest.raises(LimitError) as caught:
         device.arm(0, 0.01, "software")
