@@ -532,8 +532,8 @@ class ServedDevice:
         del self.sessions[session.token]
         if session.is_open:
             self._make_safe(session)
-        if session.simulation is not None:
-            session.simulation.close()
+        if session.simulation is not None:  # whose server may not answer: other sessions must not wait
+            threading.Thread(target=session.simulation.close, daemon=True).start()
 
     def _make_safe(self, session: Session) -> None:
         """Make the device of a session that has ended safe, and close it."""

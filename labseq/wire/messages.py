@@ -1,4 +1,4 @@
-"""A message: one part of msgpack for its structure, a raw one for all small arrays, and one for each other.
+"""A message: one part of msgpack for its structure, a raw one for all small arrays, and some for each other.
 
 Nothing that arrives is executed: it can become plain values, arrays of numbers, the types of :data:`TYPES`
 and the errors of :mod:`labseq.errors`, whose own constructors check their values.
@@ -103,11 +103,7 @@ def pack(value: Any) -> list[Part]:
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MessageError(f"it cannot be sent: {format_error(error)}") from error
     parts: list[Part] = [header, bytes(small), *arrays] if small or arrays else [header]
-    if (
-        len(header) > MAX_HEADER
-        or len(parts) > MAX_PARTS
-        or any(len(memoryview(p)) > MAX_PART for p in arrays)
-    ):
+    if len(header) > MAX_HEADER or len(small) > MAX_PART or len(parts) > MAX_PARTS:
         raise MessageError(f"it is too large to be sent: at most {MAX_PARTS} parts of {MAX_PART >> 20} MB")
     return parts
 
@@ -116,7 +112,8 @@ def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> lis
     """Where an array is, its dtype and its shape.
 
     The place is an index among the parts, to which it is appended. Small arrays share the first of them, as
-    a part costs more than copying: their place is [where they begin].
+    a part costs more than copying: their place is [where they begin]. That of an array beyond MAX_PART is
+    [the first of its parts, how many it has].
     """
     dtype = array.dtype
     if not dtype.isnative or sys.byteorder == "big":
@@ -127,8 +124,10 @@ def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> lis
         place: Any = [len(small)]
         small.extend(array.tobytes() + bytes(ALIGNMENT - array.nbytes % ALIGNMENT))  # never nothing
     else:
-        arrays.append(array.reshape(-1).view(np.uint8).data)
-        place = len(arrays) + 1
+        place, data = len(arrays) + 2, array.reshape(-1).view(np.uint8).data
+        arrays += [data[begin : begin + MAX_PART] for begin in range(0, array.nbytes, MAX_PART)]
+        if array.nbytes > MAX_PART:
+            place = [place, len(arrays) + 2 - place]
     if dtype.names is None:
         return [place, _dtype_text(dtype), array.shape, {}]
     columns = [[name, _dtype_text(dtype[name])] for name in dtype.names]
@@ -208,10 +207,6 @@ def unpack(parts: Sequence[Part]) -> Any:
 
 def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
     place, dtype, shape, about = content
-    begin = cast("list[Any]", place)[0] if isinstance(place, list) and len(place) == 1 else 0
-    index = 1 if isinstance(place, list) else place
-    if type(index) is not int or not 1 <= index < len(parts) or type(begin) is not int or begin < 0:
-        raise MessageError("an array is missing")
     if isinstance(dtype, list):
         columns = [(str(name), _known_dtype(one)) for name, one in cast("list[Any]", dtype)]
         kind = np.dtype(columns, metadata={"descriptions": dict(about)})
@@ -220,20 +215,32 @@ def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
     if (
         not isinstance(shape, list)
         or len(cast("list[Any]", shape)) > MAX_DIMENSIONS
-        or any(type(n) is not int or not 0 <= n <= MAX_PART for n in cast("list[Any]", shape))
+        or any(type(n) is not int or not 0 <= n <= MAX_PART * MAX_PARTS for n in cast("list[Any]", shape))
     ):
         raise MessageError("an array has a wrong shape")
     wanted = math.prod(cast("list[int]", shape)) * kind.itemsize
-    data = memoryview(parts[index])
-    if isinstance(place, list):
-        data = data[begin : begin + wanted]
-    if data.nbytes != wanted:
-        raise MessageError(f"an array of shape {tuple(shape)} has {data.nbytes} bytes; expected {wanted}")
-    array = np.frombuffer(data, kind).reshape(shape) if wanted else np.empty(shape, kind)
+    data = _data(parts, place, wanted)
+    n_bytes = sum(one.nbytes for one in data)
+    if n_bytes != wanted:
+        raise MessageError(f"an array of shape {tuple(shape)} has {n_bytes} bytes; expected {wanted}")
+    whole = data[0] if len(data) == 1 else np.concatenate([np.frombuffer(one, np.uint8) for one in data])
+    array = np.frombuffer(whole, kind).reshape(shape) if wanted else np.empty(shape, kind)
     if not array.flags.aligned:  # kernels are compiled for aligned arrays
         array = array.copy()
     array.flags.writeable = False
     return array
+
+
+def _data(parts: Sequence[Part], place: Any, wanted: int) -> list[memoryview]:
+    """The bytes of an array, from their place as :func:`_described` gives it."""
+    numbers = cast("list[Any]", place if isinstance(place, list) else [place, 1])
+    if not 1 <= len(numbers) <= 2 or any(type(one) is not int or one < 0 for one in numbers):
+        raise MessageError("an array is missing")
+    first, n = numbers if len(numbers) == 2 else (1, 1)
+    if not (1 <= first < len(parts) and 1 <= n <= len(parts) - first):
+        raise MessageError("an array is missing")
+    data = [memoryview(one) for one in parts[first : first + n]]
+    return data if len(numbers) == 2 else [data[0][numbers[0] : numbers[0] + wanted]]
 
 
 def _known_dtype(text: Any) -> np.dtype[Any]:

@@ -37,10 +37,12 @@ class Run:
     Attributes:
         key: Names the run at the servers, where its devices share one simulation.
         lost: Connections that are lost and not closed yet; calls over the others are aborted.
+        was_lost: Whether one was lost: its simulation need not be closed with patience.
     """
 
     key: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     lost: set[Connection] = field(default_factory=set["Connection"])
+    was_lost: bool = False
 
 
 _runs: weakref.WeakKeyDictionary[Clock, Run] = weakref.WeakKeyDictionary()
@@ -167,6 +169,11 @@ class Connection:
         self.call("safe_state", stoppable=False)
 
     @property
+    def is_run_lost(self) -> bool:
+        """Whether this connection, or another one of the run, is or was lost."""
+        return self._run.was_lost
+
+    @property
     def is_hanging(self) -> bool:
         """Whether the server is still carrying out a call, which others would have to wait for."""
         if self._calling.locked():
@@ -180,7 +187,7 @@ class Connection:
         """End the connection; the server makes the device safe if that was not done."""
         if not self._ended.is_set():
             with suppress(LabseqError):
-                self.ask("bye", BYE_S if self._lost else self._lost_s)
+                self.ask("bye", BYE_S if self.is_run_lost else self._lost_s)
             self._ended.set()
             self._run.lost.discard(self)
             if self._calling.acquire(timeout=2 * POLL_S):
@@ -200,28 +207,32 @@ class Connection:
         """
         import zmq
 
-        with self._controlling:
+        timeout_s = self._lost_s if timeout_s is None else timeout_s
+        late = f"the server did not answer within {timeout_s:.3g} s"
+        if not self._controlling.acquire(timeout=timeout_s):  # a heartbeat is not answered
+            raise self.failure(late)
+        try:
             if self._ended.is_set():
                 raise self.failure("the connection is closed")
             self._question += 1
             about |= {"n": self._question, "op": what}
             if "session" not in about and what != "hello":
                 about["session"] = self._token
-            timeout_s = self._lost_s if timeout_s is None else timeout_s
-            try:
-                self._control.send_multipart(wire.pack(about))
-                deadline_s = time.monotonic() + timeout_s
-                while self._monitor.wait(deadline_s - time.monotonic()):
-                    answer = _read(self._control.recv_multipart())
-                    if answer.get("n") in (self._question, 0):
-                        if "error" in answer:
-                            raise wire.error_of(answer["error"], self._name, self.address)
-                        return answer.get("value")
-            except zmq.Again:
-                pass  # it cannot be sent: the connection was refused or has ended
-            except zmq.ZMQError as error:
-                raise self.failure(f"{error.strerror}") from error
-            raise self.failure(self._monitor.reason or f"the server did not answer within {timeout_s:.3g} s")
+            self._control.send_multipart(wire.pack(about))
+            deadline_s = time.monotonic() + timeout_s
+            while self._monitor.wait(deadline_s - time.monotonic()):
+                answer = _read(self._control.recv_multipart())
+                if answer.get("n") in (self._question, 0):
+                    if "error" in answer:
+                        raise wire.error_of(answer["error"], self._name, self.address)
+                    return answer.get("value")
+            raise self.failure(self._monitor.reason or late)
+        except zmq.Again:  # it cannot be sent: the connection was refused or has ended
+            raise self.failure(self._monitor.reason or late) from None
+        except zmq.ZMQError as error:
+            raise self.failure(f"{error.strerror}") from error
+        finally:
+            self._controlling.release()
 
     def _hello(self, settings: RemoteSettings, kind: str) -> dict[str, Any]:
         """Begin the session; if that fails, the events of the socket say why."""
@@ -335,6 +346,7 @@ class Connection:
         if not self._ended.is_set():
             self._lost = self._lost or f"the connection is lost: {why}; its computer makes the device safe"
             self._run.lost.add(self)
+            self._run.was_lost = True
 
     def failure(self, text: str = "") -> DeviceError:
         """An error of this device, by default that its connection is lost."""

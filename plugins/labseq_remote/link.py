@@ -111,7 +111,8 @@ class Link:
         self.is_open = False
         connection = self.connect()
         try:
-            if not connection.is_hanging:  # else the server closes it when the call ends
+            # what hangs, and a simulation whose devices are lost, is closed by the server
+            if not connection.is_hanging and not (self._kind == "simulation" and connection.is_run_lost):
                 connection.call("close", stoppable=False)
         finally:
             self.end()

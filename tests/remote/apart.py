@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -43,43 +43,56 @@ SERVED: Final = {
 """Server -> the devices that it serves."""
 SHOT_S: Final = 4.0
 """How long after the begin of a shot a process is killed at most, in seconds."""
-OF_THE_EXPERIMENT: Final = {
-    "role",
-    "pick_up",
-    "drop_off",
-    "speed",
-    "speed_profile",
-    "overhead_per_cycle",
-    "max_tweezers",
-} | {"max_row_tones", "max_column_tones", "eject_slots", "rf", "channels", "blinding"}
+OF_THE_EXPERIMENT: Final = {"role", "channels", "rf", "pick_up", "drop_off", "speed", "speed_profile"} | {
+    *(
+        "overhead_per_batch",
+        "overhead_per_cycle",
+        "max_tweezers",
+        "max_row_tones",
+        "max_column_tones",
+        "eject_slots",
+    )
+}
 """What the profile of the experiment says of a device; the rest belongs to its driver."""
 
 
 @dataclass
 class Server:
-    """A process that serves devices.
+    """A process that serves devices of a profile.
 
     Attributes:
         devices: Their names.
+        host: Where it listens.
         port: Its first port.
+        key: Name of its key; "" without keys.
+        prefix: A command to start it with.
+        profile: The profile.
+        process: The process.
         lines: When it printed what.
     """
 
     devices: Sequence[str]
+    host: str
     port: int
+    key: str = ""
+    prefix: Sequence[str] = ()
+    profile: Path = BENCH
     process: subprocess.Popen[str] | None = None
     lines: list[tuple[float, str]] = field(default_factory=list[tuple[float, str]])
 
-    def start(self, simulation: int, host: str = "127.0.0.1", prefix: Sequence[str] = ()) -> None:
-        """Start it; ``prefix`` is a command to start it with."""
-        command = [*prefix, sys.executable, "-m", "labseq", "serve-devices", str(BENCH), "--bind"]
-        command += [f"tcp://{host}:{self.port}", "--plain"]
+    @property
+    def remote(self) -> dict[str, str]:
+        """How profiles name it."""
+        key = {"server_key": self.key} if self.key else {}
+        return {"use": "remote", "address": f"tcp://{self.host}:{self.port}", **key}
+
+    def start(self, simulation: Server) -> None:
+        """Start it; its devices act on the simulation of a server."""
+        command = [*self.prefix, sys.executable, "-m", "labseq", "serve-devices", str(self.profile)]
+        command += ["--bind", self.remote["address"], *([] if self.key else ["--plain"])]
         command += [f"--device={name}" for name in self.devices]
-        if "simulation" not in self.devices:
-            command += [
-                "--set",
-                f"profile.simulation={{use: remote, address: 'tcp://127.0.0.1:{simulation}'}}",
-            ]
+        if simulation is not self:
+            command += ["--set", f"profile.simulation={json.dumps(simulation.remote)}"]
         self.lines.clear()
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         threading.Thread(target=self._read, args=[self.process], daemon=True).start()
@@ -98,42 +111,41 @@ class Server:
             assert time.monotonic() < until_s, f"the server of {self.devices} has not printed '{text}'"
             time.sleep(0.01)
 
-    def end(self, signal_number: int = signal.SIGTERM) -> None:
+    def end(self) -> None:
         """End it."""
         if self.process is not None:
             self.process.send_signal(signal.SIGCONT)
-            self.process.send_signal(signal_number)
+            self.process.terminate()
             self.process.wait()
 
 
-def client_profile(servers: dict[str, Server]) -> str:
-    """The profile of the experiment: `bench` with all its devices elsewhere."""
-    text = BENCH.read_text(encoding="utf-8")
+def client_profile(servers: Collection[Server]) -> str:
+    """The profile of the experiment: that of the servers, with all devices elsewhere."""
+    text = next(iter(servers)).profile.read_text(encoding="utf-8")
     profile = yaml.safe_load(text.replace(" on: [", " 'on': ["))  # which is `true` in YAML 1.1
+    at = {name: server.remote for server in servers for name in server.devices}
 
     def remote(name: str, settings: dict[str, Any]) -> dict[str, Any]:
-        server = next(one for one in servers.values() if name in one.devices)
-        about = {"use": "remote", "address": f"tcp://127.0.0.1:{server.port}", "device": name}
         kept = {key: value for key, value in settings.items() if key in OF_THE_EXPERIMENT}
-        return {**about, "simulated": True, **kept}
+        return {**at[name], "device": name, "simulated": True, **kept}
 
-    for name in ("camera", "static_tweezers", "mobile_tweezers", "lines", "simulation"):
+    roles = {"camera", "static_tweezers", "mobile_tweezers", "lines", "simulation"}
+    for name in roles & profile.keys():
         profile[name] = remote(name, profile[name])
     profile["devices"] = {name: remote(name, one) for name, one in profile["devices"].items()}
     return yaml.safe_dump(profile, sort_keys=False)
 
 
 @contextmanager
-def served_apart(folder: Path) -> Generator[dict[str, Server]]:
-    """A server for each of :data:`SERVED`, and ``client.yaml`` for a run with them."""
-    first = free_port(40)
-    servers = {name: Server(devices, first + 8 * n) for n, (name, devices) in enumerate(SERVED.items())}
-    (folder / "client.yaml").write_text(client_profile(servers), encoding="utf-8")
+def serving_apart(folder: Path, servers: Mapping[str, Server]) -> Generator[None]:
+    """Start servers, that of the simulation first, and write ``client.yaml`` for a run with them."""
+    (folder / "client.yaml").write_text(client_profile(servers.values()), encoding="utf-8")
+    simulation = next(iter(servers.values()))
     try:
-        for server in servers.values():  # the simulation first: the others are tested on it
-            server.start(servers["simulation"].port)
+        for server in servers.values():
+            server.start(simulation)
             server.await_line("serves ")
-        yield servers
+        yield
     finally:
         for server in servers.values():
             server.end()
@@ -180,9 +192,9 @@ class Client:
         return self.process.returncode, " ".join(errors.split())
 
 
-def identical(folder: Path, n_shots: int) -> bool:
+def identical(folder: Path, n_shots: int, prefix: Sequence[str] = ()) -> bool:
     """Whether the same seed gives the same data as plain `bench`."""
-    client = Client(folder, n_shots)
+    client = Client(folder, n_shots, prefix)
     ended = client.end()
     assert ended[0] == 0, ended
     options: dict[str, Any] = {"seed": 1, "shots": n_shots, "output": folder / "plain"}
@@ -215,12 +227,9 @@ def act(servers: dict[str, Server], folder: Path, victim: str, number: signal.Si
         hit.send_signal(signal.SIGCONT)
         print(f"  {time.monotonic() - begun_s:6.2f} s the server goes on")
     time.sleep(2.0)
-    for name, server in servers.items():
-        for at_s, line in server.lines:
-            if at_s > begun_s:
-                print(f"  {at_s - begun_s:6.2f} s server of {name}: {line}", flush=True)
+    print_reports(servers, begun_s)
     if victim != "client" and hit.poll() is not None:  # a watchdog ends a server that stands still
-        servers[victim].start(servers["simulation"].port)
+        servers[victim].start(servers["simulation"])
         servers[victim].await_line("serves ")
 
 
@@ -237,6 +246,14 @@ def print_safe_states(client: Client, begun_utc: datetime) -> None:
         print(f"  {at_s:6.2f} s run: {values['device']}: {'safe' if values['ok'] else values['error']}")
 
 
+def print_reports(servers: Mapping[str, Server], begun_s: float) -> None:
+    """Print what the servers have reported since then."""
+    for name, server in servers.items():
+        for at_s, line in server.lines:
+            if at_s > begun_s:
+                print(f"  {at_s - begun_s:6.2f} s server of {name}: {line}", flush=True)
+
+
 def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -245,7 +262,10 @@ def main() -> None:
     parser.add_argument("--victims", nargs="*", default=[*SERVED, "client"])
     parser.add_argument("--signals", nargs="*", default=["SIGKILL", "SIGSTOP"])
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name, served_apart(Path(name)) as servers:
+    first = free_port(40)
+    at = {name: first + 8 * n for n, name in enumerate(SERVED)}
+    servers = {name: Server(devices, "127.0.0.1", at[name]) for name, devices in SERVED.items()}
+    with tempfile.TemporaryDirectory() as name, serving_apart(Path(name), servers):
         if options.shots:
             same = identical(Path(name), options.shots)
             print(f"{options.shots} shots: {'identical' if same else 'DIFFERENT'}", flush=True)

@@ -1,10 +1,13 @@
-"""The contract of each role, with the device served over loopback."""
+"""The contract of each role, with the device served over loopback.
+
+Between them is a proxy that delays each message, and delivers it a second time after the next one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pytest
 from labseq_remote.drivers import (
@@ -14,7 +17,7 @@ from labseq_remote.drivers import (
     RemoteMobileTweezers,
     RemoteStaticTweezers,
 )
-from labseq_remote.settings import RemoteSimulationSettings
+from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
 from labseq_remote.simulation import RemoteSimulation
 
 from labseq.plugin import Context, SiteGrid
@@ -28,14 +31,23 @@ from labseq.testing import (
 )
 from labseq.testing.fakes import FakeClock
 from tests.remote.conftest import Served
+from tests.remote.proxy import PROXY, Proxy
 
 _port = 0
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _served(server: Served) -> None:
+def _rough_network(server: Served) -> Generator[None]:
     global _port
     _port = server.port
+    proxy = Proxy(server, is_rough=True)
+    yield
+    proxy.end()
+
+
+def settings(device: str) -> RemoteSettings:
+    about = {"address": f"tcp://{PROXY}:{_port}", "device": device, "simulated": True}
+    return RemoteSettings.model_validate(about)
 
 
 def with_simulation(context: Context) -> Context:
@@ -49,8 +61,8 @@ class TestRemoteCamera(CameraContract):
         return with_simulation(super().context())
 
     @pytest.fixture
-    def factory(self, server: Served) -> Callable[[Context], RemoteCamera]:
-        return lambda context: RemoteCamera(server.settings("camera"), context)
+    def factory(self) -> Callable[[Context], RemoteCamera]:
+        return lambda context: RemoteCamera(settings("camera"), context)
 
 
 class TestRemoteStaticTweezers(StaticTweezersContract):
@@ -58,15 +70,15 @@ class TestRemoteStaticTweezers(StaticTweezersContract):
         return with_simulation(super().context())
 
     @pytest.fixture
-    def factory(self, server: Served) -> Callable[[Context], RemoteStaticTweezers]:
-        return lambda context: RemoteStaticTweezers(server.settings("static_tweezers"), context)
+    def factory(self) -> Callable[[Context], RemoteStaticTweezers]:
+        return lambda context: RemoteStaticTweezers(settings("static_tweezers"), context)
 
 
 @pytest.fixture(scope="module")
-def _warm(server: Served) -> None:
+def _warm() -> None:
     """Compile the kernels; with an empty cache the first call would come late."""
     context = with_simulation(Context("mobile_tweezers", clock=FakeClock()))
-    RemoteMobileTweezers(server.settings("mobile_tweezers"), context).warm()
+    RemoteMobileTweezers(settings("mobile_tweezers"), context).warm()
 
 
 @pytest.mark.usefixtures("_warm")
@@ -75,8 +87,8 @@ class TestRemoteMobileTweezers(MobileTweezersContract):
         return with_simulation(super().context())
 
     @pytest.fixture
-    def factory(self, server: Served) -> Callable[[Context], RemoteMobileTweezers]:
-        return lambda context: RemoteMobileTweezers(server.settings("mobile_tweezers"), context)
+    def factory(self) -> Callable[[Context], RemoteMobileTweezers]:
+        return lambda context: RemoteMobileTweezers(settings("mobile_tweezers"), context)
 
 
 class TestRemoteDevice(DeviceContract):
@@ -84,8 +96,8 @@ class TestRemoteDevice(DeviceContract):
     values: ClassVar = ("state", "power")
 
     @pytest.fixture
-    def factory(self, server: Served) -> Callable[[Context], RemoteDevice]:
-        return lambda context: RemoteDevice(server.settings("instrument"), context)
+    def factory(self) -> Callable[[Context], RemoteDevice]:
+        return lambda context: RemoteDevice(settings("instrument"), context)
 
 
 class TestRemoteLines(LinesContract):
@@ -93,12 +105,12 @@ class TestRemoteLines(LinesContract):
         return with_simulation(super().context())
 
     @pytest.fixture
-    def factory(self, server: Served) -> Callable[[Context], RemoteLines]:
-        return lambda context: RemoteLines(server.settings("lines"), context)
+    def factory(self) -> Callable[[Context], RemoteLines]:
+        return lambda context: RemoteLines(settings("lines"), context)
 
 
 class TestRemoteSimulation(SimulationContract):
     @pytest.fixture
-    def factory(self, server: Served) -> Callable[[Context], RemoteSimulation]:
-        settings: Any = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{server.port}")
-        return lambda context: RemoteSimulation(settings, context)
+    def factory(self) -> Callable[[Context], RemoteSimulation]:
+        there = RemoteSimulationSettings(address=f"tcp://{PROXY}:{_port}")
+        return lambda context: RemoteSimulation(there, context)

@@ -16,7 +16,13 @@ import numpy as np
 import pytest
 import zmq
 from labseq_remote import connection
-from labseq_remote.drivers import RemoteCamera, RemoteDevice
+from labseq_remote.drivers import (
+    RemoteCamera,
+    RemoteDevice,
+    RemoteLines,
+    RemoteMobileTweezers,
+    RemoteStaticTweezers,
+)
 from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
 from labseq_remote.simulation import RemoteSimulation
 from labseq_virtual.devices import VirtualDevice
@@ -28,12 +34,18 @@ from labseq.plugin import ConfigError, Context, DeviceError, LimitError, SiteGri
 from labseq.remote.server import Serving, serving
 from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock
+from labseq.wire import messages
 from tests.remote.conftest import PROFILE, Served, free_port, served
+from tests.remote.proxy import PROXY, Proxy
 from tests.remote.test_contracts import with_simulation
 
-Fault = Callable[[list[bytes]], list[list[bytes]]]
-PROXY = "127.0.0.2"
-"""Another address of this computer, so that a proxy has the same ports as the server."""
+ROLES: dict[str, Any] = {
+    "mobile_tweezers": RemoteMobileTweezers,
+    "lines": RemoteLines,
+    "instrument": RemoteDevice,
+    "camera": RemoteCamera,
+    "static_tweezers": RemoteStaticTweezers,
+}
 
 
 def until(condition: Callable[[], bool], limit_s: float = 10.0) -> float:
@@ -43,57 +55,6 @@ def until(condition: Callable[[], bool], limit_s: float = 10.0) -> float:
         assert time.monotonic() < begun_s + limit_s, "it did not happen in time"
         time.sleep(0.005)
     return time.monotonic() - begun_s
-
-
-class Proxy:
-    """Passes messages on, with a fault in those of the device's port."""
-
-    def __init__(self, server: Served) -> None:
-        self.fault: Fault = lambda message: [message]
-        self.reply_fault: Fault = lambda message: [message]
-        self.is_cut = False
-        self._ended = threading.Event()
-        self._context = zmq.Context()
-        ports = range(server.port, server.port + 9)
-        self._threads = [threading.Thread(target=self._pass, args=[port], daemon=True) for port in ports]
-        for thread in self._threads:
-            thread.start()
-
-    def end(self) -> None:
-        self._ended.set()
-        for thread in self._threads:
-            thread.join(5.0)
-        self._context.destroy(linger=0)
-
-    def _pass(self, port: int) -> None:
-        front = self._context.socket(zmq.ROUTER)
-        front.bind(f"tcp://{PROXY}:{port}")
-        backs: dict[bytes, Any] = {}
-        poller = zmq.Poller()
-        poller.register(front, zmq.POLLIN)
-        while not self._ended.is_set():
-            for socket, _ in poller.poll(20):
-                parts = socket.recv_multipart()
-                if self.is_cut:
-                    continue
-                if socket is front:
-                    client, *message = parts
-                    if client not in backs:
-                        backs[client] = self._context.socket(zmq.DEALER)
-                        backs[client].connect(f"tcp://127.0.0.1:{port}")
-                        poller.register(backs[client], zmq.POLLIN)
-                    for one in self.fault(message) if is_call(message) else [message]:
-                        backs[client].send_multipart(one)
-                else:
-                    client = next(name for name, back in backs.items() if back is socket)
-                    for one in self.reply_fault(parts):
-                        front.send_multipart([client, *one])
-        for socket in (front, *backs.values()):
-            socket.close(linger=0)
-
-
-def is_call(message: list[bytes]) -> bool:
-    return b"call" in message[0]
 
 
 @pytest.fixture(scope="module")
@@ -205,17 +166,31 @@ def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
 
 
 def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    with instrument(server, PROXY) as device:
-        n_told = len(server.told)
-        faulty.is_cut = True
+    context = with_simulation(Context("", clock=FakeClock()))
+    address = f"tcp://{PROXY}:{server.port}"
+    devices = {
+        name: role(server.settings(name, address=address), replace(context, name=name))
+        for name, role in ROLES.items()
+    }
+    assert context.simulation is not None
+    context.simulation.open()
+    for device in devices.values():
+        device.open()
+    devices["static_tweezers"].start()
+    n_told = len(server.told)
+    faulty.is_cut = True
+    monkeypatch.setattr(labseq.remote.server, "LOST_S", 0.3)
+    for name, device in devices.items():
         device._link.connect()._lost_s = 0.3
-        monkeypatch.setattr(labseq.remote.server, "LOST_S", 0.3)
-        with pytest.raises(DeviceError, match=r"^laser: the connection is lost.*127\.0\.0\.2"):
-            [device.read("power") for _ in range(1000)]
-        until(lambda: any("made safe" in text for text in server.told[n_told:]))
-        monkeypatch.undo()
-        with pytest.raises(DeviceError):
+        until(lambda name=name: any(f"{name}: the" in text for text in server.told[n_told:]))
+        assert "made safe" in next(text for text in server.told[n_told:] if f"{name}: the" in text)
+        until(lambda device=device: bool(device._link.connect().lost))
+        with pytest.raises(DeviceError, match=rf"^{name}: the connection is lost.*127\.0\.0\.2"):
             device.safe_state()
+        with suppress(DeviceError):
+            device.close()
+    monkeypatch.undo()
+    context.simulation.close()
     with instrument(server) as again:
         again.command("open")
 
@@ -446,6 +421,20 @@ def test_shapes_are_checked_before_arrays_are_made() -> None:
     ):
         with pytest.raises(wire.MessageError):
             wire.unpack(message(*wrong))
+
+
+def test_an_array_beyond_the_limit_of_a_part_is_divided(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(messages, "MAX_PART", 1 << 15)
+    samples = np.arange(100_001, dtype=np.int16)
+    parts = wire.pack([samples, samples[:10], samples[:9000]])
+    assert max(len(part) for part in parts) <= 1 << 15
+    for sent, came in zip([samples, samples[:10], samples[:9000]], wire.unpack(parts), strict=True):
+        assert np.array_equal(sent, came)
+    with pytest.raises(wire.MessageError, match="expected 200002"):
+        wire.unpack([*parts[:2], parts[8], *parts[3:]])  # a part was replaced by a shorter one
+    monkeypatch.setattr(messages, "MAX_PARTS", 4)
+    with pytest.raises(wire.MessageError, match="at most 4 parts"):
+        wire.pack(samples)
 
 
 def real_camera(server: Served, stop: StopFlag) -> RemoteCamera:
