@@ -2,7 +2,7 @@
 
 The device does nothing, so that the times are those of the messages: what a call takes more than locally.
 `pytest -s tests/benchmarks/test_remote.py --benchmark-enable --numprocesses=0` prints 99th percentiles, too.
-The same frame through sockets of ZeroMQ alone is what labseq can come near to, but not below.
+The same through sockets of ZeroMQ alone is what labseq can come near to, but not below.
 """
 
 from __future__ import annotations
@@ -66,11 +66,12 @@ def labseq_register(registry):
 ALONE = """
 import sys, zmq
 socket = zmq.Context().socket(zmq.ROUTER)
-if len(sys.argv) > 2:
-    socket.curve_server, socket.curve_secretkey = True, sys.argv[2].encode()
+if len(sys.argv) > 3:
+    socket.curve_server, socket.curve_secretkey = True, sys.argv[3].encode()
 socket.bind(sys.argv[1])
+reply = [bytes(64), *([bytes(512 * 512 * 2)] if sys.argv[2] == "frame" else [])]
 while True:
-    socket.send_multipart([socket.recv_multipart()[0], bytes(64), bytes(512 * 512 * 2)], copy=False)
+    socket.send_multipart([socket.recv_multipart()[0], *reply], copy=False)
 """
 PROFILE = """\
 labseq: 1
@@ -151,23 +152,25 @@ def test_tone_program_of_30_batches(address: dict[str, Any], benchmark: Any) -> 
     tweezers.close()
 
 
+@pytest.mark.parametrize("what", ["small", "frame"])
 @pytest.mark.parametrize("keys", [False, True], ids=["plain", "keys"])
-def test_frame_by_zeromq_alone(keys: bool, benchmark: Any) -> None:
+def test_zeromq_alone(keys: bool, what: str, benchmark: Any) -> None:
     public, secret = zmq.curve_keypair()
     port = free_port()
-    command = [sys.executable, "-c", ALONE, f"tcp://127.0.0.1:{port}", *([secret.decode()] if keys else [])]
+    command = [sys.executable, "-c", ALONE, f"tcp://127.0.0.1:{port}", what]
+    command += [secret.decode()] if keys else []
     with subprocess.Popen(command) as process, zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         if keys:
             socket.curve_publickey, socket.curve_secretkey = zmq.curve_keypair()
             socket.curve_serverkey = public
         socket.connect(f"tcp://127.0.0.1:{port}")
 
-        def frame() -> None:
-            socket.send(b"read")
+        def call() -> None:
+            socket.send(bytes(64))
             socket.recv_multipart(copy=False)
 
         try:
-            measure(benchmark, frame, rounds=1000)
+            measure(benchmark, call, rounds=1000)
         finally:
             process.kill()
 

@@ -3,10 +3,11 @@
     python -m tests.benchmarks.workers speed --shots 1000
     python -m tests.benchmarks.workers memory --shots 100000
     python -m tests.benchmarks.workers kills --shots 60
+    python -m tests.benchmarks.workers ends --shots 40
 
 Shots of `speed` have twelve frames each. `memory` hands the process that records a run the shots of eight
 simulated workers, whose devices take no time, with a live view beside it. `kills` ends workers at random, by
-SIGKILL.
+SIGKILL. `ends` ends runs by Ctrl-C and by a full disk (as root on Linux), and resumes them.
 """
 
 from __future__ import annotations
@@ -198,6 +199,67 @@ def index(run: labseq.Run) -> list[dict[str, Any]]:
     return [{key: value for key, value in line.items() if key not in times} for line in lines]
 
 
+@contextmanager
+def small_disk(folder: Path) -> Generator[None]:
+    """A disk of 8 MB at a folder; needs root, and Linux."""
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(folder)], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def command(data: Path, *arguments: str, ctrl_c_s: float | None = None) -> tuple[int, str]:
+    """Run labseq with two workers: its exit code, and the last line that it printed.
+
+    Args:
+        data: Folder for the data.
+        arguments: Its arguments.
+        ctrl_c_s: When Ctrl-C comes after the first shot; None: never.
+    """
+    whole = [sys.executable, "-m", "labseq", *arguments, "--workers=2"]
+    with subprocess.Popen(
+        whole, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        if ctrl_c_s is not None:
+            begun = {path: path.stat().st_size for path in data.glob("*/*/index.jsonl")}
+            while process.poll() is None and begun == {
+                path: path.stat().st_size for path in data.glob("*/*/index.jsonl")
+            }:
+                time.sleep(0.02)
+            time.sleep(ctrl_c_s)
+            os.killpg(process.pid, signal.SIGINT)
+        errors = process.communicate()[1].strip().splitlines()
+    return process.returncode, errors[-1] if errors else ""
+
+
+def ends(n_shots: int, data: Path) -> None:
+    """Compare runs that were ended and resumed with one that was not."""
+    with labseq.Session.open("compact_225", seed=1, shots=n_shots, output=data / "alone") as session:
+        alone = session.run()
+
+    def compare(name: str, folder: Path) -> None:
+        run = labseq.open_run(next(folder.glob("*/*")))
+        left = [path.name for path in (run.path / "shots").iterdir() if path.suffix != ".h5"]
+        same = table(run) == table(alone) and index(run) == index(alone) and not left
+        print(f"{name}: {'identical' if same else 'DIFFERENT'}", flush=True)
+
+    first = ("run", "compact_225", "--seed=1", f"--shots={n_shots}", "--output")
+    pressed = data / "pressed"
+    print(*command(pressed, *first, str(pressed), ctrl_c_s=random.random()))
+    for _ in range(2):
+        print(*command(pressed, "resume", str(next(pressed.glob("*/*"))), ctrl_c_s=random.random()))
+    print(*command(pressed, "resume", str(next(pressed.glob("*/*")))))
+    compare("Ctrl-C", pressed)
+    full = data / "full"
+    with small_disk(full):
+        print(*command(full, *first, str(full)))
+        subprocess.run(["mount", "-o", "remount,size=1g", str(full)], check=True)
+        print(*command(full, "resume", str(next(full.glob("*/*")))))
+        compare("full disk", full)
+
+
 def kills(n_shots: int, data: Path) -> None:
     """Compare runs whose workers are killed with one that has none."""
 
@@ -230,7 +292,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("speed", "memory", "kills"))
+    parser.add_argument("what", choices=("speed", "memory", "kills", "ends"))
     parser.add_argument("--shots", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=2, help="of `speed`; the fastest counts")
     parser.add_argument("--folder", type=Path, help="where the data are written for a while")
@@ -242,6 +304,8 @@ def main() -> None:
             speed(arguments.shots, arguments.repeats, data)
         elif arguments.what == "memory":
             memory(arguments.shots, data)
+        elif arguments.what == "ends":
+            ends(arguments.shots, data)
         else:
             kills(arguments.shots, data)
 

@@ -43,16 +43,10 @@ SERVED: Final = {
 """Server -> the devices that it serves."""
 SHOT_S: Final = 4.0
 """How long after the begin of a shot a process is killed at most, in seconds."""
-OF_THE_EXPERIMENT: Final = {"role", "channels", "rf", "pick_up", "drop_off", "speed", "speed_profile"} | {
-    *(
-        "overhead_per_batch",
-        "overhead_per_cycle",
-        "max_tweezers",
-        "max_row_tones",
-        "max_column_tones",
-        "eject_slots",
-    )
-}
+OF_THE_EXPERIMENT: Final = (
+    *("role", "channels", "rf", "pick_up", "drop_off", "speed", "speed_profile", "overhead_per_cycle"),
+    *("max_tweezers", "max_row_tones", "max_column_tones", "eject_slots"),
+)
 """What the profile of the experiment says of a device; the rest belongs to its driver."""
 
 
