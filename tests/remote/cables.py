@@ -12,6 +12,7 @@ import argparse
 import os
 import random
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Generator, Mapping
@@ -109,6 +110,8 @@ def main() -> None:
     parser.add_argument("--shots", type=int, default=2, help="of the runs that are compared; 0: none")
     parser.add_argument("--computers", nargs="*", default=[*COMPUTERS])
     options = parser.parse_args()
+    if sys.platform != "linux" or os.geteuid() != 0:
+        parser.error("network namespaces need root, on Linux")
     with tempfile.TemporaryDirectory() as name, connected():
         folder = Path(name)
         exchange_keys(folder)
