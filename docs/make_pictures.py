@@ -48,6 +48,18 @@ _SCAN = "labseq run sequences/scan_dop.yaml --seed 1 --set repeats=50 --set reco
 _KINDS = ("tweezers", "sites", "thresholds", "frequencies", "overlay")
 _MORNING = tuple(f"labseq calibrate {kind} --profile practice --seed 1" for kind in _KINDS)
 
+_SURVIVAL = "survival:before,after"
+_FIRST_WEEK = {
+    "lifetime": f"{_SURVIVAL} --fit exponential",
+    "loading_time": "loading --fit saturation",
+    "imaging_exposure": f"{_SURVIVAL} --fit exponential",
+    "trap_depth": f"{_SURVIVAL} --fit lowering",
+    "release_recapture": f"{_SURVIVAL} --fit release_recapture",
+    "transport_speed": "analysis.survival.survival --fit step",
+    "hand_over_ramp": f"{_SURVIVAL} --fit gaussian --fit-set centre=0",
+    "parking": f"{_SURVIVAL} --fit plateau",
+}
+
 PICTURES: Final = {
     "plan_kagome.png": Picture(
         "how-to/look-at-a-plan.md", (f"{_KAGOME} --png plan_kagome.png",), "plan_kagome.png"
@@ -72,6 +84,14 @@ PICTURES: Final = {
     ),
     "plot/overview.png": Picture("how-to/plot.md", (_SCAN, "labseq plot"), "*.png"),
     "plot/cycle.png": Picture("how-to/plot.md", (_SCAN, "labseq plot --shot 3 --cycle 1"), "*.png"),
+    **{
+        f"first_week/{name}.png": Picture(
+            "how-to/first-week.md",
+            (f"labseq run {name} --seed 1", f"labseq plot --scan {shown} -o {name}.png"),
+            f"{name}.png",
+        )
+        for name, shown in _FIRST_WEEK.items()
+    },
     **{
         f"calibration/{kind}.png": Picture(
             "tutorials/calibrating.md",

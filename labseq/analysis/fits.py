@@ -24,6 +24,11 @@ RB87_U, ATOMIC_MASS_KG = 86.909180531, 1.66053906660e-27
 """Mass of 87Rb (AME2020), and the unit that it is in (CODATA 2018)."""
 N_ATOMS: Final = 20_000
 """Number of atoms in the model of release and recapture."""
+N_STEPS: Final = 600
+"""Points at which their distribution is integrated."""
+FURTHEST: Final = 3.0
+"""Rayleigh lengths from the focus beyond which no atoms are: the light has a tenth there. Without an end, the
+atoms that are barely bound would be infinitely many."""
 ROUNDING: Final = 1e-9
 """Relative error below which a value counts as without error."""
 MAX_ERROR: Final = 10.0
@@ -170,8 +175,45 @@ def _guess_lowering(x: Floats, y: Floats) -> dict[str, float]:
 
 @cache
 def _draws() -> Floats:
-    """Standard normal positions and velocities of atoms, float64 (6, n): the same ones every time."""
-    return np.random.default_rng(0).standard_normal((6, N_ATOMS))
+    """Uniform random numbers of atoms, float64 (6, n): the same ones every time."""
+    return np.random.default_rng(0).random((6, N_ATOMS))
+
+
+def _bound_atoms(eta: float) -> tuple[Floats, Floats]:
+    """Atoms of the Boltzmann distribution in a Gaussian beam, restricted to bound ones.
+
+    Where the trap has the depth a, the density is ``exp(a) P(a)``, where ``P(a) = erf(sqrt(a)) - 2 sqrt(a /
+    pi) exp(-a)`` of the Maxwell distribution is slow enough to be bound. In a plane of constant z the
+    integral over x and y is one over a. The distributions of z, of a in its plane, and of the speed are
+    inverted one after the other.
+
+    Args:
+        eta: Depth in units of kT.
+
+    Returns:
+        Positions in waists, along z in Rayleigh lengths, and velocities in units of sqrt(kT / mass); both
+        float64 (3, n_atoms).
+    """
+    from scipy.special import gammainc, gammaincinv  # takes a moment
+
+    a = eta * np.linspace(0.0, 1.0, N_STEPS) ** 2  # dense where P(a) / a goes as a root
+    below = np.zeros(N_STEPS)  # integral of exp(a) P(a) / a from 0
+    mean = (a[1:] + a[:-1]) / 2
+    below[1:] = np.cumsum(np.exp(mean - eta) * gammainc(1.5, mean) / mean * np.diff(a))
+    z = np.linspace(-FURTHEST, FURTHEST, N_STEPS)
+    in_plane = (1 + z**2) * np.interp(eta / (1 + z**2), a, below)
+    up_to = np.cumsum(in_plane) - in_plane / 2
+    along, depth, slow, turn, polar, azimuth = _draws()
+    z = np.interp(along * up_to[-1], up_to, z)
+    width = 1 + z**2
+    local = np.interp(depth * np.interp(eta / width, a, below), below, a)
+    radius = np.sqrt(width / 2 * np.log(eta / width / np.maximum(local, 1e-12)).clip(0.0))
+    speed = np.sqrt(2 * gammaincinv(1.5, slow * gammainc(1.5, local)))
+    across = np.sqrt(1 - (2 * polar - 1) ** 2)
+    turn, azimuth = 2 * np.pi * turn, 2 * np.pi * azimuth
+    places = np.stack([radius * np.cos(turn), radius * np.sin(turn), z])
+    directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), 2 * polar - 1])
+    return places, speed * directions
 
 
 def _release_recapture(
@@ -185,9 +227,9 @@ def _release_recapture(
 ) -> Floats:
     """Fraction of atoms that a Gaussian tweezer recaptures after they flew freely for a time.
 
-    Atoms start from the Boltzmann distribution in the harmonic part of the trap, restricted to bound ones,
-    and fly straight on. An atom is recaptured if its kinetic energy is less than the depth of the trap at
-    its new place (Tuchendler et al., Phys. Rev. A 78, 033425, 2008). Gravity is left out.
+    Atoms start from the thermal distribution of bound ones and fly straight on. An atom is recaptured if its
+    kinetic energy is less than the depth of the trap at its new place (Tuchendler et al., Phys. Rev. A 78,
+    033425, 2008). Gravity is left out.
 
     Args:
         x: Times without the trap, in s.
@@ -200,20 +242,17 @@ def _release_recapture(
     """
     eta = depth / temperature
     rayleigh = math.pi * waist**2 / wavelength
-    speed = math.sqrt(BOLTZMANN * temperature / (mass * ATOMIC_MASS_KG))
-    size = np.array([waist / 2, waist / 2, rayleigh / math.sqrt(2)])[:, None] / math.sqrt(eta)
-    places, velocities = size * _draws()[:3], speed * _draws()[3:]
-    kinetic = (_draws()[3:] ** 2).sum(axis=0) / 2  # in kT
+    places, velocities = _bound_atoms(eta)
+    kinetic = (velocities**2).sum(axis=0) / 2  # in kT
+    flight = velocities * math.sqrt(BOLTZMANN * temperature / (mass * ATOMIC_MASS_KG))
+    flight /= np.array([waist, waist, rayleigh])[:, None]
 
-    def is_bound(at: Floats) -> NDArray[np.bool_]:
-        width = 1 + (at[2] / rayleigh) ** 2
-        trap: Floats = eta / width * np.exp(-2 * (at[0] ** 2 + at[1] ** 2) / (waist**2 * width))
-        return kinetic < trap
+    def kept(t: float) -> float:
+        at = places + t * flight
+        width = 1 + at[2] ** 2
+        return float((kinetic < eta / width * np.exp(-2 * (at[0] ** 2 + at[1] ** 2) / width)).mean())
 
-    start = is_bound(places)
-    n_bound = max(1, int(start.sum()))
-    recaptured = [np.count_nonzero(is_bound(places + t * velocities) & start) for t in x]
-    return amplitude * np.array(recaptured, np.float64) / n_bound
+    return amplitude * np.array([kept(t) for t in x])
 
 
 def _guess_release(x: Floats, y: Floats) -> dict[str, float]:

@@ -95,22 +95,28 @@ def predict_survival(
     standing = duration_s / losses.lifetime_s - math.log1p(-losses.image)
     factors, weights = _factors(losses.spread)
     total = hazards.sum(axis=0)
-    kept = np.exp(-np.multiply.outer(factors, total[report.predicted]))
-    by_cause = [
-        float(weights @ -np.expm1(-np.multiply.outer(factors, cause[report.predicted])).sum(axis=1))
-        if cause.any()
-        else 0.0
-        for cause in hazards
-    ]
+    by_cause = [_n_lost(cause[report.predicted], factors, weights) for cause in hazards]
+    lost_by_moves = max(by_cause)
+    if np.count_nonzero(by_cause) > 1:
+        lost_by_moves = _n_lost(total[report.predicted], factors, weights)
+    n_atoms = np.count_nonzero(report.predicted)
     chance = weights @ np.exp(-factors * total[target.fill].sum())
     chance *= math.exp(-standing * target.n_atoms)
     return Survival(
         float(chance) if report.n_defects == 0 else 0.0,
-        float(weights @ (1.0 - math.exp(-standing) * kept).sum(axis=1)),
+        -n_atoms * math.expm1(-standing) + math.exp(-standing) * lost_by_moves,
         *by_cause,
         n_landings=n_landings,
         n_passes=n_passes,
     )
+
+
+def _n_lost(hazards: Floats, factors: Floats, weights: Floats) -> float:
+    """Expected number of atoms lost by hazards, mean over the factors."""
+    hazards = hazards[hazards > 0.0]  # those of few atoms, in most plans
+    if not len(hazards):
+        return 0.0
+    return float(weights @ -np.expm1(-np.multiply.outer(factors, hazards)).sum(axis=1))
 
 
 @lru_cache(maxsize=8)

@@ -1,6 +1,6 @@
 """Kernels that look up how atoms respond to the stages of a move (``responses.py``), and to time.
 
-``tables``: the tables of pick-up, drop-off, transport, landing and passing, one after the other, see
+``tables``: the tables of a move, one after the other, see
 :func:`labseq_virtual.responses.move_tables`.
 """
 
@@ -24,6 +24,8 @@ from labseq_virtual.responses import (
     RATIOS,
     SITE_M,
     SPEEDS,
+    START_RAMPS_S,
+    START_SPEEDS,
     TEMPERATURES,
     WAIST_M,
 )
@@ -39,6 +41,8 @@ LANDING_AXIS, PASSING_AXIS, BESIDE_AXIS = np.array(LANDING_SPEEDS), np.array(PAS
 N_LANDING = len(LANDING_SPEEDS) * len(RAMPS_S) * len(RATIOS) * len(TEMPERATURES)
 N_PASSING = len(PASSING_SPEEDS) * len(BESIDE) * len(RATIOS) * len(TEMPERATURES)
 N_TRANSPORT = 3 * len(SPEEDS) * len(RATIOS) * len(TEMPERATURES)
+START_RAMP_AXIS, START_SPEED_AXIS = np.array(START_RAMPS_S), np.array(START_SPEEDS)
+N_START = len(START_RAMPS_S) * len(START_SPEEDS) * len(RATIOS) * len(TEMPERATURES)
 CURVED_SITES = 4.0
 """Length of the moves in the table of a curved course, in sites."""
 
@@ -217,6 +221,39 @@ def pass_by(
     )  # fmt: skip
     loss = math.exp(log_loss)
     return (loss if loss > 2 * LEAST_LOSS else 0.0), warmer
+
+
+@helper_kernel(f"UniTuple(float64, 2)(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+def at_once(
+    stage: int,
+    mobile: float,
+    speed_m_s: float,
+    ramp_s: float,
+    heat: float,
+    constants: Floats,
+    tables: Floats,
+) -> tuple[float, float]:
+    """Further loss, and ratio of temperatures, where a start follows a ramp at once, or a ramp a stop.
+
+    Args:
+        stage: 0 for a start, 1 for a stop.
+        mobile: Greatest depth of the mobile tweezer, in kelvin.
+        speed_m_s: Speed of the move, constant.
+        ramp_s: Time from the beginning of the ramp to the start, or from the stop to the end of the ramp.
+        heat: Temperature of the atom before the move, in a static tweezer of the nominal depth.
+        constants: The constants.
+        tables: The tables.
+    """
+    if not ramp_s < START_RAMP_AXIS[-1]:
+        return 0.0, 1.0
+    static = constants[STATIC_DEPTH]
+    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
+    i, part = locate(START_RAMP_AXIS, ramp_s)  # compared with the sound, whose transit does not scale
+    first = 4 * N_RAMP + 2 * N_TRANSPORT + 2 * N_LANDING + 2 * N_PASSING + 2 * N_START * stage
+    return respond(
+        tables, first, N_START, i + part, speed, START_SPEED_AXIS, mobile / static, heat * DEPTH_K / static,
+        len(START_RAMP_AXIS),
+    )  # fmt: skip
 
 
 @helper_kernel(f"float64(float64, float64, {VECTOR})")

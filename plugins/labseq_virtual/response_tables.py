@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -27,14 +27,16 @@ from labseq.plugin import (
     AxisTones,
     FrequencyCourse,
     MotionSpec,
+    Plan,
     RfSamples,
     RfSpec,
     SiteGrid,
     ToneProgram,
     render,
+    tone_program,
 )
 from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
-from labseq_virtual.responses import AXES, REFERENCE, TABLES, TRANSIT_S, Reference
+from labseq_virtual.responses import AXES, REFERENCE, START_RAMPS_S, TABLES, TRANSIT_S, Reference
 from labseq_virtual.rf_analysis import HOPS, RfPulse
 from labseq_virtual.settings import SimulationSettings
 
@@ -52,6 +54,10 @@ SOUND_S: Final = TRANSIT_S / 4
 """s.d. of the sound's weight across the beam, for a transit time of 10 us: its field and that of the beam."""
 KEYED_S: Final = 2e-6
 """Time over which the tones of the other axis are switched, at the outer end of a ramp."""
+LEAST_KEPT: Final = 0.02
+"""Fraction of atoms kept below which two moves are not compared."""
+SLOW_S: Final = 30e-6
+"""Duration of a ramp that changes nothing about the start after it, or the stop before."""
 LENGTHS: Final = (3, 4, 5, 6)
 """Lengths of the moves in sites: several, as the kicks at start and stop interfere."""
 
@@ -143,7 +149,30 @@ def drop_off(
     return outcome(before, after, at.depth, 1 / np.sqrt(ratio))
 
 
-@lru_cache(maxsize=8)
+def find_light(program: ToneProgram) -> list[tuple[Floats, Floats, Floats]]:
+    """The tweezer of a program with one row tone and one column tone, as found in its played samples.
+
+    Returns:
+        Its column, its depth relative to the full one, and the time from the start of the program, for frames
+        of a transit time over ``HOPS`` each (n_frames,); in parts, if the light goes out on the way.
+    """
+    full_v = 0.2
+    samples = render(program, RATE_HZ).samples
+    spans = [(RfSamples(1.0, RATE_HZ, one, full_v / 32767),) for one in samples]
+    pulse = RfPulse(1.0, spans[0][0].end_s, *spans, continued=False)
+    flight = RfTransport(SiteGrid(), MotionSpec(rf=RfSpec(full_scale_v=full_v)), SimulationSettings())
+    parts = list[tuple[Floats, Floats, Floats]]()
+    for (_, row_depth, place, depth), t_s in flight.find_tones(pulse):
+        strongest = np.nan_to_num(depth).argmax(axis=1)
+        frames = np.arange(len(strongest))
+        sites = place[frames, strongest]
+        light = np.nan_to_num(depth[frames, strongest] * np.nan_to_num(row_depth).max(axis=1))
+        on = np.isfinite(sites)
+        parts.append((np.interp(frames, frames[on], sites[on]), light, t_s - 1.0))
+    return parts
+
+
+@lru_cache(maxsize=512)
 def played_move(course: int, speed: float, length: int) -> tuple[Floats, Floats] | None:
     """Position (in sites from its start) and depth of a tweezer that moves, as found in played samples.
 
@@ -154,7 +183,7 @@ def played_move(course: int, speed: float, length: int) -> tuple[Floats, Floats]
         None if the light goes out on the way.
     """
     rest_s, moving_s = 4 * REST_S, length * REFERENCE.spacing / speed
-    grid, full_v = SiteGrid(), 0.2
+    grid = SiteGrid()
     at = grid.column_frequency_hz[[5, 5, 5 + length, 5 + length]]
     row_hz, duration_s = np.full(4, grid.row_frequency_hz[5]), np.array([rest_s, moving_s, rest_s])
     offsets, level = np.arange(4, dtype=np.int32), np.full(3, 1 / 20)
@@ -171,22 +200,30 @@ def played_move(course: int, speed: float, length: int) -> tuple[Floats, Floats]
     )
     kinds = np.array([0, course, 0], np.int8)
     program = ToneProgram(rows, columns, duration_s, np.full(3, 2, np.int8), np.zeros(3, np.int32), kinds)
-    samples = render(program, RATE_HZ).samples
-    spans = [(RfSamples(1.0, RATE_HZ, one, full_v / 32767),) for one in samples]
-    pulse = RfPulse(1.0, spans[0][0].end_s, *spans, continued=False)
-    flight = RfTransport(grid, MotionSpec(rf=RfSpec(full_scale_v=full_v)), SimulationSettings())
-    found = list(flight.find_tones(pulse))
-    if len(found) != 1:
+    parts = find_light(program)
+    if len(parts) != 1:
         return None
-    (_, row_depth, place, depth), t_s = found[0]
-    inner = (t_s > 1.0 + 2 * REST_S) & (t_s < t_s[-1] - 3 * REST_S)
-    strongest = np.nan_to_num(depth[inner]).argmax(axis=1)
-    frames = np.arange(len(strongest))
-    sites = place[inner][frames, strongest]
-    light = np.nan_to_num(depth[inner][frames, strongest] * np.nan_to_num(row_depth[inner]).max(axis=1))
-    on = np.isfinite(sites)
-    sites = np.interp(frames, frames[on], sites[on])
-    return sites - sites[0], light
+    sites, light, t_s = parts[0]
+    inner = (t_s > 2 * REST_S) & (t_s < t_s[-1] - 3 * REST_S)
+    return sites[inner] - sites[inner][0], light[inner]
+
+
+@lru_cache(maxsize=512)
+def played_batch(
+    speed: float, length: int, pick_up_s: float, drop_off_s: float
+) -> tuple[Floats, Floats] | None:
+    """Position and depth of a tweezer that is ramped up, moves at once, and is ramped down at once.
+
+    They are as in :func:`played_move`.
+    """
+    motion = MotionSpec(speed_m_s=speed, pick_up_s=pick_up_s, drop_off_s=drop_off_s)
+    program = tone_program(Plan.from_batches([([(5, 5)], [(5, 5 + length)])]), SiteGrid(), motion)
+    parts = find_light(program)
+    if not parts:
+        return None
+    rest = round(REST_S / (TRANSIT_S / HOPS))
+    sites, light = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    return np.pad(sites - 5, rest, mode="edge"), np.pad(light, rest)
 
 
 def transport(
@@ -213,6 +250,59 @@ def transport(
         follow_in_row(state, static, mobile, sites * at.spacing, at.spacing, at.beams, frame_s, steps, 0.0)
         after.append(_both(state, length * at.spacing, ratio, at))
     return outcome(np.concatenate(before), np.concatenate(after), whole, 1.0)
+
+
+@lru_cache(maxsize=4)
+def sudden(
+    ramps_s: tuple[float, float], speed: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """An atom is carried over several sites, with ramps directly before and after the move."""
+    from labseq_virtual.flight_kernels import follow_in_row
+
+    before, after = list[Floats](), list[Floats]()
+    frame_s = TRANSIT_S / HOPS
+    for length in LENGTHS:
+        batch = played_batch(speed, length, *ramps_s)
+        if batch is None:
+            return 1.0, np.nan
+        sites, light = batch
+        state = draw(at.depth, temperature, at, length, is_mobile=False)[: N_ATOMS // len(LENGTHS)]
+        before.append(energy_k(state, at.depth, 0.0, at, is_mobile=False))
+        static, mobile = np.full(len(sites), KELVIN * at.depth), KELVIN * ratio * at.depth * light
+        steps = round(frame_s / STEP_S)
+        follow_in_row(state, static, mobile, sites * at.spacing, at.spacing, at.beams, frame_s, steps, 0.0)
+        after.append(energy_k(state, at.depth, length * at.spacing, at, is_mobile=False))
+    return outcome(np.concatenate(before), np.concatenate(after), at.depth, 1.0)
+
+
+@lru_cache(maxsize=512)
+def _centred(
+    stage: Any, ramp_s: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    return stage(ramp_s, 0.0, ratio, temperature, at)
+
+
+def at_once(
+    is_stop: bool, ramp_s: float, speed: float, ratio: float, temperature: float, at: Reference
+) -> tuple[float, float]:
+    """What a ramp does to a start that follows at once, or to a stop, beyond what both do on their own.
+
+    That is what a batch with this ramp does compared with one whose ramp is as long as the sound takes across
+    the beam, less the difference of both ramps on their own. The ramp at the other end is a slow one.
+    """
+    longest_s = START_RAMPS_S[-1]
+    if speed == 0.0 or ramp_s == longest_s:
+        return 0.0, 1.0
+    kept, warmer = list[float](), list[float]()
+    for each_s in (ramp_s, longest_s):
+        ramps_s = (SLOW_S, each_s) if is_stop else (each_s, SLOW_S)
+        joint = sudden(ramps_s, speed, ratio, temperature, at)
+        alone = _centred(drop_off if is_stop else pick_up, each_s, ratio, temperature, at)
+        kept.append((1 - joint[0]) / max(1 - alone[0], 1e-9))
+        warmer.append(joint[1] / alone[1])
+    if kept[1] < LEAST_KEPT:  # nothing is left to compare
+        return 0.0, 1.0
+    return float(np.clip(1 - kept[0] / kept[1], 0.0, 1.0)), warmer[0] / warmer[1]
 
 
 def landing(
@@ -269,6 +359,8 @@ STAGES: Final[dict[str, Any]] = {
     "transport": transport,
     "landing": landing,
     "passing": passing,
+    "start": partial(at_once, False),
+    "stop": partial(at_once, True),
     "lowering": lowering,
 }
 
@@ -277,24 +369,26 @@ def _point(name: str, values: tuple[float, ...]) -> tuple[float, float]:
     return STAGES[name](*values, REFERENCE)
 
 
-def make_tables(names: Iterable[str], processes: int = 2) -> dict[str, NDArray[np.float32]]:
-    """Simulate all points: name -> float32 (2, ...), loss and ratio of temperatures on the axes."""
-    made: dict[str, NDArray[np.float32]] = {}
+def make_table(name: str, processes: int = 2) -> NDArray[np.float32]:
+    """Simulate all points of a table: float32 (2, ...), loss and ratio of temperatures on its axes."""
+    axes = AXES[name][::-1]
+    points = [point[::-1] for point in product(*axes)]  # neighbours share what a process keeps
     with ProcessPoolExecutor(processes) as pool:
-        for name in names:
-            start_s = time.monotonic()
-            axes = AXES[name]
-            points = list(product(*axes))
-            found = np.array(list(pool.map(partial(_point, name), points, chunksize=90)))
-            table = found.T.reshape(2, *map(len, axes))
-            table[1] = np.where(np.isfinite(table[1]), table[1], 1.0)
-            made[name] = table.astype(np.float32)
-            sys.stdout.write(f"{name}: {len(points)} points in {time.monotonic() - start_s:.0f} s\n")
-    return made
+        found = np.array(list(pool.map(partial(_point, name), points, chunksize=30)))
+    table = found.reshape(*map(len, axes), 2).T
+    table[1] = np.where(np.isfinite(table[1]), table[1], 1.0)
+    return table.astype(np.float32)
+
+
+def main(names: Sequence[str]) -> None:
+    """Make tables, by default all, and keep each as soon as it is done."""
+    for name in names or STAGES:
+        start_s = time.monotonic()
+        kept: dict[str, Any] = dict(np.load(TABLES)) if TABLES.exists() else {}
+        np.savez_compressed(TABLES, **(kept | {name: make_table(name)}))  # pyright: ignore[reportArgumentType]
+        sys.stdout.write(f"{name} in {time.monotonic() - start_s:.0f} s\n")
+    sys.stdout.write(f"{TABLES}: {TABLES.stat().st_size} bytes\n")
 
 
 if __name__ == "__main__":
-    wanted = sys.argv[1:] or list(STAGES)
-    kept = dict(np.load(TABLES)) if TABLES.exists() else {}
-    np.savez_compressed(TABLES, **(kept | make_tables(wanted)))  # pyright: ignore[reportArgumentType]
-    sys.stdout.write(f"{TABLES}: {TABLES.stat().st_size} bytes\n")
+    main(sys.argv[1:])

@@ -61,7 +61,7 @@ class Reference:
 
 REFERENCE: Final = Reference()
 
-RAMPS_S: Final = (0.0, 10e-6, 20e-6, 40e-6, 80e-6, 160e-6)
+RAMPS_S: Final = (0.0, 10e-6, 20e-6, 40e-6, 60e-6, 80e-6, 160e-6)
 AWAY: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.6, 2.3)
 RATIOS: Final = (1.0, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 7.0, 12.0, 25.0)
 TEMPERATURES: Final = (5e-6, 10e-6, 15e-6, 20e-6, 27e-6, 36e-6, 50e-6, 75e-6, 120e-6)
@@ -69,6 +69,8 @@ SPEEDS: Final = (
     0.02, 0.06, 0.1, 0.115, 0.13, 0.145, 0.16, 0.18, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3, 0.32, 0.34, 0.37, 0.4,
     0.45, 0.5, 0.6, 0.8, 1.1, 3.0,
 )  # fmt: skip
+START_RAMPS_S: Final = (0.0, 2e-6, 5e-6, 10e-6)
+START_SPEEDS: Final = (0.0, 0.13, 0.17, 0.21, 0.25, 0.3, 0.35)
 LANDING_SPEEDS: Final = (0.013, 0.13, 0.26)
 PASSING_SPEEDS: Final = (0.03, 0.13, 0.4)
 BESIDE: Final = (1.2, 1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.7, 3.1)
@@ -81,12 +83,15 @@ AXES: Final[dict[str, tuple[tuple[float, ...], ...]]] = {
     "transport": ((0, 1, 2), SPEEDS, RATIOS, TEMPERATURES),
     "landing": (LANDING_SPEEDS, RAMPS_S, RATIOS, TEMPERATURES),
     "passing": (PASSING_SPEEDS, BESIDE, RATIOS, TEMPERATURES),
+    "start": (START_RAMPS_S, START_SPEEDS, RATIOS, TEMPERATURES),
+    "stop": (START_RAMPS_S, START_SPEEDS, RATIOS, TEMPERATURES),
     "lowering": (FRACTIONS, DURATIONS_S, TEMPERATURES),
 }
 """Axes of each table: duration of a ramp (s), distance from the site (waists), mobile over static depth,
 temperature (K); course of the motion (:class:`labseq.model.FrequencyCourse`), mean speed (m/s; of a curved
 course over four sites); speed of an empty tweezer that lands on an atom, and its ramp; speed of one that
-passes an atom, and its nearest distance (waists); depth after the ramp over that before."""
+passes an atom, and its nearest distance (waists); duration of a ramp directly before a start or after a stop,
+and the speed of that move; depth after the ramp over that before."""
 
 
 def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
@@ -101,6 +106,7 @@ def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
         ("simulation.mobile_light.depth", light.depth, RATIOS, static, "temperature"),
         ("simulation.temperature", settings.temperature, TEMPERATURES, static / DEPTH_K, "temperature"),
         ("simulation.mobile_light.waist", light.waist, (0.97, 1.03), settings.static_waist, "length"),
+        ("simulation.mobile_light.transit_time", light.transit_time, (0.8, 1.25), TRANSIT_S, "time"),
     ]
     texts: list[str] = []
     for name, value, axis, unit, dimension in ranges:
@@ -114,15 +120,11 @@ def beyond(motion: MotionSpec, settings: SimulationSettings) -> list[str]:
         came, last = (format_quantity(each, "speed") for each in (motion.speed_m_s, clear_m_s))
         what = f"profile.mobile_tweezers.speed is {came}; above {last} the sound's chirp blurs the tweezers"
         texts.append(f"{what}: that more atoms are lost is right, how many is not to be trusted")
-    elif motion.speed_m_s > REFERENCE_SPEED_M_S and motion.pick_up_s < light.transit_time:
-        ramp, sound = (format_quantity(each, "time") for each in (motion.pick_up_s, light.transit_time))
-        what = f"profile.mobile_tweezers.pick_up is {ramp}; the sound takes {sound} across the beam"
-        texts.append(
-            f"{what}: a start that follows so soon at more than 130 um/ms loses more atoms than here"
-        )
     return texts
 
 
+MOVE_TABLES: Final = ("pick_up", "drop_off", "transport", "landing", "passing", "start", "stop")
+"""Tables of a move, in the order in which the kernels take them."""
 LEAST_LOSS: Final = 1e-6
 """Loss by passing that counts as none."""
 
@@ -137,7 +139,7 @@ def tables() -> dict[str, Floats]:
 @cache
 def move_tables() -> Floats:
     """The tables of a move as the kernels take them, float64 (n,); of passing the logarithm of the loss."""
-    moves = {name: tables()[name] for name in ("pick_up", "drop_off", "transport", "landing", "passing")}
+    moves = {name: tables()[name] for name in MOVE_TABLES}
     passing = moves["passing"].copy()
     passing[0] = np.log(np.maximum(passing[0], LEAST_LOSS))  # falls by decades from distance to distance
     flat = np.concatenate([one.ravel() for one in (moves | {"passing": passing}).values()])

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, helper_kernel, kernel
+from labseq.plugin import FrequencyCourse, const, helper_kernel, kernel
 from labseq_virtual.handover import (
     ADIABATIC_DEPTH,
     AT_REST,
@@ -48,7 +48,7 @@ from labseq_virtual.handover import (
     TOLERANCE,
     TRANSPORT_LOSS,
 )
-from labseq_virtual.response_kernels import carry, hand_over, land_on, pass_by, relaxed
+from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by, relaxed
 from labseq_virtual.responses import BESIDE, REFERENCE_SPEED_M_S
 from labseq_virtual.transport import COLLISION, EJECTED, FASTEST, HAND_OVER, PROGRAM, TRANSPORT
 
@@ -72,13 +72,18 @@ TABLE, VECTOR = const("float64", 2), const("float64", 1)
     DOWN,
     RIGHT,
     SPEED,
-) = range(12)
+    STOP_SPEED,
+    LEG_HEAT,
+    REST_S,
+) = range(15)
 """Columns of a course: the probability that the atom fell out because the tweezer was too shallow; the
 greatest depth in kelvin; the durations of the ramps at start and end; depth and distance of the site that it
 came from; its temperature, as it would be in a static tweezer of nominal depth; the probability that it was
 lost so far; whether the pick-up is contained in both; the velocity, in sites per second; the speed of the
-last motion, in m/s."""
-N_COURSE = 12
+last motion, in m/s, and the same if it stopped at once, else 0; the temperature at its start; the time at
+rest since the last ramp up or motion."""
+N_COURSE = 15
+LINEAR = int(FrequencyCourse.LINEAR)
 NEW_LEG = 0.8
 """Change of the velocity, relative to the greater one, from which on a tweezer has started again; smaller
 ones are the bends of a curve, each with less than a third of the energy of a start and a stop."""
@@ -281,6 +286,13 @@ def shallow(mobile: float, speed_m_s: float, n_further: int, constants: Floats) 
     return float(constants[SHALLOW_LOSS] * part)
 
 
+@helper_kernel("void(float64[::1], float64, float64)")
+def affect(course: Floats, loss: float, warmer: float) -> None:
+    """Add a loss, and a ratio of temperatures, to the course of a crossing."""
+    course[LOST] = 1.0 - (1.0 - course[LOST]) * (1.0 - loss)
+    course[HEAT] *= warmer
+
+
 @helper_kernel(f"void(float64[::1], {VECTOR}, {VECTOR})")
 def settle(course: Floats, constants: Floats, tables: Floats) -> None:
     """Add the pick-up to the course of a crossing that holds an atom, unless it is contained."""
@@ -290,8 +302,7 @@ def settle(course: Floats, constants: Floats, tables: Floats) -> None:
     loss, warmer = hand_over(
         0, course[SITE_DEPTH], course[PEAK], course[AWAY], course[RISE_S], course[HEAT], constants, tables
     )
-    course[LOST] = 1.0 - (1.0 - course[LOST]) * (1.0 - loss)
-    course[HEAT] *= warmer
+    affect(course, loss, warmer)
 
 
 @helper_kernel(
@@ -330,9 +341,10 @@ def advance(
     """
     duration_s = max(duration_s, INSTANT_S)
     course[PEAK] = max(course[PEAK], depth)
-    if start < RAMP * end:
+    rises, falls = start < RAMP * end, end < RAMP * start
+    if rises:
         course[RISE_S] += duration_s
-    course[FALL_S] = course[FALL_S] + duration_s if end < RAMP * start else 0.0
+    course[FALL_S] = course[FALL_S] + duration_s if falls else 0.0
     ratio = depth / constants[STATIC_DEPTH]
     course[HEAT] *= math.exp(min(duration_s * constants[NOISE_HZ] * ratio, 20.0))
     down_hz, right_hz = down / duration_s, right / duration_s
@@ -341,15 +353,24 @@ def advance(
     course[DOWN], course[RIGHT] = down_hz, right_hz
     length_m = math.hypot(down, right) * constants[SPACING]
     if length_m == 0.0:
+        if not falls:
+            course[REST_S] = 0.0 if rises else course[REST_S] + duration_s
         return
     course[SPEED] = length_m / duration_s
+    course[STOP_SPEED] = course[SPEED] if kind == LINEAR else 0.0
     risk = shallow(depth, length_m / duration_s * FASTEST[kind], n_further, constants)
     course[RISK] = max(course[RISK], risk)
     if is_held and starts:
+        is_first = course[IS_PICKED] == 0.0
         settle(course, constants, tables)
-        loss, warmer = carry(kind, length_m / duration_s, length_m, depth, course[HEAT], constants, tables)
-        course[LOST] = 1.0 - (1.0 - course[LOST]) * (1.0 - loss)
-        course[HEAT] *= warmer
+        heat = course[LEG_HEAT] = course[HEAT]
+        loss, warmer = carry(kind, course[SPEED], length_m, depth, heat, constants, tables)
+        affect(course, loss, warmer)
+        if is_first and course[STOP_SPEED] > 0.0:
+            ramp_s = course[RISE_S] + course[REST_S]
+            loss, warmer = at_once(0, depth, course[SPEED], ramp_s, heat, constants, tables)
+            affect(course, loss, warmer)
+    course[REST_S] = 0.0
 
 
 @helper_kernel(f"UniTuple(float64, 4)(float64, float64[::1], float64, int64, float64, {VECTOR}, {VECTOR})")
@@ -377,6 +398,12 @@ def risks(
         The probabilities of losing it to heat, to pick-up and drop-off, and in motion; and its temperature.
     """
     settle(course, constants, tables)
+    if course[STOP_SPEED] > 0.0:
+        ramp_s = course[REST_S] + course[FALL_S]
+        loss, warmer = at_once(
+            1, course[PEAK], course[STOP_SPEED], ramp_s, course[LEG_HEAT], constants, tables
+        )
+        affect(course, loss, warmer)
     ratio = math.inf if course[PEAK] > 0.0 else 0.0
     if static > 0.0:
         ratio = course[PEAK] / static

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labseq_virtual.flight import KELVIN, draw_atoms
 
 import labseq
-from labseq.analysis.fits import MODELS, Fit, fit_points
+from labseq.analysis.fits import MODELS, RB87_U, Fit, fit_points
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
 from labseq.errors import ConfigError
@@ -117,6 +118,25 @@ def test_release_and_recapture_gives_the_temperature_of_the_profile(recapture: l
     temperature = fit.values["temperature"]
     assert abs(temperature.value - 15e-6) < 2.5 * temperature.error < 2e-6
     assert 0.2 < fit.chi2 < 3
+
+
+@pytest.mark.parametrize(("temperature", "tolerance"), [(10e-6, 0.012), (60e-6, 0.015)])
+def test_the_model_of_release_and_recapture_is_the_simulation_s_also_for_hot_atoms(
+    temperature: float, tolerance: float
+) -> None:
+    waist, wavelength, depth, n = 0.98e-6, 808e-9, 300e-6, 20_000
+    rayleigh = np.pi * waist**2 / wavelength
+    depths = np.full(n, KELVIN * depth)
+    atoms = draw_atoms(depths, KELVIN * temperature, waist, rayleigh, np.random.default_rng(1))
+    t_s = np.array([5e-6, 15e-6, 40e-6])
+    kept: list[float] = []
+    for t in t_s:
+        x, y, z = (atoms[:, :3] + t * atoms[:, 3:]).T
+        width = 1 + (z / rayleigh) ** 2
+        trap = KELVIN * depth / width * np.exp(-2 * (x**2 + y**2) / (waist**2 * width))
+        kept.append(float(((atoms[:, 3:] ** 2).sum(axis=1) / 2 < trap).mean()))
+    model = MODELS["release_recapture"].evaluate(t_s, temperature, 1.0, depth, waist, wavelength, RB87_U)
+    assert model == pytest.approx(kept, abs=tolerance)
 
 
 def test_the_commands_show_write_and_draw_the_same_points(

@@ -22,8 +22,7 @@ PAPER = SimulationSettings()
             ["profile.mobile_tweezers.speed is 150 um/ms; above 144 um/ms"],
         ),
         (MotionSpec(speed_m_s=4.0), ["speed is 4000 um/ms; the virtual lab knows heat and loss from 0 "]),
-        (MotionSpec(speed_m_s=0.25, pick_up_s=2e-6), ["pick_up is 2 us; the sound takes 10 us across"]),
-        (MotionSpec(pick_up_s=2e-6), []),
+        (MotionSpec(speed_m_s=0.25, pick_up_s=2e-6), []),
         (MotionSpec(drop_off_s=1e-3), ["drop_off is 1 ms; the virtual lab knows"]),
     ],
 )
@@ -36,3 +35,9 @@ def test_moves_beyond_what_the_tables_were_derived_for(motion: MotionSpec, texts
 def test_a_deeper_static_tweezer_bears_more_speed() -> None:
     deep = PAPER.model_copy(update={"static_depth": 4 * PAPER.static_depth})
     assert not [text for text in beyond(MotionSpec(speed_m_s=0.4), deep) if "speed" in text]
+
+
+def test_the_sound_of_the_tables_takes_ten_microseconds() -> None:
+    light = PAPER.mobile_light.model_copy(update={"transit_time": 6e-6})
+    (text,) = beyond(MotionSpec(), PAPER.model_copy(update={"mobile_light": light}))
+    assert "mobile_light.transit_time is 6 us; the virtual lab knows heat and loss from 8 us to 12" in text

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import event, given, settings, strategies as st
-from labseq_virtual import transport_kernels as kernels
+from labseq_virtual import response_tables, transport_kernels as kernels
 from labseq_virtual.handover import (
     AT_REST,
     END,
@@ -25,7 +26,7 @@ from labseq_virtual.handover import (
     merging_distance,
     pair_survival,
 )
-from labseq_virtual.response_kernels import carry, hand_over, land_on, pass_by
+from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by
 from labseq_virtual.response_tables import drop_off, landing, passing, pick_up, transport
 from labseq_virtual.responses import REFERENCE, move_tables
 from labseq_virtual.settings import SimulationSettings
@@ -444,7 +445,7 @@ def test_a_static_tweezer_that_is_off_holds_nothing_back() -> None:
     assert risks(course_of(), static=0.0)[0] == 1.0
 
 
-PICK_UP, DROP_OFF, TRANSPORT, LANDING, PASSING = range(5)
+PICK_UP, DROP_OFF, TRANSPORT, LANDING, PASSING, STARTING, STOPPING = range(7)
 BETWEEN = [
     (PICK_UP, (30e-6, 0.7, 6.0, 17e-6)),
     (PICK_UP, (6e-6, 1.1, 9.0, 23e-6)),
@@ -458,13 +459,16 @@ BETWEEN = [
     (LANDING, (0.2, 40e-6, 3.0, 23e-6)),
     (PASSING, (0.13, 1.65, 6.5, 33e-6)),
     (PASSING, (0.2, 1.5, 3.5, 28e-6)),
+    (STARTING, (2e-6, 0.25, 4.0, 17e-6)),
+    (STOPPING, (4e-6, 0.27, 4.5, 20e-6)),
 ]
 """Arguments of the simulated stages, between the points of the tables."""
 
 
 @pytest.mark.parametrize(("stage", "args"), BETWEEN)
 def test_between_the_points_of_the_tables_atoms_fare_as_newtons_equations_say(stage: int, args: Any) -> None:
-    stages: tuple[Any, ...] = pick_up, drop_off, transport, landing, passing
+    sudden = (partial(response_tables.at_once, is_stop) for is_stop in (False, True))
+    stages: tuple[Any, ...] = pick_up, drop_off, transport, landing, passing, *sudden
     lost, warmer = stages[stage](*args, REFERENCE)
     first, other, ratio, heat = args
     physics, depth_k, tables = constants_of(static_waist=WAIST_M), 300e-6, move_tables()
@@ -476,10 +480,13 @@ def test_between_the_points_of_the_tables_atoms_fare_as_newtons_equations_say(st
     elif stage == PASSING:
         found = pass_by(depth_k, mobile_k, first, other * WAIST_M, heat, physics, tables)
         assert 0.01 < found[0] < 2 * lost < 4 * found[0]
+    elif stage in (STARTING, STOPPING):
+        found = at_once(stage - STARTING, mobile_k, other, first, heat, physics, tables)
+        assert lost > 0.15
     else:
         found = hand_over(stage, depth_k, mobile_k, other * WAIST_M, first, heat, physics, tables)
         assert found[1] == pytest.approx(warmer, rel=0.25)
-    assert found[0] == pytest.approx(lost, abs=0.2 if stage == TRANSPORT else 0.08)
+    assert found[0] == pytest.approx(lost, abs=0.2 if stage in (TRANSPORT, STARTING, STOPPING) else 0.08)
 
 
 @pytest.mark.parametrize(
@@ -506,6 +513,23 @@ def test_the_move_of_the_paper_loses_nothing_to_heat_and_faster_ones_do() -> Non
     assert losses[1] < 0.02
     assert 0.02 < losses[2] < 0.95
     assert losses[3] == pytest.approx(1.0)
+
+
+def lost_on_the_way(kind: int = 0, fall_s: float = 60e-6, **before: float) -> float:
+    """Fraction of atoms lost in a move at 250 um/ms, with what was before it and a ramp after it."""
+    course = course_of(**before)
+    args = 1.0, 1.0, 2.1e-3, 0.0, 5.0, 5 * 4.49e-3 / 250.0, kind, 5, constants_of(), move_tables()
+    kernels.advance(course, True, *args)
+    course[kernels.FALL_S] = fall_s
+    return risks(course)[0]
+
+
+def test_short_ramps_directly_before_a_start_or_after_a_stop_cost_atoms() -> None:
+    assert lost_on_the_way() < 0.05
+    assert lost_on_the_way(RISE_S=1e-6) > 0.3
+    assert lost_on_the_way(RISE_S=1e-6, REST_S=20e-6) < 0.05
+    assert lost_on_the_way(fall_s=1e-6) > 0.2
+    assert lost_on_the_way(kind=1, fall_s=1e-6, RISE_S=1e-6) < 0.05
 
 
 @pytest.mark.parametrize("loading", [0.5, 0.75, 0.9])

@@ -34,8 +34,8 @@ IMAGE_HZ = -math.log1p(-0.00314) / 45e-3 + 1 / 33
         ),  # the law is a simple one
         ("transport_speed", "analysis.survival.survival", "step", "centre", 0.35, 0.03),
         ("parking", SURVIVAL, "plateau", "centre", 0.0, 0.01e-6),
-        # the same fit to the losses in the tables of pick-up and drop-off, 0.9 um beside a site, at 15 uK
-        ("hand_over_ramp", SURVIVAL, "exponential", "decay", 32.5e-6, 2e-6),
+        # the same fit to flights (response_tables.pick_up and drop_off) 0.9 um beside a site, at 15 uK
+        ("hand_over_ramp", SURVIVAL, "gaussian", "sigma", 24.2e-6, 1e-6),
     ],
 )
 def test_the_fitted_value_is_that_of_the_simulation(
@@ -44,7 +44,7 @@ def test_the_fitted_value_is_that_of_the_simulation(
     sequence = ROOT / "sequences" / f"{name}.yaml"
     with labseq.Session.open(sequence, seed=3, output=tmp_path, overrides=["repeats=2"]) as session:
         run = session.run()
-    given = ("offset=free",) if name == "hand_over_ramp" else ()
+    given = ("centre=0",) if name == "hand_over_ramp" else ()
     (found,) = scan_report(run, ScanRequest((quantity,), fit=fit, fit_settings=given)).fits
     value: Estimate = found.values[parameter]
     assert abs(value.value - true) < 3 * value.error + tolerance
