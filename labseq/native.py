@@ -9,8 +9,10 @@ from __future__ import annotations
 import ctypes
 import importlib
 import math
+import os
 import sys
 import time
+import weakref
 from collections.abc import Callable
 from functools import cached_property, partial
 from inspect import Parameter, Signature
@@ -19,7 +21,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import helper_kernel
+from labseq.kernel import helper_kernel, kernel
 
 Ints = NDArray[np.int64]
 
@@ -157,3 +159,53 @@ def sleep_ns(timer: Ints, duration_ns: int) -> None:
     """Wait less than a second; on Windows it returns as soon as other threads had their turn."""
     timer[_PAUSE], timer[_PAUSE + 1] = 0, duration_ns
     call_c(timer[_SLEEP], timer[_PAUSE:].ctypes.data, 0, 0)
+
+
+_WAIT, _TAKE, _GIVE, _HANDLE, _SETS, _ROOM, _ENTRY, _BYTES = range(8)
+N_SIGNAL: Final = _BYTES + 1
+POLLIN: Final = 1
+
+
+class WakeSignal:
+    """What a kernel in one thread waits for, and another thread sets; it may be set before somebody waits.
+
+    Attributes:
+        words: For :func:`wait_signal` and :func:`set_signal`.
+    """
+
+    def __init__(self) -> None:
+        self.words = words = np.zeros(N_SIGNAL, np.int64)
+        if sys.platform == "win32":
+            library = ctypes.windll.kernel32
+            library.CreateEventW.restype = ctypes.c_void_p
+            event = library.CreateEventW(None, False, False, None)
+            words[_HANDLE] = words[_SETS] = event
+            functions = (_WAIT, library.WaitForSingleObject), (_GIVE, library.SetEvent)
+            weakref.finalize(self, library.CloseHandle, ctypes.c_void_p(event))
+        else:
+            library = ctypes.CDLL(None)
+            reads, writes = os.pipe()
+            for end in (reads, writes):
+                os.set_blocking(end, False)
+                weakref.finalize(self, os.close, end)
+            words[_HANDLE], words[_SETS] = reads, writes
+            functions = (_WAIT, library.poll), (_TAKE, library.read), (_GIVE, library.write)
+            words[_ENTRY:].view(np.int32)[0] = reads
+            words[_ENTRY:].view(np.int16)[2] = POLLIN
+        for at, function in functions:
+            words[at] = ctypes.cast(function, ctypes.c_void_p).value or 0
+
+
+@kernel("void(int64[::1])")
+def set_signal(words: Ints) -> None:
+    """Wake the thread that waits, or the next one that does; nothing happens if it is set very often."""
+    call_c(words[_GIVE], words[_SETS], words[_BYTES:].ctypes.data, 1)
+
+
+@helper_kernel("void(int64[::1], int64)")
+def wait_signal(words: Ints, most_ms: int) -> None:
+    """Wait until a signal is set, at most some milliseconds; its words are used by one thread at a time."""
+    if words[_TAKE] == 0:
+        call_c(words[_WAIT], words[_HANDLE], most_ms, 0)
+    elif call_c(words[_WAIT], words[_ENTRY:].ctypes.data, 1, most_ms) == 1:
+        call_c(words[_TAKE], words[_HANDLE], words[_ROOM:].ctypes.data, 8)

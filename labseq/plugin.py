@@ -102,7 +102,19 @@ from labseq.motion import (
     warm_rendering,
 )
 from labseq.motion.tones import site_time_s
-from labseq.native import call_c, carray, new_timer, now_ns, pointer, sleep_ns, swap
+from labseq.native import (
+    N_SIGNAL,
+    WakeSignal,
+    call_c,
+    carray,
+    new_timer,
+    now_ns,
+    pointer,
+    set_signal,
+    sleep_ns,
+    swap,
+    wait_signal,
+)
 from labseq.processes import Process
 from labseq.realtime import raise_priority
 from labseq.recording import Run, open_run
@@ -165,6 +177,7 @@ __all__ = [
     "BROKEN",
     "COMPUTER",
     "LABSEQ_API",
+    "N_SIGNAL",
     "UNITS",
     "WHOLE_SENSOR",
     "ZERO_CELSIUS_K",
@@ -274,6 +287,7 @@ __all__ = [
     "UnknownPluginError",
     "VisitedPoint",
     "Voltage",
+    "WakeSignal",
     "Waveform",
     "as_occupancy",
     "block",
@@ -325,6 +339,7 @@ __all__ = [
     "render_address",
     "scaled",
     "serial_emergency",
+    "set_signal",
     "setting_error",
     "settle",
     "site_time_s",
@@ -336,6 +351,7 @@ __all__ = [
     "unknown_name",
     "visible",
     "wait_for",
+    "wait_signal",
     "warm_rendering",
     "wire",
 ]

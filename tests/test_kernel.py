@@ -23,7 +23,18 @@ from numba.core import event
 import labseq
 import labseq.kernel
 from labseq.kernel import announcing, c_address, const, kernel, load_kernels
-from labseq.native import call_c, carray, new_timer, now_ns, pointer, sleep_ns, swap
+from labseq.native import (
+    WakeSignal,
+    call_c,
+    carray,
+    new_timer,
+    now_ns,
+    pointer,
+    set_signal,
+    sleep_ns,
+    swap,
+    wait_signal,
+)
 
 MAX_LACK = 3
 
@@ -435,3 +446,18 @@ def test_kernels_tell_the_time_and_sleep() -> None:
     took_ns, later_ns = now_ns(timer) - start_ns, time.perf_counter_ns() - start_ns
     assert 0 <= took_ns <= later_ns
     assert took_ns >= 2_000_000 or sys.platform == "win32"
+
+
+def test_a_signal_wakes_what_waits_for_it_or_will() -> None:
+    signal = WakeSignal()
+    start_s = time.perf_counter()
+    set_signal(signal.words)
+    wait_signal(signal.words, 30_000)
+    thread = threading.Thread(target=wait_signal, args=(signal.words, 30_000))
+    thread.start()
+    set_signal(signal.words)
+    thread.join()
+    assert time.perf_counter() - start_s < 20.0
+    start_s = time.perf_counter()
+    wait_signal(signal.words, 20)
+    assert time.perf_counter() - start_s > 10e-3
