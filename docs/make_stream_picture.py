@@ -14,8 +14,10 @@ from typing import Final
 import matplotlib.pyplot as plt
 import numpy as np
 from labseq_psca.planner import PscaPlanner, PscaSettings
+from labseq_spcm import stream_kernels as k
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
+from labseq_spcm.stream import Stream
 from labseq_spcm_sim import SimulatedCard, installed, registers
 from numpy.typing import NDArray
 
@@ -34,8 +36,9 @@ def record() -> tuple[NDArray[np.float64], list[float], list[float]]:
     """Play one rearrangement of 20 x 20 sites into a block of 15 x 15, its first batches first.
 
     Returns:
-        The time, and the playing time that waits in the computer and on the card, float64 (n, 3); the times
-        at which samples were handed over; those of ``play`` and ``append``, and of the end. All in seconds.
+        The time, and the playing time of the program that waits in the computer, and of what is on the card,
+        float64 (n, 3); the times at which samples were handed over; those of ``play`` and ``append``, and of
+        the end. All in seconds.
     """
     grid, clock = SiteGrid(), FakeClock()
     context = Context("mobile_tweezers", grid, clock=clock)
@@ -53,11 +56,16 @@ def record() -> tuple[NDArray[np.float64], list[float], list[float]]:
         tweezers = SpcmMobileTweezers(settings, context)
         tweezers.open()
         tweezers.settle()
+        # what it has written is known to it alone
+        stream = tweezers._mode  # noqa: SLF001 # pyright: ignore[reportPrivateUsage]
+        assert isinstance(stream, Stream)
+        box = stream._box  # noqa: SLF001 # pyright: ignore[reportPrivateUsage]
 
         def watch(duration_s: float) -> None:
             for _ in range(math.ceil(duration_s / STEP_S)):
-                waiting, on_card = card.levels
-                levels.append((clock.now(), waiting / BYTES_PER_S, on_card / BYTES_PER_S))
+                on_card = card.levels[1]
+                waiting = max(0, box[k.MADE] - box[k.FETCHED])
+                levels.append((clock.now(), waiting / RATE_HZ, on_card / BYTES_PER_S))
                 clock.sleep(STEP_S)
 
         clock.sleep(5e-3)
@@ -86,7 +94,11 @@ def draw(path: Path = PICTURE) -> None:
     times_ms, waiting_ms, on_card_ms = 1e3 * levels.T - [[1e3 * marks[0]], [0.0], [0.0]]
     colors = "#3b6ea5", "#a9c4de"
     above.stackplot(
-        times_ms, on_card_ms, waiting_ms, labels=("on the card", "in the computer"), colors=colors
+        times_ms,
+        on_card_ms,
+        waiting_ms,
+        labels=("on the card", "of the program, waiting"),
+        colors=colors,
     )
     above.set_yscale("symlog", linthresh=0.1)
     above.set(ylabel="ahead of the outputs (ms)", ylim=(0, 12))

@@ -503,6 +503,7 @@ class SpcmMobileTweezers(MobileTweezers):
         facts = dict(self._facts)
         if isinstance(self._mode, Stream):
             facts["silent_underruns"] = self._mode.n_underruns
+            facts["delayed_batches"] = self._mode.n_pauses
         return {"model": "Spectrum M4i.66xx", **self._settings.model_dump(mode="json"), **facts}
 
     def _opened(self) -> tuple[AwgCard, PlayMode]:

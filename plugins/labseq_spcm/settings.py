@@ -79,8 +79,8 @@ class SpcmSettings(Settings):
     )
     look_ahead: Annotated[Duration, Field(gt=0, le=10e-3)] | None = Field(
         default=None,
-        description="stream: how far ahead of the outputs silence is handed over, which is how long a "
-        "program takes to them; none: 0.25 ms, or more if the card's buffers hold more at this sample rate",
+        description="stream: how far ahead of the outputs a program begins, which is how long it takes to "
+        "them at most; none: 0.25 ms, or more if the card's buffers hold more at this sample rate",
     )
     notify_size: int = Field(
         default=1 << 16,

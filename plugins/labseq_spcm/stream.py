@@ -20,11 +20,13 @@ from labseq.plugin import (
     Renderer,
     ToneProgram,
     TransientError,
+    WakeSignal,
     format_quantity,
     n_cores,
     new_timer,
     raise_priority,
     render_address,
+    set_signal,
     tone_program,
 )
 from labseq_spcm import stream_kernels as k
@@ -33,8 +35,8 @@ from labseq_spcm.keep_warm import KeepWarm, tone_samples
 from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES, SAMPLE_STEP
 from labseq_spcm.settings import SpcmSettings
 
-FIRST: Final = 1 << 15
-"""Samples of a program that are rendered before it starts: 52 us at 625 MS/s, behind 0.24 ms of silence."""
+READY_SAMPLES: Final = 1 << 19
+"""Most samples that are rendered between ``prepare`` and ``start``: 0.8 ms at 625 MS/s."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 LOCK_RETRY_S: Final = 10e-6
@@ -44,14 +46,16 @@ HALT_S: Final = 0.1
 PLAYING_POLL_S: Final = 1e-3
 """Longest time between two looks at the ring while a program plays."""
 TRIES: Final = 5
-MOST_LOAD: Final = 1.0
-"""Largest part of the playing time that rendering may take on one core; two share it."""
+MOST_LOAD: Final = 0.9
+"""Largest part of the playing time that rendering may take, on all cores that share it."""
+SHARED: Final = 1.6
+"""How many times faster two cores are than one: each renders an axis, one interleaves both."""
 BUS_SAMPLES: Final = 1 << 22
 """Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
 
 
 def check_rendering(name: str, context: Context, sample_rate_hz: float, row_channel: int) -> None:
-    """Render programs with as many tones as the profile allows; of each part the fastest try counts.
+    """Render programs with as many tones as the profile allows, on one core; of each part the fastest counts.
 
     Raises:
         DeviceError: This computer renders more slowly than the card plays.
@@ -71,16 +75,17 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
     box, scratch, out = np.zeros(k.N_WORDS, np.int64), new_scratch(), np.zeros((n_samples, 2), np.int16)
     box[k.RENDER], box[k.SCRATCH] = render_address(), scratch.ctypes.data
     parts = range(0, n_samples, k.MOST_SAMPLES)
-    took_s = np.full(len(parts), np.inf)
+    took_s, made_hz = np.full(len(parts), np.inf), 0.0
     for _ in range(TRIES):
         for number, start in enumerate(parts):
             place, n_part = out[start:].ctypes.data, min(k.MOST_SAMPLES, n_samples - start)
             start_s = time.perf_counter()
             k.render_frames(box, program.words, start, place, n_part)
             took_s[number] = min(took_s[number], time.perf_counter() - start_s)
-        if took_s.sum() < MOST_LOAD * n_samples / sample_rate_hz:
+        made_hz = n_samples / took_s.sum() * (SHARED if n_cores() > 1 else 1.0)
+        if sample_rate_hz < MOST_LOAD * made_hz:
             return
-    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, n_samples / took_s.sum()))
+    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, made_hz))
     text = f"mode: stream at {wanted}, but this computer renders {n_tones} moving tones at {made}"
     hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: replay"
     raise DeviceError(name, f"{text}; {hint}")
@@ -93,12 +98,14 @@ class Program:
     Attributes:
         words: See :mod:`labseq_spcm.stream_kernels`.
         axes: Those of its renderer.
+        cuts: Samples where pieces end.
         renderer: It owns the memory of the axes.
         playing_s: Its length.
     """
 
     words: NDArray[np.int64]
     axes: NDArray[np.int64]
+    cuts: NDArray[np.int64]
     renderer: Renderer
     playing_s: float
 
@@ -116,7 +123,14 @@ def made_of(
     n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
     words[k.LENGTH], words[k.ROW_CHANNEL] = -(-n_samples // block) * block, row_channel
     words[k.AXES], words[k.N_AXIS] = axes.ctypes.data, axes.shape[1]
-    return Program(words, axes, renderer, n_samples / sample_rate_hz)
+    cuts = np.empty(len(renderer.first_sample), np.int64)
+    axis_tones = [
+        (axis.offsets, axis.start_amplitude, axis.end_amplitude) for axis in (program.row, program.column)
+    ]
+    n_cuts = k.find_cuts(renderer.first_sample, *axis_tones[0], *axis_tones[1], cuts)
+    cuts[n_cuts] = words[k.LENGTH]
+    words[k.CUTS], words[k.N_CUTS] = cuts.ctypes.data, n_cuts + 1
+    return Program(words, axes, cuts, renderer, n_samples / sample_rate_hz)
 
 
 def new_scratch() -> NDArray[np.int16]:
@@ -128,11 +142,13 @@ class Stream:
     """Keeps the card supplied from ``idle`` to ``halt``. See ``PlayMode``.
 
     Samples go into a ring in the computer, from there over the bus into the card's buffer and its
-    output FIFO, and from there to the outputs. While no program plays, silence is handed over one
-    look-ahead before it is played. A program follows the last silence that was handed over; it is
-    rendered faster than it is played, so the ring is soon full. A compiled loop does that in a thread
-    of its own, without Python's lock (:mod:`labseq_spcm.stream_kernels`); on a virtual clock the simulated
-    card calls its steps in its time. Python fills the card before its start, also after it ran dry.
+    output FIFO, and from there to the outputs. The whole ring is handed over at all times, silence where no
+    program plays, so that a computer which is held up costs nothing then. A program is written over the
+    silence that the card is about to fetch; it is rendered faster than it is played, so more and more of it
+    is ahead. A compiled loop does that in a thread of its own, without Python's lock
+    (:mod:`labseq_spcm.stream_kernels`), and sleeps for a quarter of the ring when there is nothing to do. On
+    a virtual clock the simulated card calls its steps in its time. Python fills the card before its start,
+    also after it ran dry.
 
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
@@ -165,17 +181,20 @@ class Stream:
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
         self._ring.reshape(-1, block, 2)[:] = self._silence
-        self._first = np.zeros((max(FIRST, block), 2), np.int16)
+        self._ready = [Buffer().reserve(READY_SAMPLES) for _ in range(3)]
+        for frames in self._ready:
+            frames[:] = 0  # so that the memory is there
         self._scratch = new_scratch()
         self._workspaces: dict[tuple[int, int], Any] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
+        self._signals: tuple[WakeSignal, ...] = ()  # of the loop, and of its helper
         self._is_on = self._has_thread = False
         self._failure: LabseqError | None = None
         self._prepared: Program | None = None
-        self._queued = deque[Program](maxlen=k.N_QUEUE)
+        self._alive = deque[Program](maxlen=2 * k.N_QUEUE)  # the loop may still use earlier ones
         self._box = self._new_box()
-        self.n_underruns = 0
+        self.n_underruns = self._n_pauses = 0
         self._check_bus()
         self._set_mode(settings)
 
@@ -194,11 +213,11 @@ class Stream:
         return box
 
     def _check_bus(self) -> None:
-        """Time a transfer to the card's memory; the best of three counts."""
+        """Time transfers to the card's memory; the fastest counts."""
         card, spcm, frames = self._card, self._card.spcm, Buffer().reserve(BUS_SAMPLES)
         card.set(spcm.SPC_MEMSIZE, BUS_SAMPLES, "memory size")
         took_s, needed = math.inf, FRAME_BYTES * self._rate_hz
-        for _ in range(3):
+        for _ in range(2 * TRIES):
             start_s = card.clock.now()
             card.upload(frames, poll_s=20e-6)
             took_s = min(took_s, card.clock.now() - start_s)
@@ -223,15 +242,17 @@ class Stream:
             if self._is_on:
                 return
             is_silent = self._ring_is_silent()
-            self._box, self._queued = self._new_box(), deque(maxlen=k.N_QUEUE)
+            self._n_pauses = self.n_pauses
+            self._box, self._alive = self._new_box(), deque(maxlen=2 * k.N_QUEUE)
             self._begin(is_silent=is_silent)
             self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
-            arguments = self._box, self._stop, self._queued
-            threading.Thread(target=self._run, args=arguments, name="spcm stream", daemon=True).start()
-            if n_cores() > 1:
-                threading.Thread(target=self._help, args=arguments, name="spcm helper", daemon=True).start()
+            threads = [("spcm stream", self._run)] + [("spcm helper", self._help)] * (n_cores() > 1)
+            self._signals = tuple(WakeSignal() for _ in threads)
+            for (name, target), signal in zip(threads, self._signals, strict=True):
+                arguments = self._box, self._stop, signal, self._alive
+                threading.Thread(target=target, args=arguments, name=name, daemon=True).start()
 
     def halt(self) -> None:
         """End the supply and drop the programs; the card is stopped by the caller."""
@@ -240,24 +261,29 @@ class Stream:
         with self._lock:
             box, self._is_on, self._failure, self._prepared = self._box, False, None, None
             box[k.STOP] = 1
+            self._wake()
             until_s = time.perf_counter() + HALT_S
             while box[k.IS_FEEDING] and time.perf_counter() < until_s:
                 time.sleep(50e-6)
 
     def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
-        """Render the first samples of a program; returns its playing time in seconds."""
+        """Hand a program to the loop, which renders it until it starts; returns its playing time, s."""
         start_s = time.perf_counter()
-        made = self._made(program)
-        n_ready = min(len(self._first), int(made.words[k.LENGTH]))
-        k.render_frames(self._box, made.words, 0, self._first.ctypes.data, n_ready)
-        made.words[k.READY_MADE], made.words[k.N_READY] = self._first.ctypes.data, n_ready
-        self._prepared = made
+        made = self._prepared = self._made(program)
+        with self._lock:
+            self._box[k.PREPARED] = made.words.ctypes.data
+            self._wake()
         self.render_s = time.perf_counter() - start_s
         self._check_failure()
         return made.playing_s
 
     def _made(self, program: ToneProgram) -> Program:
-        return made_of(program, self._rate_hz, self._row_channel, self._block, self._workspaces)
+        made = made_of(program, self._rate_hz, self._row_channel, self._block, self._workspaces)
+        self._ready.append(self._ready.pop(0))
+        made.words[k.READY_MADE] = self._ready[-1].ctypes.data
+        made.words[k.ROOM] = len(self._ready[-1])
+        self._alive.append(made)
+        return made
 
     def start(self, command: int) -> None:  # noqa: ARG002 - the card runs already
         """Have the prepared program follow what was handed over."""
@@ -265,6 +291,7 @@ class Stream:
         with self._lock:
             program, self._prepared = self._prepared, None
             if program is not None:  # else another thread has made the card safe
+                self._box[k.LEAST] = len(self._ring)
                 self._queue(program)
 
     def append(self, program: ToneProgram) -> float:
@@ -277,9 +304,26 @@ class Stream:
 
     def _queue(self, program: Program) -> None:
         box, n = self._box, int(self._box[k.QUEUED])
-        self._queued.append(program)  # the loop may still use the ones before
         box[k.QUEUE + n % k.N_QUEUE] = program.words.ctypes.data
         box[k.QUEUED] = n + 1
+        self._wake()
+
+    def _wake(self) -> None:
+        """Let the loop look at once: on a virtual clock its step is due now."""
+        for signal in self._signals[:1]:
+            set_signal(signal.words)
+        if self._is_on and not self._has_thread:
+            self._card.library.call_in_virtual_time(self._virtual_step)
+
+    @property
+    def n_pauses(self) -> int:
+        """How many moves came later than planned, because the computer was too slow."""
+        return self._n_pauses + int(self._box[k.N_PAUSES])
+
+    @property
+    def least_ahead_s(self) -> float:
+        """How far ahead of the card the last program was written, where it was closest; below 0: too late."""
+        return float(self._box[k.LEAST]) / self._rate_hz
 
     def triggered(self) -> bool:
         """Whether the program has begun: the stream has no trigger."""
@@ -290,7 +334,7 @@ class Stream:
         self._check_failure()
         box = self._box
         is_taken = box[k.TAKEN] == box[k.QUEUED]
-        return bool(is_taken and box[k.FETCHED] >= box[k.END] + self._on_card)
+        return bool(is_taken and box[k.MADE] == box[k.END] <= box[k.FETCHED] - self._on_card)
 
     def _check_failure(self) -> None:
         """Let a virtual clock's steps be done, and raise the error that ended the stream."""
@@ -303,13 +347,17 @@ class Stream:
 
     # Both threads keep alive what their loops know the addresses of.
 
-    def _help(self, box: NDArray[np.int64], _stop: threading.Event, _programs: deque[Program]) -> None:
+    def _help(
+        self, box: NDArray[np.int64], _stop: threading.Event, signal: WakeSignal, _programs: deque[Program]
+    ) -> None:
         """The thread that renders one of the two axes; from now on it is reckoned with."""
         raise_priority(above=1)
-        box[k.HAS_HELPER] = 1
-        k.assist(box, new_timer())
+        box[k.HELPER] = signal.words.ctypes.data
+        k.assist(box, new_timer(), signal.words)
 
-    def _run(self, box: NDArray[np.int64], stop: threading.Event, _programs: deque[Program]) -> None:
+    def _run(
+        self, box: NDArray[np.int64], stop: threading.Event, signal: WakeSignal, _programs: deque[Program]
+    ) -> None:
         """The thread that supplies the card."""
         raise_priority(above=2)  # so that the card does not run dry because other threads are busy
         timer, rate_hz, code = new_timer(), int(self._rate_hz), 0
@@ -318,7 +366,7 @@ class Stream:
                 stop.wait(pause_s)
                 code = 0
             else:
-                code = k.feed(box, rate_hz, timer)
+                code = k.feed(box, rate_hz, timer, signal.words)
 
     def _virtual_step(self) -> float | None:
         """What the thread does, a step at a time."""
@@ -355,10 +403,11 @@ class Stream:
         """Fill the card with silence, which the ring has already or not; it is started when it has some."""
         card, spcm, box = self._card, self._card.spcm, self._box
         card.stop()
-        box[k.WRITTEN] = box[k.FETCHED] = box[k.START] = box[k.END] = 0
+        box[k.WRITTEN] = box[k.FETCHED] = box[k.START] = box[k.END] = box[k.MADE] = 0
+        box[k.PART] = box[k.RENDERED_AT] = -1
         box[k.SILENT_FROM] = 0 if is_silent else len(self._ring)
         card.define_transfer(self._ring, self._block * FRAME_BYTES)
-        if k.supply_silence(box, self._ahead + self._on_card):
+        if k.supply_silence(box, len(self._ring)):
             raise self._error()
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
         box[k.IS_FILLING] = 1
@@ -368,7 +417,7 @@ class Stream:
         return DeviceError(self._card.name, f"supplying the card: {self._card.clear_error()}")
 
     def _recover(self, code: int) -> None:
-        """The card has run dry, or was stopped: begin again, with the program if it cannot have begun.
+        """The card ran dry, or was too fast: begin again, with the program if it cannot have begun.
 
         Raises:
             TransientError: In the middle of a program.
@@ -377,17 +426,23 @@ class Stream:
         box = self._box
         if code == k.FAILED:
             error = self._error()
-            if self._card.running:
+            if self._card.running or box[k.IS_FILLING]:
                 raise error
             if k.look(box) == k.FAILED:
                 raise self._error()
         start, end, fetched = (int(box[word]) for word in (k.START, k.END, k.FETCHED))
         # only whole blocks are reported as fetched: a part of the first one may have been played
-        may_have_begun = start <= fetched and start < box[k.WRITTEN]
-        if may_have_begun and fetched < end:
-            share = f"{(fetched - start) / (end - start):.0%} of the program was played"
-            text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
-            raise TransientError(f"{text} the mode replay", self._card.name)
+        may_have_begun = start <= fetched and start < box[k.MADE]
+        if code == k.LATE or (may_have_begun and fetched < end):
+            played = max(0, min(fetched, int(box[k.MADE])) - start) / (end - start)
+            share = f"{played:.0%} of the program was played"
+            was_full = box[k.MADE] - start >= len(self._ring) - self._ahead
+            remedy = (
+                f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode replay"
+            )
+            raise TransientError(
+                f"underrun: the card ran out of samples ({share}); {remedy}", self._card.name
+            )
         self.n_underruns += 1
         if fetched < end:
             box[k.TAKEN] -= 1

@@ -1,8 +1,10 @@
 """The loop that keeps a running card supplied, compiled: it needs Python's lock at no time.
 
-It reads what the card has fetched, hands silence over while no program plays, and renders programs into the
-ring. The driver library's functions are called by their addresses. Python and the loop share one array,
-int64 (N_WORDS,), whose words one of the two writes and the other reads.
+The whole ring is handed over to the card at all times, silence where no program plays. A program is written
+over the silence that the card is about to fetch, piece by piece: between two pieces no tone is on, and a
+piece begins when all of it is rendered, or when so much is ahead of the card that it surely will be in time.
+The driver library's functions are called by their addresses. Python and the loop share one array, int64
+(N_WORDS,), whose words one of the two writes and the other reads.
 """
 
 from __future__ import annotations
@@ -12,11 +14,28 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import call_c, carray, helper_kernel, kernel, now_ns, pointer, sleep_ns, swap
+from labseq.plugin import (
+    N_SIGNAL,
+    call_c,
+    carray,
+    const,
+    helper_kernel,
+    kernel,
+    now_ns,
+    pointer,
+    set_signal,
+    sleep_ns,
+    swap,
+    wait_signal,
+)
 from labseq_spcm.kernels import interleave
 from labseq_spcm.limits import FRAME_BYTES
 
 Words = NDArray[np.int64]
+Shorts = NDArray[np.int32]
+Reals = NDArray[np.float64]
+
+TONES: Final = f"{const('int32', 1)}, {const('float64', 1)}, {const('float64', 1)}"
 
 COMMAND, STATUS, USER_LEN, CARD_LEN = 100, 110, 200, 202
 """M2CMD, M2STATUS, DATA_AVAIL_USER_LEN and DATA_AVAIL_CARD_LEN, as in the vendor's header files."""
@@ -25,46 +44,85 @@ READY: Final = 0x4
 
 (GET, SET, HANDLE, RENDER, RING, N_RING, BLOCK, ON_CARD, AHEAD, SILENCE, SCRATCH, VALUE) = range(12)
 """Set before the loop: the library's functions and the card's handle, :func:`labseq.plugin.render_address`,
-address and samples of the ring, samples of a block, on the card and ahead of it in silence; addresses of a
-block of silence, of room for 2 x CHUNK samples, and of the next word but one."""
+address and samples of the ring, samples of a block, on the card, and from what was fetched to where a program
+may begin; addresses of a block of silence, of room for 2 x CHUNK samples, and of the next word but one."""
 FOUND: Final = 12
 STOP, QUEUED, QUEUE = 13, 14, 15
 """Written by Python: end the loop, the number of programs so far, and the addresses of the last N_QUEUE."""
 N_QUEUE: Final = 4
-(TAKEN, WRITTEN, FETCHED, START, END, SILENT_FROM, ERROR, IS_FEEDING) = range(19, 27)
+PREPARED: Final = 19
+"""Written by Python: address of the program that will be queued next, 0 if there is none."""
+(TAKEN, WRITTEN, FETCHED, START, END, MADE, UNTIL, PART, LEAST, N_PAUSES, SILENT_FROM, ERROR) = range(20, 32)
 """Written by the loop: programs begun, samples handed over and fetched, where the last program starts and
-ends, from where on the ring holds silence again, error code of the library, and whether the loop runs."""
-(HAS_HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(27, 33)
-"""Whether :func:`assist` runs in another thread; a part of the column axis that waits to be rendered and one
-that was, and which: the arguments of RENDER."""
-(IS_FILLING, TO_START, START_COMMAND, N_QUICK) = range(33, 37)
-"""Whether the card is filled before its start, the samples that it must have fetched then, the M2CMD, and how
-many looks are still to follow one another quickly."""
-N_WORDS: Final = 37
+ends, up to where it is in the ring, how many samples of it may be written, from where on the last part of it
+has just been written (-1: none), the least distance of such a part from what the card may have fetched by
+then, how many pieces came later than planned, from where on the ring holds silence again, and the library's
+error code."""
+(IS_FEEDING, RENDERED_AT, SLOW) = range(32, 35)
+"""Likewise: whether the loop runs, what was fetched when a block was last rendered whose place was not known,
+and how much the card fetched meanwhile."""
+(HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(35, 41)
+"""Address of the signal for :func:`assist` in another thread, 0 if there is none; a part of the column axis
+that waits to be rendered and one that was, and which: the arguments of RENDER."""
+(IS_FILLING, TO_START, START_COMMAND) = range(41, 44)
+"""Whether the card is filled before its start, the samples that it must have fetched then, and the M2CMD."""
+N_WORDS: Final = 44
 
-LENGTH, ROW_CHANNEL, READY_MADE, N_READY, AXES, N_AXIS, BEGAN = range(7)
-"""Words of a program: samples in whole blocks, output of the row axis, address and number of the samples that
-were rendered beforehand, address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop
-writes where in the stream it begins."""
-N_PROGRAM: Final = 7
+LENGTH, ROW_CHANNEL, CUTS, N_CUTS, READY_MADE, ROOM, AXES, N_AXIS, BASE, N_READY, BEGAN = range(11)
+"""Words of a program: samples in whole blocks, output of the row axis, address and number of the samples
+where pieces end, address of and room for samples that are rendered before their place in the stream is known,
+address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop writes the first of those
+samples, their number, and where in the stream the program begins."""
+N_PROGRAM: Final = 11
 
+SURE: Final = 4
+"""A piece is surely in time if so many times its length is ahead."""
 CHUNK: Final = 1 << 15
 """Samples rendered at a time, few enough to stay in the processor's cache until they are interleaved."""
 MOST_SAMPLES: Final = 1 << 17
-"""Samples handed over at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
+"""Samples written at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
 FILLING_POLL_NS: Final = 20_000
-"""Time between two looks at a card that is filled before its start, and until its own FIFO is full."""
-QUICK_LOOKS: Final = 100
-"""After the start the bus fills the card's FIFO; at a tenth more than what is played that takes 1 ms."""
+"""Time between two looks at a card that is filled before its start."""
 POLL_NS: Final = 1_000_000
 """Longest time between two looks at the ring while a program plays."""
 SPIN_NS: Final = 50_000
 """How long the helping thread waits for the next part without sleeping."""
 HELP_POLL_NS: Final = 100_000
-"""Time between two looks for a part after that."""
+"""Time between two looks for a part, or for a program, where a signal would not come in time."""
+WAIT_MS: Final = 100
+"""Longest wait for a signal."""
 
-STOPPED, DRY, FAILED = -1, -2, -3
-"""The driver asked for the end; the card has stopped; the library reports an error."""
+STOPPED, DRY, FAILED, LATE = -1, -2, -3, -4
+"""The driver asked for the end; the card has stopped; the library reports an error; the card may have fetched
+samples before they were written."""
+
+
+@kernel(f"int64({const('int64', 1)}, {TONES}, {TONES}, int64[::1])")
+def find_cuts(
+    first_sample: Words,
+    row_offsets: Shorts, row_start: Reals, row_end: Reals,
+    column_offsets: Shorts, column_start: Reals, column_end: Reals,
+    cuts: Words,
+) -> int:  # fmt: skip
+    """Find the joints between segments at which no tone is on; returns their number.
+
+    The amplitudes are those of a program's axes; ``cuts`` are the first samples after these joints.
+    """
+    n = 0
+    for i in range(1, len(first_sample) - 1):
+        is_on = False
+        for at in range(row_offsets[i - 1], row_offsets[i]):
+            is_on |= row_end[at] > 0.0
+        for at in range(row_offsets[i], row_offsets[i + 1]):
+            is_on |= row_start[at] > 0.0
+        for at in range(column_offsets[i - 1], column_offsets[i]):
+            is_on |= column_end[at] > 0.0
+        for at in range(column_offsets[i], column_offsets[i + 1]):
+            is_on |= column_start[at] > 0.0
+        if not is_on:
+            cuts[n] = first_sample[i]
+            n += 1
+    return n
 
 
 @helper_kernel("int64(int64[::1], int64)")
@@ -104,7 +162,7 @@ def render_frames(box: Words, program: Words, start: int, out: int, n_samples: i
         carray(pointer(rows), 1, np.int64)[0] = carray(pointer(columns), 1, np.int64)[0] = n
         box[HELP_AXIS], box[HELP_START] = columns, start + done
         box[HELP_OUT] = box[SCRATCH] + 2 * CHUNK * (1 - program[ROW_CHANNEL])
-        is_shared = box[HAS_HELPER]
+        is_shared = box[HELPER] != 0
         swap(box[POSTED:].ctypes.data, is_shared)
         call_c(box[RENDER], rows, start + done, box[SCRATCH] + 2 * CHUNK * program[ROW_CHANNEL])
         if not is_shared or swap(box[POSTED:].ctypes.data, 0):  # the helper sleeps
@@ -117,8 +175,8 @@ def render_frames(box: Words, program: Words, start: int, out: int, n_samples: i
         interleave(first, second, carray(pointer(out + FRAME_BYTES * done), n, np.uint32))
 
 
-@kernel("void(int64[::1], int64[::1])")
-def assist(box: Words, timer: Words) -> None:
+@kernel("void(int64[::1], int64[::1], int64[::1])")
+def assist(box: Words, timer: Words, signal: Words) -> None:
     """Render the column axis of each part while :func:`feed` renders the row axis, until STOP is set."""
     last_ns = now_ns(timer)
     while box[STOP] == 0:
@@ -127,40 +185,50 @@ def assist(box: Words, timer: Words) -> None:
             swap(box[DONE:].ctypes.data, 1)
             last_ns = now_ns(timer)
         elif now_ns(timer) - last_ns > SPIN_NS:
-            sleep_ns(timer, HELP_POLL_NS)
+            if box[MADE] < box[END]:
+                sleep_ns(timer, HELP_POLL_NS)
+            else:
+                wait_signal(signal, WAIT_MS)
+                last_ns = now_ns(timer)
 
 
 @helper_kernel("int64(int64[::1], int64)")
 def supply_program(box: Words, room: int) -> int:
-    """Copy or render the next part of a program into the ring; returns 0 or FAILED.
+    """Copy or render the next part of a piece into the ring; returns 0 or FAILED.
 
-    A part is at most a quarter of what is ahead of the outputs, so that it is there long before its time.
+    A part is at most a quarter of what is ahead of the card, so that it is there long before its time. Only
+    whole blocks are handed over.
     """
     place = box[QUEUE + (box[TAKEN] - 1) % N_QUEUE]
     program = carray(pointer(place), N_PROGRAM, np.int64)
-    done, at = box[WRITTEN] - box[START], box[WRITTEN] % box[N_RING]
-    ahead = (box[N_RING] - room + box[ON_CARD]) // (4 * box[BLOCK]) * box[BLOCK]
-    n = min(room, box[END] - box[WRITTEN], box[N_RING] - at, max(box[BLOCK], min(MOST_SAMPLES, ahead)))
-    out = box[RING] + FRAME_BYTES * at
-    if done < program[N_READY]:
-        n = min(n, program[N_READY] - done)
-        copy(program[READY_MADE] + FRAME_BYTES * done, out, n)
+    done, at, block = box[MADE] - box[START], box[MADE] % box[N_RING], box[BLOCK]
+    most = max(block, min(MOST_SAMPLES, (box[MADE] - box[FETCHED]) // 4))
+    n = min(room, box[UNTIL] - done, box[N_RING] - at, most)
+    out, ready = box[RING] + FRAME_BYTES * at, program[BASE] + program[N_READY] - done
+    if ready > 0:
+        n = min(n, ready)
+        copy(program[READY_MADE] + FRAME_BYTES * (done - program[BASE]), out, n)
     else:
         render_frames(box, program, done, out, n)
-    box[SILENT_FROM] = box[END] + box[N_RING]
-    return hand_over(box, n)  # pyright: ignore[reportReturnType]
+    box[PART] = box[MADE]
+    box[MADE] += n
+    box[SILENT_FROM] = box[MADE] + box[N_RING]
+    more = (box[MADE] - box[WRITTEN]) // block * block
+    return hand_over(box, more) if more > 0 else 0  # pyright: ignore[reportReturnType]
 
 
 @kernel("int64(int64[::1], int64)")
 def supply_silence(box: Words, n_samples: int) -> int:
     """Hand over blocks of silence, at most so many samples; returns 0 or FAILED."""
-    n = min(box[N_RING], n_samples // box[BLOCK] * box[BLOCK])
+    block = box[BLOCK]
+    n = min(box[N_RING], n_samples // block * block)
     if n <= 0:
         return 0
     if box[WRITTEN] < box[SILENT_FROM]:
-        for done in range(0, n, box[BLOCK]):
+        for done in range(0, n, block):
             at = (box[WRITTEN] + done) % box[N_RING]
-            copy(box[SILENCE], box[RING] + FRAME_BYTES * at, box[BLOCK])
+            skip = min(block, max(0, box[MADE] - box[WRITTEN] - done))  # the end of a piece
+            copy(box[SILENCE] + FRAME_BYTES * skip, box[RING] + FRAME_BYTES * (at + skip), block - skip)
     return hand_over(box, n)  # pyright: ignore[reportReturnType]
 
 
@@ -185,50 +253,124 @@ def look(box: Words) -> int:
     return DRY if status & READY else in_ring  # pyright: ignore[reportReturnType]
 
 
+@helper_kernel("boolean(int64[::1], int64[::1], int64)")
+def render_ahead(box: Words, program: Words, until: int) -> bool:
+    """Render more samples whose place is not known yet, before a certain one; returns whether it did."""
+    done = program[BASE] + program[N_READY]
+    n = min(box[BLOCK], min(until, program[BASE] + program[ROOM]) - done)
+    if n <= 0:
+        return False
+    render_frames(box, program, done, program[READY_MADE] + FRAME_BYTES * program[N_READY], n)
+    program[N_READY] += n
+    box[RENDERED_AT] = box[FETCHED]
+    return True
+
+
+@helper_kernel("void(int64[::1])")
+def take_program(box: Words) -> None:
+    """Make the next program the present one; it begins where the last one ends, or as soon as it can."""
+    program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), N_PROGRAM, np.int64)
+    start = max(box[END], box[FETCHED] + box[AHEAD])
+    box[END] = start + program[LENGTH]
+    box[START] = box[MADE] = start
+    box[PREPARED] = box[UNTIL] = 0
+    swap(box[TAKEN:].ctypes.data, box[TAKEN] + 1)  # Python sees the rest before this
+    if box[HELPER]:
+        set_signal(carray(pointer(box[HELPER]), N_SIGNAL, np.int64))
+
+
+@helper_kernel("int64(int64[::1])")
+def begin_piece(box: Words) -> int:
+    """Render the next piece, as far as there is room for it, and then let it begin; returns 0 or FAILED.
+
+    If much is ahead of the card it begins at once. If its time has passed, silence is longer, and all that
+    follows comes later. A computer that has just been slow is given more time.
+    """
+    program = carray(pointer(box[QUEUE + (box[TAKEN] - 1) % N_QUEUE]), N_PROGRAM, np.int64)
+    cuts = carray(pointer(program[CUTS]), program[N_CUTS], np.int64)
+    done = box[MADE] - box[START]
+    until = cuts[np.searchsorted(cuts, done, side="right")]
+    if done >= program[BASE] + program[N_READY]:
+        program[BASE], program[N_READY] = done, 0
+    if box[MADE] - box[FETCHED] < box[AHEAD] + SURE * (until - done) and render_ahead(box, program, until):
+        is_low = 2 * (box[WRITTEN] - box[FETCHED]) < box[N_RING]
+        return supply_silence(box, MOST_SAMPLES) if is_low else 0  # a little, as copying takes time
+    late = box[FETCHED] + box[AHEAD] + max(0, box[SLOW] - box[BLOCK]) - box[MADE]
+    if late > 0:
+        late = -(-late // box[BLOCK]) * box[BLOCK]
+        if supply_silence(box, box[MADE] + late + box[BLOCK] - box[WRITTEN]):
+            return FAILED
+        box[END] += late
+        box[START] += late
+        box[MADE] += late
+        box[N_PAUSES] += done > 0
+    if done == 0:
+        program[BEGAN] = box[START]
+    box[UNTIL] = until
+    return 0
+
+
+@helper_kernel("boolean(int64[::1])")
+def is_in_time(box: Words) -> bool:
+    """Whether the last part was written before the card fetched it.
+
+    The card reports whole blocks, so it may have fetched one more.
+    """
+    if box[PART] < 0:
+        return True
+    left = box[PART] - box[FETCHED] - box[BLOCK]
+    box[LEAST], box[PART] = min(box[LEAST], left), -1
+    return left >= 0  # pyright: ignore[reportReturnType]
+
+
 @kernel("int64(int64[::1], int64)")
 def supply(box: Words, rate_hz: int) -> int:
-    """One step: hand over what there is room for; returns after how many ns that is due again, or a code."""
+    """One step: write what there is room for; returns after how many ns that is due again, or a code."""
     in_ring = look(box)
     if box[IS_FILLING] and in_ring != FAILED:
         if box[FETCHED] < box[TO_START]:
             return FILLING_POLL_NS
-        box[IS_FILLING], box[N_QUICK] = 0, QUICK_LOOKS
+        box[IS_FILLING] = 0
         box[ERROR] = call_c(box[SET], box[HANDLE], COMMAND, box[START_COMMAND])
         return FAILED if box[ERROR] else 0
     if in_ring < 0:
         return in_ring
-    if box[WRITTEN] >= box[END] and box[TAKEN] < box[QUEUED]:
-        if in_ring < box[AHEAD] // 2 and box[WRITTEN] >= box[END] + box[ON_CARD]:  # it came late in silence
-            if supply_silence(box, box[AHEAD] - in_ring):
-                return FAILED
-            in_ring = max(in_ring, box[AHEAD])
-        program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), N_PROGRAM, np.int64)
-        program[BEGAN] = box[WRITTEN]
-        box[START], box[END] = box[WRITTEN], box[WRITTEN] + program[LENGTH]
-        box[TAKEN] += 1
-    if box[WRITTEN] < box[END]:
-        room = box[N_RING] - in_ring
-        if room:
-            return supply_program(box, room)
-        return min(POLL_NS, box[N_RING] * 125_000_000 // rate_hz)  # an eighth of the ring
-    failed = supply_silence(box, box[AHEAD] - in_ring)
-    if box[N_QUICK]:
-        box[N_QUICK] -= 1
-        return failed or FILLING_POLL_NS
-    return failed or box[AHEAD] * 500_000_000 // rate_hz  # half of it
+    if box[RENDERED_AT] >= 0:
+        box[SLOW], box[RENDERED_AT] = box[FETCHED] - box[RENDERED_AT], -1
+    if not is_in_time(box):
+        return LATE
+    if box[MADE] >= box[END] and box[TAKEN] < box[QUEUED]:
+        take_program(box)
+    if box[MADE] < box[END]:
+        if box[MADE] - box[START] == box[UNTIL]:
+            return begin_piece(box)
+        room = box[FETCHED] + box[N_RING] - box[MADE]
+        return supply_program(box, room) if room else min(POLL_NS, box[N_RING] * 125_000_000 // rate_hz)
+    room = box[FETCHED] + box[N_RING] - box[WRITTEN]
+    if room:
+        return supply_silence(box, min(room, MOST_SAMPLES) if box[WRITTEN] < box[SILENT_FROM] else room)
+    if box[PREPARED]:
+        program = carray(pointer(box[PREPARED]), N_PROGRAM, np.int64)
+        if render_ahead(box, program, program[LENGTH]):
+            return 0
+    until_end = box[END] + box[ON_CARD] + box[BLOCK] - box[FETCHED]
+    wait = min(until_end, box[N_RING] // 4) if until_end > 0 else box[N_RING] // 4
+    return wait * 1_000_000_000 // rate_hz
 
 
-@kernel("int64(int64[::1], int64, int64[::1])")
-def feed(box: Words, rate_hz: int, timer: Words) -> int:
-    """Supply the card until STOP is set, in a thread of its own; returns STOPPED, DRY or FAILED."""
+@kernel("int64(int64[::1], int64, int64[::1], int64[::1])")
+def feed(box: Words, rate_hz: int, timer: Words, signal: Words) -> int:
+    """Supply the card until STOP is set, in a thread of its own; returns a negative code."""
     box[IS_FEEDING] = 1
     code = STOPPED
     while box[STOP] == 0:
         code = supply(box, rate_hz)
         if code < 0:
             break
-        if code > 0:
-            sleep_ns(timer, code)
+        if code >= 1_000_000:
+            wait_signal(signal, code // 1_000_000)
+        elif code > 0:
+            sleep_ns(timer, min(code, HELP_POLL_NS))
         code = STOPPED
     box[IS_FEEDING] = 0
     return code

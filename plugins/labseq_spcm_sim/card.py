@@ -98,7 +98,7 @@ class SimulatedCard:
         self._error = ErrorInfo()
         self._edges_s: list[float] = []
         self._step: Callable[[], float | None] | None = None
-        self._step_s = 0.0
+        self._step_s = self._held_up_s = 0.0
         self._within_step_s: float | None = None
         self._is_open = False
         self._identity: dict[int, int] = {
@@ -133,12 +133,13 @@ class SimulatedCard:
             step: Returns after how many seconds it is due again, None if never. None: no more steps.
         """
         with self._lock:
-            self._step, self._step_s = step, self._now()
+            now_s = self._now() if step is None else self._advance()  # what was due until now first
+            self._step, self._step_s = step, max(now_s, self._held_up_s)
 
     def hold_up(self, duration_s: float) -> None:
         """Call no step for some time from now on, as if the computer were busy with something else."""
         with self._lock:
-            self._step_s = self._advance() + duration_s
+            self._step_s = self._held_up_s = self._advance() + duration_s
 
     def played(self, channel: int) -> list[Span]:
         """The output of a channel up to now, in time's order; between the spans there is silence."""

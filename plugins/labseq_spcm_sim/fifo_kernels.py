@@ -29,10 +29,11 @@ bytes and notify size of the ring, bytes of a frame and handed over, whether the
 (RATE, ROOM, BUS, TOTAL, FETCHED, PLAYED, NOW, PLAY) = range(12, 20)
 """Of float64: samples and bytes per second of output and bus, bytes of room on the card and to play, bytes
 fetched and played, the time of all that, and when the output starts."""
-(OFFSET_NS, KEPT, N_KEPT, ENTRIES, N_ENTRIES, N_READ, HAS_LEFT_OUT) = range(20, 27)
-"""From the timer's time to the session's; address and bytes of the memory for what was handed over, 0 for
-none, address of the entries, their number so far and that of those read, and whether one was left out."""
-TIMER: Final = 27
+(OFFSET_NS, KEPT, N_KEPT, ENTRIES, N_ENTRIES, N_READ, HAS_LEFT_OUT, LATCHED) = range(20, 28)
+"""From the timer's time to the session's; address and bytes of the memory for what was fetched, 0 for none,
+address of the entries, their number so far and that of those read, whether one was left out, and the bytes
+whose content is decided: the bus may read a whole block when it fetches the first byte of it."""
+TIMER: Final = 28
 N_WORDS: Final = TIMER + 10
 
 MOST_ENTRIES: Final = 1 << 14
@@ -104,14 +105,6 @@ def flow_until(words: Words, now_s: float) -> None:
     real[NOW] = max(real[NOW], now_s)
 
 
-@kernel("void(int64[::1], float64)")
-def advance(words: Words, now_s: float) -> None:
-    """Let bytes flow up to a time."""
-    acquire(words)
-    flow_until(words, now_s)
-    release(words)
-
-
 @kernel("int64(int64[::1])")
 def user_bytes(words: Words) -> int:
     """Bytes that are free for the user, in whole notify sizes."""
@@ -145,12 +138,12 @@ def is_silent(samples: Bytes) -> bool:
 
 @helper_kernel("void(int64[::1], int64)")
 def keep(words: Words, n_bytes: int) -> None:
-    """Copy what is handed over next, for those who look at the outputs.
+    """Copy what is fetched next, for those who look at the outputs.
 
     Silence is left out; of equal blocks, as of tones that keep the AODs warm, only one is kept.
     """
     ring = carray(pointer(words[ADDRESS]), words[N_BYTES], np.uint8)
-    first = words[HANDED] % words[N_BYTES]
+    first = words[LATCHED] % words[N_BYTES]
     head = min(n_bytes, words[N_BYTES] - first)
     if is_silent(ring[first : first + head]) and is_silent(ring[: n_bytes - head]):
         return
@@ -162,7 +155,7 @@ def keep(words: Words, n_bytes: int) -> None:
     if n > n_read:
         last = entries[(n - 1) % MOST_ENTRIES]
         at = last[2] + last[3]
-        if stored < n_bytes and last[3] == stored and last[0] + last[1] == words[HANDED]:
+        if stored < n_bytes and last[3] == stored and last[0] + last[1] == words[LATCHED]:
             before = kept[last[2] : at].view(np.uint64)
             if np.array_equal(before, ring[first : first + stored].view(np.uint64)):
                 last[1] += n_bytes
@@ -176,8 +169,38 @@ def keep(words: Words, n_bytes: int) -> None:
     kept[at : at + head] = ring[first : first + head]
     kept[at + head : at + stored] = ring[: stored - head]
     entry = entries[n % MOST_ENTRIES]
-    entry[0], entry[1], entry[2], entry[3] = words[HANDED], n_bytes, at, stored
+    entry[0], entry[1], entry[2], entry[3] = words[LATCHED], n_bytes, at, stored
     words[N_ENTRIES] = n + 1
+
+
+@helper_kernel("int64(int64[::1])")
+def begun_bytes(words: Words) -> int:
+    """Bytes of the blocks that the bus has begun to fetch."""
+    block = max(1, words[NOTIFY])
+    begun = math.ceil((words.view(np.float64)[FETCHED] - SMALL) / block) * block
+    return min(begun, words[HANDED])
+
+
+@helper_kernel("void(int64[::1])")
+def latch(words: Words) -> None:
+    """Keep what the bus has fetched since the last time; what the user writes there now comes too late."""
+    n_bytes = begun_bytes(words) - words[LATCHED]
+    if n_bytes > 0:
+        if words[KEPT]:
+            keep(words, n_bytes)
+        words[LATCHED] += n_bytes
+
+
+@kernel("int64(int64[::1], float64)")
+def advance(words: Words, now_s: float) -> int:
+    """Let bytes flow up to a time; returns how many are fetched that Python has to keep."""
+    acquire(words)
+    flow_until(words, now_s)
+    if words[KEPT]:
+        latch(words)
+    n_bytes = begun_bytes(words) - words[LATCHED]
+    release(words)
+    return n_bytes  # pyright: ignore[reportReturnType]
 
 
 @kernel("int64(int64[::1], int64[::1], uint8[::1])")
@@ -224,6 +247,7 @@ def read_register(handle: int, register: int, out: int) -> int:
     if words[IS_DIRECT] and register in (STATUS, USER_LEN):
         acquire(words)
         flow_until(words, session_s(words))
+        latch(words)
         is_over, free = words[FAILED] + words[FINISHED], free_bytes(words)
         is_triggered = words.view(np.float64)[PLAY] < np.inf
         release(words)
@@ -244,11 +268,10 @@ def write_register(handle: int, register: int, value: int) -> int:
     if words[IS_DIRECT] and register == CARD_LEN:
         acquire(words)
         flow_until(words, session_s(words))
+        latch(words)
         is_over, free = words[FAILED] + words[FINISHED], free_bytes(words)
         is_fine = not is_over and 0 <= value <= free and value % words[FRAME] == 0
         if is_fine:
-            if words[KEPT] and value:
-                keep(words, value)
             words[HANDED] += value
         release(words)
         if is_fine:

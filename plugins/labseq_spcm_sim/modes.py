@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, Protocol
 
 import numpy as np
@@ -184,19 +185,24 @@ class Replay:
         return cut(self._stretches, self._rate, now_s)
 
 
-def _repeats(data: Samples, n: int) -> bool:
-    """Whether all blocks of ``n`` samples are equal; most that are not differ at once."""
-    return np.array_equal(data[n : n + 8], data[: len(data[n : n + 8])]) and bool(
-        (data.reshape(-1, n, data.shape[1]) == data[:n]).all()
-    )
+def runs(blocks: Samples) -> list[tuple[int, int]]:
+    """Cut blocks, int16 (n, samples), into runs of equal ones and runs in which neighbours differ."""
+    same = np.zeros(len(blocks) + 1, np.bool_)
+    same[1:-1] = (blocks[1:, :8] == blocks[:-1, :8]).all(axis=1)  # most that are not differ at once
+    for at in same.nonzero()[0]:
+        same[at] = np.array_equal(blocks[at], blocks[at - 1])
+    alone = ~same[:-1] & ~same[1:]
+    cuts = ~same[1:-1] & ~(alone[1:] & alone[:-1])
+    edges = [0, *(cuts.nonzero()[0] + 1).tolist(), len(blocks)]
+    return [*pairwise(edges)]
 
 
 class Fifo:
     """A ring buffer in the PC, the bus, the on-board memory as a FIFO, and the output.
 
     Bytes are handed over by the user, transferred by the bus while there is room on the
-    card, and consumed by the output from the trigger on. When the output finds none it
-    stops: an underrun.
+    card, and consumed by the output from the trigger on. Until they are transferred the user
+    may change them. When the output finds none it stops: an underrun.
 
     Args:
         words: Where its state is, for code in C; see ``fifo_kernels``.
@@ -228,7 +234,7 @@ class Fifo:
         )
         words[k.FRAME] = frame_bytes
         words[k.HANDED] = words[k.DMA] = words[k.FAILED] = words[k.FINISHED] = 0
-        words[k.N_ENTRIES] = words[k.N_READ] = words[k.HAS_LEFT_OUT] = 0
+        words[k.N_ENTRIES] = words[k.N_READ] = words[k.HAS_LEFT_OUT] = words[k.LATCHED] = 0
         self._real[k.RATE : k.NOW] = sample_rate_hz, room_bytes, bus_bytes_per_s, math.inf, 0.0, 0.0
         self._real[k.NOW], self._real[k.PLAY] = -math.inf, math.inf
 
@@ -258,14 +264,10 @@ class Fifo:
             raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
-        if n_bytes:
-            handed = int(self._words[k.HANDED])
-            self._take_kept()
-            self._keep(handed, n_bytes, self._buffer.fetch(handed, n_bytes))
-            self._words[k.HANDED] += n_bytes
+        self._words[k.HANDED] += n_bytes
 
     def _take_kept(self) -> None:
-        """Take over what was handed over beside Python.
+        """Take over what was fetched beside Python.
 
         Raises:
             RuntimeError: The memory for it was full.
@@ -287,19 +289,28 @@ class Fifo:
             n_bytes: How many are played; ``data`` is repeated.
             data: Samples.
         """
+        size = self._buffer.notify_bytes
+        if size and n_bytes == data.nbytes and not n_bytes % size:
+            blocks = data.reshape(-1, size // 2)
+            for first, end in runs(blocks):
+                is_one = end - first > 1 and np.array_equal(blocks[first], blocks[first + 1])
+                part = blocks[first : first + 1 if is_one else end]
+                self._keep_piece(start + first * size, (end - first) * size, part)
+        else:
+            self._keep_piece(start, n_bytes, data)
+
+    def _keep_piece(self, start: int, n_bytes: int, data: Samples) -> None:
+        """The same for equal blocks, or for blocks of which each differs from the one before."""
         words = data.view(np.uint64) if data.nbytes % 8 == 0 else data.view(np.uint16)
         if not words.max():  # several times faster than any()
             return
         data = data.reshape(-1, self._frame // 2)
         first, n_samples = start // self._frame, n_bytes // self._frame
-        block = self._buffer.notify_bytes // self._frame
-        if block and not n_samples % block and _repeats(data, block):
-            data = data[:block]
-            if self._pieces:
-                start, last = self._pieces[-1]
-                if start + last.n_samples == first and np.array_equal(last.samples, data):
-                    self._pieces[-1] = start, replace(last, n_samples=last.n_samples + n_samples)
-                    return
+        if n_bytes > data.nbytes and self._pieces:
+            before, last = self._pieces[-1]
+            if before + last.n_samples == first and np.array_equal(last.samples, data):
+                self._pieces[-1] = before, replace(last, n_samples=last.n_samples + n_samples)
+                return
         self._pieces.append((first, Stretch(0.0, data.copy(), n_samples)))
 
     def switch_dma(self, on: bool, now_s: float) -> None:
@@ -330,8 +341,12 @@ class Fifo:
         return self.user_bytes >= max(1, self._buffer.notify_bytes) or bool(is_idle)
 
     def advance(self, now_s: float) -> None:
-        """Let bytes flow up to now."""
-        k.advance(self._words, now_s)
+        """Let bytes flow up to now; of those that are fetched, only now the content is decided."""
+        n_bytes = int(k.advance(self._words, now_s))
+        if n_bytes > 0:
+            start = int(self._words[k.LATCHED])
+            self._keep(start, n_bytes, self._buffer.fetch(start, n_bytes))
+            self._words[k.LATCHED] = start + n_bytes
 
     def trigger(self, out_s: float) -> None:
         """The first trigger starts the output."""
