@@ -92,6 +92,12 @@ NOT_RUN = {
     "docs/how-to/export.md": ["installs packages"],
     "docs/how-to/fit.md": ["needs a run with releases"],
     "docs/how-to/first-day.md": ["needs your own profile"],
+    "docs/how-to/first-week.md": [
+        *["tests/session/test_first_week.py takes these measurements"] * 3,
+        "the picture of the page",
+        *["tests/session/test_first_week.py takes these measurements"] * 4,
+        "they take minutes; tests/docs/test_paper_figures.py takes some of their shots",
+    ],
     "docs/how-to/follow.md": [
         "a drawing",
         "waits for the leader below; tests/plugins/test_labseq_follow_session.py runs both",
