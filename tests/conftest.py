@@ -62,9 +62,8 @@ _REPOSITORY = Path(__file__).parents[1]
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Three processes for two cores: a third of the time, tests wait for processes and devices."""
-    n_cores = os.cpu_count() or 1
-    return n_cores + (n_cores + 1) // 2
+    """Two processes for each core: a third of the time, tests wait for processes and devices."""
+    return 2 * (os.cpu_count() or 1)
 
 
 def pytest_configure(config: pytest.Config) -> None:
