@@ -156,4 +156,5 @@ def test_average_image_loading_map_and_counts_of_any_run(
 def test_a_file_that_is_open_in_h5py_can_be_read(run: labseq.Run) -> None:
     shot = labseq.open_run(run.path).shots[0]
     with h5py.File(shot.file) as file:
-        assert np.array_equal(shot.occupancies, file["entry/detection/occupancy"][()])
+        there: Any = file["entry/detection/occupancy"]
+        assert np.array_equal(shot.occupancies, there[()])

@@ -282,8 +282,8 @@ def test_the_next_connection_is_not_taken_for_one_that_has_ended(server: Served)
 def test_a_server_that_has_ended_is_not_waited_for_again(tmp_path: Path) -> None:
     with served(tmp_path) as one:
         context = Context("simulation", SiteGrid(6, 7), clock=FakeClock())
-        about = {"address": f"tcp://127.0.0.1:{one.port}"}
-        simulation = RemoteSimulation(RemoteSimulationSettings(**about), context)
+        settings = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{one.port}")
+        simulation = RemoteSimulation(settings, context)
         simulation.open()
         connection = simulation._link.connect()
     until(lambda: bool(connection.lost))

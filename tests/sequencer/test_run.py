@@ -295,12 +295,12 @@ def test_an_error_of_a_step_names_the_line_of_its_code():
         Rig(steps=(("mine", Broken()),))
 
 
-def test_a_device_that_hangs_delays_the_safe_state_of_no_other():
+def test_a_device_that_hangs_delays_the_safe_state_of_no_other(monkeypatch: pytest.MonkeyPatch):
     static_is_safe = threading.Event()
     rig = Rig(fail_on={"camera.read": DeviceError("camera", "unplugged")})
     for device, act in ((rig.lab.camera, static_is_safe.wait), (rig.lab.static_tweezers, static_is_safe.set)):
         made_safe = device.safe_state
-        device.safe_state = lambda act=act, made_safe=made_safe: (made_safe(), act())
+        monkeypatch.setattr(device, "safe_state", lambda act=act, made_safe=made_safe: (made_safe(), act()))
     with pytest.raises(DeviceError, match="unplugged"):
         rig.run()
     assert rig.made_safe() == SAFE_ORDER
