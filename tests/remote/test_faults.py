@@ -299,12 +299,13 @@ def test_a_simulation_ends_after_the_devices_that_act_on_it(server: Served) -> N
     simulation, of_a_device = (RemoteSimulation(settings, context) for _ in range(2))
     simulation.open()
     simulation.begin_shot()
-    of_a_device.join(connection.run_of(context.clock).key, lambda *_: None)
+    run, sessions = connection.run_of(context.clock).key, server.server.devices["simulation"].sessions
+    of_a_device.join(run, lambda *_: None)
     of_a_device.connect()
     simulation.close()  # while another server still makes a simulated device safe
     of_a_device.load(0.0, 0.1)
     of_a_device.close()
-    until(lambda: not server.server.devices["simulation"].sessions)
+    until(lambda: run not in {one.run.key for one in tuple(sessions.values())})
 
 
 def test_errors_keep_their_class_and_values(server: Served) -> None:
