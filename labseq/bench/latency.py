@@ -323,16 +323,23 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
     from labseq.pictures.figures import make_figure, save_figure
 
     def draw() -> Any:
-        figure = make_figure(6.4, 3.2)
+        from matplotlib.ticker import LogFormatter
+
+        figure = make_figure(6.4, 3.2, layout="constrained")
         axes = figure.add_subplot(xlabel="frame in memory to light (ms)", ylabel="programs")
         light_ms = 1e3 * np.array(light_s)
         bins = np.geomspace(0.95 * light_ms.min(), 1.05 * light_ms.max(), 80)
         axes.hist(light_ms, bins, color="#3b6ea5")
         axes.set(xscale="log", yscale="log")
-        for value_ms, name in zip(np.quantile(light_ms, (0.5, 0.99)), ("median", "99 %"), strict=True):
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(LogFormatter())
+            axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+        for share, name, side in ((0.5, "median", "right"), (0.99, "99 %", "left")):
+            value_ms = float(np.quantile(light_ms, share))
             axes.axvline(value_ms, color="#c44e52", linewidth=1)
-            text = f" {name} {format_quantity(1e-3 * value_ms, 'time')}"
-            axes.text(value_ms, 0.97, text, transform=axes.get_xaxis_transform(), va="top", fontsize=8)
+            place: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "va": "top", "ha": side}
+            text = f" {name} {format_quantity(1e-3 * value_ms, 'time')} "
+            axes.text(value_ms, 0.97, text, fontsize=8, **place)
         axes.set_title(title, fontsize=9)
         return figure
 
