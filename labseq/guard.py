@@ -295,14 +295,14 @@ class Guard:
         return self._named(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
 
     def begin_despite_stop(
-        self, owner: str, timeout_s: float, function: Callable[[], T]
+        self, owner: str, timeout_s: float, work: partial[T]
     ) -> tuple[threading.Event, Callable[[], T]]:
         """Begin such a call.
 
         Returns:
             What is set when it has ended; and what waits for that, as :meth:`call_despite_stop` does.
         """
-        limit, call = _limit(owner, timeout_s, partial(function)), GuardedCall(partial(function))
+        limit, call = _limit(owner, timeout_s, work), GuardedCall(work)
         is_out = self._submit(owner, call)
 
         def result() -> T:

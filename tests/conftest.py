@@ -92,8 +92,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_collect_file(file_path: Path) -> Generator[None, list[Any], list[Any]]:
     """To look for examples where there are none would be a quarter of the collection."""
     found = yield
-    is_test = file_path.is_relative_to(_REPOSITORY / "tests")
-    if is_test or (found and ">>>" not in file_path.read_text("utf-8")):
+    if found and (
+        file_path.is_relative_to(_REPOSITORY / "tests") or ">>>" not in file_path.read_text("utf-8")
+    ):
         return [one for one in found if not isinstance(one, DoctestModule)]
     return found
 
@@ -105,7 +106,7 @@ def pytest_collection_finish() -> None:
     it would be a fifth of the time of all runs, for pytest's own and those of other tests. And what is
     written need not outlive the machine; a process that is killed loses nothing of what it wrote. What is
     installed, the state of this repository and the command line stay the same: each run would read a hundred
-    files for the first, start five processes for the second, and build the last anew.
+    files for the first, start five processes for the second, and construct a parser for the last.
     """
     from labseq.session import provenance, session
 

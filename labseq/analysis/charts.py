@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from labseq.analysis.timing import StageStatistics
 from labseq.model import SiteGrid
 from labseq.model.estimate import Estimate, Estimated, Rate, mean
-from labseq.pictures.figures import DARK, LIGHT, ORANGE, RED, cell, outline, place_sites
+from labseq.pictures.figures import (
+    DARK,
+    LIGHT,
+    ORANGE,
+    RED,
+    cell,
+    outline,
+    place_sites,
+    show_plain_numbers,
+)
 from labseq.recording import Run, Shot
 from labseq.recording.images import average_frame, signals_of
 from labseq.units import format_quantity
@@ -505,9 +514,6 @@ def _vertical_grid(axes: Axes) -> None:
 
 def _plain_logarithmic(axes: Axes) -> None:
     """Make an x axis logarithmic, with as many plain numbers as fit."""
-    from matplotlib.ticker import LogFormatter
-
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(LogFormatter())
-    axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    show_plain_numbers(axes.xaxis)
     axes.tick_params(which="both", labelsize=8)

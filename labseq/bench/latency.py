@@ -320,11 +320,9 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
     Raises:
         ConfigError: matplotlib is not installed, or the file cannot be written.
     """
-    from labseq.pictures.figures import make_figure, save_figure
+    from labseq.pictures.figures import make_figure, save_figure, show_plain_numbers
 
     def draw() -> Any:
-        from matplotlib.ticker import LogFormatter
-
         figure = make_figure(6.4, 3.2, layout="constrained")
         axes = figure.add_subplot(xlabel="frame in memory to light (ms)", ylabel="programs")
         light_ms = 1e3 * np.array(light_s)
@@ -332,8 +330,7 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
         axes.hist(light_ms, bins, color="#3b6ea5")
         axes.set(xscale="log", yscale="log")
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(LogFormatter())
-            axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+            show_plain_numbers(axis)
         for share, name, side in ((0.5, "median", "right"), (0.99, "99 %", "left")):
             value_ms = float(np.quantile(light_ms, share))
             axes.axvline(value_ms, color="#c44e52", linewidth=1)

@@ -96,7 +96,7 @@ def predict_survival(
     factors, weights = _factors(losses.spread)
     total = hazards.sum(axis=0)
     by_cause = [_n_lost(cause[report.predicted], factors, weights) for cause in hazards]
-    lost_by_moves = max(by_cause)
+    lost_by_moves = max(by_cause)  # all of it, if there is one cause: the same sum need not be made twice
     if np.count_nonzero(by_cause) > 1:
         lost_by_moves = _n_lost(total[report.predicted], factors, weights)
     n_atoms = np.count_nonzero(report.predicted)

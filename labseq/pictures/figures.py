@@ -20,6 +20,7 @@ from labseq.messages import install_hint
 from labseq.model import SiteGrid
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 ENDINGS: Final = (".png", ".svg", ".pdf")
@@ -65,6 +66,14 @@ def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
     figure = Figure(figsize=(width_in, height_in), **options)
     FigureCanvasAgg(figure)
     return figure
+
+
+def show_plain_numbers(axis: Axis) -> None:
+    """Label a logarithmic axis with as many plain numbers as fit: pictures have no powers of ten."""
+    from matplotlib.ticker import LogFormatter
+
+    axis.set_major_formatter(LogFormatter())
+    axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
 
 
 def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any) -> bytes:

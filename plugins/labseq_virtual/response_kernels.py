@@ -43,6 +43,11 @@ N_PASSING = len(PASSING_SPEEDS) * len(BESIDE) * len(RATIOS) * len(TEMPERATURES)
 N_TRANSPORT = 3 * len(SPEEDS) * len(RATIOS) * len(TEMPERATURES)
 START_RAMP_AXIS, START_SPEED_AXIS = np.array(START_RAMPS_S), np.array(START_SPEEDS)
 N_START = len(START_RAMPS_S) * len(START_SPEEDS) * len(RATIOS) * len(TEMPERATURES)
+TRANSPORT_AT = 4 * N_RAMP
+LANDING_AT = TRANSPORT_AT + 2 * N_TRANSPORT
+PASSING_AT = LANDING_AT + 2 * N_LANDING
+START_AT = PASSING_AT + 2 * N_PASSING
+"""Where the tables after those of pick-up and drop-off begin."""
 CURVED_SITES = 4.0
 """Length of the moves in the table of a curved course, in sites."""
 
@@ -159,7 +164,7 @@ def carry(
         speed *= math.sqrt(CURVED_SITES * SITE_M / max(length_m, 0.1 * SITE_M))
     temperature = heat * DEPTH_K / static
     return respond(
-        tables, 4 * N_RAMP, N_TRANSPORT, float(course), speed, SPEED_AXIS, mobile / static, temperature, 3.0
+        tables, TRANSPORT_AT, N_TRANSPORT, float(course), speed, SPEED_AXIS, mobile / static, temperature, 3.0
     )
 
 
@@ -191,7 +196,7 @@ def land_on(
     speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / faster
     i, part = locate(LANDING_AXIS, speed)
     return respond(
-        tables, 4 * N_RAMP + 2 * N_TRANSPORT, N_LANDING, i + part, ramp_s * faster, RAMP_AXIS,
+        tables, LANDING_AT, N_LANDING, i + part, ramp_s * faster, RAMP_AXIS,
         mobile / static, temperature, len(LANDING_AXIS),
     )  # fmt: skip
 
@@ -216,7 +221,7 @@ def pass_by(
     speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
     i, part = locate(PASSING_AXIS, speed)
     log_loss, warmer = respond(
-        tables, 4 * N_RAMP + 2 * N_TRANSPORT + 2 * N_LANDING, N_PASSING, i + part,
+        tables, PASSING_AT, N_PASSING, i + part,
         away_m / constants[STATIC_WAIST], BESIDE_AXIS, mobile / static, temperature, len(PASSING_AXIS),
     )  # fmt: skip
     loss = math.exp(log_loss)
@@ -249,7 +254,7 @@ def at_once(
     static = constants[STATIC_DEPTH]
     speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
     i, part = locate(START_RAMP_AXIS, ramp_s)  # compared with the sound, whose transit does not scale
-    first = 4 * N_RAMP + 2 * N_TRANSPORT + 2 * N_LANDING + 2 * N_PASSING + 2 * N_START * stage
+    first = START_AT + 2 * N_START * stage
     return respond(
         tables, first, N_START, i + part, speed, START_SPEED_AXIS, mobile / static, heat * DEPTH_K / static,
         len(START_RAMP_AXIS),
