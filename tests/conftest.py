@@ -106,15 +106,17 @@ def pytest_collection_finish() -> None:
     it would be a fifth of the time of all runs, for pytest's own and those of other tests. And what is
     written need not outlive the machine; a process that is killed loses nothing of what it wrote. What is
     installed, the state of this repository and the command line stay the same: each run would read a hundred
-    files for the first, start five processes for the second, and construct a parser for the last.
+    files for the first, start five processes for the second, and construct a parser for the last. Runs and
+    checks plan for a quarter of the random loadings.
     """
-    from labseq.session import provenance, session
+    from labseq.session import check, provenance, session
 
     gc.collect()
     gc.freeze()
     gc.enable()
     patch = pytest.MonkeyPatch()
     patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
+    patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 4)
     patch.setattr(os, "fsync", os.fstat)
     patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
     patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))

@@ -25,7 +25,7 @@ from labseq.sequencer.run import plan_timeline
 from labseq.session.camera_trigger import unsuitable_exposures
 from labseq.session.chosen import changed_settings
 from labseq.session.lab import WARM_S
-from labseq.session.rehearsal import Rehearsal, rehearse, windows_of
+from labseq.session.rehearsal import Rehearsal, quantile, rehearse, windows_of
 from labseq.session.scan import Point
 from labseq.units import format_quantity
 
@@ -467,7 +467,7 @@ def _window_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
             what = f"the first cycle's window of {format_quantity(first, 'time')} is too short for most plans"
             what += f" ({n_fit} of {rehearsal.n_loadings} fit)"
             yield number, document.problem(loc, what, f"about {enough}, enough for 95 % of the plans")
-        elif shortest < np.median(rehearsal.first_batch_s):
+        elif shortest < quantile(rehearsal.first_batch_s, 0.5):
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
             yield number, document.problem(loc, what, "more than the overheads of a cycle and a batch")
     loaded = next(iter(rehearsals.values()))

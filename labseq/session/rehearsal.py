@@ -42,9 +42,14 @@ class Rehearsal:
     first_batch_s: NDArray[np.float64]
 
     def quantile_s(self, share: float) -> float:
-        """Duration within which a share of the plans end; ``np.quantile`` would import ``numpy.ma``."""
-        ranks = np.arange(len(self.duration_s))
-        return float(np.interp(share * ranks[-1], ranks, np.sort(self.duration_s)))
+        """Duration within which a share of the plans end."""
+        return quantile(self.duration_s, share)
+
+
+def quantile(values: NDArray[np.float64], share: float) -> float:
+    """Quantile of at least one value; those of numpy would import ``numpy.ma``, which takes 40 ms."""
+    ranks = np.arange(len(values))
+    return float(np.interp(share * ranks[-1], ranks, np.sort(values)))
 
 
 def windows_of(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:

@@ -22,8 +22,8 @@ from .blocks import Block, commands_of
 FILTERS: Final = ("jq", "tee", "head")
 """Programs behind a pipe that are the reader's own: what labseq gives them is not asked for."""
 FEW: Final = {
-    "run": "--shots 2 --seed 1",
-    "queue add": "--shots 2",
+    "run": "--shots 1 --seed 1",
+    "queue add": "--shots 1",
     "bench planners": "--loadings 2 --workers 1",
     "bench latency": "--loadings 2",
     "bench waveform": "--repeats 1",

@@ -24,6 +24,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """What each command does once for its process is not done a hundred times in this one."""
     monkeypatch.setattr("labseq.bench.latency.N_WARM", 1)
+    monkeypatch.setattr("labseq.session.check.N_LOADINGS", 200)  # as pages say
     monkeypatch.setattr("labseq.calibration.measure.encode_figure", lambda *_, **__: b"")
     monkeypatch.setattr("labseq.pictures.figures.encode_figure", composed)
     monkeypatch.setenv("GIT_DIR", os.devnull)  # no digest of the code's changes for each run

@@ -8,7 +8,8 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError, Problem
-from labseq.session.check import N_LOADINGS, CheckReport, check
+from labseq.session import check as checking
+from labseq.session.check import CheckReport, check
 
 ROOT = Path(__file__).parents[2]
 COMPACT = ROOT / "sequences" / "compact_225.yaml"
@@ -22,7 +23,7 @@ def test_a_good_sequence_has_no_warnings():
     report = checked()
     assert report.warnings == ()
     assert report.rehearsal is not None
-    assert (report.rehearsal.n_loadings, report.rehearsal.n_filled) == (N_LOADINGS, N_LOADINGS)
+    assert (report.rehearsal.n_loadings, report.rehearsal.n_filled) == (checking.N_LOADINGS,) * 2
     assert 0.02 < report.rehearsal.duration_s.mean() < 0.06
     assert report.n_images == 12
     assert report.shot_bytes == pytest.approx(12 * 2 * 512 * 512, rel=0.02)
