@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from labseq.console.options import FitModel, FitSettings, Json, Plugins, RunFolder, ScanQuantities, Where
+from labseq.console.options import FitName, FitSettings, Json, Plugins, RunFolder, ScanQuantities, Where
 
 REPLAY_EXAMPLES = """\b
 Examples:
@@ -99,7 +99,7 @@ def analyse(
     ] = False,
     scan: ScanQuantities = None,
     where: Where = None,
-    fit: FitModel = None,
+    fit: FitName = None,
     fit_set: FitSettings = None,
     _plugins: Plugins = None,
 ) -> None:
@@ -149,7 +149,7 @@ def plot(
     ] = None,
     scan: ScanQuantities = None,
     where: Where = None,
-    fit: FitModel = None,
+    fit: FitName = None,
     fit_set: FitSettings = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file of --output.")] = False,
 ) -> None:

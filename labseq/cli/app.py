@@ -21,7 +21,7 @@ from labseq.campaign.commands import campaign
 from labseq.cli.plan_commands import PLAN_EXAMPLES, WAVEFORM_EXAMPLES, plan, waveform
 from labseq.console.options import (
     DryRun,
-    FitModel,
+    FitName,
     FitSettings,
     Json,
     Keys,
@@ -325,7 +325,7 @@ def show(
     ] = False,
     scan: ScanQuantities = None,
     where: Where = None,
-    fit: FitModel = None,
+    fit: FitName = None,
     fit_set: FitSettings = None,
     devices: Annotated[
         bool, typer.Option("--devices", help="Print how each device described itself.")

@@ -1,4 +1,4 @@
-"""`labseq check`: prints the timeline and limits of a sequence, and all its errors."""
+"""`labseq check`: prints what `session.check` has found: timeline, limits, warnings, and all errors."""
 
 from __future__ import annotations
 

@@ -444,8 +444,12 @@ Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
 class MotionSettings(Settings):
     """How the mobile tweezers move, for every driver."""
 
-    pick_up: Duration = Field(default=_MOTION.pick_up_s, description="duration of the pick-up ramp")
-    drop_off: Duration = Field(default=_MOTION.drop_off_s, description="duration of the drop-off ramp")
+    pick_up: Duration = Field(
+        default=_MOTION.pick_up_s, description="duration of the pick-up ramp, linear in depth"
+    )
+    drop_off: Duration = Field(
+        default=_MOTION.drop_off_s, description="duration of the drop-off ramp, linear in depth"
+    )
     speed: Speed = Field(default=_MOTION.speed_m_s, description="transport speed")
     speed_profile: SpeedProfile = Field(
         default=_MOTION.speed_profile,

@@ -215,7 +215,7 @@ Where = Annotated[
         "given several times.",
     ),
 ]
-FitModel = Annotated[
+FitName = Annotated[
     str | None,
     typer.Option(
         "--fit",

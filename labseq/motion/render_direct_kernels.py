@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, helper_kernel, kernel
+from labseq.kernel import helper_kernel, kernel
 from labseq.motion.render_comb_kernels import render_comb
 from labseq.motion.render_kernels import (
     AXIS,
@@ -399,23 +399,3 @@ def render_at(address: int, start: int, out: int) -> int:
     )
     render(axis, start, carray(pointer(out), words[N_OUT], np.int16), workspace)
     return 0
-
-
-STORED_BLOCK: Final = 4096
-
-
-@kernel(f"void({const('int16', 2)}, int64[::1], int64, int16[::1])")
-def sum_stored(
-    stored: NDArray[np.int16], picked: NDArray[np.int64], first: int, out: NDArray[np.int16]
-) -> None:
-    """Sum the stored waveforms int16 (n_tones, n) that are picked, from sample ``first`` on.
-
-    Works block by block, so that the sums stay in the fastest cache.
-    """
-    for start in range(0, len(out), STORED_BLOCK):
-        part = out[start : start + STORED_BLOCK]
-        part[:] = 0
-        for k in picked:
-            one = stored[k, first + start : first + start + STORED_BLOCK]
-            for j in range(len(part)):
-                part[j] += one[j]

@@ -10,7 +10,7 @@ import threading
 import time
 import weakref
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import Any, Final
 
@@ -320,9 +320,7 @@ class Connection:
         value = reply["value"]
         if isinstance(value, Frame) and not self._clock.virtual:
             t_start_s = value.t_start_s + self._clock.now() - float(reply["now"])
-            value = Frame(
-                value.image, value.exposure_s, t_start_s, value.camera, value.number, value.device_time_s
-            )
+            value = replace(value, t_start_s=t_start_s)
         return value
 
     def _beats(self) -> None:

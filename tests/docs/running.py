@@ -30,6 +30,7 @@ FEW: Final = {
     "calibrate amplitudes": "",
     "calibrate tweezers": "",
     "calibrate sites": "--shots 8 --seed 1",
+    "calibrate timing": "--shots 5 --seed 1",
     "calibrate": "--shots 30 --seed 1",
 }
 """Commands that take long -> what makes them short where the page says nothing else."""

@@ -99,13 +99,6 @@ def test_a_moving_group_goes_on_over_many_blocks() -> None:
     assert np.abs(acc - expected).max() < 5e-7
 
 
-def test_stored_waveforms_are_summed() -> None:
-    stored = np.random.default_rng(0).integers(-1000, 1000, (6, 9000)).astype(np.int16)
-    out = np.empty(8000, np.int16)
-    render_direct_kernels.sum_stored(stored, np.array([1, 4, 5]), 700, out)
-    assert np.array_equal(out, stored[[1, 4, 5], 700:8700].sum(axis=0))
-
-
 def comb(n: int, start_hz: float, step_hz: float) -> NDArray[np.float64]:
     return (start_hz + step_hz * np.arange(n)).astype(np.float64)
 
