@@ -1,4 +1,4 @@
-"""A scan over 3 x 4 points with 5 repeats, written with records that differ from shot to shot."""
+"""A scan over 3 x 4 points with 2 repeats, written with records that differ from shot to shot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ADDRESSES = ["planner.degree_of_parallelism", "shot.2.rearrange.window"]
 DEGREES = [1, 5, 15]
 WINDOWS_S = [0.03, 0.06, 0.09, 0.12]
 POINTS = [[degree, window] for degree, window in itertools.product(DEGREES, WINDOWS_S)]
-N_REPEATS = 5
+N_REPEATS = 2
 
 
 def scan(points: Sequence[Sequence[Any]], n_repeats: int = N_REPEATS) -> dict[str, Any]:

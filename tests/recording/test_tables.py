@@ -55,7 +55,7 @@ def entries(run: Run) -> list[Any]:
 def test_a_table_agrees_with_the_files(run: Run) -> None:
     table = run.to_dataframe()
     found = entries(run)
-    assert table.index.tolist() == [one["shot"] for one in found] == list(range(60))
+    assert table.index.tolist() == [one["shot"] for one in found] == list(range(24))
     for name in ("attempt", "status", "success", "filling_fraction", "n_images", "n_missing_atoms"):
         assert table[name].tolist() == [one[name] for one in found], name
     for address in ADDRESSES:
