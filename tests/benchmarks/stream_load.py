@@ -146,7 +146,9 @@ class Rearrangement:
         self.tweezers.wait(duration_s + 1.0)
         fifo = self.card._machine.fifo
         if fifo is not None and math.isfinite(fifo.play_s):  # else it ran dry just now
-            ticks.append(fifo.play_s + int(began[words.BEGAN]) / self.stream._rate_hz)
+            light_s = fifo.play_s + int(began[words.BEGAN]) / self.stream._rate_hz
+            if light_s < time.perf_counter():  # else it ran dry after the program, and began again
+                ticks.append(light_s)
         return np.diff(ticks).tolist()
 
 
