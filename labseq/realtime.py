@@ -1,8 +1,9 @@
-"""Priority and locked memory for the time between a frame and the moves, where the system grants them.
+"""Priority, locked memory and awake processors between a frame and the moves, where the system grants them.
 
-A thread with the policy SCHED_FIFO is not interrupted by other programs, and locked memory is never moved
-to the disk. Linux grants both to root, and to users by ``/etc/security/limits.d``. On other systems nothing
-is changed.
+A thread with the policy SCHED_FIFO is not interrupted by other programs, locked memory is never moved to the
+disk, and a processor that does not fall asleep during an exposure keeps its caches and answers at once. Linux
+grants the first two to root, and to users by ``/etc/security/limits.d``; the third to those who may write to
+``/dev/cpu_dma_latency``. On other systems nothing is changed.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Final
 
 PRIORITY: Final = 20
@@ -20,6 +23,10 @@ SWITCH_S: Final = 0.2e-3
 LOCK_FLAGS: Final = 1 | 2 | 4
 """MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT: what is used stays in memory, what is only reserved takes none."""
 LIMITS: Final = "'@GROUP - rtprio 22' and '@GROUP - memlock unlimited' in a file in /etc/security/limits.d"
+LATENCY: Final = Path("/dev/cpu_dma_latency")
+"""While it is open, processors sleep only as deeply as they can wake within the time written to it, in us."""
+UDEV: Final = """KERNEL=="cpu_dma_latency", GROUP="GROUP", MODE="0660" in a file in /etc/udev/rules.d"""
+IDLE_DRIVER: Final = Path("/sys/devices/system/cpu/cpuidle/current_driver")
 
 
 def raise_priority(above: int = 0) -> bool:
@@ -47,10 +54,15 @@ def _set_scheduler(policy: str, priority: int) -> bool:
     return True
 
 
-def prepare_process() -> None:
-    """Lock the memory, and let threads that wait for Python have it soon."""
+@contextmanager
+def real_time() -> Generator[None]:
+    """Lock the memory, let waiting threads have Python soon, and keep the processors awake meanwhile."""
     sys.setswitchinterval(SWITCH_S)
     lock_memory()
+    with ExitStack() as stack:
+        with suppress(OSError):
+            stack.enter_context(LATENCY.open("wb", buffering=0)).write(bytes(4))  # 0 us
+        yield
 
 
 def lock_memory() -> bool:
@@ -66,13 +78,23 @@ def lock_memory() -> bool:
     return False
 
 
+def may_stay_awake() -> bool:
+    """Whether the system lets this process keep the processors awake, or has no states of sleep at all."""
+    with suppress(OSError):
+        return IDLE_DRIVER.read_text("ascii").strip() == "none" or os.access(LATENCY, os.W_OK)
+    return True
+
+
 def refused() -> str:
     """What this computer does not grant, and how to allow it; "" if nothing is missing or can be done."""
     if sys.platform != "linux":
         return ""
-    granted = {"priority": raise_priority(), "locked memory": lock_memory()}
+    missing = {
+        "priority": "" if raise_priority() else LIMITS,
+        "locked memory": "" if lock_memory() else LIMITS,
+        "awake processors": "" if may_stay_awake() else UDEV,
+    }
     restore_priority()
-    missing = " and ".join(name for name, is_granted in granted.items() if not is_granted)
-    if not missing:
-        return ""
-    return f"other programs may delay the moves after a frame: no {missing}; {LIMITS} grants both"
+    names = " and ".join(name for name, remedy in missing.items() if remedy)
+    remedies = "; ".join(dict.fromkeys(filter(None, missing.values())))
+    return f"the moves after a frame may be delayed: no {names}; allow it by {remedies}" if names else ""

@@ -1,8 +1,9 @@
-"""Priority and locked memory, where this system grants them."""
+"""Priority, locked memory and awake processors, where this system grants them."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -27,11 +28,34 @@ def test_a_thread_has_priority_until_it_is_restored_and_its_children_have_none()
 def test_what_is_refused_is_named_with_the_way_to_allow_it(monkeypatch):
     monkeypatch.setattr(realtime, "raise_priority", lambda: False)
     monkeypatch.setattr(realtime, "lock_memory", lambda: True)
+    monkeypatch.setattr(realtime, "may_stay_awake", lambda: True)
     text = realtime.refused()
     assert "no priority;" in text
     assert "limits.d" in text
+    assert "udev" not in text
     monkeypatch.setattr(realtime, "raise_priority", lambda: True)
     assert not realtime.refused()
+
+
+@pytest.mark.parametrize("is_granted", [True, False])
+def test_processors_stay_awake_for_a_run_in_real_time(monkeypatch, tmp_path, is_granted):
+    latency, driver = tmp_path / "cpu_dma_latency", tmp_path / "current_driver"
+    driver.write_text("intel_idle\n")
+    if is_granted:
+        latency.touch()
+    else:
+        latency.mkdir()  # nobody may write there, not even root
+    monkeypatch.setattr(realtime, "LATENCY", latency)
+    monkeypatch.setattr(realtime, "IDLE_DRIVER", driver)
+    monkeypatch.setattr(os, "access", lambda *_: is_granted)
+    monkeypatch.setattr(realtime, "lock_memory", lambda: True)
+    with realtime.real_time():
+        opened = {os.path.realpath(fd) for fd in Path("/proc/self/fd").iterdir()}
+        assert (str(latency) in opened) == is_granted
+    assert not is_granted or latency.read_bytes() == bytes(4)
+    assert ("awake processors" in realtime.refused()) != is_granted
+    driver.write_text("none\n")
+    assert "awake" not in realtime.refused()
 
 
 def test_memory_is_not_locked_under_a_limit(monkeypatch):

@@ -16,7 +16,7 @@ from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord, TimelineEntry
-from labseq.realtime import prepare_process
+from labseq.realtime import real_time
 from labseq.recording import Run, RunWriter, Shot, clear_active, data_root, mark_active, open_run
 from labseq.recording.best import best_point
 from labseq.recording.folders import later_day
@@ -255,7 +255,8 @@ class Session:
             self._warn(text)
         error: BaseException | None = None
         try:
-            self._take_shots(lab, writer, record)
+            with nullcontext() if lab.clock.virtual else real_time():
+                self._take_shots(lab, writer, record)
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down(ended_well=error is None)
@@ -274,8 +275,6 @@ class Session:
         return open_run(writer.run_dir)
 
     def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
-        if not lab.clock.virtual:
-            prepare_process()
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
         first = self.scan_run.first
         changes = {address: change["value"] for address, change in record.overrides.items()}

@@ -45,7 +45,7 @@ from labseq.plugin import (
     TargetPattern,
     TransientError,
 )
-from labseq.realtime import prepare_process, raise_priority, restore_priority
+from labseq.realtime import raise_priority, real_time, restore_priority
 
 Words = NDArray[np.int64]
 
@@ -156,8 +156,7 @@ def stream(given: argparse.Namespace) -> Counts:
     """Play programs one after another."""
     context = Context("mobile_tweezers", GRID, motion=MOTION)
     card, counts, frames = SimulatedCard(context.clock, keep_history=False), Counts(), take_frames()
-    prepare_process()
-    with installed(card) as name:
+    with real_time(), installed(card) as name:
         settings = SpcmSettings(
             card=name,
             mode="stream",
