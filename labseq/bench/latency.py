@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -21,7 +20,7 @@ from labseq.guard import stop_on_signals
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.motion import tone_program
 from labseq.realtime import raise_priority, restore_priority
-from labseq.roles import Shot, Step, StepContext, offers
+from labseq.roles import Shot, Step, StepContext
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
@@ -218,7 +217,6 @@ class _Measured(Step):
 
     def __init__(self) -> None:
         self.plans: list[tuple[int, float]] = []
-        self.settle_s: list[float] = []
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002
         """Empty: its duration is not planned."""
@@ -226,12 +224,7 @@ class _Measured(Step):
 
     def run(self, shot: Shot) -> None:
         """Plan, prepare and play, as a rearrangement does."""
-        start_s = time.perf_counter()
-        mobile = shot.mobile_tweezers
         raise_priority()  # as a run in real time does before the frame
-        if offers(mobile, "settle"):
-            mobile.settle()  # a simulated device does here what was due while the virtual clock advanced
-        self.settle_s.append(time.perf_counter() - start_s)
         plan, report = checked_plan(shot, 0)
         if plan.n_batches == 0:
             what = "there is nothing to move: a random loading needs no moves, or has no atoms to move"
@@ -268,9 +261,7 @@ def _report(
 ) -> LatencyReport:
     shots = watch.shots[N_WARM:]
     times = {n: np.array([shot[n] for shot in shots]).T for n in (*HOST_STAGES, "start", "light")}
-    settle_s = np.array(measured.settle_s[N_WARM:])
     times["prepare"][0] -= times["tones"][0]
-    times["light"][0] -= settle_s
     light_s, modelled_s = times["light"]
     total_s = light_s - times["start"][0]
     between_s = total_s - sum(times[name][0] for name in HOST_STAGES)

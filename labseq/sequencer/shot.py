@@ -452,6 +452,7 @@ class RunningShot:
             self._await_exposure()
         timeout_s, start_s = self.call_timeout_s, self.elapsed_s
         frame = self._expose(exposure_s, cycle)
+        self._catch_up()
         self._frame_s = self.clock.now(), time.perf_counter()
         self._events.hold()
         if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -468,6 +469,12 @@ class RunningShot:
         filling = math.nan if self.target.is_none else self.target.filling_fraction(occupancy)
         self._events("image", {"image": image, "filling_fraction": filling})
         return occupancy
+
+    def _catch_up(self) -> None:
+        """Have a simulated device do what was due while the virtual clock advanced: no light waits for it."""
+        mobile = self.lab.mobile_tweezers
+        if self.clock.virtual and offers(mobile, "settle"):
+            self.call("mobile_tweezers", self.call_timeout_s, mobile.settle)
 
     def _name_of_image(self, cycle: int) -> str:
         """A name that no other image of the shot has: that of the step, with the cycle or a number."""
