@@ -11,7 +11,7 @@ from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.model import CameraFacts, SiteGrid, TargetPattern
 from labseq.roles import Context
 from labseq.sequencer.lab import Blinding
-from labseq.testing.fakes import RecordingCamera, RecordingDevice, ScriptedDetector
+from labseq.testing.fakes import RecordingCamera, RecordingDevice, RecordingMobileTweezers, ScriptedDetector
 from tests.sequencer.rig import IMAGE, LOAD, Rig, given
 
 MARKED = {"shutter": Blinding("state", ("on",))}
@@ -103,6 +103,25 @@ def test_a_device_settles_after_all_are_open_and_before_the_first_shot() -> None
     assert names.count("camera.settle") == 1
     assert made.observer.of("settling") == [{"device": "camera", "timeout_s": 60.0}]
     assert made.lab.clock.now() >= 30.0
+
+
+class SettlingTweezers(RecordingMobileTweezers):
+    settling_timeout_s = 0.0
+
+    def settle(self) -> None:
+        self.use("settle")
+
+
+@pytest.mark.parametrize("is_virtual", [True, False])
+def test_what_a_simulated_device_owes_to_the_virtual_clock_is_done_before_the_frame_counts(
+    is_virtual: bool,
+) -> None:
+    made = Rig()
+    object.__setattr__(made.lab, "mobile_tweezers", SettlingTweezers(calls=made.lab.calls))
+    vars(made.lab.clock)["virtual"] = is_virtual
+    made.run()
+    names = made.lab.calls.names()
+    assert (names[names.index("camera.read") + 1] == "mobile_tweezers.settle") == is_virtual
 
 
 def test_a_device_that_does_not_settle_ends_the_run_safely() -> None:
