@@ -436,7 +436,8 @@ class Stream:
         may_have_begun = start <= fetched and start < box[k.MADE]
         if code == k.LATE or (may_have_begun and fetched < end):
             played = max(0, min(fetched, int(box[k.MADE])) - start) / (end - start)
-            share = f"{played:.0%} of the program was played"
+            length = format_quantity((end - start) / self._rate_hz, "time")
+            share = f"{played:.0%} of a part of {length} was played"
             was_full = box[k.MADE] - start >= len(self._ring) - self._ahead
             remedy = (
                 f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode replay"

@@ -139,7 +139,7 @@ def test_a_program_of_which_a_part_may_have_been_played_is_not_played_again(driv
         box, block = stream._box, stream._block
         box[k.START] = box[k.FETCHED]  # of the block that is being fetched the card reports nothing
         box[k.MADE], box[k.END] = box[k.START] + block, box[k.START] + 9 * block
-        with pytest.raises(TransientError, match=r"underrun: .* \(0% of the program was played\)"):
+        with pytest.raises(TransientError, match=r"underrun: .* \(0% of a part of .*s was played\)"):
             stream._recover(k.DRY)
 
 
@@ -157,7 +157,7 @@ def test_a_computer_that_is_held_up_in_motion(driver: Any, held_s: float, is_sur
             start_s(lab, program)
             return
         with pytest.raises(
-            TransientError, match=r"underrun: .* \(\d\d% of the program was played\); raise `fill`"
+            TransientError, match=r"underrun: .* \(\d\d% of a part of .*s was played\); raise `fill`"
         ):
             lab.tweezers.wait(duration_s + 1e-3)
         assert lab.card.outputs_on == (False, False)
