@@ -1,8 +1,6 @@
 """The flat public namespace: complete, consistent, and cheap to import."""
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 from types import FunctionType
 
@@ -35,10 +33,3 @@ def test_every_name_resolves_and_is_documented(name):
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'make_plan'"):
         getattr(labseq, "make_plan")  # noqa: B009 - pyright knows that it is not there
-
-
-def test_importing_labseq_pulls_nothing_heavy():
-    code = "import sys, labseq; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    heavy = {"numpy", "numba", "scipy", "h5py", "pydantic", "yaml", "rich", "typer", "spcm", "serial"}
-    assert not heavy & set(done.stdout.split())

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +9,6 @@ import labseq
 from labseq.errors import ConfigError, DeviceError, PlanError, Problem, StopRequested
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
-HEAVY = ("numpy", "pydantic", "yaml", "rich", "h5py", "numba", "scipy", "pluggy")
-
-
-def imported_by(*arguments: str) -> set[str]:
-    command = [sys.executable, "-X", "importtime", "-m", "labseq", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-
-
-def test_help_imports_nothing_heavy() -> None:
-    imported = imported_by("--help")
-    assert "typer" in imported
-    assert imported.isdisjoint(HEAVY)
-
-
-def test_a_check_imports_only_what_it_needs() -> None:
-    imported = imported_by("check", str(SEQUENCE))
-    if "numba" in imported:  # the first time, kernels are compiled
-        imported = imported_by("check", str(SEQUENCE))
-    assert "llvmlite" in imported
-    assert imported.isdisjoint(
-        {"h5py", "lmfit", "matplotlib", "numba", "pandas", "rich", "scipy.linalg", "scipy.special", "xarray"}
-    )
 
 
 def test_version(call: Any) -> None:

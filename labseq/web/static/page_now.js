@@ -64,7 +64,7 @@ function makeView(main) {
       el("p.note", {}, "atoms in a shot, known in simulations"));
     replace(stages, stageTable(state.stages, run.simulated));
     replace(readings, readingsOf(state));
-    replace(log, el("ul.events", {}, [...state.log].reverse().map((line) => el("li", {}, el("time", { dateTime: line.t_utc }, localTime(line.t_utc, false)), " ", line.text))));
+    replace(log, el("ul.events", { tabindex: "0" }, [...state.log].reverse().map((line) => el("li", {}, el("time", { dateTime: line.t_utc }, localTime(line.t_utc, false)), " ", line.text))));
     shotOf(state);
   }
 
