@@ -26,7 +26,7 @@ from hypothesis import settings
 from labseq.files import cache_root
 
 # A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
-settings.register_profile("labseq", deadline=None, derandomize=True)
+settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("search", deadline=None)
 settings.load_profile("labseq")
 

@@ -11,6 +11,7 @@ import pytest
 import labseq
 from labseq.model import ShotRecord
 from labseq.recording import Run, RunWriter, open_run
+from tests.session.whole_runs import SMALL_FRAMES
 
 from .records import make_run
 
@@ -96,7 +97,8 @@ def run_text(text: str, root: Path, seed: int) -> Run:
     """Run a sequence in the virtual lab."""
     (root / "sequence.yaml").write_text(text, "utf-8")
     profile = str(ROOT / "hardware_profiles" / "virtual.yaml")
-    with labseq.Session.open(root / "sequence.yaml", profile=profile, seed=seed, output=root) as session:
+    options: dict[str, Any] = {"profile": profile, "seed": seed, "output": root, "overrides": SMALL_FRAMES}
+    with labseq.Session.open(root / "sequence.yaml", **options) as session:
         return session.run()
 
 
@@ -109,4 +111,4 @@ def recapture(tmp_path_factory: pytest.TempPathFactory) -> Run:
 @pytest.fixture(scope="session")
 def lifetime(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A lifetime scan of 12 shots in the virtual lab."""
-    return run_text(LIFETIME, tmp_path_factory.mktemp("lifetime"), seed=2)
+    return run_text(LIFETIME, tmp_path_factory.mktemp("lifetime"), seed=5)

@@ -53,7 +53,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunProfile:
     @cache
     def run(profile: str, *overrides: str, shots: int = N_SHOTS) -> Run:
         folder = tmp_path_factory.mktemp(profile)
-        overrides = (*overrides, "shot.2.rearrange.cycles=1")
+        overrides = (*overrides, "shot.2.rearrange.cycles=1", "planner.degree_of_parallelism=15")
         with Session.open(
             SEQUENCE, profile=profile, shots=shots, seed=1, output=folder, overrides=overrides
         ) as session:

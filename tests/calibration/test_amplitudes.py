@@ -16,16 +16,22 @@ import labseq
 from labseq.config.profile import load_profile
 from labseq.errors import ConfigError, LabseqError
 from labseq.model import Plan, SegmentKind
+from labseq.session.profile import resolve_profile
 
 PROFILE = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
-detector: {use: threshold}
+detector: {use: threshold, frame: [150, 240], centre_px: [74.5, 119.5]}
 devices:
-  trap_camera: {use: virtual, role: camera, faults: {transient: 10 %}}
+  trap_camera:
+    use: virtual
+    role: camera
+    region: {y: 150, x: 100, height: 212, width: 312}
+    faults: {transient: 10 %}
   meter: {use: virtual_spot_meter}
 simulation:
   use: virtual
   machine_seed: 5
   mobile_light: {tone_response: 14 %}
+  image: {frame: [150, 240], centre_px: [74.5, 119.5]}
 """
 
 
@@ -34,10 +40,11 @@ def true_depths(profile: Path) -> NDArray[np.float64]:
     _, spec = load_profile(str(profile), beside=profile.parent)
     grid, light = spec.grid_model(), MobileLightSettings(tone_response=0.14)
     full = full_amplitudes(grid, with_true_response(grid, spec.motion, light, 5))
+    used = resolve_profile(str(profile))
     power = np.empty(grid.shape)
     for row, col in np.ndindex(*grid.shape):
         plan = Plan.from_batches([([(row, col)], [(row, col - 1 if col else col + 1)])])
-        program = labseq.tone_program(plan, profile=str(profile))
+        program = labseq.tone_program(plan, used.grid, used.motion)
         moving = int(np.flatnonzero(program.kind == SegmentKind.TRANSPORT)[0])
         tones = program.tones_at(float(program.joint_s[moving]))
         of_row, of_col = tones.row.amplitude[0] / full[0][row], tones.column.amplitude[0] / full[1][col]

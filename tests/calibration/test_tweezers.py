@@ -23,9 +23,13 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid, TweezerAmplitudes
 
 PROFILE = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
-detector: {use: threshold}
+detector: {use: threshold, frame: [150, 240], centre_px: [74.5, 119.5]}
 devices: {wavemeter: {use: virtual_spot_meter, noise: 1 %}}
-simulation: {use: virtual, machine_seed: 3, tone_response: 8 %}
+simulation:
+  use: virtual
+  machine_seed: 3
+  tone_response: 8 %
+  image: {frame: [150, 240], centre_px: [74.5, 119.5]}
 """
 METER = ["shot.0.equalise.device=wavemeter"]
 CAMERAS = {
@@ -33,19 +37,19 @@ CAMERAS = {
   trap_camera:
     use: virtual
     role: camera
-    region: {y: 150, x: 100, height: 250, width: 300}
+    region: {y: 180, x: 130, height: 152, width: 252}
     faults: {transient: 10 %}
 """,
     "camera of the atoms": "equalise: {device: camera, exposure: 2 ms}\n",
 }
 SIMULATION = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
-detector: {use: threshold}
+detector: {use: threshold, frame: [150, 240], centre_px: [74.5, 119.5]}
 simulation:
   use: virtual
   machine_seed: 3
   tone_response: 8 %
   depth_disorder: 0 %
-  image: {sensor: qcmos, tweezer_light: 900000}
+  image: {sensor: qcmos, tweezer_light: 900000, frame: [150, 240], centre_px: [74.5, 119.5]}
 """
 
 

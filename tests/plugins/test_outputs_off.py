@@ -10,10 +10,10 @@ import textwrap
 from collections.abc import Callable, Generator
 from importlib import reload
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from labseq.cli import main
 from labseq.drivers import serial_emergency as script
 
 from .labseq_serial_rig import PROFILE as INSTRUMENT, Simulator, opened
@@ -30,7 +30,9 @@ def test_outputs_go_off_when_a_c_call_does_not_return(tmp_path: Path) -> None:
         assert {row["cause"] for row in log_rows(tmp_path)} == {"hung"}
 
 
-def test_a_run_that_is_killed_leaves_instrument_and_lines_off(tmp_path: Path) -> None:
+def test_a_run_that_is_killed_leaves_instrument_and_lines_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """From the command line to the connectors; `labseq show` and the next run report it."""
     channels = {"light": {"channel": 4, "on": ["load", "image", "idle"]}}
     profile = PROFILE.replace("STATIC", "{use: virtual}").replace("MOBILE", "{use: virtual}")
@@ -39,9 +41,10 @@ def test_a_run_that_is_killed_leaves_instrument_and_lines_off(tmp_path: Path) ->
     profile += f"lines: {json.dumps({'use': 'ttl', 'port': str(tmp_path / 'box'), 'channels': channels})}\n"
     (tmp_path / "p.yaml").write_text(profile, encoding="utf-8")
     (tmp_path / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
-    command = [sys.executable, "-m", "labseq", "run", "s.yaml", "--output", "runs", "--shots"]
+    command = ["run", "s.yaml", "--output", "runs", "--shots"]
+    monkeypatch.chdir(tmp_path)
     with outputs(tmp_path, driven=False) as devices:
-        run = subprocess.Popen([*command, "1000"], cwd=tmp_path, stdout=subprocess.DEVNULL)
+        run = subprocess.Popen([sys.executable, "-m", "labseq", *command, "1000"], stdout=subprocess.DEVNULL)
         try:
             until(lambda: run.poll() is not None or {*devices.off_since().values()} == {None})
             assert run.poll() is None
@@ -51,17 +54,19 @@ def test_a_run_that_is_killed_leaves_instrument_and_lines_off(tmp_path: Path) ->
         folder = next(tmp_path.glob("runs/*/0001_small"))
         until(lambda: len(log_rows(folder)) == 2)
         assert None not in devices.off_since().values()
-        options: dict[str, Any] = {"cwd": tmp_path, "capture_output": True, "text": True}
-        shown = subprocess.run(
-            [sys.executable, "-m", "labseq", "show", str(folder)], check=False, **options
-        ).stdout
         because = r"off after \d+ ms, because the run died: sent"
-        shown = " ".join(shown.split())
+        shown = printed(capfd, "show", str(folder))
         assert re.search(rf"shutter {because}", shown)
         assert re.search(rf"lines {because}", shown)
-        done = subprocess.run([*command, "1"], check=False, **options)
-        printed = " ".join((done.stderr + done.stdout).split())
-        assert re.search(rf"its watchdog: lines {because}", printed)
+        assert re.search(rf"its watchdog: lines {because}", printed(capfd, *command, "1"))
+
+
+def printed(capfd: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """All that a command prints, in one line."""
+    capfd.readouterr()
+    with pytest.raises(SystemExit):
+        main([*arguments])
+    return " ".join("".join(capfd.readouterr()).split())
 
 
 @pytest.fixture

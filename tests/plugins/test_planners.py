@@ -48,7 +48,7 @@ class TestContract(PlannerContract):
     slots=st.integers(0, 2),
     tones=st.tuples(st.integers(1, 8), st.integers(1, 8)),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_any_target_is_filled_within_the_limits(
     name: str, case: tuple[TargetPattern, Occupancy], dop: int, slots: int, tones: tuple[int, int]
 ) -> None:

@@ -30,8 +30,8 @@ grid: {rows: 4, cols: 4, spacing: 4.49 um}
 camera: {use: virtual}
 static_tweezers: {use: virtual}
 mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
+detector: {use: threshold, frame: [96, 96], centre_px: [47.5, 47.5]}
+simulation: {use: virtual, image: {frame: [96, 96], centre_px: [47.5, 47.5]}}
 """
 
 

@@ -20,10 +20,10 @@ grid: {rows: 6, cols: 6, spacing: 4.49 um}
 camera: {use: virtual}
 static_tweezers: {use: virtual}
 mobile_tweezers: {use: virtual}
-detector: {use: threshold}
-simulation: {use: virtual}
+detector: {use: threshold, frame: [128, 160], centre_px: [63.5, 79.5]}
+simulation: {use: virtual, image: {frame: [128, 160], centre_px: [63.5, 79.5]}}
 """
-"""A virtual lab of 6 x 6 sites."""
+"""A virtual lab of 6 x 6 sites, and of frames as small as they allow."""
 SEQUENCE = """
 labseq: 1
 name: small µ

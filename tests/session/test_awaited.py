@@ -116,7 +116,7 @@ def test_a_result_that_does_not_come_is_no_value_and_an_analysis_that_dies_ends_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    rest = CLIMB.replace("mean", "trouble").replace("60 s", "5 s").replace("repeats: 2", "repeats: 1")
+    rest = CLIMB.replace("mean", "trouble").replace("60 s", "2 s").replace("repeats: 2", "repeats: 1")
     path, seen = write(tmp_path, rest.replace("points: 4", "points: 6")), Going()
     with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=seen) as session:
         with pytest.raises(DeviceError) as caught:
@@ -131,7 +131,7 @@ def test_a_result_that_does_not_come_is_no_value_and_an_analysis_that_dies_ends_
     assert [one["value"] is None for one in seen.of("scan_point")] == [False, True, True, False]
     texts = [one["text"] for one in seen.of("warning")]
     assert "shot 1 has no 'analysis.trouble.filling': the analysis failed: ValueError: too dark" in texts
-    assert "shot 2 has no 'analysis.trouble.filling': the analysis gave no result within 5 s" in texts
+    assert "shot 2 has no 'analysis.trouble.filling': the analysis gave no result within 2 s" in texts
 
     Path("repaired").touch()
     again = resumed(run_dir)

@@ -13,6 +13,8 @@ from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.model.estimate import Estimate
 from labseq.session.check import check
 
+from .whole_runs import SMALL_FRAMES
+
 ROOT = Path(__file__).parents[2]
 SURVIVAL = "survival:before,after"
 IMAGE_HZ = -math.log1p(-0.00314) / 45e-3 + 1 / 33
@@ -42,7 +44,9 @@ def test_the_fitted_value_is_that_of_the_simulation(
     name: str, quantity: str, fit: str, parameter: str, true: float, tolerance: float, tmp_path: Path
 ) -> None:
     sequence = ROOT / "sequences" / f"{name}.yaml"
-    with labseq.Session.open(sequence, seed=3, output=tmp_path, overrides=["repeats=2"]) as session:
+    with labseq.Session.open(
+        sequence, seed=3, output=tmp_path, overrides=["repeats=2", *SMALL_FRAMES]
+    ) as session:
         run = session.run()
     given = ("centre=0",) if name == "hand_over_ramp" else ()
     (found,) = scan_report(run, ScanRequest((quantity,), fit=fit, fit_settings=given)).fits
@@ -54,7 +58,7 @@ def test_the_fitted_value_is_that_of_the_simulation(
 def test_a_wrong_step_of_the_tones_costs_atoms(tmp_path: Path) -> None:
     lost: list[float] = []
     for step in ("1.6 MHz", "1.65 MHz"):
-        overrides = [f"profile.grid.column_frequency.step={step}", "shot.2.rearrange.cycles=1"]
+        overrides = [f"profile.grid.column_frequency.step={step}", "shot.2.rearrange.cycles=1", *SMALL_FRAMES]
         options: Any = {"shots": 3, "seed": 1, "output": tmp_path, "overrides": overrides}
         with labseq.Session.open(ROOT / "sequences" / "compact_225.yaml", **options) as session:
             run = session.run()

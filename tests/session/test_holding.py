@@ -26,6 +26,7 @@ from labseq.session.locks import lock_devices
 from labseq.session.profile import resolve_profile
 from labseq.session.safe import make_profile_safe
 from labseq.testing.fakes import RecordingObserver
+from tests.plugins.labseq_soapy_rig import until
 
 from .small_runs import OWN_DEVICE, PROFILE
 
@@ -175,8 +176,8 @@ def test_standing_by_makes_safe_what_a_process_that_dies_or_hangs_leaves_on() ->
         assert "that process is ended first" in watching.stdout.readline()
         assert watching.stdout.readline().split() == ["shutter", "safe"]
         run = child_of(stack, "-m", "labseq", "run", "s.yaml", "--shots", "100000")  # without a watchdog
-        while not list(Path("data").glob("*/*/shots/*")):
-            assert run.poll() is None
+        until(lambda: run.poll() is not None or list(Path("data").glob("*/*/shots/*")) != [])
+        assert run.poll() is None
         run.kill()
         assert re.search(
             rf" the run /.*0001_look \(process {run.pid} on .* died$", watching.stdout.readline()

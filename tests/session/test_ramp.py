@@ -9,7 +9,7 @@ import labseq
 
 from .small_runs import PROFILE
 
-SIMULATION = "simulation: {use: virtual, loading: 75 %, depth_disorder: 4 %, lost_below_depth: 10 %}"
+SIMULATION = "simulation: {use: virtual, loading: 75 %, depth_disorder: 4 %, lost_below_depth: 10 %,"
 SEQUENCE = """
 labseq: 1
 name: ramped
@@ -32,7 +32,7 @@ AGAIN = """
 
 def shots(folder: Path, depth: str, steps: str = AGAIN) -> list[Any]:
     (folder / "shallow.yaml").write_text(
-        PROFILE.replace("simulation: {use: virtual}", SIMULATION).replace("6, cols: 6", "8, cols: 8"),
+        PROFILE.replace("simulation: {use: virtual,", SIMULATION).replace("6, cols: 6", "8, cols: 8"),
         encoding="utf-8",
     )
     sequence = folder / "s.yaml"

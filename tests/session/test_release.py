@@ -16,6 +16,8 @@ from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 from tests.plugins.needs import need_library
 
+from .whole_runs import SMALL_FRAMES
+
 ROOT = Path(__file__).parents[2]
 SHOT = """labseq: 1
 name: free flight
@@ -106,7 +108,12 @@ def test_a_release_that_the_profile_cannot_make_is_refused(
 def recaptured(path: Path, folder: Path, *overrides: str) -> tuple[float, labseq.Run]:
     """The fraction of atoms that a release leaves, and the run."""
     with labseq.Session.open(
-        path, profile="virtual", shots=4, seed=3, output=folder, overrides=["record_frames=none", *overrides]
+        path,
+        profile="virtual",
+        shots=4,
+        seed=3,
+        output=folder,
+        overrides=["record_frames=none", *SMALL_FRAMES, *overrides],
     ) as session:
         run = session.run()
     before = sum(np.count_nonzero(shot.occupancies[0]) for shot in run.shots)
@@ -117,6 +124,7 @@ def recaptured(path: Path, folder: Path, *overrides: str) -> tuple[float, labseq
 def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(tmp_path: Path) -> None:
     temperature_k = 30e-6  # that of the profile, 15 uK, is found in tests/analysis/test_quantities.py
     overrides = [f"profile.simulation.temperature={temperature_k} K", "repeats=1", "record_frames=none"]
+    overrides += SMALL_FRAMES
     sequence = ROOT / "sequences" / "release_recapture.yaml"
     with labseq.Session.open(sequence, output=tmp_path, seed=2, overrides=overrides) as session:
         run = session.run()

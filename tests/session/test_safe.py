@@ -20,6 +20,7 @@ from labseq.session.devices import check_devices
 from labseq.session.safe import SafeStateReport, make_each_safe, make_profile_safe
 from labseq.testing.fakes import RecordingObserver, fake_lab
 from tests.hostile import HOSTILE
+from tests.plugins.labseq_soapy_rig import until
 
 from .small_runs import OWN_DEVICE, PROFILE as SMALL_PROFILE
 
@@ -156,8 +157,8 @@ def test_a_command_that_opens_devices_and_is_killed_leaves_them_off(command: str
     plugin.write_text(text.replace("import labseq\n", STAYS, 1).replace("class Mine:", GUARDED), "utf-8")
     labseq = [sys.executable, "-m", "labseq", command, "./p.yaml"]
     with subprocess.Popen(labseq, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        while not Path("reached").exists():
-            assert process.poll() is None, process.communicate()
+        until(lambda: process.poll() is not None or Path("reached").exists())
+        assert process.poll() is None, process.communicate()
         process.kill()
         _, said = process.communicate(timeout=20.0)  # until the watchdog has ended, too
     assert not Path("on").exists()
@@ -186,7 +187,7 @@ def test_all_are_safe_in_order_without_a_detector() -> None:
 
 
 def test_without_the_simulation_nothing_virtual_can_be_made_safe() -> None:
-    write("{use: mine}", profile=PROFILE.replace("simulation: {use: virtual}", "simulation: {use: gone}"))
+    write("{use: mine}", profile=PROFILE.replace("simulation: {use: virtual", "simulation: {use: gone"))
     outcome, _ = secured()
     assert list(outcome.attempted) == ["shutter"]
     assert set(outcome.refused) == {"mobile_tweezers", "camera", "static_tweezers", "simulation"}

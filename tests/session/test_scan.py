@@ -18,6 +18,7 @@ from labseq.session.lab import _reopened, rebuild_lab
 from labseq.testing.fakes import RecordingObserver
 
 from . import small_runs
+from .whole_runs import SMALL_FRAMES
 
 ROOT = Path(__file__).parents[2]
 REST = """labseq: 1
@@ -40,6 +41,7 @@ def open_scan(folder: Path, text: str, **options: Any) -> labseq.Session:
     path = folder / "s.yaml"
     path.write_text(REST + text)
     profile = str(ROOT / "hardware_profiles" / "virtual.yaml")
+    options["overrides"] = [*SMALL_FRAMES, *options.get("overrides", ())]
     return labseq.Session.open(path, profile=profile, output=folder / "data", **options)
 
 

@@ -9,6 +9,12 @@ import labseq
 
 ROOT = Path(__file__).parents[2]
 COMPACT = ROOT / "sequences" / "compact_225.yaml"
+SMALL_FRAMES = tuple(
+    f"profile.{part}.{setting}"
+    for part in ("detector", "simulation.image")
+    for setting in ("frame=[240, 400]", "centre_px=[119.5, 199.5]")
+)
+"""Frames that 20 x 20 sites just fill, a third of those of the virtual lab."""
 
 
 def run(tmp_path: Path, sequence: Path = COMPACT, observer: Any = None, **options: Any) -> labseq.Run:

@@ -80,9 +80,9 @@ grid: {rows: 10, cols: 10, spacing: 4.49 um}
 camera: {use: watched}
 static_tweezers: {use: watched}
 mobile_tweezers: {use: watched}
-detector: {use: threshold}
+detector: {use: threshold, frame: [160, 240], centre_px: [79.5, 119.5]}
 devices: {shutter: {use: watched, commands: [open, close]}}
-simulation: {use: virtual}
+simulation: {use: virtual, image: {frame: [160, 240], centre_px: [79.5, 119.5]}}
 plugin_folders: [plugins]
 timeouts: {call: 3 s, safe_state: 2 s, plan: 5 s}
 """

@@ -7,7 +7,7 @@ import numpy as np
 
 import labseq
 
-N_SHOTS = 12
+N_SHOTS = 8
 SEQUENCE = """
 labseq: 1
 name: scanned run
@@ -27,7 +27,7 @@ SHOTS = {
     "scan": """scan:
   planner.degree_of_parallelism: [2, 6]
   profile.mobile_tweezers.speed: [100 um/ms, 130 um/ms]
-repeats: 3
+repeats: 2
 order: shuffled""",
     "climb": """scan:
   use: climb
@@ -35,7 +35,7 @@ order: shuffled""",
     planner.degree_of_parallelism: {from: 2, to: 9}
     profile.mobile_tweezers.pick_up: {from: 20 us, to: 400 us}
   maximise: filling_fraction
-  points: 6
+  points: 4
 repeats: 2""",
 }
 NAMES = ("shot", "status", "success", "filling_fraction", "n_batches", "n_atom_moves", "parameters")

@@ -15,7 +15,7 @@ from tests.system.null_devices import write
 
 pytestmark = pytest.mark.system
 
-N_SHOTS = int(os.environ.get("LABSEQ_MANY_SHOTS", "120"))
+N_SHOTS = int(os.environ.get("LABSEQ_MANY_SHOTS", "75"))
 
 
 class Watching:

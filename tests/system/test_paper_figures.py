@@ -16,6 +16,7 @@ import pytest
 
 from labseq import Session
 from labseq.analysis.statistics import Statistics, statistics_of
+from tests.session.whole_runs import SMALL_FRAMES
 
 spec = spec_from_file_location(
     "make_paper_figures", Path(__file__).parents[2] / "docs" / "make_paper_figures.py"
@@ -35,7 +36,9 @@ MISSED = 5e-5
 @pytest.fixture(scope="module")
 def figure_5(tmp_path_factory: pytest.TempPathFactory) -> tuple[Statistics, Any]:
     folder = tmp_path_factory.mktemp("figure-5")
-    with Session.open(SEQUENCES / "figure5_multicycle.yaml", shots=N_SHOTS, seed=5, output=folder) as session:
+    options: dict[str, Any] = {"shots": N_SHOTS, "seed": 5, "output": folder}
+    options["overrides"] = ["record_frames=none", *SMALL_FRAMES]
+    with Session.open(SEQUENCES / "figure5_multicycle.yaml", **options) as session:
         run = session.run()
     losses = script.AtomLosses.of(run.record["devices"])
     assert losses is not None

@@ -113,10 +113,10 @@ def test_a_queue_that_is_killed_resumes_its_run(scanned):
 
 @pytest.fixture
 def small_disk(scanned):
-    """A data folder with room for a few shots; needs the right to mount."""
+    """A data folder with room for some shots; needs the right to mount."""
     disk = scanned.folder / "disk"
     disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)]
     try:
         subprocess.run(mount, check=True, capture_output=True)
     except (OSError, subprocess.CalledProcessError):

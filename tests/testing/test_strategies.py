@@ -15,7 +15,7 @@ NO_TARGET = TargetPattern(np.zeros((3, 5), np.bool_), np.zeros((3, 5), np.bool_)
 
 def found(strategy: SearchStrategy[Any], condition: Callable[[Any], bool]) -> Any:
     """An example, not the smallest one."""
-    return find(strategy, condition, settings=settings(phases=[Phase.generate]))
+    return find(strategy, condition, settings=settings(phases=[Phase.generate], max_examples=100))
 
 
 @given(strategies.occupancies((3, 5)))
