@@ -34,8 +34,9 @@ class Killing(RecordingObserver):
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         super().event(name, values)
-        if name == "shot_finished" and self.n_kills < 2:
-            multiprocessing.active_children()[self.n_kills % 2].kill()
+        workers = multiprocessing.active_children()
+        if name == "shot_finished" and self.n_kills < 2 and workers:
+            workers[-1].kill()  # the other one may be gone already
             self.n_kills += 1
 
 
