@@ -39,21 +39,21 @@ def test_a_server_beside_a_run_is_started_once_and_ends_with_the_terminal(
     monkeypatch.setattr(serve, "PORT", free_port())
     arguments = [sys.executable, "-c", PARENT, str(tmp_path / "data"), str(serve.PORT)]
     script = f"import subprocess; subprocess.run({arguments!r})"
-    terminal = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert terminal.stdout is not None
-    said = terminal.stdout.readline()
-    address, pid = said.split()[0], int(re.findall(r"process (\d+)", said)[0])
-    server = psutil.Process(pid)
-    for _ in range(200):
-        if serve._serves(address, tmp_path / "data"):
-            break
-        with pytest.raises(psutil.TimeoutExpired):
-            server.wait(0.1)
-    with urlopen(f"{address}api/v1/server") as answer:
-        assert json.load(answer)["data"] == str(tmp_path / "data")
-    assert "process" not in serve.start_beside(tmp_path / "data")
-    assert os.getpid() != pid
-    terminal.communicate("")
+    ) as terminal:
+        assert terminal.stdout is not None
+        said = terminal.stdout.readline()
+        address, pid = said.split()[0], int(re.findall(r"process (\d+)", said)[0])
+        server = psutil.Process(pid)
+        for _ in range(200):
+            if serve._serves(address, tmp_path / "data"):
+                break
+            with pytest.raises(psutil.TimeoutExpired):
+                server.wait(0.1)
+        with urlopen(f"{address}api/v1/server") as answer:
+            assert json.load(answer)["data"] == str(tmp_path / "data")
+        assert "process" not in serve.start_beside(tmp_path / "data")
+        assert os.getpid() != pid
+        terminal.communicate("")
     server.wait(20)
