@@ -56,6 +56,7 @@ def refused(text: str, more: str = "") -> str:
         ("= sin(variables.turn) + cos(0) + tan(0)", 2.0),
         ("= 75 % * 2", 1.5),
         ("= variables.warm - 5 K", "293.15 K"),
+        ("= 25 degC - 5 K", "293.15 K"),
         ("= exp(log(3))", 3.0),
         ("= floor(2.7) + ceil(2.1) + round(2.6)", 8),
         ("= 0.1 + 0.2", 0.3),
@@ -154,9 +155,10 @@ def test_what_depends_on_an_override_is_worked_out_again() -> None:
 
 
 def test_what_follows_from_a_value_through_another_one_is_known() -> None:
-    document = Document.parse("a: 2\nb: = 2 * a\nc: = b + 1\nd: = 2 * e\ne: 5\n", "s.yaml").evaluated()
+    document = Document.parse("a: 2\nb: = 2 * a\nc: = b + 1\nd: = 2 * e.f\ne: {f: 5}\n", "s.yaml").evaluated()
     assert document.expressions is not None
     assert document.expressions.following(("a",)) == [("b",), ("c",)]
+    assert document.expressions.following(("e",)) == [("d",)]
 
 
 def test_a_field_checks_the_result(tmp_path: Path) -> None:

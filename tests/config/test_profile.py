@@ -14,6 +14,7 @@ import pytest
 from labseq.config.document import Document
 from labseq.config.profile import (
     MOTION_KEYS,
+    BudgetSettings,
     CalibrationSettings,
     ChannelSettings,
     GridSettings,
@@ -100,6 +101,10 @@ def test_what_may_be_left_out() -> None:
     assert spec.timeouts == TimeoutSettings()
     empty = Document.parse(short + "devices:\nsimulation:\ntimeouts:\nplugin_folders:\n", "p.yaml")
     assert empty.validate(ProfileSpec) == spec
+
+
+def test_default_budgets_are_those_of_a_computer_that_keeps_up() -> None:
+    assert all(1e-3 <= budget_s <= 0.1 for budget_s in BudgetSettings().model_dump().values())
 
 
 def test_defaults_are_those_of_the_core() -> None:
