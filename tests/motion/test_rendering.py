@@ -102,6 +102,13 @@ def test_amplitudes_that_change_differently_are_blended_or_else_rendered_directl
     check(program)
 
 
+def test_tones_whose_ways_differ_a_little_are_blended() -> None:
+    tones = [(site(k), site(k + 1) + 2.0 * k, 0.05, 0.05, k) for k in range(20)]
+    program = program_of((34.538e-6, tones))
+    assert path_of(program) == [BLENDED]
+    check(program)
+
+
 def test_a_sample_rate_that_misses_the_comb_by_a_clock_step_is_made_up_for() -> None:
     step_hz = 1_623_457.1
     grid = SiteGrid(row_frequency_hz=comb(20, 100e6, step_hz), column_frequency_hz=comb(20, 90e6, step_hz))
