@@ -50,7 +50,7 @@ def test_an_array_at_half_the_depth_keeps_its_atoms(tmp_path: Path) -> None:
 
 
 def test_atoms_in_shallow_tweezers_are_lost_and_the_next_shot_loads_at_full_depth(tmp_path: Path) -> None:
-    for shot in shots(tmp_path, "0.1 %"):
+    for shot in shots(tmp_path, "0.1 %", AGAIN + "  - ramp: {depth: 0.1 %, duration: 5 ms}\n"):
         (full, shallow, again) = (np.count_nonzero(seen) for seen in shot.occupancies)
         assert full > 30  # of 64, in the second shot too
         assert shot.readings["simulation.lost.light"] >= full - 3
