@@ -193,9 +193,10 @@ class TestPrograms:
             program = lab.program()
             n_tones = int(np.diff(program.column.offsets).max())
             loud = np.full_like(program.column.start_amplitude, 1.01 / n_tones)
-            column = replace(program.column, start_amplitude=loud)
-            with pytest.raises(LimitError, match=r"sum of the amplitudes.* of full scale; .* would clip"):
-                lab.tweezers.prepare(replace(program, column=column))
+            for name in ("start_amplitude", "end_amplitude"):
+                column = replace(program.column, **{name: loud})
+                with pytest.raises(LimitError, match=r"sum of the amplitudes.* of full scale; .* would clip"):
+                    lab.tweezers.prepare(replace(program, column=column))
 
     @pytest.mark.parametrize(
         ("factor", "text"), [(0.0, "length"), (np.inf, "duration"), (np.nan, "duration"), (-1.0, "duration")]

@@ -16,7 +16,7 @@ import pytest
 from labseq_spcm import stream_kernels as k
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm.stream import check_rendering, made_of
+from labseq_spcm.stream import Stream, check_rendering, made_of
 from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
 
 from labseq.motion import render, tone_program
@@ -71,6 +71,21 @@ def test_programs_are_played_to_the_sample_within_the_look_ahead(
             assert 0.4 * ahead_s < start_s(lab, program, row_channel) - played_s <= ahead_s
         assert lab.tweezers.describe()["silent_underruns"] == 0
         assert lab.written(registers.SPC_M2CMD).count(registers.M2CMD_CARD_STOP) <= 1
+
+
+def test_a_program_is_over_when_the_outputs_have_played_it(
+    driver: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the loop looks every 0.25 ms and the driver every 0.1 ms, so both look while the end is on the card
+    monkeypatch.setattr(Stream, "max_wait_s", 0.1e-3)
+    with driver("stream", fill=1e-3) as lab:
+        lab.tweezers.settle()
+        lab.card.forget(lab.clock.now())
+        program = lab.program(1)
+        lab.play(program)
+        ended_s = lab.clock.now()
+        lab.clock.sleep(1e-3)
+        assert ended_s >= start_s(lab, program) + program.total_duration_s
 
 
 def test_a_computer_that_is_held_up_in_silence_costs_nothing(driver: Any) -> None:
