@@ -168,6 +168,13 @@ def test_what_is_the_same_in_all_shots_stands_in_an_archive_once(run: Run, tmp_p
         assert first == last
 
 
+def test_large_arrays_of_an_archive_are_compressed(tmp_path: Path) -> None:
+    large = write(tmp_path / "data", make_shot(frame_shape=(32, 32)))
+    with h5py.File(exported(large, "archive", tmp_path, frames=True)) as archive:
+        frames = everything(archive)["shots/shot_000000/camera/camera/frames"]
+        assert (frames.compression, frames.chunks) == ("gzip", (1, 32, 32))
+
+
 def test_an_archive_keeps_what_differs_after_a_resume(tmp_path: Path) -> None:
     run_dir = (writer := RunWriter.create(tmp_path, make_run())).run_dir
     writer.write_shot(make_shot(0))
