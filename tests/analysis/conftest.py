@@ -11,7 +11,6 @@ import pytest
 import labseq
 from labseq.model import ShotRecord
 from labseq.recording import Run, RunWriter, open_run
-from tests.session.whole_runs import SMALL_FRAMES
 
 from .records import make_run
 
@@ -97,8 +96,7 @@ def run_text(text: str, root: Path, seed: int) -> Run:
     """Run a sequence in the virtual lab."""
     (root / "sequence.yaml").write_text(text, "utf-8")
     profile = str(ROOT / "hardware_profiles" / "virtual.yaml")
-    options: dict[str, Any] = {"profile": profile, "seed": seed, "output": root, "overrides": SMALL_FRAMES}
-    with labseq.Session.open(root / "sequence.yaml", **options) as session:
+    with labseq.Session.open(root / "sequence.yaml", profile=profile, seed=seed, output=root) as session:
         return session.run()
 
 

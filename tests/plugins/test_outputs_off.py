@@ -55,18 +55,18 @@ def test_a_run_that_is_killed_leaves_instrument_and_lines_off(
         until(lambda: len(log_rows(folder)) == 2)
         assert None not in devices.off_since().values()
         because = r"off after \d+ ms, because the run died: sent"
-        shown = printed(capfd, "show", str(folder))
+        shown, _ = printed(capfd, "show", str(folder))
         assert re.search(rf"shutter {because}", shown)
         assert re.search(rf"lines {because}", shown)
-        assert re.search(rf"its watchdog: lines {because}", printed(capfd, *command, "1"))
+        assert re.search(rf"its watchdog: lines {because}", " ".join(printed(capfd, *command, "1")))
 
 
-def printed(capfd: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """All that a command prints, in one line."""
+def printed(capfd: pytest.CaptureFixture[str], *arguments: str) -> list[str]:
+    """What a command prints on stdout and on stderr, each in one line."""
     capfd.readouterr()
     with pytest.raises(SystemExit):
         main([*arguments])
-    return " ".join("".join(capfd.readouterr()).split())
+    return [" ".join(text.split()) for text in capfd.readouterr()]
 
 
 @pytest.fixture

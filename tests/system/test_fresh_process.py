@@ -30,7 +30,7 @@ def loaded():
     plugins = {name for name in sys.modules if name.startswith("labseq_")}
     return sorted((heavy | vendors | plugins) & set(sys.modules))
 
-print(loaded())
+print(loaded() + [name for name in ("typer",) if name in sys.modules])
 print(sorted(name for name in sys.modules if name.startswith("labseq.")))
 sys.argv = ["labseq", "--help"]
 from labseq.cli import main
@@ -59,7 +59,7 @@ print(*sorted(sys.modules))
     plugins = {name.split(".")[0] for name in modules if name.startswith("labseq_") and "." in name}
     assert plugins == {"labseq_climb", "labseq_psca", "labseq_virtual"}
     assert "llvmlite" in modules
-    assert not {"h5py", "matplotlib", "numba", "pandas", "rich", "scipy", "xarray"} & {*modules}
+    assert not {"h5py", "lmfit", "matplotlib", "numba", "pandas", "rich", "scipy", "xarray"} & {*modules}
 
 
 def test_no_kernel_is_loaded_in_a_shot_of_the_virtual_lab(tmp_path: Path) -> None:

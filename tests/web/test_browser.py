@@ -102,7 +102,9 @@ def server(tmp_path: Path) -> Generator[Server]:
 @pytest.fixture(scope="module")
 def browser() -> Generator[Any]:
     with playwright.sync_playwright() as started:
-        found = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        nowhere_else = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
+        options = ["--no-sandbox", "--disable-gpu", nowhere_else]
+        found = started.chromium.launch(executable_path=CHROMIUM, args=options)
         yield found
         found.close()
 
