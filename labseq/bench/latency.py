@@ -319,7 +319,7 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
         light_ms = 1e3 * np.array(light_s)
         bins = np.geomspace(0.95 * light_ms.min(), 1.05 * light_ms.max(), 80)
         axes.hist(light_ms, bins, color="#3b6ea5")
-        axes.set(xscale="log", yscale="log")
+        axes.set(xscale="log", yscale="log", ylim=(0.7, None))  # counts begin at one
         for axis in (axes.xaxis, axes.yaxis):
             show_plain_numbers(axis)
         for share, name, side in ((0.5, "median", "right"), (0.99, "99 %", "left")):
