@@ -194,3 +194,28 @@ def pretend_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
         monkeypatch.syspath_prepend(str(package / "src"))
 
     return install
+
+
+@pytest.fixture
+def call(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str, str]]:
+    """Runs a command in this process; returns its exit code, stdout and stderr."""
+
+    from labseq.cli import main
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "stdout", sys.stdout)
+        stdout, descriptor = sys.stdout, os.dup(1)  # --json redirects both for the rest of the process
+        try:
+            with pytest.raises(SystemExit) as leaving:
+                main(arguments)
+        finally:
+            sys.stdout = stdout
+            os.dup2(descriptor, 1)
+            os.close(descriptor)
+        code: Any = leaving.value.code or 0
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return run

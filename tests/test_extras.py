@@ -18,7 +18,7 @@ from labseq_pylon.library import load_pypylon
 import labseq.testing
 from labseq import messages
 from labseq.builtin.patterns import read_drawing
-from labseq.campaign.keys import make_keys
+from labseq.campaign import make_keys
 from labseq.cluster import connect
 from labseq.errors import LabseqError
 from labseq.model import ScanSpace

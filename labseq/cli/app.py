@@ -17,8 +17,7 @@ from labseq.analysis.commands import (
 )
 from labseq.bench.commands import bench
 from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibration
-from labseq.campaign.commands import campaign
-from labseq.cli.plan_commands import PLAN_EXAMPLES, WAVEFORM_EXAMPLES, plan, waveform
+from labseq.campaign import campaign
 from labseq.console.options import (
     DryRun,
     FitName,
@@ -43,6 +42,7 @@ from labseq.console.options import (
     profile_option,
     run_argument,
 )
+from labseq.plans.commands import PLAN_EXAMPLES, WAVEFORM_EXAMPLES, plan, waveform
 from labseq.queue.commands import queue
 from labseq.remote.commands import SERVE_EXAMPLES, keys, serve_devices
 from labseq.scaffold.commands import (
@@ -258,7 +258,7 @@ def run_campaign(
 ) -> None:
     """Run a sequence at each point of a grid of values; continue a campaign that was stopped."""
     from labseq.analysis.campaigns import export_campaign
-    from labseq.campaign.terminal import run_file
+    from labseq.campaign import run_file
     from labseq.cli.run import run_session
     from labseq.session.options import Options
 

@@ -19,7 +19,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from labseq.cli.arrays import Glyphs, draw_array, glyphs_for, scales
+from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
 from labseq.console.text import clock_time, count_of, plural
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -13,32 +11,10 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from labseq.cli import main
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming, TargetPattern
 
 Event = tuple[str, Mapping[str, Any]]
 Call = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Call:
-    """Runs a command in this process; returns its exit code, stdout and stderr."""
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "stdout", sys.stdout)
-        stdout, descriptor = sys.stdout, os.dup(1)  # --json redirects both for the rest of the process
-        try:
-            with pytest.raises(SystemExit) as leaving:
-                main(arguments)
-        finally:
-            sys.stdout = stdout
-            os.dup2(descriptor, 1)
-            os.close(descriptor)
-        code: Any = leaving.value.code or 0
-        out, err = capfd.readouterr()
-        return code, out, err
-
-    return run
 
 
 def make_target(n: int = 20, filled: int = 15) -> TargetPattern:

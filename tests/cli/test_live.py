@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from labseq.cli.arrays import ASCII, UNICODE
 from labseq.cli.live import REDRAW_S, LiveView, Picture, ScanTally, Tally, draw_scan, observer_for
+from labseq.console.arrays import ASCII, UNICODE
 from labseq.console.events import LogLines
 from labseq.model import ShotRecord, StageTiming
 

@@ -10,10 +10,10 @@ from rich.console import Console
 
 import labseq
 from labseq.analysis.scanned import ScanRequest
-from labseq.cli.arrays import UNICODE
 from labseq.cli.live import Picture, Tally, draw_scan
 from labseq.cli.show import Tables, show_run
 from labseq.cli.watch import EventReader
+from labseq.console.arrays import UNICODE
 from labseq.console.events import LogLines, event_text
 from labseq.recording.points import scan_points
 from tests.session.small_runs import PROFILE

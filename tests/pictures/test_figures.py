@@ -90,7 +90,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from labseq.pictures.targets import save_target
-import labseq.pictures.waveforms
+import labseq.plans.waveform_picture
 from labseq.model import SiteGrid, TargetPattern
 assert "matplotlib" not in sys.modules
 full = np.ones((2, 2), np.bool_)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.campaign.keys import make_keys
+from labseq.campaign import make_keys
 from labseq.cluster import ClusterWorkers
 from labseq.errors import ConfigError, DeviceError
 from labseq.session.options import Options

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.cli.arrays import (
+from labseq.console.arrays import (
     ATOM,
     DEFECT,
     DENSE,

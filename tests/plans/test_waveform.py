@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import labseq
-from labseq.bench.waveform import (
+from labseq.errors import ConfigError, LimitError
+from labseq.model import Plan, SegmentKind
+from labseq.plans.waveform import (
     DEFAULT_RATE_HZ,
     PlannedWaveform,
     WaveformRequest,
     plan_waveform,
     read_batches,
 )
-from labseq.errors import ConfigError, LimitError
-from labseq.model import Plan, SegmentKind
 from labseq.session.planning import PlanRequest, plan_moves
 
 RATE = "250 MHz"

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.bench.samples_file import check_samples_file, save_samples
-from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.errors import ConfigError
+from labseq.plans.waveform import (
+    PlannedWaveform,
+    WaveformRequest,
+    check_samples_file,
+    plan_waveform,
+    save_samples,
+)
 from labseq.session.planning import PlanRequest
 
 REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)

@@ -14,7 +14,7 @@ from PIL import Image
 from labseq.model import Batch, MotionSpec, Plan, SegmentKind
 from labseq.model.motion import SpeedProfile
 from labseq.motion import Renderer, render, tone_program
-from labseq.pictures.waveforms import (
+from labseq.plans.waveform_picture import (
     DPI,
     INTENDED,
     KINDS,

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from rich.text import Text
 
-from labseq.cli.plan import PlanOutput, moves_text, plan_once, print_plan, totals, warnings
 from labseq.model import Batch
+from labseq.plans.plan import PlanOutput, moves_text, plan_once, print_plan, totals, warnings
 from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
@@ -249,7 +249,7 @@ def test_json_in_a_file_is_printed_with_the_report(
 
 def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, call: Any) -> None:
     got: list[Any] = []
-    monkeypatch.setattr("labseq.cli.plan.plan_once", lambda *arguments: got.extend(arguments))
+    monkeypatch.setattr("labseq.plans.plan.plan_once", lambda *arguments: got.extend(arguments))
     target = ["--target", "a:3x3", "--origin", "-1,2"]
     planner = ["--planner", "p", "--dop", "4", "--set", "a=1", "--set", "b=2"]
     output = ["--step", "--json", "-", "--png", "x.png"]

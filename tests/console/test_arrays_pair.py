@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from rich.text import Text
 
-from labseq.cli.arrays import ASCII, UNICODE, ArrayPair, Glyphs
+from labseq.console.arrays import ASCII, UNICODE, ArrayPair, Glyphs
 from labseq.model import Occupancy, TargetPattern
 from labseq.testing.strategies import cases
 

@@ -6,12 +6,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from labseq.bench.axis_statistics import AxisStatistics
-from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.cli.plan import subject, warnings
 from labseq.console.output import check_different, json_writer, report_compiling, say
 from labseq.console.text import columns, percent, plural, size_text
 from labseq.model import RfSpec
+from labseq.plans.axis_statistics import AxisStatistics
+from labseq.plans.plan import subject, warnings
+from labseq.plans.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.units import format_quantity
 
 Both = tuple[AxisStatistics, AxisStatistics]
@@ -40,7 +40,7 @@ def show_waveform(request: WaveformRequest, output: WaveformOutput) -> None:
     waveform = plan_waveform(request, announce=report_compiling)
     both = waveform.statistics()
     if output.npz is not None:
-        from labseq.bench.samples_file import save_samples
+        from labseq.plans.waveform import save_samples
 
         save_samples(output.npz, waveform)
     if output.png is not None:
@@ -57,13 +57,13 @@ def _check_files(output: WaveformOutput) -> None:
 
         check_picture(output.png, (1, 1))
     if output.npz is not None:
-        from labseq.bench.samples_file import check_samples_file
+        from labseq.plans.waveform import check_samples_file
 
         check_samples_file(output.npz)
 
 
 def _draw(waveform: PlannedWaveform, both: Both, path: Path) -> None:
-    from labseq.pictures.waveforms import WaveformDrawing, save_waveform
+    from labseq.plans.waveform_picture import WaveformDrawing, save_waveform
 
     drawing = WaveformDrawing(
         title(waveform),

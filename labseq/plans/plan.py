@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from labseq.cli.arrays import ArrayPair, glyphs_for
+from labseq.console.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
 from labseq.console.text import columns, count_of, encodes, percent, plural
 from labseq.kernel import interpret

@@ -8,9 +8,9 @@ import numba
 import numpy as np
 import pytest
 
-from labseq.bench.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.cli.waveform import WaveformOutput, note, report, show_waveform, title
 from labseq.messages import install_hint
+from labseq.plans.waveform import PlannedWaveform, WaveformRequest, plan_waveform
+from labseq.plans.waveform_report import WaveformOutput, note, report, show_waveform, title
 from labseq.session.planning import PlanRequest
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
@@ -86,7 +86,9 @@ def test_everything_can_be_written_at_once(tmp_path: Path, capsys: pytest.Captur
 
 def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, call: Any) -> None:
     got: list[Any] = []
-    monkeypatch.setattr("labseq.cli.waveform.show_waveform", lambda *arguments: got.extend(arguments))
+    monkeypatch.setattr(
+        "labseq.plans.waveform_report.show_waveform", lambda *arguments: got.extend(arguments)
+    )
     planned = ["--target", "a:3x3", "--origin", "-1,2", "--planner", "p", "--dop", "4", "--set", "a=1"]
     rest = ["--seed", "5", "-p", "lab", "--batches", "1-3", "--sample-rate", "5 MHz"]
     files = ["--json", "-", "--png", "x.png", "--npz", "x.npz"]

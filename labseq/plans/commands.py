@@ -95,7 +95,7 @@ def plan(
 
     Batches, cycles, rows and columns are counted from 0.
     """
-    from labseq.cli.plan import PlanOutput, plan_once
+    from labseq.plans.plan import PlanOutput, plan_once
     from labseq.session.planning import PlanRequest
 
     request = PlanRequest(occupancy, target, planner, dop, tuple(overrides or ()), seed, origin, profile)
@@ -145,8 +145,8 @@ def waveform(
     _plugins: Plugins = None,
 ) -> None:
     """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
-    from labseq.bench.waveform import WaveformRequest
-    from labseq.cli.waveform import WaveformOutput, show_waveform
+    from labseq.plans.waveform import WaveformRequest
+    from labseq.plans.waveform_report import WaveformOutput, show_waveform
     from labseq.session.planning import PlanRequest
 
     request = PlanRequest(plan, target, planner, dop, tuple(overrides or ()), seed, origin, profile)

@@ -1,1 +1,0 @@
-"""Parameter campaigns: one run for each point of a grid; and the certificates of clusters."""
