@@ -81,8 +81,8 @@ NOT_RUN = {
     "docs/how-to/cluster.md": [
         "needs three computers",
         "needs three computers",
-        "tests/campaign/test_campaign.py runs one",
-        "tests/campaign/test_campaign.py does it",
+        "tests/test_campaign.py runs one",
+        "tests/test_campaign.py does it",
     ],
     "docs/how-to/compare-planners.md": ["tests/docs/test_planner_tables.py runs the script"],
     "docs/how-to/editor.md": [
