@@ -112,7 +112,7 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
     return profile
 
 
-def find(root: Node, address: str, name: str, source: str, may_add: Collection[str] | None = None) -> Loc:
+def find(root: Node, address: str, source: str = "", may_add: Collection[str] | None = None) -> Loc:
     """Convert an address to a location in a file; the last key of a mapping need not exist yet.
 
     With ``may_add``, missing mappings are created, too: at the top of the file only those that it lists,
@@ -120,6 +120,9 @@ def find(root: Node, address: str, name: str, source: str, may_add: Collection[s
 
     A list item with a ``name`` is addressed by it, and the address continues in its
     settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
+
+    Args:
+        source: The option that has the address, for messages; "" for none.
 
     Raises:
         ConfigError: A part of the address does not exist.
@@ -139,7 +142,8 @@ def find(root: Node, address: str, name: str, source: str, may_add: Collection[s
             may_add is not None and (part in may_add if i == 0 else here not in NAMED)
         )
         if child is None and not (new and isinstance(node.value, dict)):
-            raise ConfigError(_missing_part(node, part, here, name, source))
+            where = f"'{here}'" if here else clean(root.mark.source)
+            raise ConfigError(_missing_part(node, part, where, source))
         loc, node = loc + (keys or (part,)), child
     return loc
 
@@ -159,9 +163,8 @@ def _keys_of_part(node: Node, part: str) -> Loc:
     return ()
 
 
-def _missing_part(node: Node, part: str, here: str, name: str, source: str) -> Problem:
+def _missing_part(node: Node, part: str, where: str, source: str) -> Problem:
     """Explain why an address does not exist."""
-    where = f"'{here}'" if here else clean(name)
     if isinstance(node.value, dict):
         known = list(node.value)
         what = f"there is no '{clean(part)}' in {where}"

@@ -50,7 +50,6 @@ class Document:
 
     Attributes:
         path: The file.
-        name: The file's name as the user gave it, for messages.
         text: The file's text, without a byte order mark.
         root: The top mapping, with the results of the expressions once they are computed.
         expressions: The expressions; None before :meth:`evaluated`.
@@ -58,7 +57,6 @@ class Document:
     """
 
     path: Path
-    name: str
     text: str
     root: Node
     expressions: Expressions | None = None
@@ -91,8 +89,13 @@ class Document:
             raise ConfigError(Problem("the file is empty", name, expected=expected))
         if not isinstance(root.value, dict):
             what = f"the file holds {shown(root.plain(), root.raw)} at its top"
-            raise ConfigError(root.mark.problem(name, what, expected))
-        return cls(Path(name), name, decoded, root)
+            raise root.mark.error(what, expected)
+        return cls(Path(name), decoded, root)
+
+    @property
+    def name(self) -> str:
+        """The file's name as the user gave it, for messages."""
+        return self.root.mark.source
 
     @property
     def data(self) -> dict[str, Any]:
@@ -110,7 +113,7 @@ class Document:
         Raises:
             ConfigError: All errors in them.
         """
-        expressions = evaluate(self.written, self.name, self.text)
+        expressions = evaluate(self.written, self.text)
         return replace(self, root=expressions.root, expressions=expressions)
 
     def get(self, loc: Loc, default: Any = None) -> Any:
@@ -128,7 +131,7 @@ class Document:
 
     def problem(self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False) -> Problem:
         """Create a problem at a location: in the file, or in the option that set the value."""
-        return self.root.mark_at(loc, key).problem(self.name, what, expected, hint)
+        return self.root.mark_at(loc, key).problem(what, expected, hint)
 
     def error(
         self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False
@@ -161,8 +164,8 @@ class Document:
         Raises:
             ConfigError: The address does not exist, or the value is no YAML.
         """
-        loc = find(self.root, address, self.name, origin, may_add)
-        node = compose(value, self.name, origin) or Node(None, Mark(0, 0, origin))
+        loc = find(self.root, address, origin, may_add)
+        node = compose(value, origin, is_option=True) or Node(None, Mark(origin))
         return self.with_values([(loc, node, None)])
 
     def override_all(
@@ -215,7 +218,7 @@ class Document:
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
         context = ValidationContext(name, called, drop, other_keys, self.path.parent, self.needs_units)
         node = self.root.at(loc) or Node({}, self.root.mark_at(loc))
-        return validate(model, node, context, self.name)
+        return validate(model, node, context)
 
 
 def check_kind(document: Document, kind: FileKind) -> None:

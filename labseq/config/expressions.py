@@ -370,7 +370,7 @@ def is_expression(node: Node) -> bool:
     return isinstance(node.value, str) and node.value.startswith("=") and not node.value.startswith("==")
 
 
-def evaluate(root: Node, name: str, text: str) -> Expressions:
+def evaluate(root: Node, text: str) -> Expressions:
     """Compute all expressions of a file.
 
     Args:
@@ -379,7 +379,7 @@ def evaluate(root: Node, name: str, text: str) -> Expressions:
     Raises:
         ConfigError: All errors in them.
     """
-    evaluator = _Evaluator(root, name, _LINE_BREAK.split(text))
+    evaluator = _Evaluator(root, _LINE_BREAK.split(text))
     result = root
     for loc, node in root.leaves():
         if is_expression(node) and loc[0] != "scan":
@@ -406,7 +406,6 @@ class _Evaluator:
     """Computes the expressions of a file, each after those that it refers to."""
 
     root: Node
-    name: str
     lines: list[str]
     problems: list[Problem] = field(default_factory=list[Problem])
     nodes: dict[Loc, Node] = field(default_factory=dict[Loc, Node])
@@ -450,7 +449,7 @@ class _Evaluator:
 
     def _find(self, address: str, at: int) -> Loc:
         try:
-            loc = find(self.root, address, self.name, "")
+            loc = find(self.root, address)
         except ConfigError as error:
             (problem,) = error.problems
             raise ExpressionError(problem.what, problem.expected, problem.hint or _KNOWN, at) from None
@@ -513,11 +512,11 @@ class _Evaluator:
         what = problem.what
         line = self.lines[mark.line - 1][mark.column - 1 :] if 0 < mark.line <= len(self.lines) else ""
         quoted = line[:1] in ("'", '"')
-        if not mark.origin and line[quoted:].startswith(text):
+        if mark.source == self.root.mark.source and line[quoted:].startswith(text):
             mark = mark._replace(column=mark.column + quoted + at)
         elif at:
             what += f" (character {at + 1} of '{clean(text)}')"
-        self.problems.append(mark.problem(self.name, what, problem.expected, problem.hint))
+        self.problems.append(mark.problem(what, problem.expected, problem.hint))
 
 
 def _scalar(value: Quantity) -> Number | str:

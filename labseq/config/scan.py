@@ -55,10 +55,6 @@ class Axis:
         """Whether the value is in the profile."""
         return self.address.startswith(PROFILE)
 
-    def error(self, what: str, expected: str = "", hint: str = "") -> ConfigError:
-        """Create an error at the place of the address."""
-        return ConfigError(self.key.problem("", what, expected, hint))
-
 
 Group = tuple[Axis, ...]
 """Axes that change together: all have the same number of values."""
@@ -69,7 +65,6 @@ class Scan:
     """The points of a scan: the outer product of its groups, of which the first changes most slowly.
 
     Attributes:
-        name: The sequence's name in messages.
         groups: The groups, in the order written; without any there is one point.
         repeats: Number of shots at each point.
         order: "sequential" or "shuffled".
@@ -78,7 +73,6 @@ class Scan:
             axis, whose two values are the ends of its range.
     """
 
-    name: str
     groups: tuple[Group, ...]
     repeats: int
     order: ScanOrder
@@ -167,14 +161,15 @@ class Scan:
     def explained(self, error: ConfigError) -> ConfigError:
         """A copy of an error that adds to each invalid value its scanned address."""
         places = {
-            (mark.line, mark.column): axis.address
+            (mark.source, mark.line, mark.column): axis.address
             for axis in self.axes
             for node in axis.values
             for mark in _marks(node)
+            if mark.line
         }
 
         def with_address(problem: Problem) -> Problem:
-            address = places.get((problem.line, problem.column)) if problem.source == self.name else None
+            address = places.get((problem.source, problem.line, problem.column))
             note = f"the scan puts it into '{clean(address or '')}'"
             if address is None or note in problem.notes:
                 return problem
@@ -317,21 +312,21 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None
         return _read_adaptive(document, repeats, fixed, found)
     notes: list[str] = []
     groups: list[Group] = []
-    for mapping in _mappings(node, document.name, found):
+    for mapping in _mappings(node, found):
         axes = [_axis(document, address, *place, found) for address, place in mapping.items()]
         group = tuple(axis for axis in axes if axis and _is_free(axis, fixed, document, notes))
         with found:
-            _check_together(group, document.name)
+            _check_together(group)
         groups += [group] if group else []
     if not found.problems:
         with found:
             _refuse_twice(groups)
     found.raise_any()
     order: ScanOrder = "shuffled" if document.get(("order",)) == "shuffled" else "sequential"
-    scan = Scan(document.name, tuple(groups), repeats, order, tuple(notes))
+    scan = Scan(tuple(groups), repeats, order, tuple(notes))
     if scan.n_points > MAX_POINTS:
         what = f"the scan has {' x '.join(map(str, scan.shape))} = {scan.n_points} points"
-        raise scan_error(node.mark, document.name, what, f"at most {MAX_POINTS}")
+        raise node.mark.error(what, f"at most {MAX_POINTS}")
     return scan
 
 
@@ -339,18 +334,18 @@ _Written = Mapping[str, tuple[Mark, Node]]
 """A group as written: address -> its place and values."""
 
 
-def _mappings(node: Node, name: str, found: ProblemCollector) -> list[_Written]:
+def _mappings(node: Node, found: ProblemCollector) -> list[_Written]:
     """In a mapping each address is a separate group; in a list each mapping is a group."""
     expected = "a mapping of addresses and their values, or a list of such mappings"
     items = node.value if isinstance(node.value, list) else [node]
     groups: list[_Written] = []
     if not items:
-        found.add(scan_error(node.mark, name, "scan is empty", expected))
+        found.add(node.mark.error("scan is empty", expected))
     for item in items:
         if not isinstance(item.value, dict) or not item.value:
             called = "scan" if item is node else "a group of the scan"
             came = "empty" if item.value == {} else shown(item.plain(), item.raw)
-            found.add(scan_error(item.mark, name, f"{called} is {came}", expected))
+            found.add(item.mark.error(f"{called} is {came}", expected))
             continue
         written = {address: (item.keys[address], values) for address, values in item.value.items()}
         groups += [{address: one} for address, one in written.items()] if item is node else [written]
@@ -360,24 +355,24 @@ def _mappings(node: Node, name: str, found: ProblemCollector) -> list[_Written]:
 def _axis(document: Document, address: str, key: Mark, node: Node, found: ProblemCollector) -> Axis | None:
     """The axis of an address; None if it has an error."""
     with found:
-        return placed_axis(address, key, values_of(node, address, document.name), document)
+        return placed_axis(address, key, values_of(node, address), document)
     return None
 
 
-def _check_together(group: Group, name: str) -> None:
+def _check_together(group: Group) -> None:
     """Raise for a group whose axes differ in length, or in which a combination of values occurs twice."""
     for axis in group[1:]:
         n, n_first = len(axis.values), len(group[0].values)
         if n != n_first:
             own, first = clean(axis.address), clean(group[0].address)
             what = f"'{own}' has {n} value{'s' if n > 1 else ''}, but '{first}' in its group has {n_first}"
-            raise axis.error(what, "as many", "for every combination, make each a group of its own")
+            raise axis.key.error(what, "as many", "for every combination, make each a group of its own")
     seen: set[str] = set()
     for i, node in enumerate(group[0].values if group else ()):
         position = json.dumps([axis.values[i].plain() for axis in group])
         if position in seen:
             what = f"{shown(node.plain(), node.raw)} occurs twice in the scan of '{clean(group[0].address)}'"
-            raise scan_error(node.mark, name, what, "each value once", "write 'repeats' for more shots")
+            raise node.mark.error(what, "each value once", "write 'repeats' for more shots")
         seen.add(position)
 
 
@@ -390,7 +385,7 @@ def _refuse_twice(groups: Sequence[Group], *, in_profile: bool | None = None) ->
             if n and axis.of_profile == other.of_profile and axis.loc[:n] == other.loc[:n]:
                 own, others = clean(axis.address), clean(other.address)
                 what = f"'{own}' is scanned, and so is '{others}', which holds the same value"
-                raise axis.error(what, "each value in one place of the scan")
+                raise axis.key.error(what, "each value in one place of the scan")
 
 
 def _is_free(axis: Axis, fixed: Sequence[Override], document: Document, notes: list[str]) -> bool:
@@ -399,7 +394,7 @@ def _is_free(axis: Axis, fixed: Sequence[Override], document: Document, notes: l
         other: Loc = tuple(override.address.split("."))
         if not override.address.startswith(PROFILE):
             try:
-                other = find(document.root, override.address, document.name, "")
+                other = find(document.root, override.address)
             except ConfigError:  # reported where it was applied
                 continue
         own: Loc = tuple(axis.address.split(".")) if axis.of_profile else axis.loc
@@ -447,21 +442,21 @@ def _read_adaptive(
         raise document.error(("scan", "over"), "nothing is left to choose: options set every address")
     quantity = choice.maximise or choice.minimise or ""
     adaptive = Adaptive(choice, tuple(ends), n_points, quantity, choice.maximise is not None)
-    return Scan(document.name, tuple(groups), repeats, "sequential", tuple(notes), adaptive)
+    return Scan(tuple(groups), repeats, "sequential", tuple(notes), adaptive)
 
 
 def _range_of(document: Document, address: str, n_steps: int) -> tuple[Axis, Ends]:
     loc = ("scan", "over", address)
+    key, mark = document.root.mark_at(loc, key=True), document.root.mark_at(loc)
     nodes = [document.root.at((*loc, end)) for end in ("from", "to")]
-    low_node, high_node = (node or Node(None, Mark(0, 0)) for node in nodes)
-    low, high = numbers_of([low_node, high_node], document.name)
+    low_node, high_node = (node or Node(None, mark) for node in nodes)
+    low, high = numbers_of([low_node, high_node])
     if not low.amount < high.amount:
         limits = [shown(node.plain(), node.raw) for node in (low_node, high_node)]
         what = f"'{clean(address)}' goes from {limits[0]} to {limits[1]}"
         raise document.error((*loc, "to"), what, "a greatest value above the least")
-    key, mark = document.root.mark_at(loc, key=True), document.root.mark_at(loc)
     axis = placed_axis(address, key, [low_node, high_node], document)
-    return axis, Ends(low, high, n_steps, _with_file(mark, document.name))
+    return axis, Ends(low, high, n_steps, mark)
 
 
 def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Document) -> Axis:
@@ -470,9 +465,7 @@ def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Docum
     Raises:
         ConfigError: The address does not exist, or a scan cannot change its setting.
     """
-    name = document.name
-    nodes = tuple(_node_with_file(value, name) for value in values)
-    axis = Axis(address, (), nodes, _with_file(key, name))
+    axis = Axis(address, (), tuple(values), key)
     if axis.of_profile:
         return axis
     axis = _found(axis, document)
@@ -493,35 +486,20 @@ def _placed_in_profile(axis: Axis, document: Document) -> Axis:
 def _found(axis: Axis, document: Document) -> Axis:
     """An axis with the location of its address; a variable must exist."""
     try:
-        loc = find(document.root, axis.address.removeprefix(PROFILE), document.name, "", MAY_ADD)
+        loc = find(document.root, axis.address.removeprefix(PROFILE), may_add=MAY_ADD)
     except ConfigError as error:
-        problems = [axis.key.problem("", p.what, p.expected, p.hint) for p in error.problems]
+        problems = [axis.key.problem(p.what, p.expected, p.hint) for p in error.problems]
         raise ConfigError(problems) from None
     if loc[0] == VARIABLES and (len(loc) != 2 or document.root.at(loc) is None):
         known = list(document.get((VARIABLES,)) or {})
         what, hint = f"there is no variable '{clean(axis.address)}'", did_you_mean(str(loc[-1]), known)
-        raise axis.error(what, listing(known) if known else "'variables'", hint)
+        raise axis.key.error(what, listing(known) if known else "'variables'", hint)
     return replace(axis, loc=loc)
 
 
 def _unscannable(axis: Axis) -> ConfigError:
     expected = "an address in 'planner', 'shot.N.<step>', 'variables' or 'profile.<role or device>'"
-    return axis.error(f"a scan cannot change '{clean(axis.address)}'", expected)
-
-
-def _with_file(mark: Mark, name: str) -> Mark:
-    """A mark that still refers to its file when its value is put into another document."""
-    return mark if mark.origin else mark._replace(origin=name)
-
-
-def _node_with_file(node: Node, name: str) -> Node:
-    value = node.value
-    if isinstance(value, list):
-        value = [_node_with_file(child, name) for child in value]
-    elif isinstance(value, dict):
-        value = {key: _node_with_file(child, name) for key, child in value.items()}
-    keys = {key: _with_file(mark, name) for key, mark in node.keys.items()}
-    return replace(node, value=value, mark=_with_file(node.mark, name), keys=keys)
+    return axis.key.error(f"a scan cannot change '{clean(axis.address)}'", expected)
 
 
 class Number(NamedTuple):
@@ -537,7 +515,7 @@ class Number(NamedTuple):
         return scaled(self.amount, factor_of(self.unit))
 
 
-def numbers_of(nodes: Sequence[Node], name: str) -> list[Number]:
+def numbers_of(nodes: Sequence[Node]) -> list[Number]:
     """Read numbers of one dimension, all in the unit of the first.
 
     Raises:
@@ -545,26 +523,26 @@ def numbers_of(nodes: Sequence[Node], name: str) -> list[Number]:
     """
     numbers: list[Number] = []
     for node in nodes:
-        number, first = _number(node, name), numbers[0] if numbers else None
+        number, first = _number(node), numbers[0] if numbers else None
         if first is not None and dimension_of(number.unit) != dimension_of(first.unit):
             dimension = dimension_of(first.unit)
             what = f"{shown(node.plain(), node.raw)} does not go with {shown(nodes[0].plain(), nodes[0].raw)}"
             expected = f"a {dimension} with its unit" if dimension else "a number without a unit"
-            raise scan_error(node.mark, name, what, expected)
+            raise node.mark.error(what, expected)
         if first is not None and number.unit != first.unit:
             number = Number(number.si / factor_of(first.unit), first.unit, is_whole=False)
         numbers.append(number)
     return numbers
 
 
-def _number(node: Node, name: str) -> Number:
+def _number(node: Node) -> Number:
     value = node.value
     if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
         return Number(float(value), "", isinstance(value, int))
     amount, unit = split_quantity(value) if isinstance(value, str) else (math.nan, "")
     if not math.isfinite(amount) or not any(unit in units for units in UNITS.values() if unit):
         what = f"{shown(node.plain(), node.raw)} is among the limits of a scan"
-        raise scan_error(node.mark, name, what, "a number, or a number with a unit such as '50 um/ms'")
+        raise node.mark.error(what, "a number, or a number with a unit such as '50 um/ms'")
     return Number(amount, unit, is_whole=False)
 
 
@@ -577,13 +555,12 @@ _FORMS: Final = {"linspace": "[first, last, number of values]", "range": "[start
 _TOLERANCE: Final = 1e-9  # of a step: rounding must not drop the last value of a range
 
 
-def values_of(node: Node, address: str, name: str) -> list[Node]:
+def values_of(node: Node, address: str) -> list[Node]:
     """The values that an address takes, each with its place.
 
     Args:
         node: The values in the scan.
         address: The address, for messages.
-        name: The sequence's name in messages.
 
     Raises:
         ConfigError: It is no list, ``linspace`` or ``range``, is empty, or has more than
@@ -591,41 +568,41 @@ def values_of(node: Node, address: str, name: str) -> list[Node]:
     """
     if isinstance(node.value, list):
         if not node.value:
-            raise scan_error(node.mark, name, f"the scan of '{clean(address)}' has no values", _VALUES)
+            raise node.mark.error(f"the scan of '{clean(address)}' has no values", _VALUES)
         return node.value
     if not isinstance(node.value, dict) or len(node.value) != 1:
         what = f"the scan of '{clean(address)}' is {shown(node.plain(), node.raw)}"
-        raise scan_error(node.mark, name, what, _VALUES)
+        raise node.mark.error(what, _VALUES)
     kind, given = next(iter(node.value.items()))
     if kind not in _FORMS:
         what = f"'{clean(kind)}' is not a way to give values"
-        raise scan_error(node.keys[kind], name, what, listing(_FORMS), did_you_mean(kind, _FORMS))
+        raise node.keys[kind].error(what, listing(_FORMS), did_you_mean(kind, _FORMS))
     if not isinstance(given.value, list) or len(given.value) != 3:
-        raise scan_error(given.mark, name, f"{kind} is {shown(given.plain(), given.raw)}", _FORMS[kind])
+        raise given.mark.error(f"{kind} is {shown(given.plain(), given.raw)}", _FORMS[kind])
     limits = given.value
-    amounts, first = _linspace(limits, name) if kind == "linspace" else _range(given.mark, limits, name)
+    amounts, first = _linspace(limits) if kind == "linspace" else _range(given.mark, limits)
     return [_written_node(float(f"{amount:.12g}"), first, given.mark) for amount in amounts]
 
 
-def _linspace(limits: list[Node], name: str) -> tuple[list[float], Number]:
+def _linspace(limits: list[Node]) -> tuple[list[float], Number]:
     """The values of a ``linspace``, in the unit of the first; integers if both ends are integers."""
-    (first, last), count = numbers_of(limits[:2], name), limits[2]
+    (first, last), count = numbers_of(limits[:2]), limits[2]
     if type(count.value) is not int or not 2 <= count.value <= MAX_POINTS:
         what = f"the number of values is {shown(count.plain(), count.raw)}"
-        raise scan_error(count.mark, name, what, f"a whole number from 2 to {MAX_POINTS}")
+        raise count.mark.error(what, f"a whole number from 2 to {MAX_POINTS}")
     amounts = np.linspace(first.amount, last.amount, count.value).tolist()
     return amounts, first._replace(is_whole=first.is_whole and last.is_whole)
 
 
-def _range(mark: Mark, limits: list[Node], name: str) -> tuple[list[float], Number]:
+def _range(mark: Mark, limits: list[Node]) -> tuple[list[float], Number]:
     """The values of a ``range``, in the unit of its start; integers if start and step are integers."""
-    start, stop, step = numbers_of(limits, name)
+    start, stop, step = numbers_of(limits)
     n_steps = (stop.amount - start.amount) / step.amount if step.amount else math.nan
     if not n_steps >= 0:
         what = f"the step {shown(limits[2].plain(), limits[2].raw)} does not lead from start to stop"
-        raise scan_error(limits[2].mark, name, what, "a step towards the stop")
+        raise limits[2].mark.error(what, "a step towards the stop")
     if n_steps >= MAX_POINTS:
-        raise scan_error(mark, name, f"the range has {n_steps:.3g} values", f"at most {MAX_POINTS}")
+        raise mark.error(f"the range has {n_steps:.3g} values", f"at most {MAX_POINTS}")
     amounts = [start.amount + i * step.amount for i in range(math.floor(n_steps + _TOLERANCE) + 1)]
     return amounts, start._replace(is_whole=start.is_whole and step.is_whole)
 
@@ -637,8 +614,3 @@ def _written_node(amount: float, like: Number, mark: Mark) -> Node:
         return Node(text, mark, raw=text)
     value = int(amount) if like.is_whole and amount.is_integer() else amount
     return Node(value, mark, raw=repr(value))
-
-
-def scan_error(mark: Mark, name: str, what: str, expected: str, hint: str = "") -> ConfigError:
-    """Create an error at a place in the sequence; ``name`` is that of the sequence in messages."""
-    return ConfigError(mark.problem(name, what, expected, hint))

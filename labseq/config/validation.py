@@ -80,7 +80,7 @@ class ValidationContext:
         return ".".join(map(str, loc[last:])) if loc else self.name
 
 
-def validate(model: type[M], node: Node, context: ValidationContext, file: str) -> M:
+def validate(model: type[M], node: Node, context: ValidationContext) -> M:
     """Validate a mapping with a settings model; an empty value counts as {}.
 
     Raises:
@@ -91,7 +91,7 @@ def validate(model: type[M], node: Node, context: ValidationContext, file: str) 
         return result
     placed = [(node.mark_at(found.loc, found.key), found.problem) for found in result]
     placed.sort(key=lambda pair: pair[0].order)
-    raise ConfigError([mark.problem(file, p.what, p.expected, p.hint) for mark, p in placed])
+    raise ConfigError([mark.problem(p.what, p.expected, p.hint) for mark, p in placed])
 
 
 def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Finding]:
@@ -441,8 +441,8 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
     Raises:
         ConfigError: All errors in them.
     """
-    root = node_of(dict(values), Mark(0, 0, called))
-    made = validate(model or NoSettings, root, ValidationContext("", "it"), "")
+    root = node_of(dict(values), Mark(called))
+    made = validate(model or NoSettings, root, ValidationContext("", "it"))
     return None if model is None else cast("M", made)
 
 
@@ -464,9 +464,9 @@ def node_of(value: Any, mark: Mark) -> Node:
     if isinstance(value, PurePath):
         return Node(str(value), mark)
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
-        raise ConfigError(mark.problem("", f"there is half a character in '{clean(value)}'", "text"))
+        raise mark.error(f"there is half a character in '{clean(value)}'", "text")
     if value is None or isinstance(value, str | int | float):
         return Node(value, mark)
     kind = type(cast("object", value)).__name__
     expected = "a number, text, list or dict"
-    raise ConfigError(mark.problem("", f"a value of type {kind} is not a setting", expected))
+    raise mark.error(f"a value of type {kind} is not a setting", expected)

@@ -37,27 +37,33 @@ MAX_DIGITS: Final = 100
 
 
 class Mark(NamedTuple):
-    """A place: line and column from 1, or an option such as ``--set shots=5``.
+    """The place of a value or key, which stays with it when it is put into another document.
 
-    With both, ``origin`` is the file of a value that was put into another document.
+    Attributes:
+        source: Name of the file in messages, or an option such as ``--set shots=5``.
+        line: Line, from 1; 0 in an option.
+        column: Column, from 1; 0 in an option.
     """
 
-    line: int
-    column: int
-    origin: str = ""
+    source: str
+    line: int = 0
+    column: int = 0
 
-    def problem(self, name: str, what: str, expected: str = "", hint: str = "") -> Problem:
-        """Create a problem at this place, in the file called ``name`` or in the origin.
+    def problem(self, what: str, expected: str = "", hint: str = "") -> Problem:
+        """Create a problem at this place.
 
         Unprintable characters are escaped: validators, those of plugins too, quote values unchanged.
         """
-        texts = visible(expected), visible(hint)
-        return Problem(visible(what), self.origin or name, self.line, self.column, *texts)
+        return Problem(visible(what), self.source, self.line, self.column, visible(expected), visible(hint))
+
+    def error(self, what: str, expected: str = "", hint: str = "") -> ConfigError:
+        """Create an error for a problem at this place."""
+        return ConfigError(self.problem(what, expected, hint))
 
     @property
     def order(self) -> tuple[bool, int, int]:
         """Sorting key: the file in its order, then the options."""
-        return bool(self.origin), self.line, self.column
+        return self.line == 0, self.line, self.column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,13 +154,13 @@ class Node:
 
 
 @lru_cache(maxsize=8)  # nodes are immutable, and most sessions of a process read the same profile
-def compose(text: str, name: str, origin: str = "") -> Node | None:
+def compose(text: str, source: str, *, is_option: bool = False) -> Node | None:
     """Read YAML text.
 
     Args:
         text: The text, without a byte order mark.
-        name: File name for the messages.
-        origin: The option that holds the text; "" for a file.
+        source: Name of the file in messages, or the option that holds the text.
+        is_option: Whether it is an option, whose text has no lines and columns.
 
     Returns:
         The top node, or None for an empty text.
@@ -162,20 +168,20 @@ def compose(text: str, name: str, origin: str = "") -> Node | None:
     Raises:
         ConfigError: All errors up to the one at which reading had to stop.
     """
-    _check_characters(text, name, origin)
-    composer = _Composer(text, name, origin)
+    _check_characters(text, source, is_option)
+    composer = _Composer(text, source, is_option)
     try:
         root = composer.get_single_node()
     except MarkedYAMLError as error:
         # A stray closing bracket makes the level negative.
         opened = composer.marks[-1] if composer.flow_level > 0 else None
         found = explain_syntax_error(error, text, composer.last, opened)
-        mark = Mark(found.line, found.column)
+        mark = Mark(source) if is_option else Mark(source, found.line, found.column)
         composer.stop(mark, found.what, found.expected, found.hint)
     except ConfigError:
         raise
     except ValueError:  # PyYAML passes the escape of a character that does not exist to chr()
-        composer.stop(Mark(composer.line + 1, composer.column + 1), "this number or escape is out of range")
+        composer.stop(composer.get_mark(), "this number or escape is out of range")
     node = None if root is None or composer.problems else composer.converted(root)
     if composer.problems:
         raise ConfigError(composer.problems)
@@ -192,18 +198,18 @@ class _Alias(yaml.Node):
 class _Composer(yaml.SafeLoader):
     """Text to PyYAML's nodes, in pure Python, with the rules and limits checked on the way."""
 
-    def __init__(self, text: str, name: str, origin: str) -> None:
+    def __init__(self, text: str, source: str, is_option: bool) -> None:
         super().__init__(text)
         self.problems: list[Problem] = []
         self.last: Event | None = None
-        self._name, self._origin = name, origin
+        self._source, self._is_option = source, is_option
         self._depth = self._n_values = 0
         self._sizes: dict[str, int] = {}  # number of values behind an anchor that is complete
         self._keys: dict[int, dict[str, YamlMark]] = {}  # of each mapping
 
     def report(self, mark: Mark | YamlMark, what: str, expected: str = "", hint: str = "") -> None:
         """Record a problem, and continue."""
-        self.problems.append(self._mark(mark).problem(self._name, what, expected, hint))
+        self.problems.append(self._mark(mark).problem(what, expected, hint))
 
     def stop(self, mark: Mark | YamlMark, what: str, expected: str = "", hint: str = "") -> NoReturn:
         """Record a problem after which nothing else can be read, and raise all problems."""
@@ -245,9 +251,9 @@ class _Composer(yaml.SafeLoader):
         return Node(values, self._mark(mark), {text: self._mark(key.start_mark) for text, key, _ in pairs})
 
     def _mark(self, mark: Mark | YamlMark) -> Mark:
-        if self._origin:
-            return Mark(0, 0, self._origin)
-        return mark if isinstance(mark, Mark) else Mark(mark.line + 1, mark.column + 1)
+        if isinstance(mark, Mark):
+            return mark
+        return Mark(self._source) if self._is_option else Mark(self._source, mark.line + 1, mark.column + 1)
 
     def _count(self, event: Any, n: int) -> None:
         self._n_values += n
@@ -267,7 +273,7 @@ class _Composer(yaml.SafeLoader):
         is_scalar = isinstance(event, yaml.ScalarEvent)
         if not is_scalar and self._depth >= MAX_DEPTH:
             self.stop(event.start_mark, f"lists and mappings are nested more than {MAX_DEPTH} deep")
-        if not is_scalar and self._origin and not event.flow_style:
+        if not is_scalar and self._is_option and not event.flow_style:
             expected = "one value: 5, '45 ms', [a, b] or {key: value}"
             self.stop(event.start_mark, "this is YAML of several lines", expected)
 
@@ -295,7 +301,7 @@ class _Composer(yaml.SafeLoader):
             self.report(mark, "merge keys ('<<') are not allowed", "every setting written out")
         elif key.value in keys:
             first = keys[key.value]
-            where = "" if self._origin else f" (first in line {first.line + 1}, column {first.column + 1})"
+            where = "" if self._is_option else f" (first in line {first.line + 1}, column {first.column + 1})"
             self.report(mark, f"'{clean(key.value)}' is given twice{where}", "", "remove one of them")
         else:
             keys[key.value] = mark
@@ -366,7 +372,7 @@ _FORBIDDEN: Final = re.compile(
 _ODD_INDENT: Final = re.compile("^[ \t-]*([\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000])", re.MULTILINE)
 
 
-def _check_characters(text: str, name: str, origin: str) -> None:
+def _check_characters(text: str, source: str, is_option: bool) -> None:
     """Raise for control characters, unusual line breaks and spaces, and incomplete characters.
 
     Raises:
@@ -384,11 +390,11 @@ def _check_characters(text: str, name: str, origin: str) -> None:
     elif char == "\0":
         what, hint = f"a NUL character ({code})", "is this a YAML file, saved as UTF-8?"
     elif "\ud800" <= char <= "\udfff":
-        what = "a byte that is not UTF-8" if origin else f"half of a character ({code})"
+        what = "a byte that is not UTF-8" if is_option else f"half of a character ({code})"
     else:
         what = f"an invisible character ({code}, {kind})"
-    mark = Mark(0, 0, origin) if origin else Mark(*line_and_column(text, match.start(group)))
-    raise ConfigError(mark.problem(name, what, expected, hint))
+    place = () if is_option else line_and_column(text, match.start(group))
+    raise Mark(source, *place).error(what, expected, hint)
 
 
 _QUOTE_IT: Final = "put text with special characters in quotes"

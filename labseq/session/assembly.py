@@ -99,7 +99,7 @@ class Assembly:
         of_profile = address.startswith(PROFILE)
         document = self.hardware.document if of_profile else self.document
         try:
-            loc = find(document.root, address.removeprefix(PROFILE) if of_profile else address, "", "")
+            loc = find(document.root, address.removeprefix(PROFILE) if of_profile else address)
             value: Any = self.resolved["profile"] if of_profile else self.resolved
             for key in loc:
                 value = value[key]
@@ -454,7 +454,7 @@ def make_search(
     for axis, ends in zip(scanned.scan.axes, adaptive.ends, strict=True):
         with found:
             present = scanned.present(axis)
-            ranges.append(_range(axis, ends, (low[axis.address], high[axis.address]), present, document.name))
+            ranges.append(_range(axis, ends, (low[axis.address], high[axis.address]), present))
     if chosen is None or len(found.problems) > n_before:
         return None
     search = Search(scanned, adaptive, chosen, tuple(ranges))
@@ -463,18 +463,16 @@ def make_search(
     return search
 
 
-def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any, name: str) -> ScanRange:
+def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any) -> ScanRange:
     """The range of an axis, if its ends are numbers that the settings model accepts unchanged."""
     low, high = ends.low.si, ends.high.si
     if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
         what = f"'{clean(axis.address)}' is not a number, or not the one that is written"
-        raise ConfigError(axis.key.problem(name, what, "an address of a number or quantity"))
+        raise axis.key.error(what, "an address of a number or quantity")
     is_whole = all(type(value) is int for value in resolved)
     if is_whole and ends.n_steps and (high - low) % ends.n_steps:
         what = f"{ends.n_steps} equal steps from {low:g} to {high:g} are not whole numbers"
-        raise ConfigError(
-            axis.key.problem(name, what, f"a number of steps that {high - low:g} is a multiple of")
-        )
+        raise axis.key.error(what, f"a number of steps that {high - low:g} is a multiple of")
     low, high = resolved if is_whole else (float(resolved[0]), float(resolved[1]))
     start = float(present) if _is_number(present) and low <= present <= high else math.nan
     return ScanRange(axis.address, low, high, is_whole, ends.n_steps, start)

@@ -118,7 +118,7 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
 
 def _with_advice(error: ConfigError, document: Document, choice: Choice) -> ConfigError:
     """The error about settings of another plugin that are left in the file, if an option chose this one."""
-    option = document.root.mark_at((*choice.loc, choice.key)).origin
+    option = document.root.mark_at((*choice.loc, choice.key)).source
     address, dot, key = option.removeprefix("--set ").partition("=")[0].rpartition(".")
     if not (option.startswith("--set ") and dot and key == choice.key):
         return error

@@ -193,16 +193,16 @@ class ScanPoints:
     def _check_dependents(self) -> None:
         """Raise for an axis that changes no setting, or a setting that must be the same in the whole run."""
         for axis in self.scan.axes:
-            dependents, own, name = self._dependents(axis), clean(axis.address), self.scan.name
+            dependents, own = self._dependents(axis), clean(axis.address)
             if axis.loc[0] == VARIABLES and not dependents:
                 hint = f"write '= {own.removeprefix(PROFILE)}' in the setting that is to follow it"
                 what = f"nothing follows from '{own}'"
-                raise ConfigError(axis.key.problem(name, what, "an expression with it", hint))
+                raise axis.key.error(what, "an expression with it", hint)
             for loc in dependents:
                 if not _is_part(axis.of_profile, loc):
                     other = clean(_address(axis.of_profile, loc))
                     what = f"'{other}' follows from '{own}', and a scan cannot change it"
-                    raise ConfigError(axis.key.problem(name, what, "one value of it for the whole run"))
+                    raise axis.key.error(what, "one value of it for the whole run")
 
     def _document_at(self, in_profile: bool, point: int) -> Document:
         """The sequence or the profile with the values of a point."""

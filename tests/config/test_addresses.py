@@ -26,7 +26,7 @@ none: []
 
 
 def locate(address: str) -> Loc:
-    return find(DOCUMENT.root, address, "f.yaml", "--set")
+    return find(DOCUMENT.root, address, "--set")
 
 
 @pytest.mark.parametrize(
@@ -80,9 +80,9 @@ def test_lost(address: str, message: str) -> None:
     ],
 )
 def test_optional_mappings_are_added_by_an_override(address: str, loc: Loc) -> None:
-    assert find(DOCUMENT.root, address, "f.yaml", "--set", ("policy",)) == loc
+    assert find(DOCUMENT.root, address, "--set", ("policy",)) == loc
     with pytest.raises(ConfigError, match=r"there is no 'shoot' in f\.yaml"):
-        find(DOCUMENT.root, f"shoot.{address}", "f.yaml", "--set", ("policy",))
+        find(DOCUMENT.root, f"shoot.{address}", "--set", ("policy",))
 
 
 def test_split() -> None:

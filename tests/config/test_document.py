@@ -161,7 +161,7 @@ def test_what_is_right_beside_something_wrong_is_kept(changes: dict[str, Any]):
     root = node_of({**GOOD, **changes}, base.root.mark)
     found = ProblemCollector()
     document, spec = load_checked(
-        Document(Path("s.yaml"), "s.yaml", "", root), SequenceSpec, "a sequence", FALLBACKS, found
+        Document(Path("s.yaml"), "", root), SequenceSpec, "a sequence", FALLBACKS, found
     )
     assert document.validate(SequenceSpec) == spec
     for key in GOOD.keys() - changes.keys():

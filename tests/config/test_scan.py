@@ -39,7 +39,7 @@ def points(scan: Scan) -> list[list[object]]:
 def plain(text: str) -> list[object]:
     node = Document.parse(f"it: {text}\n", "s.yaml").root.child("it")
     assert node is not None
-    return [value.value for value in values_of(node, "a.b", "s.yaml")]
+    return [value.value for value in values_of(node, "a.b")]
 
 
 @pytest.mark.parametrize(
