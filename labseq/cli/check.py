@@ -21,9 +21,10 @@ from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.recording import data_root
 from labseq.sequencer.policies import StepPolicy
-from labseq.session.assembly import Assembly, Search
+from labseq.session.assembly import Assembly
 from labseq.session.check import CheckReport, Rehearsal, check
 from labseq.session.chosen import HARDWARE_KINDS, DryRun
+from labseq.session.search import Search
 from labseq.session.session import Session
 from labseq.units import format_quantity
 

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
-from labseq.config.scan import Adaptive, Axis, Ends, Scan
+from labseq.config.scan import Scan
 from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
-from labseq.messages import clean
-from labseq.model import ScanRange, ScanSpace, TargetPattern
-from labseq.recording.points import SCANNER
+from labseq.model import TargetPattern
 from labseq.recording.results import PREFIX
 from labseq.roles import Context, Step
 from labseq.sequencer.policies import RunPolicy
@@ -32,11 +29,12 @@ from labseq.session.chosen import (
     validate,
 )
 from labseq.session.options import Options
-from labseq.session.policies import check_quantity, make_policy, with_policies
+from labseq.session.policies import make_policy, with_policies
 from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
+from labseq.session.search import Search, make_search
 from labseq.settings import si_unit_at
-from labseq.units import si_unit_of, written
+from labseq.units import si_unit_of
 
 
 class Setting(NamedTuple):
@@ -357,126 +355,3 @@ def make_analyses(
 def _grid_note(hardware: ResolvedProfile) -> str:
     grid = hardware.grid
     return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(hardware.document, 'grid')}"
-
-
-CLIMBED: Final = "to optimise"
-"""The purpose of the quantity, for messages."""
-
-
-Steps = Sequence[tuple[str, Step]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Search:
-    """The scanner of an adaptive scan, and the range of values of each scanned address.
-
-    Attributes:
-        scanned: The scan; its points are the corners of the ranges.
-        adaptive: The settings in the sequence.
-        chosen: The scanner.
-        ranges: The range of each address.
-    """
-
-    scanned: ScanPoints
-    adaptive: Adaptive
-    chosen: ChosenPlugin
-    ranges: tuple[ScanRange, ...]
-
-    @property
-    def name(self) -> str:
-        """Name of the scanner in messages."""
-        return f"scanner '{self.chosen.entry.name}'"
-
-    @property
-    def units(self) -> list[str]:
-        """Unit in which the sequence writes the values of each address."""
-        return [ends.unit for ends in self.adaptive.ends]
-
-    def space(self, seed: int) -> ScanSpace:
-        """The argument of the scanner's constructor."""
-        return ScanSpace(self.ranges, self.adaptive.n_points, self.scanned.scan.repeats, seed)
-
-    def at(self, values: Mapping[str, float]) -> Point:
-        """The settings of a point, from address -> value, SI.
-
-        Raises:
-            ConfigError: A plugin refuses these values.
-        """
-        chosen = [values[one.address] for one in self.ranges]
-        alone = self.scanned.of(self.scanned.scan.at(chosen))
-        try:
-            return alone.at(0)
-        except ConfigError as error:
-            raise alone.scan.explained(error) from None
-
-    def written(self, values: Mapping[str, Any]) -> dict[str, str]:
-        """The values of a point as text in the units of the sequence: address -> text."""
-        pairs = zip(self.ranges, self.units, strict=True)
-        return {one.address: written(values[one.address], unit) for one, unit in pairs}
-
-    def record(self) -> dict[str, Any]:
-        """The scan for the run's record, JSON-ready; the points are in the index."""
-        return {
-            "addresses": [one.address for one in self.ranges],
-            "written_units": self.units,
-            "ranges": [asdict(one) for one in self.ranges],
-            SCANNER: self.chosen.dump(),
-            "figure": self.adaptive.quantity,
-            "maximise": self.adaptive.maximise,
-            "n_points": self.adaptive.n_points,
-            "repeats": self.scanned.scan.repeats,
-        }
-
-
-def make_search(
-    scanned: ScanPoints, steps: Steps, results: Collection[str], found: ProblemCollector
-) -> Search | None:
-    """Make and check the scanner of a scan; None if the scan is not adaptive, or if there is a problem.
-
-    The scanner is constructed once, to check that its constructor accepts the settings.
-
-    Args:
-        scanned: The scan, its ends checked.
-        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_quantity`.
-    """
-    adaptive = scanned.scan.adaptive
-    if adaptive is None:
-        return None
-    n_before, document = len(found.problems), scanned.document
-    with found:
-        check_quantity(document, adaptive.aim, adaptive.quantity, CLIMBED, steps, results)
-    chosen: ChosenPlugin | None = None
-    with found:
-        chosen = resolve(scanned.hardware.host, document, "scanner", adaptive.choice)
-    low = scanned.at(0).parameters
-    high = scanned.at(math.prod(scanned.scan.shape) - 1).parameters
-    ranges: list[ScanRange] = []
-    for axis, ends in zip(scanned.scan.axes, adaptive.ends, strict=True):
-        with found:
-            present = scanned.present(axis)
-            ranges.append(_range(axis, ends, (low[axis.address], high[axis.address]), present))
-    if chosen is None or len(found.problems) > n_before:
-        return None
-    search = Search(scanned, adaptive, chosen, tuple(ranges))
-    with found:
-        construct_one(chosen, search.space(0))
-    return search
-
-
-def _range(axis: Axis, ends: Ends, resolved: tuple[Any, Any], present: Any) -> ScanRange:
-    """The range of an axis, if its ends are numbers that the settings model accepts unchanged."""
-    low, high = ends.low.si, ends.high.si
-    if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
-        what = f"'{clean(axis.address)}' is not a number, or not the one that is written"
-        raise axis.key.error(what, "an address of a number or quantity")
-    is_whole = all(type(value) is int for value in resolved)
-    if is_whole and ends.n_steps and (high - low) % ends.n_steps:
-        what = f"{ends.n_steps} equal steps from {low:g} to {high:g} are not whole numbers"
-        raise axis.key.error(what, f"a number of steps that {high - low:g} is a multiple of")
-    low, high = resolved if is_whole else (float(resolved[0]), float(resolved[1]))
-    start = float(present) if _is_number(present) and low <= present <= high else math.nan
-    return ScanRange(axis.address, low, high, is_whole, ends.n_steps, start)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -6,7 +6,7 @@ import json
 import math
 import shlex
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -339,9 +339,9 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
     checks = _Checks(session, guard)
     try:
         first = checks.of(assembly.first_point)
-        numbers: dict[_PointCheck, list[int]] = {}
-        for number, point in _numbered(session).items():
-            numbers.setdefault(checks.of(point), []).append(number)
+        numbers: dict[_PointCheck, set[int]] = {first: {0}}
+        for known in session.scan_run.known_points():
+            numbers.setdefault(checks.of(known.settings), set()).add(known.number)
         asks = (
             _PointCheck.ask_steps,
             _PointCheck.ask_timeline,
@@ -377,25 +377,14 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
 def _run_s(checks: _Checks) -> tuple[float, float]:
     """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
     run, least_s, most_s = checks.session.scan_run, list[float](), list[float]()
-    for point, n in run.counted():
+    for _, point, n in run.known_points():
         bars = [bar for _, bars in checks.of(point).timeline for bar in bars]
         least_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
     return (min(least_s), max(most_s)) if run.is_adaptive else (sum(least_s), sum(most_s))
 
 
-def _numbered(session: Session) -> dict[int, Point]:
-    """Number -> each point of the run, that of the check first; adaptive: a number -> each corner."""
-    run, first = session.scan_run, session.assembly.first_point
-    if run.is_adaptive:
-        return dict(enumerate([first, *run.each()]))
-    return {
-        0: first,
-        **dict(zip(dict.fromkeys(run.points[shot] for shot in run.shots), run.each(), strict=True)),
-    }
-
-
-def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Sequence[int]]) -> list[Problem]:
+def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
     found: dict[Any, tuple[Problem, list[int]]] = {}
     is_adaptive, n_points = checks.session.scan_run.is_adaptive, sum(map(len, numbers.values()))

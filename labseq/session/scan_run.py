@@ -5,45 +5,43 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
+from labseq.config.scan import Scan
 from labseq.errors import DeviceError
-from labseq.guard import Guard, StopFlag
-from labseq.messages import clean
-from labseq.model import ScanRange, VisitedPoint
+from labseq.guard import StopFlag
+from labseq.model import VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.columns import quantities_in
 from labseq.recording.quantities import Quantity, make_quantity
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
-from labseq.roles import Scanner
 from labseq.sequencer.leader import Emit
 from labseq.sequencer.run import Sequencer
-from labseq.session.assembly import CLIMBED, Assembly, Search
+from labseq.session.assembly import Assembly
 from labseq.session.awaited import AwaitedResults
-from labseq.session.chosen import construct_one
 from labseq.session.lab import rebuild_lab
 from labseq.session.policies import Checks, check_stop_file, missing_quantity
 from labseq.session.scan import Point
-from labseq.units import written
+from labseq.session.search import CLIMBED, ScannerCall, Search
 
 
 class ShotTaker(Protocol):
     """Takes the shots of a run one after the other."""
 
-    def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
+    def take(self, shot: int, point: Point, skipped: Collection[int]) -> str:
         """Take and record a shot.
 
         Args:
             skipped: Shots that will not be taken.
 
         Returns:
-            The shot and why, if it failed for good.
+            Why it failed for good, or "".
 
         Raises:
             LabseqError: The error that ends the run.
@@ -66,13 +64,27 @@ class OwnShots:
         self._changes = changes
         self._seed = seed
 
-    def take(self, shot: int, point: Point, skipped: Collection[int] = ()) -> Mapping[int, str]:  # noqa: ARG002
+    def take(self, shot: int, point: Point, skipped: Collection[int] = ()) -> str:  # noqa: ARG002
         """See :class:`ShotTaker`."""
         if point is not self._point:
             lab, reopened = rebuild_lab(self._sequencer.lab, self._point, point, self._seed)
             self._sequencer.change(lab, point.steps, {**self._changes, **point.parameters}, reopened)
             self._point = point
-        return self._sequencer.run([shot])
+        return self._sequencer.run([shot]).get(shot, "")
+
+
+class KnownPoint(NamedTuple):
+    """A point of a run that is known before its first shot.
+
+    Attributes:
+        number: Its number in the scan; of an adaptive scan, any number above 0.
+        settings: The settings of its shots.
+        n_shots: Shots of the run there; of an adaptive scan, as if all shots were taken there.
+    """
+
+    number: int
+    settings: Point
+    n_shots: int
 
 
 class ScanRun:
@@ -88,16 +100,15 @@ class ScanRun:
 
     def __init__(self, assembly: Assembly, seed: int, done: Collection[int] = ()) -> None:
         self.assembly = assembly
-        self._seed = seed
-        self._missing = [shot for shot in range(assembly.sequence.shots) if shot not in done]
+        n_shots, scanned = assembly.sequence.shots, assembly.scanned
+        self._missing = [shot for shot in range(n_shots) if shot not in done]
+        self.points = [0] * n_shots
+        if scanned is not None:
+            self.points = self._points_of_shots(scanned.scan, seed)[:n_shots]
         self._current: tuple[int, Point | None] = -1, None
-        self.points = self._points_of_shots()
 
-    def _points_of_shots(self) -> list[int]:
-        n_shots, scanned = self.assembly.sequence.shots, self.assembly.scanned
-        if scanned is None:
-            return [0] * n_shots
-        return [int(point) for point in scanned.scan.points_of_shots(self._seed)[:n_shots]]
+    def _points_of_shots(self, scan: Scan, seed: int) -> list[int]:
+        return scan.points_of_shots(seed).tolist()
 
     @cached_property
     def shots(self) -> list[int]:
@@ -106,7 +117,7 @@ class ScanRun:
 
     @property
     def n_points(self) -> int:
-        """Number of points of the run."""
+        """Number of points of the run; of an adaptive scan at most."""
         return len({*self.points})
 
     @property
@@ -116,22 +127,16 @@ class ScanRun:
         assert point is not None
         return point
 
-    def each(self) -> Iterator[Point]:
-        """The settings of each point with a shot to take."""
-        return map(self.assembly.at, dict.fromkeys(self.points[shot] for shot in self.shots))
+    def known_points(self) -> list[KnownPoint]:
+        """The points of the run; of an adaptive scan, the next one and the corners of the ranges."""
+        return [KnownPoint(point, self.assembly.at(point), n) for point, n in Counter(self.points).items()]
 
-    def representative_labs(self) -> Iterator[Point]:
+    def known_labs(self) -> list[Point]:
         """One point for each combination of planner and profile; that of the first shot comes first."""
-        seen: set[tuple[int, int]] = set()
-        for point in self.each():
-            key = id(point.planner), id(point.hardware)
-            if key not in seen:
-                seen.add(key)
-                yield point
-
-    def counted(self) -> list[tuple[Point, int]]:
-        """Each point of the run, with the number of its shots."""
-        return [(self.assembly.at(point), n) for point, n in Counter(self.points).items()]
+        found: dict[tuple[int, int], Point] = {}
+        for point in (self.first, *(one.settings for one in self.known_points())):
+            found.setdefault((id(point.planner), id(point.hardware)), point)
+        return [*found.values()]
 
     def run(self, taker: ShotTaker, writer: RunWriter, checks: Checks, emit: Emit) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
@@ -169,9 +174,8 @@ class ScanRun:
             given_up = taker.take(shot, point, skipped)
             if warning := self._add_result(writer):
                 emit("warning", {"text": warning})
-            why = next(iter(given_up.values()), "") or checks.after(writer.last_row)
-            if why:
-                skip([*given_up, *self._later_at_its_point(shot)], why)
+            if why := given_up or checks.after(writer.last_row):
+                skip([*([shot] if given_up else []), *self._later_at_its_point(shot)], why)
             if self.is_adaptive and skipped.issuperset(self._later_at_its_point(shot)):
                 emit("scan_point", self._progress(shot))
 
@@ -247,24 +251,22 @@ class AdaptiveScanRun(ScanRun):
         done: Collection[int] = (),
         awaited: AwaitedResults | None = None,
     ) -> None:
-        self._search = search
-        self.scanner_name = search.name
         super().__init__(assembly, seed, done)
+        self.scanner_name = search.name
+        self._search = search
         self._scanner = ScannerCall(search, seed, stop)
-        self._results = Results(
-            search,
-            {} if run is None else {shot.index: shot for shot in run.shots},
-            make_quantity(search.adaptive.quantity, assembly.target, awaited.values if awaited else None),
-            awaited,
+        self._load = caching_loader()
+        quantity = make_quantity(
+            search.adaptive.quantity, assembly.target, awaited.values if awaited else None
         )
+        shots = {} if run is None else {shot.index: shot for shot in run.shots}
+        self._results = Results(search, shots, quantity, awaited)
         for attempt in () if run is None else run.attempts:
             if run is not None and attempt.index in run.skipped:
                 self._results.add_skipped(attempt.index, attempt.row["parameters"])
-        self._load = caching_loader()
 
-    def _points_of_shots(self) -> list[int]:
-        repeats = self._search.scanned.scan.repeats
-        return [shot // repeats for shot in range(self.assembly.sequence.shots)]
+    def _points_of_shots(self, scan: Scan, seed: int) -> list[int]:  # noqa: ARG002
+        return [shot // scan.repeats for shot in range(self.assembly.sequence.shots)]
 
     @cached_property
     def shots(self) -> list[int]:
@@ -280,21 +282,11 @@ class AdaptiveScanRun(ScanRun):
         """The largest possible number of points."""
         return self._search.adaptive.n_points
 
-    def each(self) -> Iterator[Point]:
-        """The settings of the first shot to take, and of the corners of the ranges."""
-        if self.shots:
-            yield self.first
-        yield from map(self.assembly.at, range(math.prod(self._search.scanned.scan.shape)))
-
-    def representative_labs(self) -> Iterator[Point]:
-        """The first point, and two opposite corners."""
-        points = [*self.each()]
-        yield from (*points[:2], points[-1])
-
-    def counted(self) -> list[tuple[Point, int]]:
-        """Each corner, as if all shots were taken there."""
-        n_corners = math.prod(self._search.scanned.scan.shape)
-        return [(self.assembly.at(corner), self.assembly.sequence.shots) for corner in range(n_corners)]
+    def known_points(self) -> list[KnownPoint]:
+        """The point of the first shot to take, and the corners of the ranges."""
+        corners = [self.assembly.at(n) for n in range(math.prod(self._search.scanned.scan.shape))]
+        points = [self.first, *corners] if self.shots else corners
+        return [KnownPoint(n, point, len(self.points)) for n, point in enumerate(points, start=1)]
 
     def record(self) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; see :meth:`Search.record`."""
@@ -360,10 +352,8 @@ class Results:
     shots: dict[int, Shot]
     quantity: Quantity
     awaited: AwaitedResults | None = None
-    _visited: dict[int, VisitedPoint] = field(default_factory=dict[int, VisitedPoint])
+    _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
     _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
-    _scores: dict[str, tuple[int, list[float]]] = field(default_factory=dict[str, tuple[int, list[float]]])
-    _n_counted: int = 0
     _warned: bool = False
 
     @property
@@ -386,7 +376,7 @@ class Results:
 
     def before(self, visit: int) -> list[VisitedPoint]:
         """The results of all points before the given one, as the scanner receives them."""
-        return [one for one in map(self._visit, range(visit)) if one.values]
+        return [one for one in self._first(visit) if one.values]
 
     def missing_quantity(self, shot: int) -> str:
         """A warning, given once, that a shot lacks the quantity that the scan optimises; else ""."""
@@ -398,24 +388,23 @@ class Results:
 
     def progress(self, visit: int) -> dict[str, Any]:
         """The score of a point and the best one so far, JSON-ready, for the run's events."""
-        own = self._visit(visit)
+        visited = self._first(visit + 1)
         sign = 1.0 if self.search.adaptive.maximise else -1.0
+        scores: dict[tuple[float, ...], tuple[int, list[float]]] = {}
+        for number, one in enumerate(visited):  # a point that is visited again has the mean score
+            if not math.isnan(one.score):
+                scores.setdefault((*one.values.values(),), (number, []))[1].append(one.score)
 
-        def plain(number: int, values: Mapping[str, Any], score: float) -> dict[str, Any]:
+        def plain(number: int, score: float) -> dict[str, Any]:
             value = None if math.isnan(score) else sign * score
-            return {"point": number, "written": self.search.written(values), "value": value}
+            return {"point": number, "written": self.search.written(visited[number].values), "value": value}
 
-        for number in range(self._n_counted, visit + 1):  # a point that is visited again has the mean score
-            one = self._visit(number)
-            _, scores = self._scores.setdefault(dumps(dict(one.values)), (number, []))
-            scores += [] if math.isnan(one.score) else [one.score]
-        self._n_counted = max(self._n_counted, visit + 1)
-        means = [(sum(scores) / len(scores), -first) for first, scores in self._scores.values() if scores]
+        means = [(sum(own) / len(own), -first) for first, own in scores.values()]
         mean, first = max(means, default=(math.nan, 0))
         return {
             "figure": self.search.adaptive.quantity,
-            **plain(visit, own.values, own.score),
-            "best": plain(-first, self._visit(-first).values, mean) if means else None,
+            **plain(visit, visited[visit].score),
+            "best": plain(-first, mean) if means else None,
         }
 
     def _shots_of(self, visit: int) -> list[Shot]:
@@ -423,11 +412,11 @@ class Results:
         indices = range(visit * repeats, (visit + 1) * repeats)
         return [self.shots[index] for index in indices if index in self.shots]
 
-    def _visit(self, visit: int) -> VisitedPoint:
-        """The result of a point whose shots have all been taken or skipped; worked out once."""
-        if visit not in self._visited:
-            self._visited[visit] = self._result(visit)
-        return self._visited[visit]
+    def _first(self, n_points: int) -> list[VisitedPoint]:
+        """The results of the first points, whose shots have all been taken or skipped; worked out once."""
+        for visit in range(len(self._visited), n_points):
+            self._visited.append(self._result(visit))
+        return self._visited[:n_points]
 
     def _result(self, visit: int) -> VisitedPoint:
         shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
@@ -440,67 +429,3 @@ class Results:
     def _value(self, shot: Shot) -> dict[str, float]:
         value = self.quantity.of_shot(shot)
         return {} if math.isnan(value) else {self.quantity.name: value}
-
-
-class ScannerCall:
-    """Calls a scanner, with a timeout, and checks its answers.
-
-    Raises:
-        ConfigError: The scanner refuses its settings; with their place.
-        PluginLoadError: Its constructor raised.
-    """
-
-    def __init__(self, search: Search, seed: int, stop: StopFlag) -> None:
-        self._search = search
-        self._stop = stop
-        self._timeout_s = search.scanned.hardware.profile.timeouts.call
-        self._scanner: Scanner = construct_one(search.chosen, search.space(seed))
-
-    def choose(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
-        """The next point, address -> value; None if the scanner has finished.
-
-        Raises:
-            DeviceError: The scanner raised, or returned no point of its ranges; names the scanner.
-            DeviceTimeoutError: It did not answer in time.
-            StopRequested: The operator asked to stop.
-        """
-        guard = Guard(self._stop)
-        try:
-            return guard.call(self._search.name, self._timeout_s, self.next_point, tuple(visited))
-        finally:
-            guard.end()
-
-    def next_point(self, visited: Sequence[VisitedPoint]) -> dict[str, float] | None:
-        """The scanner's answer, checked. Error messages of a guarded call name this function."""
-        try:
-            answer: Any = self._scanner.next_point(visited)
-            given = dict(cast("Mapping[Any, Any]", answer)) if isinstance(answer, Mapping) else None
-        except Exception as error:
-            text = f"next_point() raised {type(error).__name__}"
-            raise self._error(f"{text}: {error}" if str(error) else text) from error
-        if answer is None:
-            return None
-        ranges = {one.address: one for one in self._search.ranges}
-        if given is None or {*given} != {*ranges}:
-            came = f"a {type(answer).__name__}" if given is None else f"values for {_names(given)}"
-            raise self._error(f"next_point() gave {came}; expected a value for each of {_names(ranges)}")
-        units = dict(zip(ranges, self._search.units, strict=True))
-        return {address: self._value(one, given[address], units[address]) for address, one in ranges.items()}
-
-    def _value(self, range_: ScanRange, value: object, unit: str) -> float:
-        """A value snapped to its range, without rounding errors."""
-        what = "a whole number" if range_.is_whole else "a number"
-        expected = f"{what} from {written(range_.low, unit)} to {written(range_.high, unit)}"
-        expected += f" on one of its {range_.n_steps} steps" if range_.n_steps else ""
-        near = range_.allowed(value)
-        if near is not None:
-            return near
-        came = f"{value:.12g} (SI)" if isinstance(value, float) and unit else clean(repr(value))
-        raise self._error(f"next_point() gave {came} for '{range_.address}'; expected {expected}")
-
-    def _error(self, text: str) -> DeviceError:
-        return DeviceError(self._search.name, text)
-
-
-def _names(addresses: Mapping[Any, Any]) -> str:
-    return ", ".join(f"'{clean(str(address))}'" for address in addresses) or "no address"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext, suppress
@@ -226,10 +225,10 @@ class Session:
                 from labseq.session.workers import open_workers
 
                 self._workers = stack.enter_context(closing(open_workers(self.options)))
-            labs = (self.build_lab(point) for point in self.scan_run.representative_labs())
-            lab = next(labs)
-            for one in itertools.chain([lab], labs):
-                self.warm(one)
+            first, *others = self.scan_run.known_labs()
+            self.warm(lab := self.build_lab(first))
+            for point in others:
+                self.warm(self.build_lab(point))
             if gc.get_freeze_count():  # by an earlier run in this process
                 gc.unfreeze()
                 gc.collect()

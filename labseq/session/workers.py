@@ -131,12 +131,12 @@ class TakenShot:
     Attributes:
         events: In order: the events, name and values, and the attempts at the shot: the line in the index,
             and the bytes of the file, or its name once it is written.
-        given_up: The shot, and why, if it failed for good.
+        given_up: Why it failed for good, or "".
         error: The error that ends the run, or None.
     """
 
     events: list[tuple[Any, Any]]
-    given_up: Mapping[int, str]
+    given_up: str
     error: LabseqError | None
 
 
@@ -175,13 +175,13 @@ class ShotWorker:
     def __call__(self, task: tuple[int, Place]) -> Unfinished:
         """Take a shot; its files are written, and its :class:`TakenShot` pickled, when it is finished."""
         shot, place = task
-        self._events, given_up = [], dict[int, str]()
+        self._events, given_up = [], ""
         if self._error is None:
             point = self._point_at(place)
             if self._own is None:
                 self._own = self._open(point)
             try:
-                given_up = dict(self._own.take(shot, point))
+                given_up = self._own.take(shot, point)
             except LabseqError as error:
                 self._error = portable(error)  # it ends the run before the shots that this worker still has
         return Unfinished(partial(self._finish, TakenShot(self._events, given_up, self._error)))
@@ -318,7 +318,7 @@ class WorkersShots:
         recipe = Recipe(writer.run, run_id, for_worker, str(self._folder), mark, needs_frames)
         workers.prepare(ShotWorker, recipe)
 
-    def take(self, shot: int, point: Point, skipped: Collection[int]) -> Mapping[int, str]:
+    def take(self, shot: int, point: Point, skipped: Collection[int]) -> str:
         """Wait for a shot, and record it; see :class:`labseq.session.scan_run.ShotTaker`."""
         self._out.difference_update(skipped)
         for late in self._done.keys() & skipped:
