@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias
 
@@ -94,18 +94,10 @@ class Scan:
         """All axes, in the order written."""
         return tuple(axis for group in self.groups for axis in group)
 
-    def groups_in(self, in_profile: bool) -> list[int]:
-        """Indices of the groups that change values of the profile, or of the sequence."""
-        groups = enumerate(self.groups)
-        return [i for i, group in groups if any(axis.of_profile == in_profile for axis in group)]
-
-    def positions(self, point: int) -> tuple[int, ...]:
-        """The position in each group at a point, counted from 0."""
-        return tuple(int(i) for i in np.unravel_index(point, self.shape)) if self.groups else ()
-
     def values(self, point: int) -> Iterator[tuple[Axis, Node]]:
         """Each axis with its value at a point."""
-        for group, position in zip(self.groups, self.positions(point), strict=True):
+        positions = np.unravel_index(point, self.shape) if self.groups else ()
+        for group, position in zip(self.groups, positions, strict=True):
             for axis in group:
                 yield axis, axis.values[position]
 
@@ -146,17 +138,12 @@ class Scan:
         _refuse_twice(groups, in_profile=True)
         return replace(self, groups=tuple(groups))
 
-    def put(self, document: Document, point: int, *, profile: bool) -> Document:
-        """A copy of the sequence or of the profile with the values of a point."""
-        pairs = [(axis, node) for axis, node in self.values(point) if axis.of_profile == profile]
-        return document.with_values((axis.loc, node, axis.key) for axis, node in pairs)
-
     def at_first_point(self, document: Document, *, profile: bool) -> Document:
         """A copy of the sequence or of the profile with the values of the first point.
 
         The first point of an adaptive scan is not known yet; the values of the file are then kept.
         """
-        return document if self.adaptive is not None else self.put(document, 0, profile=profile)
+        return document if self.adaptive is not None else put(self.values(0), document, profile=profile)
 
     def explained(self, error: ConfigError) -> ConfigError:
         """A copy of an error that adds to each invalid value its scanned address."""
@@ -176,6 +163,12 @@ class Scan:
             return replace(problem, notes=(*problem.notes, note))
 
         return ConfigError([with_address(problem) for problem in error.problems])
+
+
+def put(values: Iterable[tuple[Axis, Node]], document: Document, *, profile: bool) -> Document:
+    """A copy of the sequence or of the profile with the values of its axes."""
+    own = [(axis.loc, node, axis.key) for axis, node in values if axis.of_profile == profile]
+    return document.with_values(own) if own else document
 
 
 def _marks(node: Node) -> Iterator[Mark]:

@@ -62,7 +62,6 @@ class Assembly:
         target: The target pattern.
         planner: The planner and its settings.
         steps: Name and step, in order.
-        dry_run: "off", "full" or "fast".
         resolved: Every setting after defaults and overrides, SI, JSON-ready; for a scan, at its first
             point, like all other attributes.
         scanned: The points of the scan; None without one.
@@ -76,11 +75,15 @@ class Assembly:
     target: TargetPattern
     planner: ChosenPlugin
     steps: tuple[tuple[str, Step], ...]
-    dry_run: DryRun
     resolved: Mapping[str, Any]
     scanned: ScanPoints | None = None
     policy: RunPolicy = field(default_factory=RunPolicy)
     search: Search | None = None
+
+    @property
+    def dry_run(self) -> DryRun:
+        """Whether devices are replaced: "off", "full" or "fast"."""
+        return self.hardware.dry_run
 
     @property
     def virtual_time(self) -> bool:
@@ -191,7 +194,7 @@ def assemble(
     except ConfigError as error:
         _check_alone(document, sequence, found)
         raise _explained(found.stop(error), scan) from None
-    return _assembled(document, sequence, hardware, scan, found, dry_run)
+    return _assembled(document, sequence, hardware, scan, found)
 
 
 def _assembled(
@@ -200,7 +203,6 @@ def _assembled(
     hardware: ResolvedProfile,
     scan: Scan | None,
     found: ProblemCollector,
-    dry_run: DryRun,
 ) -> Assembly:
     """Make the target, planner, steps and analyses of a sequence on its profile."""
     is_whole = not found.problems
@@ -216,8 +218,7 @@ def _assembled(
     search: Search | None = None
     try:
         if scan is not None and is_whole:
-            bound, planner = scan.bound(hardware.document), made.get("planner")
-            scanned = ScanPoints(bound, document, sequence, hardware, dry_run, planner, tuple(steps))
+            scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
             scanned.check(found)
             if not found.problems:
                 search = make_search(scanned, steps, results, found)
@@ -235,7 +236,7 @@ def _assembled(
     }
     if texts := _expressions(document, hardware.document):
         resolved["expressions"] = texts
-    parts = (document, sequence, hardware, target, planner, tuple(steps), dry_run, resolved)
+    parts = (document, sequence, hardware, target, planner, tuple(steps), resolved)
     return Assembly(*parts, scanned, policy=policy, search=search)
 
 
@@ -269,8 +270,7 @@ def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
 def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
     spec = hardware.profile
     core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
-    roles = {role: chosen.dump() for role, chosen in hardware.chosen.items() if role in ROLES}
-    roles["mobile_tweezers"] |= spec.mobile_tweezers.model_dump(mode="json", exclude={"use"})
+    roles = {role: hardware.dump(role) for role in hardware.chosen if role in ROLES}
     roles["mobile_tweezers"]["overhead_per_cycle"] = hardware.motion.overhead_per_cycle_s
     if "amplitudes" in hardware.calibrations:
         rf = hardware.motion.rf

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, NamedTuple
 from labseq.calibration.store import Store, Stored, check_grid
 from labseq.config.addresses import Override
 from labseq.config.document import Document, StoredText, plugin_paths
-from labseq.config.profile import OFF, DeviceChoice, ProfileSpec, load_profile
+from labseq.config.profile import OFF, DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
 from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
@@ -39,6 +39,7 @@ class ResolvedProfile:
     Attributes:
         document: The profile's file.
         profile: Its content.
+        dry_run: "off", "full" or "fast".
         host: The plugins.
         grid: The grid of sites, with calibrated tones.
         chosen: Role or device name -> its plugin; without the planner.
@@ -49,6 +50,7 @@ class ResolvedProfile:
 
     document: Document
     profile: ProfileSpec
+    dry_run: DryRun
     host: PluginHost
     grid: SiteGrid
     chosen: Mapping[str, ChosenPlugin]
@@ -79,6 +81,43 @@ class ResolvedProfile:
         if typical_s is not None and "overhead_per_cycle" not in mobile.model_fields_set:
             motion = replace(motion, overhead_per_cycle_s=typical_s)
         return with_calibrations(motion, self.calibrations)
+
+    def dump(self, name: str) -> dict[str, Any]:
+        """The settings of a role or device for the record, SI, JSON-ready."""
+        found = self.chosen[name].dump()
+        if name == "mobile_tweezers":
+            found |= self.profile.mobile_tweezers.model_dump(mode="json", exclude={"use"})
+        return found
+
+    def changed(self, document: Document) -> ResolvedProfile:
+        """The profile with other settings of its plugins; drivers, grid and calibrations stay the same.
+
+        Args:
+            document: The profile's file with the other settings.
+
+        Raises:
+            ConfigError: All that is wrong with them.
+        """
+        found, chosen, profile = ProblemCollector(), dict(self.chosen), self.profile
+        for role, choice in {**profile.choices, **profile.devices}.items():
+            loc = choice.loc
+            if document.get(loc) == self.document.get(loc):
+                continue
+            with found:
+                own = document.validate(type(choice), loc).placed(*loc)
+                kind = kind_of(role, own)
+                if kind in HARDWARE_KINDS and own.use != choice.use:
+                    what = f"a scan cannot change the driver of {role}"
+                    raise document.error((*loc, "use"), what, "one driver for the whole run")
+                one, _ = choose_role(self.host, document, profile, role, own, self.dry_run)
+                if kind in HARDWARE_KINDS and one.virtual_time != chosen[role].virtual_time:
+                    what = f"the scan would change whether {role} is simulated"
+                    raise document.error(loc, what, "all points simulated, or none")
+                chosen[role] = one
+                if isinstance(own, MobileTweezersChoice):
+                    profile = profile.model_copy(update={"mobile_tweezers": own})
+        found.raise_any()
+        return replace(self, document=document, profile=profile, chosen=chosen)
 
     @property
     def key(self) -> str:
@@ -200,14 +239,11 @@ def choose_plugins(
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
-        kind = choice.role if isinstance(choice, DeviceChoice) else role
         if repaired and _is_fallback(document, choice):
             refused[role] = ConfigError("what the profile says of it is wrong")
             continue
         try:
-            one, warning = choose(host, document, kind, choice, dry_run)
-            by_line = kind == role and trigger_line(spec.line_specs, role) is not None
-            chosen[role] = replace(one, by_line=by_line)
+            chosen[role], warning = choose_role(host, document, spec, role, choice, dry_run)
             warnings += [f"{role}: {warning}"] if warning else []
         except ConfigError as error:
             refused[role] = error
@@ -221,7 +257,24 @@ def choose_plugins(
         else calibrated(document, spec, found, dry_run, detector, calibrations)
     )
     warnings += made.warnings
-    return ResolvedProfile(document, spec, host, made.grid, chosen, tuple(warnings), refused, made.entries)
+    return ResolvedProfile(
+        document, spec, dry_run, host, made.grid, chosen, tuple(warnings), refused, made.entries
+    )
+
+
+def kind_of(role: str, choice: Choice) -> str:
+    """The kind of plugin that a role or a device of the profile needs."""
+    return choice.role if isinstance(choice, DeviceChoice) else role
+
+
+def choose_role(
+    host: PluginHost, document: Document, spec: ProfileSpec, role: str, choice: Choice, dry_run: DryRun
+) -> tuple[ChosenPlugin, str]:
+    """The plugin of a role or device, and a warning for the user or ""."""
+    kind = kind_of(role, choice)
+    chosen, warning = choose(host, document, kind, choice, dry_run)
+    by_line = kind == role and trigger_line(spec.line_specs, role) is not None
+    return replace(chosen, by_line=by_line), warning
 
 
 def _is_fallback(document: Document, choice: Choice) -> bool:

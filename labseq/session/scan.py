@@ -1,64 +1,42 @@
-"""The points of a scan: each is a set of overrides, validated by the same functions as the files.
+"""The settings of a run at each point of its scan: values put into the files, and validated as those are.
 
-A scan has many points, but few different settings: a *part* is the settings of one plugin (the planner,
-a step, a role or a device of the profile). A part is validated once for each content that the points
-give it. Constructors are called later, when the run opens or by ``labseq check``.
+A scan has many points, but few different settings: those of a plugin are validated once for each content
+that the points give them. Devices are constructed later, when the run opens or by ``labseq check``.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
-
-import numpy as np
+from functools import partial
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from labseq.config.addresses import PROFILE, ROLES, VARIABLES
 from labseq.config.document import Document
-from labseq.config.profile import DeviceChoice, MobileTweezersChoice
-from labseq.config.scan import Axis, Scan
+from labseq.config.scan import Axis, Scan, put
 from labseq.config.sequence import SequenceSpec, StepSpec
 from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
 from labseq.messages import clean
 from labseq.roles import Step
-from labseq.session.chosen import (
-    HARDWARE_KINDS,
-    ChosenPlugin,
-    DryRun,
-    choose,
-    construct_role,
-    dump,
-    named,
-    resolve,
-    validate,
-)
+from labseq.session.chosen import ChosenPlugin, construct_role, dump, named, resolve, validate
 from labseq.session.profile import ResolvedProfile
 from labseq.settings import Choice
 from labseq.units import parse_any
 
 MAX_PROBLEMS: Final = 20
-"""The check of a scan stops after this number of wrong values."""
+"""The check of a scan stops after this number of problems."""
+_PLANNER: Final[Loc] = ("planner",)
 
-Part = tuple[bool, Loc]
-"""Key of a part: whether it is in the profile, and the place of its settings."""
+T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class PartSettings:
-    """The settings of a part at one point.
+class Made(NamedTuple, Generic[T]):
+    """A planner or step, and its settings after defaults, SI, JSON-ready."""
 
-    Attributes:
-        chosen: The plugin; None for a step.
-        step: The step; None for everything else.
-        choice: The entry of a role in the profile; None for planner and steps.
-        dump: The settings after defaults, SI, JSON-ready.
-    """
-
-    chosen: ChosenPlugin | None
-    step: Step | None
-    choice: Choice | None
+    plugin: T
     dump: Mapping[str, Any]
 
 
@@ -90,99 +68,121 @@ class ScanPoints:
         document: The sequence's file.
         sequence: Its content.
         hardware: The profile.
-        dry_run: "off", "full" or "fast".
-        planner: The planner if no axis changes it; None if it has an error.
-        steps: Name and step, in order, if no axis changes them.
     """
 
     scan: Scan
     document: Document
     sequence: SequenceSpec
     hardware: ResolvedProfile
-    dry_run: DryRun
-    planner: ChosenPlugin | None
-    steps: tuple[tuple[str, Step], ...]
-    _documents: dict[Any, Document] = field(default_factory=dict[Any, Document], repr=False)
-    _made: dict[Any, PartSettings] = field(default_factory=dict[Any, PartSettings], repr=False)
-    _profiles: dict[Any, ResolvedProfile] = field(default_factory=dict[Any, ResolvedProfile], repr=False)
+    _known: dict[Any, Any] = field(default_factory=dict[Any, Any], repr=False)
 
     def check(self, found: ProblemCollector) -> None:
-        """Validate the parts with the values of every point.
+        """Validate the settings at every point; of an adaptive scan, at the corners of its ranges.
 
         Args:
-            found: Receives the problems, those of the first :data:`MAX_PROBLEMS` wrong values.
+            found: Receives the problems; after :data:`MAX_PROBLEMS` no further point is tried.
         """
         try:
             self._check_dependents()
         except ConfigError as error:
             found.add(error)
             return
-        known, n_wrong = set(self.scan.explained(ConfigError(found.problems)).problems), 0
-        for in_profile, point in [(side, point) for side in (False, True) for point in self._points(side)]:
-            for part in self._parts():
-                if part[0] != in_profile:
-                    continue
-                try:
-                    self._part(part, point)
-                except ConfigError as error:
-                    new = [one for one in self.scan.explained(error).problems if one not in known]
-                    known.update(new)
-                    n_wrong += bool(new)
-                    found.problems += new
-                if n_wrong == MAX_PROBLEMS:
-                    return
+        known = set(self.scan.explained(ConfigError(found.problems)).problems)
+        n_before = len(found.problems)
+        for point in range(math.prod(self.scan.shape)):
+            try:
+                self.at(point)
+            except ConfigError as error:
+                new = [one for one in self.scan.explained(error).problems if one not in known]
+                known.update(new)
+                found.problems += new
+            if len(found.problems) >= n_before + MAX_PROBLEMS:
+                return
 
     def at(self, point: int) -> Point:
-        """The settings of a point.
+        """The settings of a point; of an adaptive scan, of a corner of its ranges.
 
         Raises:
-            ConfigError: A plugin refuses the values.
+            ConfigError: All that plugins refuse of the values.
         """
-        parts = {part: self._part(part, point) for part in self._parts()}
-        planner, steps = self.planner, list(self.steps)
-        for (in_profile, loc), made in parts.items():
-            if not in_profile and made.step is None:
-                planner = made.chosen
-            elif not in_profile and made.step is not None:
-                steps[int(loc[1])] = (steps[int(loc[1])][0], made.step)
-        assert planner is not None
-        parameters = {axis.address: _value_of(axis, node, parts) for axis, node in self.scan.values(point)}
-        for axis in self.scan.axes:
-            for loc in self._dependents(axis):
-                part = _part_of(axis.of_profile, loc)
-                parameters[_address(axis.of_profile, loc)] = _value_in(parts[part], part, loc)
-        hardware = self._profile_at(parts, self._document_at(True, point))
-        return Point(planner, tuple(steps), hardware, parameters, self._document_at(False, point))
+        return self.with_values([*self.scan.values(point)])
 
-    def of(self, scan: Scan) -> ScanPoints:
-        """The points of another scan of the same run."""
-        return replace(self, scan=scan, _documents={})
+    def with_values(self, values: Sequence[tuple[Axis, Node]]) -> Point:
+        """The settings with a value for each axis.
+
+        Raises:
+            ConfigError: All that plugins refuse of the values.
+        """
+        found, hardware, made = ProblemCollector(), self.hardware, dict[Loc, Made[Any]]()
+        document = put(values, self.document, profile=False)
+        with found:
+            hardware = self._profile_with(values)
+        with found:
+            made = self._planner_and_steps(document)
+        found.raise_any()
+        parameters: dict[str, Any] = {}
+        for axis, node in values:
+            value = _setting(made, hardware, axis.of_profile, axis.loc)
+            if axis.loc[0] == VARIABLES:
+                value = _si(node.plain())
+            elif value is None or isinstance(node.value, dict):
+                value = node.plain()  # a mapping as it is written
+            parameters[axis.address] = value
+        for axis, _ in values:
+            for loc in self._dependents(axis):
+                address = _address(axis.of_profile, loc)
+                parameters[address] = _setting(made, hardware, axis.of_profile, loc)
+        steps = tuple((spec.name or spec.kind, made[spec.loc].plugin) for spec in self.sequence.shot)
+        return Point(made[_PLANNER].plugin, steps, hardware, parameters, document)
 
     def present(self, axis: Axis) -> Any:
-        """The value of an axis in the files, SI; None if it is missing or invalid."""
-        document = self.hardware.document if axis.of_profile else self.document
+        """The value of an axis in the files, SI; None if it is missing."""
         if axis.loc[0] == VARIABLES:
-            return _si(document.get(axis.loc))
-        part = _part_of(axis.of_profile, axis.loc)
-        try:
-            return _value_in(self._make(part, document), part, axis.loc)
-        except ConfigError:
-            return None
+            return _si((self.hardware.document if axis.of_profile else self.document).get(axis.loc))
+        return _setting(self._planner_and_steps(self.document), self.hardware, axis.of_profile, axis.loc)
 
-    def _points(self, in_profile: bool) -> list[int]:
-        """A point for each combination of the values that go into one of the two files."""
-        shape, touched = self.scan.shape, self.scan.groups_in(in_profile)
-        if not touched:
-            return []
-        sizes = [n if i in touched else 1 for i, n in enumerate(shape)]
-        return [int(np.ravel_multi_index(positions, shape)) for positions in np.ndindex(*sizes)]
+    def _planner_and_steps(self, document: Document) -> dict[Loc, Made[Any]]:
+        """Planner and steps by the place of their settings.
 
-    def _parts(self) -> list[Part]:
-        """The parts that the scan changes, directly or through expressions."""
-        places = [
-            (axis.of_profile, loc) for axis in self.scan.axes for loc in (axis.loc, *self._dependents(axis))
-        ]
-        return list(dict.fromkeys(_part_of(*place) for place in places if place[1][0] != VARIABLES))
+        Raises:
+            ConfigError: All that they refuse.
+        """
+        found, made = ProblemCollector(), dict[Loc, Made[Any]]()
+        for loc in (_PLANNER, *(spec.loc for spec in self.sequence.shot)):
+            with found:
+                key = loc, json.dumps(document.get(loc))
+                made[loc] = self._once(key, partial(self._make, document, loc))
+        found.raise_any()
+        return made
+
+    def _profile_with(self, values: Sequence[tuple[Axis, Node]]) -> ResolvedProfile:
+        """The profile with the values of a point; points with the same values share one object."""
+        own = [node.plain() for axis, node in values if axis.of_profile]
+        if not own:
+            return self.hardware
+
+        def change() -> ResolvedProfile:
+            return self.hardware.changed(put(values, self.hardware.document, profile=True))
+
+        return self._once(json.dumps(own), change)
+
+    def _make(self, document: Document, loc: Loc) -> Made[Any]:
+        if loc == _PLANNER:
+            choice = document.validate(Choice, loc).placed(*loc)
+            chosen = resolve(self.hardware.host, document, "planner", choice)
+            return Made(chosen, chosen.dump())
+        return make_step(self.hardware, document, self.sequence.shot[int(loc[1])])
+
+    def _once(self, key: object, make: Callable[[], T]) -> T:
+        """What a function makes, or the error that it raises: worked out once for each key."""
+        if key not in self._known:
+            try:
+                self._known[key] = make()
+            except ConfigError as error:
+                self._known[key] = error
+        if isinstance(self._known[key], ConfigError):
+            raise self._known[key]
+        return self._known[key]
 
     def _dependents(self, axis: Axis) -> list[Loc]:
         """The settings with an expression that depends on an axis."""
@@ -199,101 +199,29 @@ class ScanPoints:
                 what = f"nothing follows from '{own}'"
                 raise axis.key.error(what, "an expression with it", hint)
             for loc in dependents:
-                if not _is_part(axis.of_profile, loc):
+                if not _may_be_scanned(axis.of_profile, loc):
                     other = clean(_address(axis.of_profile, loc))
                     what = f"'{other}' follows from '{own}', and a scan cannot change it"
                     raise axis.key.error(what, "one value of it for the whole run")
 
-    def _document_at(self, in_profile: bool, point: int) -> Document:
-        """The sequence or the profile with the values of a point."""
-        positions = self.scan.positions(point)
-        key = in_profile, tuple(positions[group] for group in self.scan.groups_in(in_profile))
-        if key not in self._documents:
-            document = self.hardware.document if in_profile else self.document
-            self._documents[key] = self.scan.put(document, point, profile=in_profile)
-        return self._documents[key]
 
-    def _part(self, part: Part, point: int) -> PartSettings:
-        document = self._document_at(part[0], point)
-        key = part, json.dumps(document.get(part[1]))
-        if key not in self._made:
-            self._made[key] = self._make(part, document)
-        return self._made[key]
-
-    def _make(self, part: Part, document: Document) -> PartSettings:
-        in_profile, loc = part
-        if in_profile:
-            return self._make_role(document, loc)
-        if loc == ("planner",):
-            choice = document.validate(Choice, loc).placed("planner")
-            chosen = resolve(self.hardware.host, document, "planner", choice)
-            return PartSettings(chosen, None, None, chosen.dump())
-        step, dumped = make_step(self.hardware, document, self.sequence.shot[int(loc[1])])
-        return PartSettings(None, step, None, dumped)
-
-    def _make_role(self, document: Document, loc: Loc) -> PartSettings:
-        role = str(loc[-1])
-        own = {**self.hardware.profile.choices, **self.hardware.profile.devices}[role]
-        choice = document.validate(type(own), loc).placed(*map(str, loc))
-        kind = choice.role if isinstance(choice, DeviceChoice) else role
-        if kind in HARDWARE_KINDS and choice.use != self.hardware.document.get((*loc, "use")):
-            what = f"a scan cannot change the driver of {role}"
-            raise document.error((*loc, "use"), what, "one driver for the whole run")
-        chosen, _ = choose(self.hardware.host, document, kind, choice, self.dry_run)
-        if kind in HARDWARE_KINDS and chosen.virtual_time != self.hardware.chosen[role].virtual_time:
-            what = f"the scan would change whether {role} is simulated"
-            raise document.error(loc, what, "all points simulated, or none")
-        dumped = chosen.dump()
-        if isinstance(choice, MobileTweezersChoice):
-            dumped |= choice.model_dump(mode="json", exclude={"use"})
-        return PartSettings(chosen, None, choice, dumped)
-
-    def _profile_at(self, parts: Mapping[Part, PartSettings], document: Document) -> ResolvedProfile:
-        """The profile at a point; points with equal parts share one object."""
-        changed = {str(loc[-1]): made for (in_profile, loc), made in parts.items() if in_profile}
-        key = tuple(map(id, changed.values()))
-        if key not in self._profiles:
-            chosen, profile = dict(self.hardware.chosen), self.hardware.profile
-            for name, made in changed.items():
-                assert made.chosen is not None
-                chosen[name] = made.chosen
-                if isinstance(made.choice, MobileTweezersChoice):
-                    profile = profile.model_copy(update={"mobile_tweezers": made.choice})
-            own = replace(self.hardware, document=document, profile=profile, chosen=chosen)
-            self._profiles[key] = own if changed else self.hardware
-        return self._profiles[key]
-
-
-def _part_of(in_profile: bool, loc: Loc) -> Part:
-    if not in_profile:
-        return False, loc[:1] if loc[0] == "planner" else loc[:3]
-    return True, loc[:2] if loc[0] == "devices" else loc[:1]
-
-
-def _is_part(in_profile: bool, loc: Loc) -> bool:
-    """Whether a scan may change a setting."""
-    if in_profile:
+def _may_be_scanned(of_profile: bool, loc: Loc) -> bool:
+    if of_profile:
         return loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 2)
     return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
 
 
-def _address(in_profile: bool, loc: Loc) -> str:
-    return (PROFILE if in_profile else "") + ".".join(map(str, loc))
+def _address(of_profile: bool, loc: Loc) -> str:
+    return (PROFILE if of_profile else "") + ".".join(map(str, loc))
 
 
-def _value_of(axis: Axis, node: Node, parts: Mapping[Part, PartSettings]) -> Any:
-    """A scanned value after the plugin's validation, in SI; a mapping as it is written."""
-    if axis.loc[0] == VARIABLES:
-        return _si(node.plain())
-    part = _part_of(axis.of_profile, axis.loc)
-    value = _value_in(parts[part], part, axis.loc)
-    return node.plain() if value is None or isinstance(node.value, dict) else value
-
-
-def _value_in(made: PartSettings, part: Part, loc: Loc) -> Any:
-    """The value of an address in the settings of its part; None if it is missing."""
-    value: Any = made.dump
-    for step in loc[len(part[1]) :]:
+def _setting(made: Mapping[Loc, Made[Any]], hardware: ResolvedProfile, of_profile: bool, loc: Loc) -> Any:
+    """The value at a location after the plugin's validation, SI; None if it is missing."""
+    if loc[0] == VARIABLES:
+        return None
+    n = 2 if loc[0] == "devices" else 3 if loc[0] == "shot" else 1
+    value: Any = hardware.dump(str(loc[n - 1])) if of_profile else made[loc[:n]].dump
+    for step in loc[n:]:
         try:
             value = value[step]
         except (KeyError, IndexError, TypeError):
@@ -306,7 +234,7 @@ def _si(value: Any) -> Any:
     return parse_any(value)[0] if isinstance(value, str) else value
 
 
-def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> tuple[Step, dict[str, Any]]:
+def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> Made[Step]:
     """A step of a sequence, and its settings for the record.
 
     Raises:
@@ -338,7 +266,7 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
             what = f"'{name}' is a camera, which '{spec.kind}' cannot use"
         problem = document.problem((*spec.loc, key), what, one_of(sorted(known)))
         raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
-    return step, dumped
+    return Made(step, dumped)
 
 
 def place_note(document: Document, key: str) -> str:

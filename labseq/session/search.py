@@ -60,11 +60,11 @@ class Search:
             ConfigError: A plugin refuses these values.
         """
         chosen = [values[one.address] for one in self.ranges]
-        alone = self.scanned.of(self.scanned.scan.at(chosen))
+        alone = self.scanned.scan.at(chosen)
         try:
-            return alone.at(0)
+            return self.scanned.with_values([*alone.values(0)])
         except ConfigError as error:
-            raise alone.scan.explained(error) from None
+            raise alone.explained(error) from None
 
     def written(self, values: Mapping[str, Any]) -> dict[str, str]:
         """The values of a point as text in the units of the sequence: address -> text."""
