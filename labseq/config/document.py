@@ -53,14 +53,12 @@ class Document:
         text: The file's text, without a byte order mark.
         root: The top mapping, with the results of the expressions once they are computed.
         expressions: The expressions; None before :meth:`evaluated`.
-        needs_units: Whether quantities need their units; not in the copy that an earlier run recorded.
     """
 
     path: Path
     text: str
     root: Node
     expressions: Expressions | None = None
-    needs_units: bool = True
 
     @classmethod
     def read(cls, path: Path, kept: StoredText | None = None) -> Document:
@@ -73,7 +71,7 @@ class Document:
             ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
         """
         text, name = (read_bytes(path), str(path)) if kept is None else kept
-        return replace(cls.parse(text, visible(name)), path=path, needs_units=kept is None)
+        return replace(cls.parse(text, visible(name)), path=path)
 
     @classmethod
     def parse(cls, text: str | bytes, name: str) -> Document:
@@ -216,7 +214,7 @@ class Document:
             ConfigError: All errors in the mapping, in file order.
         """
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
-        context = ValidationContext(name, called, drop, other_keys, self.path.parent, self.needs_units)
+        context = ValidationContext(name, called, drop, other_keys, self.path.parent, needs_units=True)
         node = self.root.at(loc) or Node({}, self.root.mark_at(loc))
         return validate(model, node, context)
 
@@ -305,7 +303,7 @@ def _without_wrong_values(document: Document, model: type[BaseModel], fallbacks:
     """A copy whose invalid values are replaced by fallbacks, or removed if there is no fallback."""
     root, seen = document.root, set[Loc]()
     for _ in range(_MAX_PASSES):  # validators of a whole list run once all its items are right
-        found = check(model, root, ValidationContext("", needs_units=document.needs_units))
+        found = check(model, root, ValidationContext("", needs_units=True))
         if not isinstance(found, list):
             break
         values = dict(cast("dict[str, Node]", root.value))

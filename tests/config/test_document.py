@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.builtin.steps import LoadSettings
 from labseq.config.document import Document, FallbackValues, StoredText, load_checked
 from labseq.config.profile import load_profile
 from labseq.config.sequence import SequenceSpec, load_sequence
@@ -126,10 +125,6 @@ def test_a_stored_text_replaces_the_file(tmp_path: Path) -> None:
     document = Document.read(path, StoredText("\ufeffshots: 3\n", "copy/sequence.yaml"))
     assert (document.path, document.name, document.text) == (path, "copy/sequence.yaml", "shots: 3\n")
     assert str(document.problem(("shots",), "wrong")) == "copy/sequence.yaml:1:8: wrong"
-    si = Document.read(
-        path, StoredText("load: {duration: 3}\n", "copy.yaml")
-    )  # of a run before units were needed
-    assert si.override("load.duration", "0.5", "").validate(LoadSettings, ("load",)).duration == 0.5
     kept = StoredText("labseq: 1\nname: 5\n", "copy.yaml")
     with pytest.raises(ConfigError, match=r"(?m)^copy\.yaml:2:7: name is 5"):
         load_sequence(path, kept=kept)
