@@ -23,8 +23,8 @@ from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
 from labseq.sequencer.leader import Emit
 from labseq.sequencer.run import Sequencer
+from labseq.session.analyses_beside import AnalysesBeside
 from labseq.session.assembly import Assembly
-from labseq.session.awaited import AwaitedResults
 from labseq.session.lab import rebuild_lab
 from labseq.session.policies import Checks, check_stop_file, missing_quantity
 from labseq.session.scan import Point
@@ -249,7 +249,7 @@ class AdaptiveScanRun(ScanRun):
         stop: StopFlag,
         run: Run | None = None,
         done: Collection[int] = (),
-        awaited: AwaitedResults | None = None,
+        analyses: AnalysesBeside | None = None,
     ) -> None:
         super().__init__(assembly, seed, done)
         self.scanner_name = search.name
@@ -257,10 +257,10 @@ class AdaptiveScanRun(ScanRun):
         self._scanner = ScannerCall(search, seed, stop)
         self._load = caching_loader()
         quantity = make_quantity(
-            search.adaptive.quantity, assembly.target, awaited.values if awaited else None
+            search.adaptive.quantity, assembly.target, analyses.values if analyses else None
         )
         shots = {} if run is None else {shot.index: shot for shot in run.shots}
-        self._results = Results(search, shots, quantity, awaited)
+        self._results = Results(search, shots, quantity, analyses)
         for attempt in () if run is None else run.attempts:
             if run is not None and attempt.index in run.skipped:
                 self._results.add_skipped(attempt.index, attempt.row["parameters"])
@@ -317,12 +317,12 @@ def scan_run_of(
     stop: StopFlag,
     run: Run | None = None,
     done: Collection[int] = (),
-    awaited: AwaitedResults | None = None,
+    analyses: AnalysesBeside | None = None,
 ) -> ScanRun:
     """The shots of a run and their points."""
     if assembly.search is None:
         return ScanRun(assembly, seed, done)
-    return AdaptiveScanRun(assembly, assembly.search, seed, stop, run, done, awaited)
+    return AdaptiveScanRun(assembly, assembly.search, seed, stop, run, done, analyses)
 
 
 def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
@@ -345,13 +345,13 @@ class Results:
         search: The scanner and its ranges.
         shots: The shots that count: index -> shot.
         quantity: What is optimised.
-        awaited: The results of analyses that this needs.
+        analyses: The analyses whose results this may need.
     """
 
     search: Search
     shots: dict[int, Shot]
     quantity: Quantity
-    awaited: AwaitedResults | None = None
+    analyses: AnalysesBeside | None = None
     _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
     _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
     _warned: bool = False
@@ -420,8 +420,8 @@ class Results:
 
     def _result(self, visit: int) -> VisitedPoint:
         shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
-        if self.awaited is not None:
-            self.awaited.await_shots(self.quantity.name, [shot.index for shot in shots])
+        if self.analyses is not None:
+            self.analyses.await_shots(self.quantity.name, [shot.index for shot in shots])
         quantities = [MappingProxyType(quantities_in(shot.row) | self._value(shot)) for shot in shots]
         score = sign * self.quantity.over(shots).value
         return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(quantities))

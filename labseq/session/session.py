@@ -24,8 +24,8 @@ from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, plan_timelines
+from labseq.session.analyses_beside import AnalysesBeside
 from labseq.session.assembly import Assembly, assemble
-from labseq.session.awaited import AwaitedResults
 from labseq.session.check import check
 from labseq.session.chosen import DryRun
 from labseq.session.lab import build_lab, clock_for, warm
@@ -76,8 +76,9 @@ class Session:
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
         self._observers = Observers(assembly.hardware.host, observer)
-        self._awaited = self._awaited_results(before)
-        self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._awaited)
+        self._analyses = self._analyses_beside(before)
+        self._observers.after_shot = self._analyses.look
+        self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._analyses)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
         self._workers: Workers | None = None
@@ -259,7 +260,7 @@ class Session:
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down(ended_well=error is None)
-        self._try(self._observers.finish_analyses)
+        self._try(self._analyses.finish)
         if error is None and self.scan_run.is_adaptive:
             self._try(self._report_best, writer.run_dir)
         if error is None and unsafe:
@@ -294,17 +295,17 @@ class Session:
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))
-        self._awaited.follow(self._observers.analyse(writer.run_dir, self.assembly.resolved["analysis"]))
+        self._analyses.start(writer.run_dir)
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
-        quantities = [make_quantity(check.value, target, self._awaited.values) for check in settings]
+        quantities = [make_quantity(check.value, target, self._analyses.values) for check in settings]
         load = caching_loader()
 
         def values_of(row: Mapping[str, Any]) -> list[float]:
             shot = Shot(writer.run_dir / row["file"], dict(row), load)
             for quantity in quantities:
-                self._awaited.await_shots(quantity.name, [shot.index])
+                self._analyses.await_shots(quantity.name, [shot.index])
             return [quantity.of_shot(shot) for quantity in quantities]
 
         checks = Checks(settings, before, self._warn, values_of)
@@ -321,15 +322,15 @@ class Session:
         with closing(shots):
             self.scan_run.run(shots, writer, checks, emit)
 
-    def _awaited_results(self, run: Run | None) -> AwaitedResults:
-        """The results of analyses without which the run cannot be continued, or a check cannot be made."""
+    def _analyses_beside(self, run: Run | None) -> AnalysesBeside:
+        """The analyses of the sequence, and what the run needs of their results."""
         checks, search = self.assembly.sequence.policy.checks, self.assembly.search
         needed = {check.value: "" for check in checks}
         needed |= {check.value: "for a check that stops it" for check in checks if check.then == "stop"}
         if search is not None:
             needed[search.adaptive.quantity] = "to choose the next point"
         analyses = self.assembly.resolved["analysis"]
-        return AwaitedResults(needed, analyses, self._observers, self.stop_flag, run)
+        return AnalysesBeside(analyses, needed, self._observers, self.stop_flag, run)
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
         """Create the run's folder, or reopen that of a resumed run."""
