@@ -18,8 +18,7 @@ from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.session.chosen import DryRun, load_plugins
 from labseq.session.devices import CheckedDevice, DevicesReport, check_devices
-from labseq.session.safe import make_profile_safe
-from labseq.session.stand_by import stand_by
+from labseq.session.safe import make_profile_safe, stand_by
 from labseq.units import format_quantity
 
 _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")

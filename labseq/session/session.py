@@ -12,9 +12,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
-from labseq.guard import Guard, StopFlag, stop_on_signals
+from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
-from labseq.model import RunRecord, TimelineEntry
+from labseq.model import RunRecord
 from labseq.realtime import real_time
 from labseq.recording import Run, RunWriter, Shot, clear_active, data_root, mark_active, open_run
 from labseq.recording.best import best_point
@@ -23,7 +23,7 @@ from labseq.recording.quantities import make_quantity
 from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.run import Sequencer, plan_timelines
+from labseq.sequencer.run import Sequencer
 from labseq.session.analyses_beside import AnalysesBeside
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.check import check
@@ -179,16 +179,6 @@ class Session:
         self._shut_down()
         if self.earlier is not None:
             self.earlier.release()
-
-    def timeline(self) -> list[tuple[str, list[TimelineEntry]]]:
-        """The timeline of a shot: name and entries of each step."""
-        lab, guard = self.build_lab(), Guard(self.stop_flag)
-        steps = self.assembly.steps
-        try:
-            entries = plan_timelines(lab, guard, steps)
-        finally:
-            guard.end()
-        return [(name, own) for (name, _), own in zip(steps, entries, strict=True)]
 
     def run(self) -> Run:
         """Take all shots.

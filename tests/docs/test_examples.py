@@ -19,6 +19,7 @@ from labseq.config.profile import ProfileSpec
 from labseq.config.sequence import SequenceSpec
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import format_config_error
+from tests.session.whole_runs import timelines
 
 from .blocks import BLOCKS, COMMENT, PAGES, ROOT, Block, commands_of, inline_of
 from .running import split
@@ -217,7 +218,7 @@ def test_every_yaml_example_is_valid(block: Block, tmp_path: Path) -> None:
     write(sequence, SEQUENCE, block.text if is_sequence else "", own if is_sequence else set())
     write(profile, PROFILE, "" if is_sequence else block.text, set() if is_sequence else keys)
     with labseq.Session.open(sequence, profile=str(profile)) as session:
-        assert session.timeline()
+        assert timelines(session)
 
 
 def write(path: Path, rest: dict[str, str], text: str, keys: set[str]) -> None:

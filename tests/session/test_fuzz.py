@@ -9,6 +9,8 @@ import labseq
 from labseq.errors import LabseqError
 from tests.config.mutations import mutated
 
+from .whole_runs import timelines
+
 ROOT = Path(__file__).parents[2]
 SEQUENCE = (ROOT / "sequences" / "compact_225.yaml").read_bytes()
 PROFILE = (ROOT / "hardware_profiles" / "virtual.yaml").read_bytes()
@@ -28,7 +30,7 @@ def test_a_mutated_file_opens_or_is_the_users_mistake(tmp_path: Path, which: str
     path.write_bytes(sequence)
     try:
         session = labseq.Session.open(path)
-        session.timeline()
+        timelines(session)
     except LabseqError as error:
         assert error.exit_code == 2, error
         assert str(error).strip()

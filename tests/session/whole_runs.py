@@ -6,6 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import labseq
+from labseq.guard import Guard
+from labseq.model import TimelineEntry
+from labseq.sequencer.run import plan_timelines
 
 ROOT = Path(__file__).parents[2]
 COMPACT = ROOT / "sequences" / "compact_225.yaml"
@@ -20,3 +23,12 @@ SMALL_FRAMES = tuple(
 def run(tmp_path: Path, sequence: Path = COMPACT, observer: Any = None, **options: Any) -> labseq.Run:
     with labseq.Session.open(sequence, output=tmp_path / "data", observer=observer, **options) as session:
         return session.run()
+
+
+def timelines(session: labseq.Session) -> list[list[TimelineEntry]]:
+    """The timeline of each step of a shot; nothing is opened."""
+    guard = Guard(session.stop_flag)
+    try:
+        return plan_timelines(session.build_lab(), guard, session.assembly.steps)
+    finally:
+        guard.end()
