@@ -15,13 +15,17 @@ from labseq.config.document import Document
 from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettings, StepSpec
 from labseq.errors import CheckFailedError, Loc, ProblemCollector, StopRequested
 from labseq.messages import clean, did_you_mean, listing
+from labseq.model import TargetPattern
 from labseq.model.records import unique_names
+from labseq.recording import Shot
 from labseq.recording.columns import QUANTITIES, quantities_in
 from labseq.recording.folders import STOP_FILE
-from labseq.recording.quantities import OF_IMAGES, quantity_problem, split_name
+from labseq.recording.quantities import OF_IMAGES, make_quantity, quantity_problem, split_name
 from labseq.recording.results import PREFIX
+from labseq.recording.shot import caching_loader
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
+from labseq.session.analyses_beside import AnalysesBeside
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
@@ -144,8 +148,11 @@ class Checks:
     """Checks the quantities of the most recent shots against their limits, between two shots.
 
     Args:
+        run_dir: The run's folder.
         rows: The index's lines of earlier shots of a resumed run, in order.
-        values_of: A line of the index -> the value of each check for its shot; nan if it has none.
+        target: The target of the run.
+        analyses: The analyses whose results are checked.
+        warn: Receives the messages of checks that only warn.
 
     Attributes:
         left_open: The last of the earlier shots, and why a check would skip the rest of its point, or "".
@@ -154,13 +161,20 @@ class Checks:
     def __init__(
         self,
         checks: Sequence[CheckSettings],
+        run_dir: Path,
         rows: Iterable[Mapping[str, Any]],
+        target: TargetPattern,
+        analyses: AnalysesBeside,
         warn: Callable[[str], None],
-        values_of: Callable[[Mapping[str, Any]], Sequence[float]],
     ) -> None:
-        self._values_of = values_of
-        self._checks = [(check, deque[float](maxlen=check.shots)) for check in checks]
+        self._checks = [
+            (check, make_quantity(check.value, target, analyses.values), deque[float](maxlen=check.shots))
+            for check in checks
+        ]
+        self._run_dir = run_dir
+        self._analyses = analyses
         self._warn = warn
+        self._load = caching_loader()
         self._unseen = {check.value for check in checks if not check.value.startswith(PREFIX)}
         self.left_open = -1, ""
         for row in rows:
@@ -193,8 +207,10 @@ class Checks:
     def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
         """The checks that fail after a shot, each with a message."""
         broken: list[tuple[CheckSettings, str]] = []
-        of_shot = self._values_of(row)
-        for (check, values), value in zip(self._checks, of_shot, strict=True):
+        shot = Shot(self._run_dir / row["file"], dict(row), self._load)
+        for check, quantity, values in self._checks:
+            self._analyses.await_shots(quantity.name, [shot.index])
+            value = quantity.of_shot(shot)
             if math.isnan(value) and check.value in self._unseen:  # its name may be misspelt
                 self._unseen.discard(check.value)
                 self._warn(missing_quantity(row["shot"], check.value, _CHECKED, quantities_in(row)))

@@ -9,18 +9,16 @@ from contextlib import ExitStack, closing, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, ParamSpec, Self
+from typing import TYPE_CHECKING, ParamSpec, Self
 
 from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord
 from labseq.realtime import real_time
-from labseq.recording import Run, RunWriter, Shot, clear_active, data_root, mark_active, open_run
+from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, open_run
 from labseq.recording.best import best_point
 from labseq.recording.folders import later_day
-from labseq.recording.quantities import make_quantity
-from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer
@@ -289,16 +287,7 @@ class Session:
         self._observers.event("run_started", about)
         before = () if self.earlier is None else self.earlier.rows
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
-        quantities = [make_quantity(check.value, target, self._analyses.values) for check in settings]
-        load = caching_loader()
-
-        def values_of(row: Mapping[str, Any]) -> list[float]:
-            shot = Shot(writer.run_dir / row["file"], dict(row), load)
-            for quantity in quantities:
-                self._analyses.await_shots(quantity.name, [shot.index])
-            return [quantity.of_shot(shot) for quantity in quantities]
-
-        checks = Checks(settings, before, self._warn, values_of)
+        checks = Checks(settings, writer.run_dir, before, target, self._analyses, self._warn)
         emit = self._observers.event
         if self._workers is None:
             own = OwnShots(sequencer, first, changes, record.seed)
