@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
 
@@ -30,16 +29,14 @@ from labseq.model import (
 from labseq.model.estimate import mean
 from labseq.motion import check_plan
 from labseq.recording import Run, Shot
-from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.roles import Context, Detector, NeedsWarmUp, Planner
-from labseq.session.assembly import Assembly, assemble
+from labseq.session.assembly import Assembly, assemble_recorded
 from labseq.session.chosen import ChosenPlugin, changed_settings, resolve
 from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import image_before
 from labseq.session.options import Options
 from labseq.session.planning import call_planner
-from labseq.session.profile import RecordedSetup
-from labseq.session.recorded import calibrations_of, machine_of, stored_text
+from labseq.session.recorded import calibrations_of, files_of, machine_of
 from labseq.session.scan import Point
 from labseq.session.scan_run import point_of, scan_run_of
 from labseq.settings import Choice
@@ -416,14 +413,8 @@ def assembly_of(run: Run) -> Assembly:
         ConfigError: The run can no longer be assembled.
         RecordingError: Its recorded files are missing.
     """
-    record = run.record
-    options = Options.of(run.changes)
-    return assemble(
-        Path(record["sequence_path"]),
-        replace(options, profile=Path(record["profile_path"]), dry_run="fast"),
-        kept=stored_text(run.path / SEQUENCE_FILE, record["sequence_sha256"]),
-        again=RecordedSetup(stored_text(run.path / PROFILE_FILE, record["profile_sha256"]), {}),
-    )
+    options = replace(Options.of(run.changes), dry_run="fast")
+    return assemble_recorded(files_of(run)._replace(calibrations={}), options)
 
 
 def shots_of(run: Run, text: str | None) -> list[Shot]:

@@ -30,7 +30,7 @@ from labseq.session.chosen import (
 )
 from labseq.session.options import Options
 from labseq.session.policies import make_policy, with_policies
-from labseq.session.profile import RecordedSetup, ResolvedProfile, resolve_profile
+from labseq.session.profile import RecordedFiles, ResolvedProfile, resolve_profile
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
 from labseq.session.search import Search, make_search
 from labseq.settings import si_unit_at
@@ -151,15 +151,15 @@ def assemble(
     options: Options,
     *,
     kept: StoredText | None = None,
-    again: RecordedSetup | None = None,
+    recorded: RecordedFiles | None = None,
 ) -> Assembly:
     """Read and validate everything that can be validated without opening a device.
 
     Args:
         sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find.find_sequence`.
         options: Values that replace those in the files.
-        kept: The sequence's text when the run began, if it is resumed.
-        again: Profile and calibrations when the run began, if it is resumed.
+        kept: The sequence's text, of a run that was queued or began earlier.
+        recorded: Profile and calibrations of a run that began earlier.
 
     Raises:
         ConfigError: The sequence, the profile or an override has an error.
@@ -189,12 +189,18 @@ def assemble(
             plugin_folders=plugin_paths(document, sequence.plugin_folders),
             scan=scan,
             found=found,
-            again=again,
+            recorded=recorded,
         )
     except ConfigError as error:
         _check_alone(document, sequence, found)
         raise _explained(found.stop(error), scan) from None
     return _assembled(document, sequence, hardware, scan, found)
+
+
+def assemble_recorded(recorded: RecordedFiles, options: Options) -> Assembly:
+    """Assemble a run from the files and calibrations that it began with; see :func:`assemble`."""
+    options = replace(options, profile=recorded.profile_path)
+    return assemble(recorded.sequence_path, options, kept=recorded.sequence, recorded=recorded)
 
 
 def _assembled(

@@ -165,14 +165,20 @@ def check_dead_time(document: Document, spec: ProfileSpec, found: ProblemCollect
         found.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))
 
 
-class RecordedSetup(NamedTuple):
-    """The profile and calibrations that a run began with, for resuming it.
+class RecordedFiles(NamedTuple):
+    """The files and calibrations that a run began with, to assemble it once more.
 
     Attributes:
-        profile: The text of the profile.
+        sequence_path: Where the sequence was; paths in it are relative to this.
+        sequence: Its text.
+        profile_path: Where the profile was.
+        profile: Its text.
         calibrations: Kind -> id of the calibrations; no others are active.
     """
 
+    sequence_path: Path
+    sequence: StoredText
+    profile_path: Path
     profile: StoredText
     calibrations: Mapping[str, str]
 
@@ -187,7 +193,7 @@ def resolve_profile(
     plugin_folders: Sequence[Path] = (),
     scan: Scan | None = None,
     found: ProblemCollector | None = None,
-    again: RecordedSetup | None = None,
+    recorded: RecordedFiles | None = None,
 ) -> ResolvedProfile:
     """Read a profile, load the plugins and choose the plugin of each role.
 
@@ -195,7 +201,7 @@ def resolve_profile(
         named_in: The sequence that names the profile, for messages.
         plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
         found: Receives the problems of a readable profile; without it they are raised.
-        again: The profile's text and calibrations, if a run is resumed.
+        recorded: The profile's text and calibrations, of a run that began earlier.
 
     Raises:
         ConfigError: The profile has an error.
@@ -208,12 +214,12 @@ def resolve_profile(
         named_in=named_in,
         scan=scan,
         found=found,
-        kept=None if again is None else again.profile,
+        kept=None if recorded is None else recorded.profile,
     )
     folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
     host = load_plugins(folders, max_wait_s=spec.timeouts.load)
     problems = ProblemCollector() if found is None else found
-    pins = None if again is None else again.calibrations
+    pins = None if recorded is None else recorded.calibrations
     hardware = choose_plugins(document, spec, host, dry_run, problems, pins)
     if found is None:
         problems.raise_any()

@@ -15,11 +15,12 @@ from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
 from labseq.plugins import PluginHost
-from labseq.recording.folders import RUN_FILE
+from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
 from labseq.recording.reader import Run
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
 from labseq.session.chosen import load_plugins
+from labseq.session.profile import RecordedFiles
 from labseq.text_files import beside
 
 
@@ -48,6 +49,19 @@ def stored_text(path: Path, sha256: str) -> StoredText:
     if sha256_of_text(text) != sha256:
         raise RecordingError(path, f"is not what {RUN_FILE} says it was; restore it from a backup")
     return StoredText(text, str(path))
+
+
+def files_of(run: Run) -> RecordedFiles:
+    """The files and calibrations that a run began with, from the copies in its folder.
+
+    Raises:
+        RecordingError: A copy is missing or has been changed.
+    """
+    record = run.record
+    sequence = stored_text(run.path / SEQUENCE_FILE, record["sequence_sha256"])
+    profile = stored_text(run.path / PROFILE_FILE, record["profile_sha256"])
+    paths = Path(record["sequence_path"]), Path(record["profile_path"])
+    return RecordedFiles(paths[0], sequence, paths[1], profile, record.get("calibrations", {}))
 
 
 def plugins_of(run: Run) -> PluginHost:

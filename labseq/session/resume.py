@@ -18,14 +18,13 @@ from labseq.model import RunRecord
 from labseq.plain import dumps, now_utc
 from labseq.processes import Lock, knows_no_locks
 from labseq.recording import Run, RunWriter, open_run
-from labseq.recording.folders import INDEX_FILE, LOCK_FILE, PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, find_run
+from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
 from labseq.recording.points import SCANNER
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
-from labseq.session.assembly import Assembly, assemble
+from labseq.session.assembly import Assembly, assemble_recorded
 from labseq.session.options import Options
-from labseq.session.profile import RecordedSetup
 from labseq.session.provenance import run_record
-from labseq.session.recorded import stored_text
+from labseq.session.recorded import files_of
 from labseq.session.scan_run import scan_run_of
 from labseq.text_files import decode, read_bytes
 
@@ -134,19 +133,10 @@ class ResumableRun:
             ConfigError: That is no longer possible, for example because a calibration or plugin is missing.
             RecordingError: The run's own files have been changed.
         """
-        record, options = self.run.record, Options.of(self.run.changes, realtime=realtime)
-        sequence, profile = Path(record["sequence_path"]), Path(record["profile_path"])
-        kept = {
-            "sequence": stored_text(self.run.path / SEQUENCE_FILE, record["sequence_sha256"]),
-            "profile": stored_text(self.run.path / PROFILE_FILE, record["profile_sha256"]),
-        }
-        assembly = assemble(
-            sequence,
-            replace(options, profile=profile),
-            kept=kept["sequence"],
-            again=RecordedSetup(kept["profile"], record.get("calibrations", {})),
-        )
-        for path, own in ((sequence, kept["sequence"]), (profile, kept["profile"])):
+        options, recorded = Options.of(self.run.changes, realtime=realtime), files_of(self.run)
+        assembly = assemble_recorded(recorded, options)
+        files = (recorded.sequence_path, recorded.sequence), (recorded.profile_path, recorded.profile)
+        for path, own in files:
             if _has_changed(path, own.text):
                 self.warnings.append(
                     f"{path} has been changed since; the run continues with its earlier content"

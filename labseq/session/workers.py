@@ -32,12 +32,12 @@ from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leader import leaders
 from labseq.sequencer.run import Sequencer
-from labseq.session.assembly import Assembly, assemble
+from labseq.session.assembly import Assembly, assemble_recorded
 from labseq.session.chosen import HARDWARE_KINDS
 from labseq.session.lab import build_lab, warm
 from labseq.session.observers import Observers
 from labseq.session.options import Options
-from labseq.session.profile import RecordedSetup
+from labseq.session.profile import RecordedFiles
 from labseq.session.provenance import run_record
 from labseq.session.resume import changes_between, plain_record
 from labseq.session.scan import Point
@@ -264,12 +264,14 @@ def _assembled_again(recipe: Recipe) -> Assembly:
         ConfigError: That is not possible here, or its shots would differ.
     """
     record = recipe.record
-    assembly = assemble(
+    recorded = RecordedFiles(
         Path(record.sequence_path),
-        replace(recipe.options, profile=record.profile_path),
-        kept=StoredText(record.sequence_text, record.sequence_path),
-        again=RecordedSetup(StoredText(record.profile_text, record.profile_path), record.calibrations),
+        StoredText(record.sequence_text, record.sequence_path),
+        Path(record.profile_path),
+        StoredText(record.profile_text, record.profile_path),
+        record.calibrations,
     )
+    assembly = assemble_recorded(recorded, recipe.options)
     folder = Path(record.provenance["folder"])
     today = run_record(assembly, record.seed, recipe.options.changes(), {}, folder)
     if changes := changes_between(plain_record(record), today):
