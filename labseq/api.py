@@ -14,8 +14,8 @@ from labseq.errors import ConfigError, Problem
 from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
+from labseq.session.calibrations import calibrated_machine
 from labseq.session.chosen import ChosenPlugin, construct_one, construct_target, load_plugins
-from labseq.session.profile import calibrated_machine
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""

@@ -34,8 +34,9 @@ from labseq.pictures.figures import can_draw, encode_figure
 from labseq.plain import now_utc
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
+from labseq.session.calibrations import store_of, why_left_out
 from labseq.session.chosen import DryRun
-from labseq.session.profile import ResolvedProfile, resolve_profile, store_of, why_left_out
+from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.recorded import recorded_machine
 from labseq.session.session import Session
 

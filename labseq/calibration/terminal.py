@@ -23,8 +23,8 @@ from labseq.console.text import age_text, columns
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationKind
+from labseq.session.calibrations import open_store
 from labseq.session.chosen import DryRun
-from labseq.session.profile import open_store
 
 MAX_LISTED: Final = 4
 """Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""

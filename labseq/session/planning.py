@@ -26,6 +26,7 @@ from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
 from labseq.roles import Context, Planner
+from labseq.session.calibrations import calibrated_machine
 from labseq.session.chosen import (
     ChosenPlugin,
     changed_settings,
@@ -35,7 +36,6 @@ from labseq.session.chosen import (
 )
 from labseq.session.lab import construct, parallelism_of
 from labseq.session.occupancies import Source, read_source
-from labseq.session.profile import calibrated_machine
 from labseq.session.recorded import Machine, recorded_machine
 from labseq.settings import Choice, PatternChoice
 from labseq.text_files import YAML_SUFFIXES
