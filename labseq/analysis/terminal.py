@@ -36,7 +36,8 @@ from labseq.model.estimate import as_mapping, mean
 from labseq.pictures.figures import check_place
 from labseq.plain import to_plain
 from labseq.recording import Run
-from labseq.session.analyses import USE, AnalysisOutcome, analyse_missing, analyses_of
+from labseq.session.analyses import AnalysisOutcome, analyse_missing, analyses_of
+from labseq.session.analyses_beside import USE
 from labseq.units import format_quantity
 
 MAX_REPORTED: Final = 5

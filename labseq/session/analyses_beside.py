@@ -18,9 +18,13 @@ from labseq.messages import clean, did_you_mean, listing
 from labseq.recording import Run, open_run
 from labseq.recording.results import ERROR, PREFIX, SHOT, Results, done, read_results, results_file
 from labseq.roles import RunObserver
-from labseq.session.analyses import FAILED, FINISH_WITHIN, USE
 from labseq.units import format_quantity
 
+USE: Final = "use"
+FINISH_WITHIN: Final = "finish_within"
+"""Keys of the core in the settings of an analysis."""
+FAILED: Final = "failed: "
+"""Lines of an analysis's log with this prefix are shown as warnings of the run."""
 GRACE_S: Final = 2.0
 """Extra time for a process to exit before it is killed, in seconds."""
 MAX_START_S: Final = 60.0

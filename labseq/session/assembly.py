@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
@@ -28,13 +28,16 @@ from labseq.session.chosen import (
     resolve,
     validate,
 )
-from labseq.session.options import Options
+from labseq.session.options import NOT_SET, Options
 from labseq.session.policies import make_policy, with_policies
-from labseq.session.profile import RecordedFiles, ResolvedProfile, resolve_profile
+from labseq.session.profile import ResolvedProfile, resolve_profile
 from labseq.session.scan import Point, ScanPoints, make_step, place_note
 from labseq.session.search import Search, make_search
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of
+
+if TYPE_CHECKING:
+    from labseq.session.recorded import RecordedFiles
 
 
 class Setting(NamedTuple):
@@ -97,6 +100,8 @@ class Assembly:
             address: Its address; "profile." for one in the profile.
             written: What was typed for it: taken if the record has no such setting.
         """
+        if address in NOT_SET:
+            return Setting(written, "", written)
         of_profile = address.startswith(PROFILE)
         document = self.hardware.document if of_profile else self.document
         try:

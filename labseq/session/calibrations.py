@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from labseq.calibration.store import Store, Stored, check_grid
 from labseq.config.document import Document
@@ -16,7 +16,9 @@ from labseq.files import profile_dir
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, MotionSpec, SiteGrid
 from labseq.model.calibration import correct_overlay
 from labseq.registry import VIRTUAL_TWIN
-from labseq.session.chosen import DryRun
+
+if TYPE_CHECKING:
+    from labseq.session.chosen import DryRun
 
 FOLDER: Final = "calibrations"
 

@@ -7,7 +7,7 @@ import signal
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -17,15 +17,16 @@ from labseq.errors import CheckFailedError, Loc, ProblemCollector, StopRequested
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import TargetPattern
 from labseq.model.records import unique_names
-from labseq.recording import Shot
 from labseq.recording.columns import QUANTITIES, quantities_in
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.quantities import OF_IMAGES, make_quantity, quantity_problem, split_name
 from labseq.recording.results import PREFIX
-from labseq.recording.shot import caching_loader
+from labseq.recording.shot import Shot, caching_loader
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
-from labseq.session.analyses_beside import AnalysesBeside
+
+if TYPE_CHECKING:
+    from labseq.session.analyses_beside import AnalysesBeside
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from labseq.config.addresses import Override
-from labseq.config.document import Document, StoredText, plugin_paths
+from labseq.config.document import Document, plugin_paths
 from labseq.config.profile import DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
 from labseq.config.scan import Scan
 from labseq.errors import (
@@ -26,6 +26,9 @@ from labseq.sequencer.lines import trigger_line
 from labseq.session.calibrations import ActiveCalibrations, calibrated, with_calibrations
 from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
 from labseq.settings import Choice
+
+if TYPE_CHECKING:
+    from labseq.session.recorded import RecordedFiles
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,24 +162,6 @@ def check_dead_time(document: Document, spec: ProfileSpec, found: ProblemCollect
         what = f"a dead time before each batch is set for '{clean(mobile.use)}', which would play silence"
         expected = "none: batches follow each other, and only `use: virtual` models a setup that cannot do so"
         found.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))
-
-
-class RecordedFiles(NamedTuple):
-    """The files and calibrations that a run began with, to assemble it once more.
-
-    Attributes:
-        sequence_path: Where the sequence was; paths in it are relative to this.
-        sequence: Its text.
-        profile_path: Where the profile was.
-        profile: Its text.
-        calibrations: Kind -> id of the calibrations; no others are active.
-    """
-
-    sequence_path: Path
-    sequence: StoredText
-    profile_path: Path
-    profile: StoredText
-    calibrations: Mapping[str, str]
 
 
 def resolve_profile(

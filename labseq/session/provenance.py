@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import labseq
 from labseq.calibration.store import encode_entry
@@ -23,8 +23,9 @@ from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
 from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
-from labseq.session.assembly import Assembly, Setting
-from labseq.session.options import NOT_SET
+
+if TYPE_CHECKING:
+    from labseq.session.assembly import Assembly
 
 _GIT_TIMEOUT_S: Final = 5.0
 
@@ -119,10 +120,7 @@ def run_record(
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """
     spec, hardware = assembly.sequence, assembly.hardware
-    changed = {
-        address: Setting(text, "", text) if address in NOT_SET else assembly.setting(address, text)
-        for address, text in changes.items()
-    }
+    changed = {address: assembly.setting(address, text) for address, text in changes.items()}
     scanned = () if assembly.scanned is None else assembly.scanned.at(0).parameters
     at_points = {address: assembly.setting(address) for address in scanned}
     return RunRecord(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from labseq.calibration.store import read_entry
 from labseq.config.document import StoredText
@@ -20,7 +20,6 @@ from labseq.recording.reader import Run
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
 from labseq.session.chosen import load_plugins
-from labseq.session.profile import RecordedFiles
 from labseq.text_files import beside
 
 
@@ -49,6 +48,24 @@ def stored_text(path: Path, sha256: str) -> StoredText:
     if sha256_of_text(text) != sha256:
         raise RecordingError(path, f"is not what {RUN_FILE} says it was; restore it from a backup")
     return StoredText(text, str(path))
+
+
+class RecordedFiles(NamedTuple):
+    """The files and calibrations that a run began with, to assemble it once more.
+
+    Attributes:
+        sequence_path: Where the sequence was; paths in it are relative to this.
+        sequence: Its text.
+        profile_path: Where the profile was.
+        profile: Its text.
+        calibrations: Kind -> id of the calibrations; no others are active.
+    """
+
+    sequence_path: Path
+    sequence: StoredText
+    profile_path: Path
+    profile: StoredText
+    calibrations: Mapping[str, str]
 
 
 def files_of(run: Run) -> RecordedFiles:

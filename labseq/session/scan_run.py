@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from labseq.config.scan import Scan
 from labseq.errors import DeviceError
@@ -24,11 +24,13 @@ from labseq.recording.shot import caching_loader
 from labseq.sequencer.leader import Emit
 from labseq.sequencer.run import Sequencer
 from labseq.session.analyses_beside import AnalysesBeside
-from labseq.session.assembly import Assembly
 from labseq.session.lab import rebuild_lab
 from labseq.session.policies import Checks, check_stop_file, missing_quantity
 from labseq.session.scan import Point
 from labseq.session.search import CLIMBED, ScannerCall, Search
+
+if TYPE_CHECKING:
+    from labseq.session.assembly import Assembly
 
 
 class ShotTaker(Protocol):

@@ -37,8 +37,8 @@ from labseq.session.chosen import HARDWARE_KINDS
 from labseq.session.lab import build_lab, warm
 from labseq.session.observers import Observers
 from labseq.session.options import Options
-from labseq.session.profile import RecordedFiles
 from labseq.session.provenance import run_record
+from labseq.session.recorded import RecordedFiles
 from labseq.session.resume import changes_between, plain_record
 from labseq.session.scan import Point
 from labseq.session.scan_run import OwnShots, ScanRun
