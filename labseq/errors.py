@@ -7,7 +7,8 @@ what to do. ``exit_code`` is the exit code of the command line.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, ClassVar, Literal, TypeAlias
@@ -136,6 +137,20 @@ class ProblemCollector:
     def _joined(self) -> ConfigError:
         sources = list(dict.fromkeys(problem.source for problem in self.problems))
         return ConfigError(sorted(self.problems, key=lambda p: (sources.index(p.source), p.line, p.column)))
+
+
+@contextmanager
+def collecting(found: ProblemCollector | None) -> Generator[ProblemCollector]:
+    """Collect problems in ``found``; without it, raise all of the block when it ends."""
+    if found is not None:
+        yield found
+        return
+    own = ProblemCollector()
+    try:
+        yield own
+    except ConfigError as error:
+        raise own.stop(error) from error
+    own.raise_any()
 
 
 class PluginLoadError(LabseqError):

@@ -13,7 +13,7 @@ from labseq.config.addresses import Override, find
 from labseq.config.expressions import Expressions, evaluate
 from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
-from labseq.errors import ConfigError, Loc, Problem, ProblemCollector
+from labseq.errors import ConfigError, Loc, Problem, ProblemCollector, collecting
 from labseq.messages import clean, shown, visible
 from labseq.settings import FORMAT
 from labseq.text_files import beside, decode, is_folder, read_bytes
@@ -182,15 +182,13 @@ class Document:
             ConfigError: All the overrides that cannot be applied.
         """
         document = self
-        collected = ProblemCollector() if found is None else found
-        for one in overrides:
-            override = Override(*one)
-            with collected:
-                document = document.override(
-                    override.address, override.value, override.source, may_add=may_add
-                )
-        if found is None:
-            collected.raise_any()
+        with collecting(found) as problems:
+            for one in overrides:
+                override = Override(*one)
+                with problems:
+                    document = document.override(
+                        override.address, override.value, override.source, may_add=may_add
+                    )
         return document
 
     def validate(

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 from labseq.config.addresses import Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
 from labseq.config.scan import Scan, ScanOrder, read_scan
-from labseq.errors import Loc, ProblemCollector
+from labseq.errors import Loc, ProblemCollector, collecting
 from labseq.messages import clean, shown
 from labseq.settings import (
     FORMAT,
@@ -267,12 +267,11 @@ def load_sequence(
     check_kind(document, "sequence")
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
-    document = document.override_all(overrides, may_add=("policy",), found=found)
-    problems = ProblemCollector() if found is None else found
-    document = document.evaluated()
-    document, scan = _at_first_point(document, [Override(*one) for one in overrides], profile_set, problems)
-    if found is None:
-        problems.raise_any()
+    with collecting(found) as problems:
+        document = document.override_all(overrides, may_add=("policy",), found=problems).evaluated()
+        document, scan = _at_first_point(
+            document, [Override(*one) for one in overrides], profile_set, problems
+        )
     return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, found), scan
 
 

@@ -91,7 +91,7 @@ class Assembly:
     @property
     def virtual_time(self) -> bool:
         """Whether the run's clock is virtual, without real waiting times."""
-        return self.dry_run != "off" or self.hardware.virtual_time
+        return self.hardware.virtual_time
 
     def setting(self, address: str, written: str = "") -> Setting:
         """A setting of the run, after defaults and overrides; the scan is at its first point.

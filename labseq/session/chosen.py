@@ -20,6 +20,7 @@ from labseq.errors import (
     Problem,
     ProblemCollector,
     UnknownPluginError,
+    collecting,
     one_of,
 )
 from labseq.messages import clean
@@ -273,12 +274,8 @@ def load_plugins(
     host = PluginHost(max_wait_s)
     host.load_builtin(builtins)
     host.load_entry_points()
-    try:
+    with collecting(found) as problems, problems:
         host.load_folders(folders)
-    except ConfigError as error:
-        if found is None:
-            raise
-        found.add(error)
     return host
 
 

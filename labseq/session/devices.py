@@ -97,8 +97,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
     check_dry_run(dry_run)
     hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
     stop = StopFlag()
-    is_virtual = dry_run != "off" or hardware.virtual_time
-    clock = VirtualClock(stop) if is_virtual else RealClock(stop)
+    clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
     warnings = [*hardware.warnings]
     with ExitStack() as stack:
         stack.enter_context(lock_devices(hardware, "labseq devices", warnings.append))
@@ -114,7 +113,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         devices = check_each_device(
             in_order, timeouts_of(hardware.profile), stop, simulation, warnings.append
         )
-    if not is_virtual and (text := realtime.refused()):
+    if not hardware.virtual_time and (text := realtime.refused()):
         warnings.append(text)
     warnings += [f"{one.name}: {note}" for one in devices for note in one.described.get("notes", ())]
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]

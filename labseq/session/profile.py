@@ -14,6 +14,7 @@ from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
     ProblemCollector,
+    collecting,
     one_of,
 )
 from labseq.messages import clean, did_you_mean
@@ -120,8 +121,9 @@ class ResolvedProfile:
 
     @property
     def key(self) -> str:
-        """The profile's name in the markers of active runs."""
-        return str(self.document.path.resolve())
+        """The profile's name in the markers of active runs; a dry run, which touches nothing, has another."""
+        path = str(self.document.path.resolve())
+        return path if self.dry_run == "off" else f"{path} (dry run)"
 
     @property
     def identities(self) -> Mapping[str, str]:
@@ -131,8 +133,9 @@ class ResolvedProfile:
 
     @property
     def virtual_time(self) -> bool:
-        """Whether no device needs real time."""
-        return all(c.virtual_time for c in self.chosen.values() if c.entry.kind in HARDWARE_KINDS)
+        """Whether no device needs real time, so that the clock can be virtual."""
+        hardware = [one for one in self.chosen.values() if one.entry.kind in HARDWARE_KINDS]
+        return self.dry_run != "off" or all(one.virtual_time for one in hardware)
 
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
@@ -199,12 +202,9 @@ def resolve_profile(
     )
     folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
     host = load_plugins(folders, max_wait_s=spec.timeouts.load)
-    problems = ProblemCollector() if found is None else found
     pins = None if recorded is None else recorded.calibrations
-    hardware = choose_plugins(document, spec, host, dry_run, problems, pins)
-    if found is None:
-        problems.raise_any()
-    return hardware
+    with collecting(found) as problems:
+        return choose_plugins(document, spec, host, dry_run, problems, pins)
 
 
 def choose_plugins(

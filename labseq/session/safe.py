@@ -153,20 +153,19 @@ def make_profile_devices_safe(
     return SafeStateReport(attempted, refused)
 
 
-def make_safe_after_crash(hardware: ResolvedProfile, key: str, stop: StopFlag, observer: RunObserver) -> None:
+def make_safe_after_crash(hardware: ResolvedProfile, stop: StopFlag, observer: RunObserver) -> None:
     """Make the devices of a profile safe if the process of their last run died, because they may still be on.
 
     This comes first, because constructing and compiling may fail.
 
     Args:
-        key: The profile's name in the markers of runs.
         stop: The request to stop; obeyed once every device has been tried.
 
     Raises:
         LabseqError: The first device that is not safe.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    dead = find_dead_run(key, hardware.identities)
+    dead = find_dead_run(hardware.key, hardware.identities)
     if dead is None:
         return
     text = f"the last run on these devices ({dead}) died; they are made safe first"
@@ -177,7 +176,7 @@ def make_safe_after_crash(hardware: ResolvedProfile, key: str, stop: StopFlag, o
     if failures:
         raise failures[0]
     try:
-        clear_active(key, hardware.identities)
+        clear_active(hardware.key, hardware.identities)
     except RecordingError as failure:
         observer.event("warning", {"text": str(failure)})
     stop.check()

@@ -67,10 +67,8 @@ class Session:
         seed = assembly.sequence.seed if earlier is None else earlier.run.seed
         self.seed = secrets.randbits(63) if seed is None else seed
         self.run_dir: Path | None = None
-        self._folder = Path.cwd()  # before devices are opened: some vendors' libraries change it
-        # Identifies the hardware; a dry run touches none, so it has a separate key.
-        profile = assembly.hardware.key
-        self._profile_key = profile if options.dry_run == "off" else f"{profile} (dry run)"
+        # Before devices are opened: some vendors' libraries change the working folder.
+        self._folder, self._profile_key = Path.cwd(), assembly.hardware.key
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
         self._observers = Observers(assembly.hardware.host, observer)
@@ -199,7 +197,7 @@ class Session:
             stack.enter_context(stop_on_signals(self.stop_flag))
             hardware, what = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
             self._hold = stack.enter_context(lock_devices(hardware, what, self._warn))
-            make_safe_after_crash(hardware, self._profile_key, self.stop_flag, self._observers)
+            make_safe_after_crash(hardware, self.stop_flag, self._observers)
             if not self.scan_run.shots:  # its process died between the last shot and the end of the run
                 _, writer = self._begin(root)
                 writer.finish("complete")
@@ -276,9 +274,9 @@ class Session:
             parameters={**changes, **first.parameters},
             watchdog=Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG),
         )
-        hardware = self.assembly.hardware.identities
-        with nullcontext() if hardware else suppress(RecordingError):
-            mark_active(self._profile_key, hardware, writer.run_dir)
+        profile = self.assembly.hardware
+        with nullcontext() if profile.identities else suppress(RecordingError):
+            mark_active(self._profile_key, profile.identities, writer.run_dir)
         self._observers.event("run_starting", about)
         sequencer.open()
         writer.set_devices(describe(lab, sequencer.guard))
