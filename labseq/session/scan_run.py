@@ -14,20 +14,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from labseq.config.scan import Scan
 from labseq.errors import DeviceError
 from labseq.guard import StopFlag
-from labseq.model import VisitedPoint
+from labseq.model import RunRecord, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.columns import quantities_in
 from labseq.recording.quantities import Quantity, make_quantity
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
+from labseq.roles import RunObserver
+from labseq.sequencer.lab import Lab
 from labseq.sequencer.leader import Emit
-from labseq.sequencer.run import Sequencer
+from labseq.sequencer.policies import RunPolicy
+from labseq.sequencer.run import Sequencer, ShotSink
 from labseq.session.analyses_beside import AnalysesBeside
 from labseq.session.lab import rebuild_lab
 from labseq.session.policies import Checks, check_stop_file, missing_quantity
 from labseq.session.scan import Point
 from labseq.session.search import CLIMBED, ScannerCall, Search
+from labseq.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from labseq.session.assembly import Assembly
@@ -55,24 +59,52 @@ class OwnShots:
     """Takes the shots in this process.
 
     Args:
-        sequencer: Open, at the point of the first shot.
+        lab: The devices, not open, at the point of the first shot.
         point: That point.
-        changes: Address -> value of what differs from the files in every shot.
+        record: The record of the run.
+        policy: Reactions to failures and exceeded budgets.
+        stop: The request to stop.
+        sink: Receives the shots.
+        observer: Receives the events.
+        watchdog: Switches the outputs off if this process dies or hangs.
+
+    Attributes:
+        sequencer: Runs the shots; the caller opens it and shuts it down.
     """
 
-    def __init__(self, sequencer: Sequencer, point: Point, changes: Mapping[str, Any], seed: int) -> None:
-        self._sequencer = sequencer
+    def __init__(
+        self,
+        lab: Lab,
+        point: Point,
+        record: RunRecord,
+        policy: RunPolicy,
+        stop: StopFlag,
+        sink: ShotSink,
+        observer: RunObserver,
+        watchdog: Watchdog,
+    ) -> None:
         self._point = point
-        self._changes = changes
-        self._seed = seed
+        self._seed = record.seed
+        self._changes = {address: change["value"] for address, change in record.overrides.items()}
+        self.sequencer = Sequencer(
+            lab,
+            point.steps,
+            stop,
+            sink,
+            observer,
+            seed=record.seed,
+            policy=policy,
+            parameters={**self._changes, **point.parameters},
+            watchdog=watchdog,
+        )
 
     def take(self, shot: int, point: Point, skipped: Collection[int] = ()) -> str:  # noqa: ARG002
         """See :class:`ShotTaker`."""
         if point is not self._point:
-            lab, reopened = rebuild_lab(self._sequencer.lab, self._point, point, self._seed)
-            self._sequencer.change(lab, point.steps, {**self._changes, **point.parameters}, reopened)
+            lab, reopened = rebuild_lab(self.sequencer.lab, self._point, point, self._seed)
+            self.sequencer.change(lab, point.steps, {**self._changes, **point.parameters}, reopened)
             self._point = point
-        return self._sequencer.run([shot]).get(shot, "")
+        return self.sequencer.run([shot]).get(shot, "")
 
 
 class KnownPoint(NamedTuple):

@@ -261,19 +261,10 @@ class Session:
 
     def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
-        first = self.scan_run.first
-        changes = {address: change["value"] for address, change in record.overrides.items()}
-        sequencer = self._sequencer = Sequencer(
-            lab,
-            first.steps,
-            self.stop_flag,
-            writer,
-            self._observers,
-            seed=record.seed,
-            policy=self.assembly.policy,
-            parameters={**changes, **first.parameters},
-            watchdog=Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG),
-        )
+        watchdog = Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG)
+        first, policy = self.scan_run.first, self.assembly.policy
+        own = OwnShots(lab, first, record, policy, self.stop_flag, writer, self._observers, watchdog)
+        sequencer = self._sequencer = own.sequencer
         profile = self.assembly.hardware
         with nullcontext() if profile.identities else suppress(RecordingError):
             mark_active(self._profile_key, profile.identities, writer.run_dir)
@@ -287,7 +278,6 @@ class Session:
         checks = Checks(settings, writer.run_dir, before, target, self._analyses, self._warn)
         emit = self._observers.event
         if self._workers is None:
-            own = OwnShots(sequencer, first, changes, record.seed)
             self.scan_run.run(own, writer, checks, emit)
             return
         from labseq.session.workers import WorkersShots

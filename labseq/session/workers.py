@@ -31,7 +31,6 @@ from labseq.recording.writer import encoded, run_id_of, write_hashed
 from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leader import leaders
-from labseq.sequencer.run import Sequencer
 from labseq.session.assembly import Assembly, assemble_recorded
 from labseq.session.chosen import HARDWARE_KINDS
 from labseq.session.lab import build_lab, warm
@@ -226,21 +225,11 @@ class ShotWorker:
     def _open(self, point: Point) -> OwnShots:
         lab = build_lab(point, self._assembly.target, VirtualClock(self._stop), self._record.seed)
         warm(lab, self._stop, self)
-        changes = {address: change["value"] for address, change in self._record.overrides.items()}
-        sequencer = Sequencer(
-            lab,
-            point.steps,
-            self._stop,
-            self,
-            self,
-            seed=self._record.seed,
-            policy=self._assembly.policy,
-            parameters={**changes, **point.parameters},
-            watchdog=_NoWatchdog(),
-        )
+        policy, watchdog = self._assembly.policy, _NoWatchdog()
+        own = OwnShots(lab, point, self._record, policy, self._stop, self, self, watchdog)
         gc.freeze()
-        sequencer.open()
-        return OwnShots(sequencer, point, changes, self._record.seed)
+        own.sequencer.open()
+        return own
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Keep an event for the process that records the run."""
