@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from labseq.config.addresses import split_overrides
 from labseq.config.document import plugin_paths
-from labseq.config.plan_file import MAX_BYTES
 from labseq.config.profile import load_profile
 from labseq.errors import ConfigError, LimitError, Problem
 from labseq.files import whole_file
@@ -27,9 +26,10 @@ from labseq.model import Plan, SegmentKind, ToneProgram
 from labseq.motion import Renderer, tone_program
 from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
 from labseq.plans.axis_statistics import AxisStatistics, measure_axes
+from labseq.plans.plan_file import MAX_BYTES, read_plan
 from labseq.session.chosen import choose, load_plugins
 from labseq.session.occupancies import read_source
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves, read_plan
+from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.text_files import check_output, read_bytes
 from labseq.units import format_quantity, parse_quantity
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.document import Document, plugin_paths
-from labseq.config.plan_file import PlanFile, parse_plan
 from labseq.config.profile import load_profile
 from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
@@ -400,7 +399,7 @@ def call_planner(
 
 
 def _batch(batch: Batch) -> dict[str, Any]:
-    """A batch as :mod:`labseq.config.plan_file` reads it."""
+    """A batch as :mod:`labseq.plans.plan_file` reads it."""
     values: dict[str, Any] = {
         "from": batch.from_sites.tolist(),
         "to": batch.to_sites.tolist(),
@@ -414,60 +413,3 @@ def _batch(batch: Batch) -> dict[str, Any]:
 
 def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:
     return sites.astype(int).tolist()
-
-
-_OPTIONS = ("target", "planner", "degree_of_parallelism", "seed", "origin")
-"""Fields of a request that only planning accepts."""
-
-
-def read_plan(
-    data: bytes, name: str, request: PlanRequest, *, announce: Callable[[float], None] = lambda _: None
-) -> PlannedMoves:
-    """Read the JSON of a plan, and check the plan as a run does.
-
-    Args:
-        data: UTF-8, what ``labseq plan --json`` writes.
-        request: Names the profile with grid and motion; without one the grid is that of
-            the file, and the motion the paper's. Nothing is planned.
-        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
-
-    Raises:
-        ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request
-            asks for something to be planned.
-    """
-    from labseq.kernel import announcing
-
-    file = parse_plan(data, name)
-    machine = _machine(file, name, request)
-    with announcing(announce):
-        try:
-            dop = file.degree_of_parallelism
-            report = check_plan(file.plan, file.occupancy, file.target, dop, machine.grid, machine.motion)
-        except PlanError as error:
-            raise ConfigError(Problem(str(error), name)) from error
-    return PlannedMoves(
-        source=name,
-        occupancy=file.occupancy,
-        target=file.target,
-        grid=machine.grid,
-        motion=machine.motion,
-        planner=file.planner,
-        settings={},
-        degree_of_parallelism=file.degree_of_parallelism,
-        seed=file.seed,
-        plan=file.plan,
-        report=report,
-    )
-
-
-def _machine(file: PlanFile, name: str, request: PlanRequest) -> Machine:
-    for_planner, for_profile = split_overrides(request.overrides)
-    default = PlanRequest(request.occupancy)
-    given = [name for name in _OPTIONS if getattr(request, name) != getattr(default, name)]
-    if given or for_planner:
-        option = f"--{given[0]}".replace("degree_of_parallelism", "dop") if given else for_planner[0].source
-        what = f"{name} is a plan already: there is nothing to plan"
-        raise ConfigError(Problem(what, option, hint="leave the option out, or give an occupancy"))
-    if request.profile is None and not for_profile:
-        return Machine(file.grid, MotionSpec())
-    return read_machine(request, for_profile, Source(file.occupancy, name))[0]

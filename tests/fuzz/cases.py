@@ -17,9 +17,9 @@ import h5py
 import numpy as np
 
 from labseq.calibration.store import encode_entry, read_entry, stem_of
-from labseq.config.plan_file import parse_plan
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
+from labseq.plans.plan_file import parse_plan
 from labseq.queue.queue import Entry, Queue
 from labseq.queue.running import list_entries
 from labseq.recording import open_run

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.config.plan_file import parse_plan
 from labseq.errors import ConfigError
+from labseq.plans.plan_file import parse_plan
 from labseq.session.planning import PlanRequest, plan_moves
 
 PLANNER = """

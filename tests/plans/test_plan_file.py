@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.config.plan_file import MAX_BYTES, parse_plan
 from labseq.errors import ConfigError
+from labseq.plans.plan_file import MAX_BYTES, parse_plan
 
 
 def document() -> dict[str, Any]:

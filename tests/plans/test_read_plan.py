@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from labseq.errors import ConfigError
-from labseq.session.planning import PlanRequest, plan_moves, read_plan
+from labseq.plans.plan_file import read_plan
+from labseq.session.planning import PlanRequest, plan_moves
 
 
 def planned(**options: Any) -> dict[str, Any]:

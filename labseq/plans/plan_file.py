@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
@@ -11,10 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
+from labseq.config.addresses import split_overrides
 from labseq.config.profile import Sites
 from labseq.config.validation import validate_values
-from labseq.errors import ConfigError, Problem
-from labseq.model import Batch, Occupancy, Plan, SiteGrid, TargetPattern, TonePaths
+from labseq.errors import ConfigError, PlanError, Problem
+from labseq.model import Batch, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern, TonePaths
+from labseq.motion import check_plan
+from labseq.session.occupancies import Source
+from labseq.session.planning import PlannedMoves, PlanRequest, read_machine
+from labseq.session.recorded import Machine
 from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
 
@@ -194,3 +199,60 @@ def _bits(rows: Rows, key: str, shape: tuple[int, int], name: str) -> NDArray[np
         expected = f"{shape[0]} rows of {shape[1]} sites, as in 'grid'"
         raise ConfigError(Problem(f"'{key}' is not of the grid's shape", name, expected=expected))
     return np.array(rows, np.bool_)
+
+
+_OPTIONS = ("target", "planner", "degree_of_parallelism", "seed", "origin")
+"""Fields of a request that only planning accepts."""
+
+
+def read_plan(
+    data: bytes, name: str, request: PlanRequest, *, announce: Callable[[float], None] = lambda _: None
+) -> PlannedMoves:
+    """Read the JSON of a plan, and check the plan as a run does.
+
+    Args:
+        data: UTF-8, what ``labseq plan --json`` writes.
+        request: Names the profile with grid and motion; without one the grid is that of
+            the file, and the motion the paper's. Nothing is planned.
+        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
+
+    Raises:
+        ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request
+            asks for something to be planned.
+    """
+    from labseq.kernel import announcing
+
+    file = parse_plan(data, name)
+    machine = _machine(file, name, request)
+    with announcing(announce):
+        try:
+            dop = file.degree_of_parallelism
+            report = check_plan(file.plan, file.occupancy, file.target, dop, machine.grid, machine.motion)
+        except PlanError as error:
+            raise ConfigError(Problem(str(error), name)) from error
+    return PlannedMoves(
+        source=name,
+        occupancy=file.occupancy,
+        target=file.target,
+        grid=machine.grid,
+        motion=machine.motion,
+        planner=file.planner,
+        settings={},
+        degree_of_parallelism=file.degree_of_parallelism,
+        seed=file.seed,
+        plan=file.plan,
+        report=report,
+    )
+
+
+def _machine(file: PlanFile, name: str, request: PlanRequest) -> Machine:
+    for_planner, for_profile = split_overrides(request.overrides)
+    default = PlanRequest(request.occupancy)
+    given = [name for name in _OPTIONS if getattr(request, name) != getattr(default, name)]
+    if given or for_planner:
+        option = f"--{given[0]}".replace("degree_of_parallelism", "dop") if given else for_planner[0].source
+        what = f"{name} is a plan already: there is nothing to plan"
+        raise ConfigError(Problem(what, option, hint="leave the option out, or give an occupancy"))
+    if request.profile is None and not for_profile:
+        return Machine(file.grid, MotionSpec())
+    return read_machine(request, for_profile, Source(file.occupancy, name))[0]
