@@ -6,7 +6,6 @@ import json
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -18,7 +17,7 @@ from labseq.model import RunRecord, VisitedPoint
 from labseq.plain import dumps
 from labseq.recording import Run, RunWriter, Shot
 from labseq.recording.columns import quantities_in
-from labseq.recording.quantities import Quantity, make_quantity
+from labseq.recording.quantities import make_quantity
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
@@ -290,14 +289,17 @@ class AdaptiveScanRun(ScanRun):
         self._search = search
         self._scanner = ScannerCall(search, seed, stop)
         self._load = caching_loader()
-        quantity = make_quantity(
-            search.adaptive.quantity, assembly.target, analyses.values if analyses else None
-        )
-        shots = {} if run is None else {shot.index: shot for shot in run.shots}
-        self._results = Results(search, shots, quantity, analyses)
+        self._analyses = analyses
+        results = analyses.values if analyses else None
+        self._quantity = make_quantity(search.adaptive.quantity, assembly.target, results)
+        self._sign = 1.0 if search.adaptive.maximise else -1.0
+        self._has_warned = False
+        self._visited: list[VisitedPoint] = []
+        self._shots: dict[int, Shot] = {} if run is None else {shot.index: shot for shot in run.shots}
+        self._skipped: dict[int, dict[str, float]] = {}  # the scanner receives these points without a score
         for attempt in () if run is None else run.attempts:
             if run is not None and attempt.index in run.skipped:
-                self._results.add_skipped(attempt.index, attempt.row["parameters"])
+                self._skipped[self.place_of(attempt.index)] = self._values_in(attempt.row)
 
     def _points_of_shots(self, scan: Scan, seed: int) -> list[int]:  # noqa: ARG002
         return [shot // scan.repeats for shot in range(self.assembly.sequence.shots)]
@@ -307,7 +309,7 @@ class AdaptiveScanRun(ScanRun):
         """Indices of the shots to take, at most; none if the scanner has finished."""
         if not self._missing or self._point_of(self._missing[0]) is not None:
             return self._missing
-        if self._results.is_empty:
+        if not (self._shots or self._skipped):
             raise DeviceError(self._search.name, "next_point() gave no point at all; expected a first one")
         return []
 
@@ -327,22 +329,76 @@ class AdaptiveScanRun(ScanRun):
         return self._search.record()
 
     def _settings(self, place: int) -> Point | None:
-        values = self._results.values(place)
+        values = self._values(place)
         if values is None:
-            values = self._scanner.choose(self._results.before(place))
+            visited = [one for one in self._first(place) if one.values]
+            values = self._scanner.choose(visited)
         return None if values is None else self._search.at(values)
 
     def _add_result(self, writer: RunWriter) -> str:
         row = writer.last_row
         if not row["counts"]:
-            self._results.add_skipped(row["shot"], row["parameters"])
+            self._skipped[self.place_of(row["shot"])] = self._values_in(row)
             return ""
         shot = Shot(writer.run_dir / row["file"], json.loads(dumps(row)), self._load)
-        self._results.shots[shot.index] = shot
-        return self._results.missing_quantity(shot.index)
+        self._shots[shot.index] = shot
+        name = self._quantity.name
+        if self._has_warned or name.startswith(PREFIX) or not math.isnan(self._quantity.of_shot(shot)):
+            return ""
+        self._has_warned = True
+        return missing_quantity(shot.index, name, CLIMBED, quantities_in(shot.row))
 
     def _progress(self, shot: int) -> dict[str, Any]:
-        return self._results.progress(self.place_of(shot))
+        """The score of the point of a shot and the best one so far, JSON-ready, for the run's events."""
+        place = self.place_of(shot)
+        visited = self._first(place + 1)
+        scores: dict[tuple[float, ...], tuple[int, list[float]]] = {}
+        for number, one in enumerate(visited):  # a point that is visited again has the mean score
+            if not math.isnan(one.score):
+                scores.setdefault((*one.values.values(),), (number, []))[1].append(one.score)
+
+        def plain(number: int, score: float) -> dict[str, Any]:
+            value = None if math.isnan(score) else self._sign * score
+            return {"point": number, "written": self._search.written(visited[number].values), "value": value}
+
+        means = [(sum(own) / len(own), -first) for first, own in scores.values()]
+        mean, first = max(means, default=(math.nan, 0))
+        return {
+            "figure": self._quantity.name,
+            **plain(place, visited[place].score),
+            "best": plain(-first, mean) if means else None,
+        }
+
+    def _values(self, place: int) -> dict[str, float] | None:
+        """The values of a point; None if no shot was attempted there."""
+        shots = self._shots_at(place)
+        return self._values_in(shots[0].row) if shots else self._skipped.get(place)
+
+    def _values_in(self, row: Mapping[str, Any]) -> dict[str, float]:
+        return {one.address: row["parameters"][one.address] for one in self._search.ranges}
+
+    def _shots_at(self, place: int) -> list[Shot]:
+        repeats = self._search.scanned.scan.repeats
+        indices = range(place * repeats, (place + 1) * repeats)
+        return [self._shots[index] for index in indices if index in self._shots]
+
+    def _first(self, n_points: int) -> list[VisitedPoint]:
+        """The results of the first points, whose shots have all been taken or skipped; worked out once."""
+        for place in range(len(self._visited), n_points):
+            self._visited.append(self._result(place))
+        return self._visited[:n_points]
+
+    def _result(self, place: int) -> VisitedPoint:
+        shots, name = self._shots_at(place), self._quantity.name
+        if self._analyses is not None:
+            self._analyses.await_shots(name, [shot.index for shot in shots])
+        quantities: list[Mapping[str, float]] = []
+        for shot in shots:
+            value = self._quantity.of_shot(shot)
+            own = {} if math.isnan(value) else {name: value}
+            quantities.append(MappingProxyType(quantities_in(shot.row) | own))
+        score = self._sign * self._quantity.over(shots).value
+        return VisitedPoint(MappingProxyType(self._values(place) or {}), score, tuple(quantities))
 
 
 def scan_run_of(
@@ -369,97 +425,3 @@ def point_of(assembly: Assembly, shot: Shot, scan_run: ScanRun) -> Point:
         return assembly.at(scan_run.points[shot.index])
     values = {one.address: shot.row["parameters"][one.address] for one in assembly.search.ranges}
     return assembly.search.at(values)
-
-
-@dataclass(slots=True, eq=False)
-class Results:
-    """The results of the points of an adaptive scan.
-
-    Attributes:
-        search: The scanner and its ranges.
-        shots: The shots that count: index -> shot.
-        quantity: What is optimised.
-        analyses: The analyses whose results this may need.
-    """
-
-    search: Search
-    shots: dict[int, Shot]
-    quantity: Quantity
-    analyses: AnalysesBeside | None = None
-    _visited: list[VisitedPoint] = field(default_factory=list[VisitedPoint])
-    _skipped: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])
-    _warned: bool = False
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no shot has been taken."""
-        return not (self.shots or self._skipped)
-
-    def add_skipped(self, shot: int, parameters: Mapping[str, Any]) -> None:
-        """Remember the point of a skipped shot: the scanner receives the point without a score."""
-        visit = shot // self.search.scanned.scan.repeats
-        self._skipped[visit] = self._values_in(parameters)
-
-    def values(self, visit: int) -> dict[str, float] | None:
-        """The values of a point; None if no shot was attempted there."""
-        shots = self._shots_of(visit)
-        return self._values_in(shots[0].row["parameters"]) if shots else self._skipped.get(visit)
-
-    def _values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
-        return {one.address: parameters[one.address] for one in self.search.ranges}
-
-    def before(self, visit: int) -> list[VisitedPoint]:
-        """The results of all points before the given one, as the scanner receives them."""
-        return [one for one in self._first(visit) if one.values]
-
-    def missing_quantity(self, shot: int) -> str:
-        """A warning, given once, that a shot lacks the quantity that the scan optimises; else ""."""
-        name = self.quantity.name
-        if self._warned or name.startswith(PREFIX) or not math.isnan(self.quantity.of_shot(self.shots[shot])):
-            return ""
-        self._warned = True
-        return missing_quantity(shot, name, CLIMBED, quantities_in(self.shots[shot].row))
-
-    def progress(self, visit: int) -> dict[str, Any]:
-        """The score of a point and the best one so far, JSON-ready, for the run's events."""
-        visited = self._first(visit + 1)
-        sign = 1.0 if self.search.adaptive.maximise else -1.0
-        scores: dict[tuple[float, ...], tuple[int, list[float]]] = {}
-        for number, one in enumerate(visited):  # a point that is visited again has the mean score
-            if not math.isnan(one.score):
-                scores.setdefault((*one.values.values(),), (number, []))[1].append(one.score)
-
-        def plain(number: int, score: float) -> dict[str, Any]:
-            value = None if math.isnan(score) else sign * score
-            return {"point": number, "written": self.search.written(visited[number].values), "value": value}
-
-        means = [(sum(own) / len(own), -first) for first, own in scores.values()]
-        mean, first = max(means, default=(math.nan, 0))
-        return {
-            "figure": self.search.adaptive.quantity,
-            **plain(visit, visited[visit].score),
-            "best": plain(-first, mean) if means else None,
-        }
-
-    def _shots_of(self, visit: int) -> list[Shot]:
-        repeats = self.search.scanned.scan.repeats
-        indices = range(visit * repeats, (visit + 1) * repeats)
-        return [self.shots[index] for index in indices if index in self.shots]
-
-    def _first(self, n_points: int) -> list[VisitedPoint]:
-        """The results of the first points, whose shots have all been taken or skipped; worked out once."""
-        for visit in range(len(self._visited), n_points):
-            self._visited.append(self._result(visit))
-        return self._visited[:n_points]
-
-    def _result(self, visit: int) -> VisitedPoint:
-        shots, sign = self._shots_of(visit), 1.0 if self.search.adaptive.maximise else -1.0
-        if self.analyses is not None:
-            self.analyses.await_shots(self.quantity.name, [shot.index for shot in shots])
-        quantities = [MappingProxyType(quantities_in(shot.row) | self._value(shot)) for shot in shots]
-        score = sign * self.quantity.over(shots).value
-        return VisitedPoint(MappingProxyType(self.values(visit) or {}), score, tuple(quantities))
-
-    def _value(self, shot: Shot) -> dict[str, float]:
-        value = self.quantity.of_shot(shot)
-        return {} if math.isnan(value) else {self.quantity.name: value}
