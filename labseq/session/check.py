@@ -22,11 +22,11 @@ from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
-from labseq.session.camera_trigger import unsuitable_exposures
 from labseq.session.chosen import changed_settings
 from labseq.session.lab import WARM_S
 from labseq.session.rehearsal import Rehearsal, quantile, rehearse, windows_of
 from labseq.session.scan import Point
+from labseq.session.wiring import unsuitable_exposures
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:

@@ -8,9 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq import motion
-from labseq.config.document import Document
 from labseq.config.profile import MotionSettings, ProfileSpec
-from labseq.errors import ConfigError, LabseqError, PlanError, Problem
+from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
@@ -18,10 +17,9 @@ from labseq.plugins import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, offers
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
-from labseq.sequencer.lines import blinding_lines, trigger_line
-from labseq.session.camera_trigger import wiring_of_trigger
 from labseq.session.chosen import ChosenPlugin, construct_one
 from labseq.session.profile import ResolvedProfile
+from labseq.session.wiring import wrong_wiring
 
 if TYPE_CHECKING:
     from labseq.session.scan import Point
@@ -71,7 +69,8 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         line_specs=profile.line_specs,
         budgets=profile.budgets.model_dump(),
     )
-    _refuse_wrong_wiring(hardware.document, lab)
+    if problems := [*wrong_wiring(hardware.document, lab)]:
+        raise ConfigError(problems)
     return lab
 
 
@@ -194,32 +193,6 @@ def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tu
 def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
     marks = {name: device.blinding for name, device in profile.devices.items()}
     return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
-
-
-def _refuse_wrong_wiring(document: Document, lab: Lab) -> None:
-    """Raise for lines that the timing box does not have, that would harm the camera, or cannot trigger it."""
-    problems: list[Problem] = []
-    camera = lab.step_context.camera
-    if lab.lines is not None and offers(lab.lines, "lines_facts"):
-        channels = lab.lines.lines_facts.channels
-        for spec in lab.line_specs:
-            if spec.channel not in channels:
-                loc = ("lines", "channels", spec.name, "channel")
-                expected = f"one of {', '.join(map(str, channels))}"
-                problems.append(document.problem(loc, f"the box has no channel {spec.channel}", expected))
-    if camera.em_gain > 1.0:
-        for name in blinding_lines(lab.line_specs, "image"):
-            what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
-            loc = ("lines", "channels", name, "on")
-            problems.append(document.problem(loc, what, "a line that is off in an exposure"))
-    problems += wiring_of_trigger(document, camera, trigger_line(lab.line_specs, "camera"))
-    wired, mobile = trigger_line(lab.line_specs, "mobile_tweezers"), lab.mobile_tweezers
-    if wired is not None and not (offers(mobile, "waits_for_trigger") and mobile.waits_for_trigger):
-        loc = ("lines", "channels", wired.name, "triggers")
-        what = "the mobile tweezers take no external trigger"
-        problems.append(document.problem(loc, what, "mobile tweezers that do, such as `spcm`"))
-    if problems:
-        raise ConfigError(problems)
 
 
 def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:

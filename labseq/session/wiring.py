@@ -1,4 +1,4 @@
-"""Whether wiring and exposures suit the trigger of a camera that a line starts."""
+"""Whether the lines are wired so that devices work, and exposures suit the trigger of the camera."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from typing import Final
 from labseq.config.document import Document
 from labseq.errors import Loc, Problem, one_of
 from labseq.model import CameraFacts, LinesFacts, LineSpec, TimelineEntry
+from labseq.roles import offers
+from labseq.sequencer.lab import Lab
+from labseq.sequencer.lines import blinding_lines, trigger_line
 from labseq.units import format_quantity
 
 ROUNDING: Final = 1e-9
@@ -16,7 +19,34 @@ BULB_ERROR: Final = 1e-3
 """Largest relative error of an exposure that the edges of a line make."""
 
 
-def wiring_of_trigger(document: Document, camera: CameraFacts, line: LineSpec | None) -> Iterator[Problem]:
+def wrong_wiring(document: Document, lab: Lab) -> Iterator[Problem]:
+    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger a device.
+
+    Args:
+        document: The profile's file.
+        lab: The devices, not open.
+    """
+    camera, specs = lab.step_context.camera, lab.line_specs
+    if lab.lines is not None and offers(lab.lines, "lines_facts"):
+        channels = lab.lines.lines_facts.channels
+        for spec in (spec for spec in specs if spec.channel not in channels):
+            loc = ("lines", "channels", spec.name, "channel")
+            expected = f"one of {', '.join(map(str, channels))}"
+            yield document.problem(loc, f"the box has no channel {spec.channel}", expected)
+    if camera.em_gain > 1.0:
+        for name in blinding_lines(specs, "image"):
+            what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
+            loc = ("lines", "channels", name, "on")
+            yield document.problem(loc, what, "a line that is off in an exposure")
+    yield from _trigger_of_camera(document, camera, trigger_line(specs, "camera"))
+    wired, mobile = trigger_line(specs, "mobile_tweezers"), lab.mobile_tweezers
+    if wired is not None and not (offers(mobile, "waits_for_trigger") and mobile.waits_for_trigger):
+        loc = ("lines", "channels", wired.name, "triggers")
+        what = "the mobile tweezers take no external trigger"
+        yield document.problem(loc, what, "mobile tweezers that do, such as `spcm`")
+
+
+def _trigger_of_camera(document: Document, camera: CameraFacts, line: LineSpec | None) -> Iterator[Problem]:
     """Why a line cannot trigger the camera as its ``line_trigger`` says; ``line`` is None if none does."""
     kind = camera.line_trigger
     if line is None:
