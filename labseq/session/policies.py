@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,12 +12,11 @@ import numpy as np
 
 from labseq.config.document import Document
 from labseq.config.sequence import CheckSettings, SequenceSpec, StepPolicySettings, StepSpec
-from labseq.errors import CheckFailedError, Loc, ProblemCollector, StopRequested
+from labseq.errors import CheckFailedError, Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import TargetPattern
 from labseq.model.records import unique_names
 from labseq.recording.columns import QUANTITIES, quantities_in
-from labseq.recording.folders import STOP_FILE
 from labseq.recording.quantities import OF_IMAGES, make_quantity, quantity_problem, split_name
 from labseq.recording.results import PREFIX
 from labseq.recording.shot import Shot, caching_loader
@@ -235,13 +233,3 @@ def _failure(check: CheckSettings, values: deque[float]) -> str:
     if check.at_most is not None and mean > check.at_most:
         return f"{check.value} is {mean:.6g}{of}; it should be at most {check.at_most:g}"
     return ""
-
-
-def check_stop_file(run_dir: Path) -> None:
-    """Raise if another process has asked a run to end.
-
-    Raises:
-        StopRequested: Another process has.
-    """
-    if (run_dir / STOP_FILE).exists():
-        raise StopRequested(signal.SIGTERM, after_shot=True)

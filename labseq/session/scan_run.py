@@ -27,9 +27,10 @@ from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer, ShotSink
 from labseq.session.analyses_beside import AnalysesBeside
 from labseq.session.lab import rebuild_lab
-from labseq.session.policies import Checks, check_stop_file, missing_quantity
+from labseq.session.policies import Checks, missing_quantity
 from labseq.session.scan import Point
 from labseq.session.search import CLIMBED, ScannerCall, Search
+from labseq.session.stopping import check_stop_file
 from labseq.watchdog import Watchdog
 
 if TYPE_CHECKING:
