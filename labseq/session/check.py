@@ -89,7 +89,7 @@ class _PointCheck:
         self.windows = windows_of(point.steps)
         # what is planned; the last windows do not change it
         self.rehearsal_key: tuple[object, ...] = (id(lab), *[*self.windows.values()][:-1])
-        self._shot = checks.session.assembly.sequence.shot
+        self.shot = checks.session.assembly.sequence.shot
         self._guard = checks.guard
 
     @property
@@ -110,7 +110,7 @@ class _PointCheck:
 
     def ask_steps(self) -> None:
         """Have every step check its settings against the devices."""
-        for spec, (name, step) in zip(self._shot, self.point.steps, strict=True):
+        for spec, (name, step) in zip(self.shot, self.point.steps, strict=True):
             if offers(step, "check_devices"):
                 for setting, one in _wrong_settings(self._guard, self.lab, name, step).items():
                     loc = (*spec.loc, setting) if setting else spec.loc
@@ -124,7 +124,7 @@ class _PointCheck:
             try:
                 named.append((name, plan_timeline(self.lab, self._guard, number, name, step)))
             except LimitError as error:
-                self._add(self._shot[number].loc, str(error))
+                self._add(self.shot[number].loc, str(error))
         bars = with_waits([own for _, own in named], self.lab.step_context)
         return [(name, own) for (name, _), own in zip(named, bars, strict=True)]
 
@@ -136,11 +136,11 @@ class _PointCheck:
         """Refuse durations that the computer cannot keep."""
         for number, one, is_refused in _badly_timed(self):
             if is_refused:
-                self._add((*self._shot[number].loc, "duration"), one.what, one.expected, one.hint)
+                self._add((*self.shot[number].loc, "duration"), one.what, one.expected, one.hint)
 
     def ask_devices(self) -> None:
         """Have camera and lines check what each step of a shot would ask of them."""
-        for spec, (_, bars) in zip(self._shot, self.timeline, strict=True):
+        for spec, (_, bars) in zip(self.shot, self.timeline, strict=True):
             for bar in bars:
                 try:
                     if bar.exposure_s:
@@ -177,7 +177,7 @@ class _PointCheck:
         context = self.lab.step_context
         if trigger_line(self.lab.line_specs, "camera") is None:
             return
-        bars = [(self._shot[n].loc, bar) for n, (_, own) in enumerate(self.timeline) for bar in own]
+        bars = [(self.shot[n].loc, bar) for n, (_, own) in enumerate(self.timeline) for bar in own]
         for loc, one in unsuitable_exposures(context.camera, context.lines_facts, bars):
             add = self._add_to_profile if loc[0] == "camera" else self._add
             add(loc, one.what, one.expected, one.hint)
@@ -258,10 +258,9 @@ def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, 
 
 def _timing_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """Warnings about durations that the computer keeps roughly."""
-    shot = one.checks.session.assembly.sequence.shot
     for number, found, is_refused in _badly_timed(one):
         if not is_refused:
-            yield number, one.point.document.problem((*shot[number].loc, "duration"), found.what)
+            yield number, one.point.document.problem((*one.shot[number].loc, "duration"), found.what)
 
 
 def _timeout_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
@@ -443,7 +442,7 @@ def _plan_options(session: Session, point: Point) -> str:
 
 
 def _window_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
-    document, shot = one.point.document, one.checks.session.assembly.sequence.shot
+    document, shot = one.point.document, one.shot
     windows, rehearsals = one.windows, one.rehearsed
     if min((found.n_loadings for found in rehearsals.values()), default=0) < N_LOADINGS_ELSEWHERE // 4:
         return
@@ -527,7 +526,7 @@ def _deadline_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
             longest = format_quantity(longest_s, "time")
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
-            loc = (*one.checks.session.assembly.sequence.shot[number].loc, "for")
+            loc = (*one.shot[number].loc, "for")
             hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
             yield number, point.document.problem(loc, what, hint=hint)
 
