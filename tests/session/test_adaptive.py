@@ -23,13 +23,13 @@ DOP = "planner.degree_of_parallelism"
 
 def test_each_point_is_chosen_by_what_came_of_those_before(tmp_path: Path) -> None:
     seen = RecordingObserver()
-    done = run(tmp_path, f"use: scripted, dops: [3, 5, 3], {OVER}, points: 5", "repeats: 2\n", observer=seen)
+    done = run(tmp_path, f"use: scripted, dops: [5, 5, 3], {OVER}, points: 5", "repeats: 2\n", observer=seen)
     assert done.status == "complete"
-    assert [shot.parameters[DOP] for shot in done.shots] == [3, 3, 5, 5, 3, 3]
+    assert [shot.parameters[DOP] for shot in done.shots] == [5, 5, 5, 5, 3, 3]
     points = [values for name, values in seen.events if name == "scan_point"]
     filling = [np.mean([shot.filling_fraction for shot in done.shots[i : i + 2]]) for i in (0, 2, 4)]
     assert [values["value"] for values in points] == pytest.approx(filling)
-    of_points = {"3": (filling[0] + filling[2]) / 2, "5": filling[1]}
+    of_points = {"5": (filling[0] + filling[1]) / 2, "3": filling[2]}
     best = max(of_points, key=lambda dop: of_points[dop])
     assert points[-1]["best"]["written"] == {DOP: best}
     assert points[-1]["best"]["value"] == pytest.approx(of_points[best])

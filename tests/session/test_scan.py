@@ -15,6 +15,7 @@ from labseq.errors import ConfigError
 from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.session.lab import _reopened, rebuild_lab
+from labseq.session.scan import MAX_PROBLEMS
 from labseq.testing.fakes import RecordingObserver
 
 from . import small_runs
@@ -143,6 +144,10 @@ WRONG = [
     ("scan: {profile.grid.rows: [19, 20]}", ["8: a scan cannot change 'profile.grid.rows' ("]),
     ("scan: {profile.calibrations.use.sites: [a, b]}", ["8: a scan cannot change 'profile.calibrations.use"]),
     ("scan: {profile.camera.use: [virtual, andor]}", ["38: a scan cannot change the driver of camera ("]),
+    (
+        "scan: {profile.mobile_tweezers: [{use: spcm, card: simulated}, {use: spcm, card: /dev/spcm0}]}",
+        ["64: the scan would change whether mobile_tweezers is simulated (the scan puts it into"],
+    ),
 ]
 
 
@@ -154,6 +159,12 @@ def test_every_wrong_value_is_reported_with_its_place(tmp_path: Path, text: str,
     assert {problem.line for problem in found} == {N_REST + 1}
     for problem, message in zip(found, messages, strict=True):
         assert f"{problem.column}: {problem.what} ({(*problem.notes, '')[0]})".startswith(message)
+
+
+def test_after_many_wrong_values_no_further_point_is_tried(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        open_scan(tmp_path, f"scan: {{shot.sort.cycles: {list(range(-3 * MAX_PROBLEMS, 0))}}}\n")
+    assert len(caught.value.problems) == MAX_PROBLEMS + 1  # the first is also in the file
 
 
 def test_without_a_simulation_only_what_changes_is_reopened(tmp_path: Path) -> None:
