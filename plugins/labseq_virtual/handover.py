@@ -1,7 +1,7 @@
 """The model of pick-up and drop-off of an atom, its constants, and tables of the tones of an axis.
 
 The model uses only depths and positions of the tweezers and does not follow the atoms; its constants are
-those of ``settings.py``. Energies are in kelvin. The formulas are in ``transport_kernels.py``; the reasons:
+those of ``settings.py``. Energies are in kelvin. The formulas are in ``tweezer_kernels.py``; the reasons:
 
 1. *Pick-up.* A static well of depth U_s and waist w_s and a mobile one of U_m and w_m at a distance d form
    one well as long as d is below :func:`merging_distance`. Then the atom follows the mobile tweezer if
@@ -155,6 +155,12 @@ START, END, POWER_START, POWER_END, ON_START, ON_END = range(6)
 and whether the tone is on (1 or 0)."""
 DARK, NEW, EMPTY, HELD = range(4)
 """States of a crossing of two tones: off, just switched on, on without an atom, on with an atom."""
+
+ATOM, TRAP_DEPTH, ATOM_HEAT, HEAT_AT_S, HAZARD = range(5)
+"""Columns of a table of sites: whether there is an atom (1 or 0); the depth of the static tweezer in kelvin;
+the temperature of the atom, as it would be at the nominal depth; the time that it belongs to; and the hazard
+of the atom by tweezers that passed it: it stays with the probability ``exp(-hazard)``."""
+N_SITE: Final = 5
 
 
 def tone_table(axis: AxisTones, start: Floats, end: Floats, full: Floats, on_amplitude: float) -> Floats:

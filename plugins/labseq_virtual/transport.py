@@ -35,8 +35,14 @@ from numpy.typing import NDArray
 
 from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
 from labseq_virtual.handover import (
+    ATOM,
+    ATOM_HEAT,
     COOLING_HZ,
+    HAZARD,
+    HEAT_AT_S,
+    N_SITE,
     PAIR_SURVIVAL,
+    TRAP_DEPTH,
     constants,
     full_amplitudes,
     merging_distance,
@@ -135,18 +141,20 @@ class Transport:
         draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), 3))
         self._constants[COOLING_HZ] = cooled / self._settings.cooling_time
         self._constants[PAIR_SURVIVAL] = pair_survival(self._settings) if cooled > 0 else 0.0
-        if thermal is None:
-            thermal = np.stack(
-                [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
-            )
-        hazards = np.zeros(occupied.shape)
+        sites = np.zeros((*occupied.shape, N_SITE))
+        sites[..., ATOM], sites[..., TRAP_DEPTH] = occupied, depth * self._settings.static_depth
+        sites[..., ATOM_HEAT] = self._settings.temperature
+        if thermal is not None:
+            sites[..., ATOM_HEAT], sites[..., HEAT_AT_S] = thermal
         lost = carry_atoms(
-            occupied, thermal, start_s, depth * self._settings.static_depth, rows, offsets[0], cols,
-            offsets[1], program.duration_s, program.course, n_segments, loss_factor, draws, self._constants,
-            self._merging, move_tables(), hazards,
+            sites, start_s, rows, offsets[0], cols, offsets[1], program.duration_s, program.course,
+            n_segments, loss_factor, draws, self._constants, self._merging, move_tables(),
         )  # fmt: skip
-        if hazards.any():
-            taken = occupied & (rng.random(occupied.shape) < -np.expm1(-hazards))
+        occupied[...] = sites[..., ATOM] > 0
+        if thermal is not None:
+            thermal[0], thermal[1] = sites[..., ATOM_HEAT], sites[..., HEAT_AT_S]
+        if sites[..., HAZARD].any():
+            taken = occupied & (rng.random(occupied.shape) < -np.expm1(-sites[..., HAZARD]))
             occupied &= ~taken
             lost[COLLISION] += np.count_nonzero(taken)
         by_cause: Counter[str] = Counter(dict(zip(CAUSES, lost.tolist(), strict=True)))

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import event, given, settings, strategies as st
-from labseq_virtual import response_tables, transport_kernels as kernels
+from labseq_virtual import response_tables, tweezer_kernels as kernels
 from labseq_virtual.handover import (
     AT_REST,
+    EMPTY,
     END,
+    HELD,
     MIXING,
     ON_END,
     ON_START,
@@ -26,14 +28,13 @@ from labseq_virtual.handover import (
     merging_distance,
     pair_survival,
 )
-from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by
+from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by, relaxed
 from labseq_virtual.response_tables import drop_off, landing, passing, pick_up, transport
 from labseq_virtual.responses import REFERENCE, move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
-from labseq_virtual.transport_kernels import max_drop_offs
+from labseq_virtual.transport_kernels import max_drop_offs, one_left
 from numpy.typing import NDArray
-from scipy.integrate import quad
 from scipy.special import ndtr
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
@@ -137,10 +138,11 @@ class NaiveTransport:
         if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
             self._sweep(lit & (depth > self.settings.static_depth), loaded, course, row, col)
         self._pass(lit, loaded, course, depth, row, col, duration_s)
+        course[..., kernels.STATE], course[..., kernels.DEPTH] = np.where(loaded, HELD, EMPTY), depth
         for i, j in np.argwhere(lit):
             kernels.advance(
-                course[i, j], bool(loaded[i, j]), start[i, j], end[i, j], depth[i, j], float(down[i, 0]),
-                float(right[0, j]), duration_s, kind, further, self.constants, self.tables,
+                course[i, j], start[i, j], end[i, j], float(down[i, 0]), float(right[0, j]), duration_s, kind,
+                further, self.constants, self.tables,
             )  # fmt: skip
         self._land(lit & ~loaded & ~lit_end, course, row, col, duration_s)
         self._set_down(loaded & ~lit_end, course, row, col, further, duration_s)
@@ -149,13 +151,12 @@ class NaiveTransport:
     def _continued(self, before: Before | None, row: Floats, col: Floats) -> tuple[Mask, Mask, Mask, Floats]:
         if before is None:
             dark = np.zeros((len(row), len(col)), np.bool_)
-            return dark, dark.copy(), dark.copy(), np.zeros((*dark.shape, kernels.N_COURSE))
+            return dark, dark.copy(), dark.copy(), np.zeros((*dark.shape, kernels.N_TWEEZER))
         pairs = (row, before.row), (col, before.col)
         away: list[Any] = [np.abs(now[:, START, None] - then[:, END]) for now, then in pairs]
         tolerance = self.settings.site_tolerance
-        in_order = all(e.shape[0] == e.shape[1] and (e.diagonal() <= tolerance).all() for e in away)
-        source: Any = np.ix_(*(np.arange(len(e)) if in_order else e.argmin(axis=1) for e in away))
-        close: Any = in_order or np.logical_and.outer(*(_followed(e, tolerance) for e in away))
+        source: Any = np.ix_(*(each.argmin(axis=1) for each in away))
+        close: Any = np.logical_and.outer(*(_followed(each, tolerance) for each in away))
         old: Any = before.lit, before.loaded, before.fresh
         lit, loaded, fresh = (mask[source] & close for mask in old)
         return lit, loaded, fresh, before.course[source]
@@ -179,7 +180,7 @@ class NaiveTransport:
             self.occupied[site] &= not taken[i, j]
             if taken[i, j]:
                 waited_s = self.now_s - self.thermal[1][site]
-                heat = kernels.relaxed(self.thermal[0][site], waited_s, self.constants)
+                heat = relaxed(self.thermal[0][site], waited_s, self.constants)
                 course[i, j, kernels.SITE_DEPTH : kernels.HEAT + 1] = static, away_m[i, j], heat
                 course[i, j, kernels.IS_PICKED] = 0.0
                 course[i, j, kernels.LOST] = 1 - np.exp(-self.hazards[site])
@@ -204,7 +205,7 @@ class NaiveTransport:
                 if not self.settings.site_tolerance * GRID.spacing_m < away_m < 3.1 * WAIST_M:
                     continue
                 waited_s = self.now_s - self.thermal[1, r, c]
-                heat = kernels.relaxed(self.thermal[0, r, c], waited_s, self.constants)
+                heat = relaxed(self.thermal[0, r, c], waited_s, self.constants)
                 speed = float(np.linalg.norm(way)) / duration_s
                 loss, warmer = pass_by(
                     float(self.depth[r, c]), depth[i, j], speed, away_m, heat, self.constants, self.tables
@@ -254,7 +255,7 @@ class NaiveTransport:
             if away_m > self.settings.site_tolerance * GRID.spacing_m:
                 continue
             peak, speed, fall_s = course[i, j, [kernels.PEAK, kernels.SPEED, kernels.FALL_S]]
-            heat = kernels.relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c], self.constants)
+            heat = relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c], self.constants)
             static = float(self.depth[r, c])
             loss, warmer = land_on(static, peak, speed, fall_s, heat, self.constants, self.tables)
             self.thermal[:, r, c] = heat * warmer, now_s
@@ -401,16 +402,6 @@ def constants_of(light: dict[str, Any] | None = None, **simulation: Any) -> NDAr
     )
 
 
-@pytest.mark.parametrize("x", [0.0, 0.5, 3.0, 20.0])
-def test_thermal_energies_follow_boltzmann_in_three_dimensions(x: float) -> None:
-    energy = (
-        np.random.default_rng(1).chisquare(6, 400_000) / 2
-    )  # three kinetic, three potential degrees of freedom
-    assert np.mean(energy > x) == pytest.approx(kernels.exceeds(x), abs=4e-3)
-    exact, _ = quad(lambda e: e**2 * math.exp(-e) / 2, x, math.inf)
-    assert kernels.exceeds(x) == pytest.approx(exact, rel=1e-6)
-
-
 @pytest.mark.parametrize("ratio", [0.5, 3.0, 25.0])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_wells_merge_where_the_middle_minimum_vanishes(ratio: float, side: int) -> None:
@@ -430,8 +421,8 @@ def test_a_mobile_tweezer_takes_only_from_a_shallower_one() -> None:
 def course_of(**values: float) -> Floats:
     """The course of a tweezer that picked an atom up on a site of nominal depth, by default the paper's."""
     paper = {"PEAK": 2.1e-3, "RISE_S": 60e-6, "FALL_S": 60e-6, "SITE_DEPTH": 300e-6, "HEAT": 15e-6}
-    course = np.zeros(kernels.N_COURSE)
-    for name, value in (paper | values).items():
+    course = np.zeros(kernels.N_TWEEZER)
+    for name, value in (paper | {"STATE": HELD, "DEPTH": 2.1e-3} | values).items():
         course[getattr(kernels, name)] = value
     return course
 
@@ -504,9 +495,7 @@ def test_the_move_of_the_paper_loses_nothing_to_heat_and_faster_ones_do() -> Non
     losses: list[float] = []
     for speed_um_ms in (130.0, 160.0, 330.0, 3000.0):
         course, segment_s = course_of(), 5 * 4.49e-3 / speed_um_ms
-        kernels.advance(
-            course, True, 1.0, 1.0, 2.1e-3, 0.0, 5.0, segment_s, 0, 5, constants_of(), move_tables()
-        )
+        kernels.advance(course, 1.0, 1.0, 0.0, 5.0, segment_s, 0, 5, constants_of(), move_tables())
         course[kernels.FALL_S] = 60e-6
         losses.append(risks(course)[0])
     assert losses[0] == 0.0
@@ -518,8 +507,8 @@ def test_the_move_of_the_paper_loses_nothing_to_heat_and_faster_ones_do() -> Non
 def lost_on_the_way(kind: int = 0, fall_s: float = 60e-6, **before: float) -> float:
     """Fraction of atoms lost in a move at 250 um/ms, with what was before it and a ramp after it."""
     course = course_of(**before)
-    args = 1.0, 1.0, 2.1e-3, 0.0, 5.0, 5 * 4.49e-3 / 250.0, kind, 5, constants_of(), move_tables()
-    kernels.advance(course, True, *args)
+    args = 1.0, 1.0, 0.0, 5.0, 5 * 4.49e-3 / 250.0, kind, 5, constants_of(), move_tables()
+    kernels.advance(course, *args)
     course[kernels.FALL_S] = fall_s
     return risks(course)[0]
 
@@ -540,9 +529,9 @@ def test_collisions_leave_one_of_two_atoms_as_often_as_the_loading_says(loading:
     while (n_atoms > 1).any():
         n_atoms -= np.where(n_atoms > 1, np.where(rng.random(len(n_atoms)) < pairs, 1, 2), 0)
     assert n_atoms.mean() == pytest.approx(loading, abs=0.01)
-    assert kernels.one_left(1, pairs) == pytest.approx(1.0)
-    assert kernels.one_left(2, pairs) == pytest.approx(pairs)
-    assert (kernels.one_left(40, pairs) + kernels.one_left(41, pairs)) / 2 == pytest.approx(loading)
+    assert one_left(1, pairs) == pytest.approx(1.0)
+    assert one_left(2, pairs) == pytest.approx(pairs)
+    assert (one_left(40, pairs) + one_left(41, pairs)) / 2 == pytest.approx(loading)
 
 
 def test_more_tones_make_shallower_tweezers() -> None:
