@@ -26,6 +26,13 @@ from labseq.drivers.settings import (
     IndustrialCameraSettings,
     OrientationSettings,
 )
+from labseq.drivers.tweezers import (
+    Amplitudes,
+    calibrated_amplitudes,
+    check_amplitudes,
+    check_ramp,
+    check_tone_program,
+)
 from labseq.errors import (
     ConfigError,
     DeviceError,
@@ -181,6 +188,7 @@ __all__ = [
     "UNITS",
     "WHOLE_SENSOR",
     "ZERO_CELSIUS_K",
+    "Amplitudes",
     "Analysis",
     "Angle",
     "AxisTones",
@@ -293,11 +301,15 @@ __all__ = [
     "block",
     "c_address",
     "cache_root",
+    "calibrated_amplitudes",
     "call_c",
     "carray",
+    "check_amplitudes",
     "check_plan",
+    "check_ramp",
     "check_size",
     "check_step",
+    "check_tone_program",
     "choose_plan",
     "clean",
     "closest",

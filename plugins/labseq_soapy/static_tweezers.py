@@ -10,10 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from labseq_soapy_stream.messages import REF_LOCKED, Facts, Setup, unlocked
 
 from labseq.plugin import (
+    Amplitudes,
     Context,
     DeviceError,
     Emergency,
@@ -21,11 +21,13 @@ from labseq.plugin import (
     StaticTweezers,
     TransientError,
     TweezersFacts,
+    calibrated_amplitudes,
+    check_ramp,
 )
 from labseq_soapy.access import choose_radio, end_stale_process, marker_of
 from labseq_soapy.link import Link
 from labseq_soapy.settings import SoapySettings
-from labseq_soapy.tones import Amplitudes, ArrayTones
+from labseq_soapy.tones import ArrayTones
 
 SHORTEST_RELEASE_S: Final = 1e-6
 """Shortest release. The light of an AOD cannot be switched faster: sound crosses a beam of 4 mm in 6 us."""
@@ -81,7 +83,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._settings = settings
         self._clock = context.clock
         self._tones = ArrayTones(self._name, settings, context.grid.shape)
-        self._calibrated = _calibrated(context)
+        self._calibrated = calibrated_amplitudes(context)
         self._amplitudes: Amplitudes | None = None
         self._depth: float | None = 0.0  # None: a ramp was interrupted
         self._seen: Mapping[str, int] = {}  # errors while the array was on
@@ -153,13 +155,7 @@ class SoapyStaticTweezers(StaticTweezers):
             LimitError: A depth or duration that the array cannot have.
         """
         self._checked()
-        deepest = self._settings.max_depth
-        if not 0 <= depth <= deepest:
-            raise LimitError(
-                f"{self._name}: depth", f"{depth:g} of the nominal depth", f"0 to {deepest:g} of it"
-            )
-        if not 0 <= duration_s < math.inf:
-            raise LimitError(f"{self._name}: duration of the ramp", f"{duration_s:g} s", "0 or more")
+        check_ramp(self._name, depth, duration_s, self._settings.max_depth)
         if not self._is_loaded:
             self._load(self._amplitudes)
         self._ramp(depth, duration_s)
@@ -368,12 +364,3 @@ class SoapyStaticTweezers(StaticTweezers):
                 link.close()
         finally:
             self.radio.disconnect()
-
-
-def _calibrated(context: Context) -> Amplitudes:
-    """The amplitudes of the active calibration; without one all are equal and add up to full scale."""
-    found = context.calibrations.get("tweezers")
-    if found is None:
-        n_rows, n_cols = context.grid.shape
-        return np.full(n_rows, 1 / n_rows), np.full(n_cols, 1 / n_cols)
-    return found.values["row_amplitudes"], found.values["column_amplitudes"]

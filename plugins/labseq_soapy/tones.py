@@ -15,12 +15,11 @@ from labseq_soapy_stream.messages import Facts
 from labseq_soapy_stream.output import Samples
 from numpy.typing import NDArray
 
-from labseq.plugin import DeviceError, LimitError, format_quantity
+from labseq.plugin import Amplitudes, DeviceError, LimitError, check_amplitudes, format_quantity
 from labseq_soapy.radios import tunes_digitally
 from labseq_soapy.settings import SoapySettings
 
 Floats = NDArray[np.float64]
-Amplitudes = tuple[Floats, Floats]
 
 RATE_ERROR: Final = 1e-6
 """How far the sample rate may be from the requested one, as a fraction."""
@@ -269,12 +268,9 @@ class ArrayTones:
             LimitError: Not one amplitude for each tone, a bad one, or their sum exceeds full scale.
         """
         made: list[NDArray[np.complex64]] = []
+        n_rows, n_cols = (len(loop.cycles) for loop in self.loops)
+        check_amplitudes(self._name, amplitudes, (n_rows, n_cols))
         for axis, values, loop in zip(("row", "column"), amplitudes, self.loops, strict=True):
-            what, shape = f"{self._name}: shape of the {axis} amplitudes", loop.cycles.shape
-            if values.shape != shape:
-                raise LimitError(what, values.shape, shape)
-            if not (np.isfinite(values).all() and (values >= 0).all()):
-                raise LimitError(f"{self._name}: a {axis} amplitude", "negative or not finite", "0 or more")
             made.append(loop.samples(values))
             peak = float(np.abs(made[-1]).max()) * max(1.0, self._settings.max_depth) ** 0.25
             if peak > 1.0 + 1e-6:

@@ -160,7 +160,7 @@ def compile_commands(
 
     Args:
         name: Name of the device, for messages.
-        program: A program that passed :func:`labseq_spcm.limits.check_program`.
+        program: A program that passed :func:`labseq.plugin.check_tone_program`.
         cores: The cores of each axis.
         keep_warm: The tones before and after the program; None for silence.
 

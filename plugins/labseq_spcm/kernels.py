@@ -74,26 +74,6 @@ def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
         out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
 
 
-@kernel(f"boolean({REALS}, {REALS}, {REALS}, {REALS}, {REALS}, {OFFSETS}, float64, float64, float64)")
-def is_within(
-    start_hz: Reals, end_hz: Reals, start: Reals, end: Reals, phase_rad: Reals, offsets: Shorts,
-    low_hz: float, high_hz: float, most: float,
-) -> bool:  # fmt: skip
-    """Whether the tones of an axis are in a band, and the sums of their amplitudes at most ``most``."""
-    for segment in range(len(offsets) - 1):
-        sum_start = sum_end = 0.0
-        for i in range(offsets[segment], offsets[segment + 1]):
-            if not (low_hz <= start_hz[i] <= high_hz and low_hz <= end_hz[i] <= high_hz):
-                return False
-            if not (start[i] >= 0.0 and end[i] >= 0.0 and abs(phase_rad[i]) < np.inf):
-                return False
-            sum_start += start[i]
-            sum_end += end[i]
-        if not (sum_start <= most and sum_end <= most):
-            return False
-    return True
-
-
 @helper_kernel("float64(int64, float64)")
 def course_at(course: int, u: float) -> float:
     """Part of its change that a frequency has covered; as :meth:`labseq.plugin.FrequencyCourse.fraction`."""

@@ -1,4 +1,4 @@
-"""Figures of the card, and the checks of set-up and program against them (memory: ``replay_fifo.py``).
+"""Figures of the card, and the checks of the set-up against them (memory: ``replay_fifo.py``).
 
 Source of the figures, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on
 analog outputs, clock, generation modes, trigger and DDS20. Figures marked (EDMSuite) were measured
@@ -9,10 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from labseq.plugin import AxisTones, LimitError, RfSpec, ToneProgram, format_quantity
+from labseq.plugin import LimitError, RfSpec, format_quantity
 
 FAMILY: Final = 0x66
 """Second byte of the card type: M4i.66xx."""
@@ -59,9 +56,6 @@ FOLLOWS_M: Final = 20e-9
 DDS_DELAY_S: Final = 560e-9
 """From the trigger to the output (EDMSuite)."""
 
-ROUNDING: Final = 1e-9
-"""How far a sum of amplitudes may exceed its limit by rounding errors."""
-
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
     """From the trigger to the first sample: 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
@@ -99,54 +93,3 @@ def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
         rate, highest, least = (format_quantity(f, "frequency") for f in (sample_rate_hz, max_hz, 2 * max_hz))
         limit = f"above {least}, twice the end of the AODs' band, {highest}"
         raise LimitError(f"{name}: sample_rate", rate, limit)
-
-
-def check_program(name: str, program: ToneProgram, rf: RfSpec) -> None:
-    """Refuse what must not reach the outputs, whatever produced the program.
-
-    Args:
-        name: Name of the device, for the message.
-        program: The program to play.
-        rf: Bands of the AODs.
-
-    Raises:
-        LimitError: The program has no length, leaves an AOD's band, clips, or has values that are
-            not finite.
-    """
-    durations = program.duration_s
-    if not (np.isfinite(durations).all() and (durations >= 0).all()):
-        raise LimitError(f"{name}: a segment's duration", "negative or not finite", "0 s or more")
-    if not program.total_duration_s > 0:
-        raise LimitError(f"{name}: length of the program", "0 s", "more than 0 s")
-    _check_axis(f"{name}: {{}} of a row tone", program.row, program.batch, rf.row_band_hz)
-    _check_axis(f"{name}: {{}} of a column tone", program.column, program.batch, rf.column_band_hz)
-
-
-def _check_axis(what: str, axis: AxisTones, batch: NDArray[np.int32], band_hz: tuple[float, float]) -> None:
-    from labseq_spcm.kernels import is_within
-
-    low, high = band_hz
-    tones = axis.start_hz, axis.end_hz, axis.start_amplitude, axis.end_amplitude, axis.phase_rad
-    if is_within(*tones, axis.offsets, low, high, 1.0 + ROUNDING):
-        return
-    band = f"the AOD's band, {low / 1e6:g} to {high / 1e6:g} MHz"
-    amplitudes = 0.0, 1.0 + ROUNDING, "0 to 1 of full scale"
-    for quantity, values, (least, most, limit) in (
-        ("frequency", axis.start_hz, (low, high, band)),
-        ("frequency", axis.end_hz, (low, high, band)),
-        ("phase", axis.phase_rad, (-np.inf, np.inf, "a finite number of radians")),
-        ("amplitude", axis.start_amplitude, amplitudes),
-        ("amplitude", axis.end_amplitude, amplitudes),
-    ):
-        within = np.isfinite(values) & (values >= least) & (values <= most)
-        if not within.all():
-            tone = int(within.argmin())
-            segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
-            where = f"{what.format(quantity)} in batch {batch[segment]}"
-            raise LimitError(where, f"{values[tone]:.9g}", limit)
-    for values in (axis.start_amplitude, axis.end_amplitude):
-        sums = np.diff(np.concatenate([[0.0], np.cumsum(values)])[axis.offsets])
-        if len(sums) and sums.max() > 1.0 + ROUNDING:
-            worst = int(sums.argmax())
-            where = f"{what.format('sum of the amplitudes')}s in batch {batch[worst]}"
-            raise LimitError(where, f"{sums[worst]:.9g} of full scale", "1: the output would clip")

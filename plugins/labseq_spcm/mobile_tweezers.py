@@ -26,6 +26,7 @@ from labseq.plugin import (
     MobileTweezers,
     ToneProgram,
     TransientError,
+    check_tone_program,
     comb_sample_rate,
     format_quantity,
     trigger_line,
@@ -288,9 +289,12 @@ class SpcmMobileTweezers(MobileTweezers):
         Raises:
             LimitError: It does.
         """
-        limits.check_program(self._name, program, self._rf)
+        self._check_limits(program)
         if self._cores is not None:
             compile_commands(self._name, program, self._cores)
+
+    def _check_limits(self, program: ToneProgram) -> None:
+        check_tone_program(self._name, program, self._rf.row_band_hz, self._rf.column_band_hz)
 
     def prepare(self, program: ToneProgram) -> float:
         """Render a program and transfer it to the card.
@@ -323,7 +327,7 @@ class SpcmMobileTweezers(MobileTweezers):
         self._check_idle("prepare()")
         self._duration_s = None
         start_s = time.perf_counter()
-        limits.check_program(self._name, program, self._rf)
+        self._check_limits(program)
         took_s = time.perf_counter() - start_s
         if not self._is_settled:
             self.settle()
@@ -347,7 +351,7 @@ class SpcmMobileTweezers(MobileTweezers):
             raise DeviceError(
                 self._name, "append() while nothing plays; call prepare_beginning() and play() first"
             )
-        limits.check_program(self._name, program, self._rf)
+        self._check_limits(program)
         self._due_s += max(mode.append(program), program.total_duration_s)
 
     def timings(self) -> Mapping[str, float]:

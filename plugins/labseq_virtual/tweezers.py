@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from labseq.plugin import (
+    Amplitudes,
     AxisTones,
     ConfigError,
     Context,
@@ -26,6 +26,10 @@ from labseq.plugin import (
     ToneProgram,
     TweezerAmplitudes,
     TweezersFacts,
+    calibrated_amplitudes,
+    check_amplitudes,
+    check_ramp,
+    check_tone_program,
     format_quantity,
     trigger_line,
 )
@@ -146,9 +150,8 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         Raises:
             LimitError: It does.
         """
-        self._check_durations(program)
-        self._check_axis("row", program.row, program)
-        self._check_axis("column", program.column, program)
+        band_hz = self._band_hz
+        check_tone_program(self._name, program, band_hz, band_hz, self._settings.max_amplitude_sum)
 
     def play(self) -> None:
         """Start playing the prepared program; returns at once.
@@ -209,8 +212,10 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         low, high = self._band_hz
         tones = (("row", self._grid.row_frequency_hz), ("column", self._grid.column_frequency_hz))
         for axis, hz in tones:
-            for line, value in _first_outside(hz[:, np.newaxis], low, high):
-                text = f"{axis} {line} is out of reach: its tone of {value / 1e6:.6g} MHz is not in the band"
+            for line in np.flatnonzero(~((hz >= low) & (hz <= high))).tolist():
+                text = (
+                    f"{axis} {line} is out of reach: its tone of {hz[line] / 1e6:.6g} MHz is not in the band"
+                )
                 raise DeviceError(self._name, f"{text} of {low / 1e6:.6g} to {high / 1e6:.6g} MHz")
 
     def describe(self) -> Mapping[str, Any]:
@@ -229,61 +234,6 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
                 f"{call} while a program plays until {self._playing_until_s:.6f} s; call wait() first",
             )
 
-    def _check_durations(self, program: ToneProgram) -> None:
-        durations = program.duration_s
-        if not (np.isfinite(durations).all() and (durations >= 0).all()):
-            raise LimitError(f"{self._name}: a segment's duration", "negative or not finite", "0 s or more")
-        if not program.total_duration_s > 0:
-            raise LimitError(f"{self._name}: length of the program", "0 s", "more than 0 s")
-
-    def _check_axis(self, axis: str, tones: AxisTones, program: ToneProgram) -> None:
-        low, high = self._band_hz
-        hz = np.stack([tones.start_hz, tones.end_hz], axis=1)
-        for tone, value in _first_outside(hz, low, high):
-            raise LimitError(
-                f"{self._name}: frequency of {_where(axis, tones, program, tone)}",
-                f"{value / 1e6:.6g} MHz",
-                f"the band of {low / 1e6:.6g} to {high / 1e6:.6g} MHz",
-            )
-        most = self._settings.max_amplitude_sum
-        amplitudes = np.stack([tones.start_amplitude, tones.end_amplitude], axis=1)
-        for tone, value in _first_outside(amplitudes, 0.0, most + ROUNDING):
-            raise LimitError(
-                f"{self._name}: amplitude of {_where(axis, tones, program, tone)}",
-                f"{value:g} of full scale",
-                f"0 to {most:g}",
-            )
-        sums = _sums(amplitudes, tones.offsets)
-        for segment, value in _first_outside(sums, -ROUNDING, most + ROUNDING):
-            where = f"segment {segment} (batch {program.batch[segment]})"
-            raise LimitError(
-                f"{self._name}: sum of the {axis} amplitudes in {where}",
-                f"{value:g} of full scale",
-                f"{most:g}: the output would clip",
-            )
-
-
-def _first_outside(values: NDArray[np.float64], low: float, high: float) -> list[tuple[int, float]]:
-    """Row and value of the first number outside the limits, or an empty list; nan is outside."""
-    rows, columns = np.nonzero(~((values >= low) & (values <= high)))
-    return [(int(rows[0]), float(values[rows[0], columns[0]]))] if len(rows) else []
-
-
-def _sums(values: NDArray[np.float64], offsets: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Sums over the tones of each segment, (n_segments, 2) of values (n_tones, 2)."""
-    running = np.concatenate([np.zeros((1, 2)), np.cumsum(values, axis=0)])
-    return np.diff(running[offsets], axis=0)
-
-
-def _where(axis: str, tones: AxisTones, program: ToneProgram, tone: int) -> str:
-    """Name a tone: its axis, number, segment and batch."""
-    segment = int(np.searchsorted(tones.offsets, tone, side="right")) - 1
-    number = tone - int(tones.offsets[segment])
-    return f"{axis} tone {number} in segment {segment} (batch {program.batch[segment]})"
-
-
-Amplitudes = tuple[NDArray[np.float64], NDArray[np.float64]]
-
 
 class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
     """The static array of the simulation.
@@ -296,7 +246,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
         self._settings = settings
         self._grid = context.grid
         self._amplitudes: Amplitudes | None = None
-        self._calibrated = _calibrated(context)
+        self._calibrated = calibrated_amplitudes(context)
         self._depth = 0.0
 
     @property
@@ -332,13 +282,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
             LimitError: A depth or duration that the array cannot have.
         """
         self._check_open()
-        deepest = self._settings.max_depth
-        if not 0 <= depth <= deepest:
-            raise LimitError(
-                f"{self._name}: depth", f"{depth:g} of the nominal depth", f"0 to {deepest:g} of it"
-            )
-        if not 0 <= duration_s < float("inf"):
-            raise LimitError(f"{self._name}: duration of the ramp", f"{duration_s:g} s", "0 or more")
+        check_ramp(self._name, depth, duration_s, self._settings.max_depth)
         self._play(depth, duration_s)
         self._clock.sleep(duration_s)
 
@@ -392,24 +336,8 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
         self._simulation.play("static_tweezers", DepthRamp(start, depth, duration_s), self._clock.now())
 
     def _check(self, amplitudes: Amplitudes) -> None:
-        rows, cols = amplitudes
-        self._check_axis("row", rows, self._grid.n_rows)
-        self._check_axis("column", cols, self._grid.n_cols)
-
-    def _check_axis(self, axis: str, amplitudes: NDArray[np.float64], n_tones: int) -> None:
-        if amplitudes.shape != (n_tones,):
-            raise LimitError(f"{self._name}: shape of the {axis} amplitudes", amplitudes.shape, (n_tones,))
-        if not (np.isfinite(amplitudes).all() and (amplitudes >= 0).all()):
-            raise LimitError(f"{self._name}: a {axis} amplitude", "negative or not finite", "0 or more")
-        total, most = float(amplitudes.sum()), self._settings.max_amplitude_sum
-        if total > most + 1e-9:
-            raise LimitError(f"{self._name}: sum of the {axis} amplitudes", f"{total:g}", f"{most:g}")
-
-
-def _calibrated(context: Context) -> Amplitudes:
-    """The amplitudes of the active calibration; without one all equal, with a sum of full scale."""
-    found = context.calibrations.get("tweezers")
-    if found is None:
-        n_rows, n_cols = context.grid.shape
-        return np.full(n_rows, 1 / n_rows), np.full(n_cols, 1 / n_cols)
-    return found.values["row_amplitudes"], found.values["column_amplitudes"]
+        check_amplitudes(self._name, amplitudes, self._grid.shape)
+        for axis, values in zip(("row", "column"), amplitudes, strict=True):
+            total, most = float(values.sum()), self._settings.max_amplitude_sum
+            if total > most + ROUNDING:
+                raise LimitError(f"{self._name}: sum of the {axis} amplitudes", f"{total:g}", f"{most:g}")

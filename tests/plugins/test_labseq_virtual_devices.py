@@ -193,24 +193,16 @@ def test_static_tweezers_hold_atoms_until_they_are_made_safe(lab: Lab) -> None:
     assert lab.static.describe()["depth"] == 0.0
 
 
-@pytest.mark.parametrize(("depth", "duration_s"), [(2.0, 0.0), (1.0, -1.0), (float("nan"), 0.0)])
-def test_an_impossible_ramp_is_refused(lab: Lab, depth: float, duration_s: float) -> None:
-    with pytest.raises(LimitError, match="static_tweezers"):
-        lab.static.ramp(depth, duration_s)
+def test_what_exceeds_a_limit_is_refused_and_moves_nothing(lab: Lab) -> None:
+    with pytest.raises(LimitError, match="static_tweezers: depth"):
+        lab.static.ramp(2.0, 0.0)
+    with pytest.raises(LimitError, match="sum of the column amplitudes"):
+        lab.static.load((np.array([0.1, 0.1]), np.array([0.4] * 3)))
+    with pytest.raises(LimitError, match=r"column tone 0 in segment 1 \(batch 0\) is 118\.1 MHz"):
+        lab.mobile.prepare(program(end_hz=118.1e6))
+    with pytest.raises(DeviceError, match="without a prepared program"):
+        lab.mobile.play()
     assert lab.n_atoms == 6
-
-
-@pytest.mark.parametrize(
-    ("rows", "cols", "what"),
-    [
-        ([0.1, 0.1], [0.1, 0.1], "shape of the column amplitudes"),
-        ([0.1, float("nan")], [0.1] * 3, "a row amplitude"),
-        ([0.1, 0.1], [0.4] * 3, "sum of the column amplitudes"),
-    ],
-)
-def test_impossible_amplitudes_are_refused(lab: Lab, rows: list[float], cols: list[float], what: str) -> None:
-    with pytest.raises(LimitError, match=what):
-        lab.static.load((np.array(rows), np.array(cols)))
 
 
 def test_mobile_tweezers_carry_an_atom(lab: Lab) -> None:
@@ -253,38 +245,6 @@ def test_the_safe_state_drops_atoms_in_flight(lab: Lab) -> None:
     assert not lab.simulation.truth()[0, 0]
     assert lab.n_atoms == 5
     lab.mobile.prepare(program())
-
-
-@pytest.mark.parametrize(
-    ("wrong", "what"),
-    [
-        (
-            {"col_hz": 80e6},
-            r"column tone 0 in segment 0 \(batch 0\) is 80 MHz; the limit is the band of 82 to 118 MHz",
-        ),
-        ({"end_hz": 118.1e6}, r"column tone 0 in segment 1 \(batch 0\) is 118\.1 MHz"),
-        ({"row_hz": float("nan")}, "row tone 0 in segment 0"),
-        ({"amplitude": 1.1}, r"amplitude of row tone 0 .* is 1\.1 of full scale"),
-        ({"duration_s": 0.0}, "length of the program is 0 s"),
-        ({"duration_s": float("nan")}, "a segment's duration"),
-    ],
-)
-def test_an_impossible_program_is_refused_before_it_plays(
-    lab: Lab, wrong: dict[str, float], what: str
-) -> None:
-    with pytest.raises(LimitError, match=what):
-        lab.mobile.prepare(program(**wrong))
-    with pytest.raises(DeviceError, match="without a prepared program"):
-        lab.mobile.play()
-
-
-def test_tones_that_would_clip_together_are_refused(lab: Lab) -> None:
-    hz, on = np.array([99e6, 101e6]), np.array([0.6, 0.6])
-    two = AxisTones(np.array([0, 2], np.int32), hz, hz, on, on, np.zeros(2))
-    one = axis([100e6, 100e6], [1.0, 1.0])
-    clipping = ToneProgram(two, one, np.array([1e-3]), np.zeros(1, np.int8), np.array([7], np.int32))
-    with pytest.raises(LimitError, match=r"sum of the row amplitudes in segment 0 \(batch 7\) is 1\.2"):
-        lab.mobile.prepare(clipping)
 
 
 def test_virtual_hardware_needs_a_simulation() -> None:
