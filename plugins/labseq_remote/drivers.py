@@ -1,33 +1,45 @@
-"""Drivers of devices on other computers: each method is a call to the server of the device."""
+"""Drivers of devices on other computers: each method is a call to the server of the device.
+
+A driver lists what travels: the methods that the served device carries out, and the properties that come back
+with every answer. Their meaning is that of the role.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from importlib.metadata import version
 from typing import Any, ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from labseq.plugin import (
     Camera,
     CameraFacts,
     Context,
     Device,
-    Frame,
     Hardware,
-    LineProgram,
     Lines,
     LinesFacts,
     MobileTweezers,
     StaticTweezers,
-    ToneProgram,
-    Trigger,
     TweezersFacts,
 )
-from labseq_remote.link import Link
+from labseq_remote.link import Link, called, called_if_able, known
 from labseq_remote.settings import RemoteSettings
 from labseq_remote.simulation import RemoteSimulation
+
+# pyright: reportIncompatibleMethodOverride=false
+# (pyright does not know the properties that `known` makes)
+
+
+def checked(name: str) -> Any:
+    """A check by the driver at the server, if it has it; the device need not be open."""
+
+    def method(driver: RemoteHardware, *args: Any, **named: Any) -> None:
+        if name in driver.link.about["abilities"]:
+            driver.link.connect().call(name, *args, **named)
+
+    method.__name__ = name
+    return method
 
 
 class RemoteHardware(Hardware):
@@ -39,6 +51,9 @@ class RemoteHardware(Hardware):
     Args:
         settings: Where the device is.
         context: What the driver at the server is constructed with, too.
+
+    Attributes:
+        link: The connection.
     """
 
     any_thread = True
@@ -47,7 +62,11 @@ class RemoteHardware(Hardware):
     def __init__(self, settings: RemoteSettings, context: Context) -> None:
         simulation = context.simulation
         first = simulation.connect if isinstance(simulation, RemoteSimulation) else None
-        self._link = Link(settings, context, self._kind, first)
+        self.link = Link(settings, context, self._kind, first)
+
+    def call(self, name: str, *args: Any, **named: Any) -> Any:
+        """Call a method of the open device."""
+        return self.link.call(name, *args, **named)
 
     def open(self) -> None:
         """Connect, and open the device for this client alone.
@@ -55,11 +74,11 @@ class RemoteHardware(Hardware):
         Raises:
             DeviceError: The server does not answer, or another client uses the device.
         """
-        self._link.open()
+        self.link.open()
 
     def close(self) -> None:
         """Close the device, and end the connection."""
-        self._link.close()
+        self.link.close()
 
     def safe_state(self) -> None:
         """Make the device safe, also while another call hangs.
@@ -67,211 +86,97 @@ class RemoteHardware(Hardware):
         Raises:
             DeviceError: It failed, or the connection is lost: then the server does it by itself.
         """
-        self._link.make_safe()
+        self.link.make_safe()
 
     def describe(self) -> Mapping[str, Any]:
         """What the device says of itself, with address, settings and version of the server."""
-        return self._link.describe()
+        return self.link.describe()
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
         """Versions of the served device, and of labseq at its server; that should be the same as here."""
-        from importlib.metadata import version
-
-        about = self._link.about
-        found: Mapping[str, Any] = self._link.call_if_able("versions", {})
+        about = self.link.about
+        found: Mapping[str, Any] = self.link.call_if_able("versions", {})
         there = {f"labseq on {about['host']}": (str(about["labseq"]), version("labseq"))}
         return {**{str(name): (str(one[0]), str(one[1])) for name, one in found.items()}, **there}
 
-    @property
-    def idle_output(self) -> str:
-        """That of the served device."""
-        return str(self._link.known("idle_output", ""))
-
     def warm(self) -> None:
         """Compile the kernels at the server."""
-        self._link.connect().call("warm")
+        self.link.connect().call("warm")
 
-    @property
-    def settling_timeout_s(self) -> float:
-        """That of the served device."""
-        return float(self._link.known("settling_timeout_s", 0.0))
-
-    def settle(self) -> None:
-        """Wait until the served device is ready."""
-        self._link.call_if_able("settle")
-
-    def self_test(self) -> None:
-        """Test the served device if it has a self test; else this tests the connection alone."""
-        self._link.call_if_able("self_test")
-
-    def poll(self) -> Mapping[str, bool | int | float | str]:
-        """Values to record of the served device."""
-        return self._link.call_if_able("poll", {})
-
-    def check_interlocks(self) -> None:
-        """Check those of the served device."""
-        self._link.call_if_able("check_interlocks")
+    idle_output = known("idle_output", "")
+    settling_timeout_s = known("settling_timeout_s", 0.0)
+    settle = called_if_able("settle")
+    self_test = called_if_able("self_test")  # else it tests the connection alone
+    poll = called_if_able("poll", {})
+    check_interlocks = called_if_able("check_interlocks")
 
 
 class RemoteCamera(RemoteHardware, Camera):
     """A camera on another computer; the times of its frames are on the clock of this one."""
 
     _kind = "camera"
-
-    @property
-    def facts(self) -> CameraFacts:
-        """Those of the served camera."""
-        return self._link.known("facts", CameraFacts())
-
-    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        """See :class:`labseq.plugin.Camera`."""
-        self._link.call("arm", n_frames, exposure_s, trigger)
+    facts = known("facts", CameraFacts())
+    arm = called("arm")
+    trigger = called("trigger")
+    read = called("read")
 
     def disarm(self) -> None:
         """End the series."""
-        if self._link.is_open:
-            self._link.call("disarm")
-
-    def trigger(self) -> None:
-        """Start the next exposure."""
-        self._link.call("trigger")
-
-    def read(self, timeout_s: float) -> Frame:
-        """Wait for the oldest frame that has not been read yet."""
-        return self._link.call("read", timeout_s)
+        if self.link.is_open:
+            self.link.call("disarm")
 
 
 class RemoteStaticTweezers(RemoteHardware, StaticTweezers):
     """Static tweezers on another computer."""
 
     _kind = "static_tweezers"
-
-    @property
-    def facts(self) -> TweezersFacts:
-        """Those of the served tweezers."""
-        return self._link.known("facts", TweezersFacts())
-
-    def load(self, amplitudes: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> None:
-        """Set the amplitudes of the tones."""
-        self._link.call("load", amplitudes)
-
-    def start(self) -> None:
-        """Bring the array to its nominal depth."""
-        self._link.call("start")
-
-    def ramp(self, depth: float, duration_s: float) -> None:
-        """Change the depth."""
-        self._link.call("ramp", depth, duration_s)
-
-    def release(self, duration_s: float) -> float:
-        """Turn the light off for a time that the device there keeps."""
-        return float(self._link.call("release", duration_s))
-
-    def leave_on(self) -> bool:
-        """Leave the light on if the settings there say so."""
-        return bool(self._link.call_if_able("leave_on", default=False))
+    facts = known("facts", TweezersFacts())
+    load = called("load")
+    start = called("start")
+    ramp = called("ramp")
+    release = called("release")
+    leave_on = called_if_able("leave_on", default=False)
 
 
 class RemoteMobileTweezers(RemoteHardware, MobileTweezers):
-    """Mobile tweezers on another computer: programs travel as tones, and are rendered there."""
+    """Mobile tweezers on another computer: programs travel as tones, and are rendered there.
+
+    The way of the message that starts them comes in addition to their delay.
+    """
 
     _kind = "mobile_tweezers"
-
-    @property
-    def waits_for_trigger(self) -> bool:
-        """Whether the served tweezers do."""
-        return bool(self._link.known("waits_for_trigger", default=False))
-
-    def check_program(self, program: ToneProgram) -> None:
-        """Have the served driver check it."""
-        if "check_program" in self._link.about["abilities"]:
-            self._link.connect().call("check_program", program)
-
-    def prepare(self, program: ToneProgram) -> float:
-        """Have it rendered and uploaded there."""
-        return float(self._link.call("prepare", program))
-
-    def play(self) -> None:
-        """Start playing."""
-        self._link.call("play")
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait for the end of the program."""
-        self._link.call("wait", timeout_s)
-
-    @property
-    def start_delay_s(self) -> float:
-        """That of the served tweezers; the way of the message comes in addition."""
-        return float(self._link.known("start_delay_s", 0.0))
-
-    @property
-    def beginning_s(self) -> float:
-        """That of the served tweezers."""
-        return float(self._link.known("beginning_s", math.inf))
-
-    def prepare_beginning(self, program: ToneProgram) -> float:
-        """Have the beginning of a program rendered and uploaded there."""
-        return float(self._link.call("prepare_beginning", program))
-
-    def append(self, program: ToneProgram) -> None:
-        """Have the rest follow."""
-        self._link.call("append", program)
+    waits_for_trigger = known("waits_for_trigger", default=False)
+    start_delay_s = known("start_delay_s", 0.0)
+    beginning_s = known("beginning_s", math.inf)
+    check_program = checked("check_program")
+    prepare = called("prepare")
+    prepare_beginning = called("prepare_beginning")
+    append = called("append")
+    play = called("play")
+    wait = called("wait")
 
     def timings(self) -> Mapping[str, float]:
         """Durations of the parts of the last ``prepare()`` there."""
-        return self._link.known("timings", {})
+        return self.link.known("timings", {})
 
 
 class RemoteDevice(RemoteHardware, Device):
     """Any other instrument on another computer."""
 
     _kind = "device"
-
-    def command(self, name: str, **arguments: Any) -> None:
-        """Carry out a command."""
-        self._link.call("command", name, **arguments)
-
-    def read(self, name: str) -> Any:
-        """Read a value."""
-        return self._link.call("read", name)
-
-    def check_command(self, name: str, **arguments: Any) -> None:
-        """Have the served driver check it."""
-        if "check_command" in self._link.about["abilities"]:
-            self._link.connect().call("check_command", name, **arguments)
+    command = called("command")
+    read = called("read")
+    check_command = checked("check_command")
 
 
 class RemoteLines(RemoteHardware, Lines):
     """A timing box on another computer."""
 
     _kind = "lines"
-
-    @property
-    def lines_facts(self) -> LinesFacts:
-        """Those of the served box."""
-        return self._link.known("lines_facts", LinesFacts(()))
-
-    def check_program(self, program: LineProgram) -> None:
-        """Have the served driver check it."""
-        if "check_program" in self._link.about["abilities"]:
-            self._link.connect().call("check_program", program)
-
-    def idle(self) -> None:
-        """Turn on the lines that are on between steps."""
-        self._link.call("idle")
-
-    def compile(self, program: LineProgram) -> None:
-        """Compile a program."""
-        self._link.call("compile", program)
-
-    def arm(self) -> None:
-        """Get ready to fire."""
-        self._link.call("arm")
-
-    def fire(self) -> None:
-        """Start the program."""
-        self._link.call("fire")
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait for its end."""
-        self._link.call("wait", timeout_s)
+    lines_facts = known("lines_facts", LinesFacts(()))
+    check_program = checked("check_program")
+    idle = called("idle")
+    compile = called("compile")
+    arm = called("arm")
+    fire = called("fire")
+    wait = called("wait")

@@ -1,10 +1,10 @@
-"""The connection of a driver, made when it is first needed."""
+"""The connection of a driver, made when it is first needed, and what travels over it."""
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from labseq.plugin import Context, DeviceError
 from labseq_remote.connection import Connection, Joins
@@ -134,3 +134,38 @@ class Link:
             "settings": about["settings"],
         }
         return {**self.connect().call("describe"), "remote": remote}
+
+
+class Linked(Protocol):
+    """A driver or simulation whose methods are those of another computer."""
+
+    link: Link
+
+    def call(self, name: str, *args: Any, **named: Any) -> Any:
+        """Call a method there."""
+        ...
+
+
+def called(name: str) -> Any:
+    """A method that is carried out at the server; its meaning is that of the role."""
+
+    def method(driver: Linked, *args: Any, **named: Any) -> Any:
+        return driver.call(name, *args, **named)
+
+    method.__name__ = name
+    return method
+
+
+def called_if_able(name: str, default: Any = None) -> Any:
+    """The same, of an optional method; without it the default is returned."""
+
+    def method(driver: Linked) -> Any:
+        return driver.link.call_if_able(name, default)
+
+    method.__name__ = name
+    return method
+
+
+def known(name: str, default: Any) -> Any:
+    """A property, as it was at the server after the last call."""
+    return property(lambda driver: driver.link.known(name, default))

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeAlias
 
-from numpy.typing import NDArray
-
 from labseq.plugin import (
-    WHOLE_SENSOR,
     Context,
     DeviceError,
-    Frame,
     LabseqError,
-    Occupancy,
     RfSource,
-    SensorMode,
-    Signal,
     Simulation,
     ToneSource,
     wire,
 )
 from labseq_remote.connection import Connection, Joins, run_of
-from labseq_remote.link import Link
+from labseq_remote.link import Link, called, known
 from labseq_remote.settings import RemoteSimulationSettings
 
 CatchUp: TypeAlias = Callable[[float | None, tuple[int, int] | None], object]
@@ -79,22 +72,22 @@ class RemoteSimulation(Simulation):
 
     def __init__(self, settings: RemoteSimulationSettings, context: Context) -> None:
         self._settings, self._context = settings, context
-        self._link = Link(settings, context, "simulation")
-        self._first: Callable[[], object] = self._link.connect
+        self.link = Link(settings, context, "simulation")
+        self._first: Callable[[], object] = self.link.connect
         self._catch_up: CatchUp = lambda _now_s, _place: None
         self._asked: dict[tuple[str, str], _Asked] = {}
 
     def join(self, run: bytes, catch_up: CatchUp) -> None:
         """Use the simulation that a run has there, for the simulated devices of a server."""
-        self._link.joins, self._catch_up = Joins(run), catch_up
+        self.link.joins, self._catch_up = Joins(run), catch_up
 
     def seen_by(self, camera: str) -> RemoteSimulation:
         """What a camera receives that is not the camera of the atoms."""
         view = RemoteSimulation(self._settings, self._context)
-        run = run_of(self._context.clock).key if self._link.joins is None else self._link.joins.run
+        run = run_of(self._context.clock).key if self.link.joins is None else self.link.joins.run
         view._first = self.connect
-        view._link = Link(self._settings, self._context, "simulation", self.connect)
-        view._link.joins = Joins(run, camera)
+        view.link = Link(self._settings, self._context, "simulation", self.connect)
+        view.link.joins = Joins(run, camera)
         return view
 
     def connect(self) -> None:
@@ -103,7 +96,7 @@ class RemoteSimulation(Simulation):
 
     def open(self) -> None:
         """Draw the disorder of the machine."""
-        self._link.open()
+        self.link.open()
 
     def close(self) -> None:
         """Discard the state."""
@@ -111,15 +104,7 @@ class RemoteSimulation(Simulation):
             asked.connection.close()
         self._asked.clear()
         with suppress(DeviceError):  # the server does it by itself when the connection is lost
-            self._link.close()
-
-    def begin_shot(self) -> None:
-        """Remove all atoms."""
-        self._call("begin_shot")
-
-    def load(self, t_start_s: float, duration_s: float) -> None:
-        """The atom source is on."""
-        self._call("load", t_start_s, duration_s)
+            self.link.close()
 
     def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
         """Have the simulation there trigger a simulated device of this process."""
@@ -129,69 +114,41 @@ class RemoteSimulation(Simulation):
         """Have the simulation there ask a simulated device of this process what it has played."""
         self._answer("connect_outputs", role, source.played)
 
-    def warm(self) -> None:
-        """Compile the kernels there."""
-        self._call("warm")
-
     def _answer(self, what: str, role: str, function: Callable[..., Any]) -> None:
         self.connect()
         asked = self._asked.get((what, role))
         if asked is not None:
             asked.connection.close()
-        joins = self._link.joins or Joins(run_of(self._context.clock).key)
-        connection = self._link.another(joins)
+        joins = self.link.joins or Joins(run_of(self._context.clock).key)
+        connection = self.link.another(joins)
         connection.call(what, role)
         self._asked[what, role] = _Asked(connection, function, self._catch_up)
 
-    def _call(self, name: str, *args: Any) -> Any:
+    def call(self, name: str, *args: Any) -> Any:
         """Call a method, also while an answer is made to a question that came from there."""
         here = threading.current_thread()
         connection = next((one.connection for one in self._asked.values() if one.thread is here), None)
-        return (connection or self._link.connect()).call(name, *args)
-
-    def play(self, role: str, signal: Signal, t_start_s: float) -> None:
-        """Receive the output of a device of this computer."""
-        self._call("play", role, signal, t_start_s)
-
-    def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        """The frame of a camera of this computer."""
-        return self._call("expose", t_start_s, exposure_s, mode)
+        return (connection or self.link.connect()).call(name, *args)
 
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model, and where it runs."""
-        return self._link.describe()
+        return self.link.describe()
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
         """That of the served simulation."""
-        rows, columns = self._link.known("sensor_shape", (0, 0))
+        rows, columns = self.link.known("sensor_shape", (0, 0))
         return rows, columns
 
-    def warnings(self) -> Sequence[str]:
-        """Those of the served simulation."""
-        return self._call("warnings")
-
-    def readout_fraction(self, mode: SensorMode) -> float:
-        """That of the served simulation."""
-        return self._call("readout_fraction", mode)
-
-    def prepare_sensor(self, mode: SensorMode) -> None:
-        """Compute there what frames share."""
-        self._call("prepare_sensor", mode)
-
-    @property
-    def loading_probability(self) -> float | None:
-        """That of the served simulation."""
-        return self._link.known("loading_probability", None)
-
-    def truth(self) -> Occupancy | None:
-        """The current true occupancy."""
-        return self._call("truth")
-
-    def losses(self) -> Mapping[str, int]:
-        """Atoms lost since the shot began."""
-        return self._call("losses")
-
-    def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
-        """Events of the shot."""
-        return self._call("atom_events", since_s)
+    warm = called("warm")
+    begin_shot = called("begin_shot")
+    load = called("load")
+    play = called("play")
+    prepare_sensor = called("prepare_sensor")
+    expose = called("expose")
+    truth = called("truth")
+    losses = called("losses")
+    atom_events = called("atom_events")
+    warnings = called("warnings")
+    readout_fraction = called("readout_fraction")
+    loading_probability = known("loading_probability", None)  # pyright: ignore[reportIncompatibleMethodOverride]

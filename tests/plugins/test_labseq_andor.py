@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from labseq_andor.camera import AndorCamera
 from labseq_andor.codes import Code
 from labseq_andor.library import load_pylablib
@@ -25,7 +23,6 @@ unopened = partial(Rig, "andor")
 rig = partial(opened_rig, "andor")
 
 COLD: Final[dict[str, Any]] = {"temperature": "-70 degC"}
-ROOT: Final = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -37,45 +34,6 @@ def test_nothing_is_compiled_to_import_pylablib() -> None:
     from pylablib.devices.Andor.atcore_lib import read_uint12
 
     assert read_uint12.signatures == []
-
-
-@settings(max_examples=12)
-@given(data=st.data(), binning=st.integers(1, 4), isolated=st.booleans())
-def test_region_and_binning_are_those_of_the_settings(data: Any, binning: int, isolated: bool) -> None:
-    height, width = (binning * data.draw(st.integers(1, 96 // binning)) for _ in range(2))
-    y, x = data.draw(st.integers(0, 96 - height)), data.draw(st.integers(0, 128 - width))
-    region = {"y": y, "x": x, "height": height, "width": width}
-    with rig(region=region, binning=binning, isolated_crop=isolated, frame_transfer=isolated) as lab:
-        frame = lab.take(1, 0.1)[0]
-        assert frame.image.shape == lab.camera.facts.frame_shape == (height // binning, width // binning)
-    assert (lab.world.modes[0].region or (0, 0, 96, 128)) == (y, x, height, width)
-    assert lab.world.modes[0].binning == binning
-    assert_shown([frame], lab)
-
-
-@settings(max_examples=12)
-@given(
-    rate=st.sampled_from([None, "17 MHz", "10 MHz", "1 MHz"]),
-    shift=st.sampled_from([None, "0.3 us", "3.3 us"]),
-    isolated=st.booleans(),
-    binning=st.sampled_from([1, 2, 8]),
-)
-def test_the_read_out_time_before_opening_is_that_of_the_simulated_camera(
-    rate: str | None, shift: str | None, isolated: bool, binning: int
-) -> None:
-    chosen: dict[str, Any] = {"readout_rate": rate, "vertical_shift_speed": shift, "binning": binning}
-    region = {"y": 8, "x": 16, "height": 64, "width": 64}
-    lab = unopened(region=region, isolated_crop=isolated, frame_transfer=isolated, **chosen)
-    estimate = lab.camera.facts.readout_s
-    lab.camera.open()
-    try:
-        assert lab.camera.facts.readout_s == estimate
-        start_s = lab.clock.now()
-        frame = lab.take(1, 0.1)[0]
-        assert lab.clock.now() == pytest.approx(frame.t_start_s + 0.1 + estimate)
-        assert frame.t_start_s >= start_s
-    finally:
-        lab.camera.close()
 
 
 def test_smaller_regions_and_isolated_crop_are_read_faster() -> None:
@@ -110,25 +68,6 @@ def test_em_gain_is_on_in_a_series_only() -> None:
     assert lab.world.modes[0].em_gain == 1
 
 
-def test_a_series_like_the_last_sets_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    set_for: list[tuple[Any, ...]] = []
-    with rig(em_gain=50) as lab:
-        camera = lab.camera._opened().camera
-        for name in ("set_trigger_mode", "setup_cont_mode", "setup_kinetic_mode"):
-            call = getattr(camera, name)
-            monkeypatch.setattr(camera, name, lambda *given, call=call: (set_for.append(given), call(*given)))
-        for exposure_s in (0.01, 0.01, 0.02, 0.02):
-            assert lab.take(2, exposure_s)[-1].exposure_s == pytest.approx(exposure_s)
-        assert set_for == [("software",), (0,)] * 2
-        lab.take(2, 0.02, "external")
-        assert set_for[-2:] == [("ext",), (2, 0.0)]
-        lab.camera.close()
-        lab.camera.open()
-        lab.take(1, 0.02)
-        assert set_for[4:] == [("ext",), (2, 0.0)]  # of the camera as it was before
-        assert lab.sim.timing.exposure_s == pytest.approx(0.02)
-
-
 def test_it_works_in_real_time_and_while_it_acquires_its_temperature_is_unknown() -> None:
     with rig(clock=NeverStopped()) as lab:
         frames = [*lab.take(2, 1e-3), *lab.take(2, 1e-3, "internal")]
@@ -156,12 +95,6 @@ def test_the_shutter_is_open_from_opening_to_the_safe_state() -> None:
         assert frame.t_start_s - start_s == pytest.approx(0.027)
 
 
-def test_the_automatic_shutter_needs_no_wait() -> None:
-    with rig(shutter="auto") as lab:
-        assert lab.take(1)[0].t_start_s == 0.0
-        assert lab.world.modes[0].shutter_open
-
-
 def test_frame_transfer_exposes_while_it_reads() -> None:
     with rig(frame_transfer=True) as lab:
         lab.clock.sleep(1.0)
@@ -186,16 +119,6 @@ def test_external_triggers_may_come_before_anybody_reads() -> None:
         frames = [lab.camera.read(1.0) for _ in range(5)]
     assert np.diff([frame.t_start_s for frame in frames]) == pytest.approx(0.05)
     assert_shown(frames, lab)
-
-
-def test_the_baseline_clamp_and_speeds_reach_the_camera() -> None:
-    chosen: dict[str, Any] = {"readout_rate": "5 MHz", "preamp_gain": 2, "vertical_shift_speed": "0.9 us"}
-    with rig(baseline_clamp=False, fast_trigger=True, trigger_edge="falling", fan="low", **chosen) as lab:
-        amplifiers = lab.sim.amplifiers
-        assert (amplifiers.rate_hz, amplifiers.preamp_gain, amplifiers.shift_s) == (5e6, 2.0, 0.9e-6)
-        assert not amplifiers.baseline_clamp
-    with rig() as lab:
-        assert lab.sim.amplifiers.baseline_clamp
 
 
 # cooling
@@ -232,23 +155,6 @@ def test_closing_leaves_the_cooler_as_the_settings_say(after: str, is_on: bool) 
     lab.camera.settle()
     assert (lab.clock.now() - start_s < 10.0) == is_on
     lab.camera.close()
-
-
-def test_without_cooling_the_cooler_is_left_alone() -> None:
-    with rig() as lab:
-        assert lab.camera.settling_timeout_s == 0.0
-        lab.camera.settle()
-        assert (lab.clock.now(), lab.sim.cooler.is_on) == (0.0, False)
-
-
-def test_a_cooler_that_never_gets_cold() -> None:
-    with rig(cooling={"temperature": "-80 degC", "timeout": "10 min"}) as lab:
-        lab.sim.faults.coldest_c = -60.0
-        with pytest.raises(
-            DeviceTimeoutError, match=r"sensor is at -60.0 degC after 600 s.*-80.0 degC.*water"
-        ):
-            lab.camera.settle()
-        assert lab.clock.now() == pytest.approx(600.0, abs=1.5)
 
 
 def test_a_camera_that_never_calls_itself_stabilized() -> None:

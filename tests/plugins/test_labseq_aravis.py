@@ -26,7 +26,7 @@ from labseq_aravis.library import load_library
 from labseq_aravis.stream import MONO, unpacked
 from labseq_genicam_sim.fake import FakeCamera
 
-from .labseq_genicam_rig import REGION, WAIT_S, opened, pattern, plugged_in, set_region
+from .labseq_genicam_rig import WAIT_S, opened, pattern, plugged_in
 from .needs import need_library
 
 
@@ -35,72 +35,6 @@ def fake() -> Iterator[FakeCamera]:
     need_library(load_library)
     with plugged_in() as fake:
         yield fake
-
-
-def test_what_is_set_is_read_back(fake: FakeCamera) -> None:
-    with Camera(fake.address) as camera:
-        assert (camera.vendor, camera.model, camera.serial) == ("labseq", "Simulated", "T1")
-        assert (camera.sensor_shape, camera.is_ethernet, camera.is_lost) == ((2048, 2048), True, False)
-        assert camera.pixel_formats == ("Mono8", "Mono10", "Mono12", "Mono16")
-        assert camera.trigger_sources == ("Software", "Line1")
-        camera.set_pixel_format("Mono12")
-        camera.set_binning(2, 4)
-        set_region(camera, {"OffsetX": 10, "OffsetY": 20, "Width": 300, "Height": 100})
-        camera.set_exposure_s(0.0123)
-        camera.set_gain(3.25)
-        camera.set_packet_size(4000)
-        camera.set_packet_delay_s(1e-6)
-        assert camera.get_string("PixelFormat") == "Mono12"
-        assert (camera.get_integer("BinningVertical"), camera.get_integer("BinningHorizontal")) == (2, 4)
-        assert camera.integer_bounds("OffsetX") == (0, 2048 // 4 - 300, 1)
-        assert camera.payload == 300 * 100 * 2
-        assert camera.exposure_s == pytest.approx(0.0123)
-        assert camera.get_float("ExposureTime") == pytest.approx(12300.0)
-        assert camera.float_bounds("ExposureTime") == (10.0, 10e6)
-        assert camera.exposure_bounds_s == pytest.approx((1e-5, 10.0))
-        assert (camera.has_gain, camera.gain) == (True, pytest.approx(3.25))
-        assert camera.gain_bounds == pytest.approx((0.0, 1000.0))
-        assert (camera.packet_size, camera.packet_delay_s) == (4000, pytest.approx(1e-6))
-
-
-def test_what_the_camera_does_not_offer_is_refused(fake: FakeCamera) -> None:
-    with Camera(fake.address) as camera:
-        assert camera.is_available("ExposureTime")
-        assert not camera.is_available("Nonsense")
-        with pytest.raises(AravisError, match="Nonsense") as caught:
-            camera.get_string("Nonsense")
-        assert caught.value.code == "feature not found"
-        with pytest.raises(AravisError, match="greater than allowed"):
-            camera.set_exposure_s(1000.0)
-        with pytest.raises(AravisError) as caught:
-            camera.set_integer("Width", 4096)
-        assert caught.value.code == "out of range"
-        with pytest.raises(AravisError, match="BayerRG8"):
-            camera.set_pixel_format("BayerRG8")
-        with pytest.raises(AravisError, match="Line7"):
-            camera.set_trigger("Line7")
-
-
-def test_frames_arrive_as_they_were_made(fake: FakeCamera) -> None:
-    rows, columns = np.indices((REGION["Height"], REGION["Width"]))
-    first = (rows + REGION["OffsetY"]) * 7 + columns + REGION["OffsetX"]
-    n = 0
-    for pixel_format in ("Mono8", "Mono10", "Mono12", "Mono16"):
-        largest, ids, times = 2 ** int(pixel_format.removeprefix("Mono")) - 1, list[int](), list[int]()
-        with opened(fake, pixel_format=pixel_format, n_buffers=2) as (camera, stream):
-            assert stream.pop(0.0) is stream.pop(0.02) is None
-            for _ in range(4):
-                camera.trigger()
-                buffer = stream.pop(WAIT_S)
-                assert buffer is not None
-                assert buffer.image is not None
-                assert buffer.status == "success"
-                np.testing.assert_array_equal(buffer.image, np.minimum(first + 1000 * n, largest))
-                ids.append(buffer.frame_id)
-                times.append(buffer.camera_time_ns)
-                n += 1
-        assert ids == list(range(ids[0], ids[0] + 4))
-        assert times == sorted(times)
 
 
 def test_closing_is_legal_in_any_order_and_again(fake: FakeCamera) -> None:

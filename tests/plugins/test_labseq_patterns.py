@@ -105,25 +105,6 @@ def test_nearest_neighbours_in_the_bulk(name: str, expected: int, shear: Literal
     assert (neighbours(target, grid, 1)[bulk] == expected).all()
 
 
-@BOTH_SHEARS
-def test_a_link_of_the_kagome_lattice_has_six_links_at_its_ends(shear: Literal[1, -1]) -> None:
-    grid = SiteGrid(shear=shear)
-    target = make("link_kagome", grid, **A_BLOCK)
-    bulk = in_bulk(target, 2)
-    for distance in (1, np.sqrt(3), 2):
-        assert (neighbours(target, grid, distance)[bulk] == 2).all()
-
-
-@BOTH_SHEARS
-def test_links_lie_halfway_between_neighbours_of_a_kagome_lattice(shear: Literal[1, -1]) -> None:
-    grid = SiteGrid(17, 17, shear=shear)
-    links = positions(make("link_kagome", grid, rows=17, cols=17), grid)
-    coarse = SiteGrid(9, 9, shear=shear)
-    ends = 2 * positions(make("kagome", coarse, rows=9, cols=9), coarse)
-    pairs = [(a, b) for i, a in enumerate(ends) for b in ends[:i] if np.isclose(np.linalg.norm(a - b), 2)]
-    assert as_points(links) == as_points(np.array([(a + b) / 2 for a, b in pairs]))
-
-
 @pytest.mark.parametrize(
     ("name", "settings", "n_atoms"),
     [
@@ -159,32 +140,6 @@ def test_numbers_of_atoms_on_a_square_grid(name: str, settings: dict[str, Any], 
     assert target.n_atoms == n_atoms
 
 
-@pytest.mark.parametrize("name", [*TRIANGULAR, "sierpinski", "ring"])
-@pytest.mark.parametrize(("rows", "cols"), [(3, 16), (8, 9), (16, 5)])
-def test_the_other_shear_makes_the_mirror_image(name: str, rows: int, cols: int) -> None:
-    there, here = (SiteGrid(16, 16, shear=shear) for shear in (1, -1))
-    left = positions(make(name, there, rows=rows, cols=cols, origin=(0, 0)), there) * (-1, 1)
-    right = positions(make(name, here, rows=rows, cols=cols, origin=(0, 16 - cols)), here)
-    assert as_points(left) == as_points(right)
-
-
-@BOTH_SHEARS
-def test_no_atom_of_a_honeycomb_has_only_one_neighbour(shear: Literal[1, -1]) -> None:
-    grid = SiteGrid(shear=shear)
-    for size in [n for n in range(3, 20) if n % 3 < 2]:
-        assert neighbours(make("honeycomb", grid, rows=size, cols=size), grid, 1).min() == 2
-
-
-@pytest.mark.parametrize("order", [0, 1, 4])
-@BOTH_SHEARS
-def test_a_sierpinski_triangle_looks_the_same_from_each_corner(order: int, shear: Literal[1, -1]) -> None:
-    grid = SiteGrid(shear=shear)
-    places = positions(make("sierpinski", grid, order=order), grid)
-    assert as_points(turned(places, 120)) == as_points(places)
-    assert np.count_nonzero(places[:, 1] == places[:, 1].min()) == 1
-    assert np.count_nonzero(places[:, 1] == places[:, 1].max()) == 2**order
-
-
 def test_a_sierpinski_triangle_holds_three_of_the_order_below() -> None:
     grid = SiteGrid(lattice="square")
     large, small = (make("sierpinski", grid, order=n, origin=(0, 0)).fill for n in (4, 3))
@@ -205,14 +160,6 @@ def test_a_ring_is_round_and_whole(
     assert (target.fill == ((distance <= radius + 1e-9) & (distance > radius - width + 1e-9))).all()
     places = positions(target, grid)
     assert as_points(turned(places, 60 if lattice == "triangular" else 90)) == as_points(places)
-
-
-@pytest.mark.parametrize(("rows", "cols"), [(15, 15), (12, 15), (15, 12)])
-def test_a_ring_fills_its_block(rows: int, cols: int) -> None:
-    grid = SiteGrid(lattice="square")
-    sites = np.argwhere(make("ring", grid, rows=rows, cols=cols).fill)
-    height, width = np.ptp(sites, axis=0) + 1
-    assert max(height, width) == min(rows, cols)
 
 
 @pytest.mark.parametrize("name", [*TRIANGULAR, *ANYWHERE])

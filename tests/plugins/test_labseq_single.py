@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from labseq_single.planner import layers, travel
+from labseq_single.planner import travel
 from scipy.optimize import linear_sum_assignment
 
 from labseq.plugin import Occupancy, Plan, TargetPattern
@@ -65,26 +65,6 @@ def test_the_cluster_algorithm_needs_hardly_more_moves_than_there_are_defects_at
 
 
 @each
-def test_a_hole_behind_full_sites_takes_two_moves(name: str) -> None:
-    atoms = np.ones((5, 5), np.bool_)
-    atoms[2, 2] = False
-    plan, report = plan_and_check(SINGLE[name], atoms, in_the_middle(np.ones((3, 3)), (5, 5)))
-    assert report.meets_target
-    assert (len(paths(plan)), distance(plan)) == (2, 2)
-
-
-def test_atoms_go_round_a_corner_in_one_move() -> None:
-    atoms, fill = np.zeros((2, 3, 4), np.bool_)
-    atoms[0, 0] = fill[2, 3] = True
-    atoms[0, 2] = fill[0, 2] = True  # stands in the way along the row
-    target = TargetPattern(fill, np.zeros_like(fill))
-    for planner in (LSAP, HCA):
-        assert paths(plan_and_check(planner, atoms, target)[0]) == [[(0, 0), (2, 0), (2, 3)]]
-    squared = paths(plan_and_check(SQUARED, atoms, target)[0])  # 3 * 3 + 2 * 2 is less than 5 * 5
-    assert squared == [[(0, 2), (0, 3), (2, 3)], [(0, 0), (0, 2)]]
-
-
-@each
 def test_a_surplus_atom_goes_to_the_reservoir_rather_than_out(name: str) -> None:
     clear = np.array([[True, True, True, True, False]])
     target = TargetPattern(np.zeros_like(clear), clear)
@@ -124,13 +104,6 @@ def test_the_squares_prefer_two_short_moves_to_a_long_one() -> None:
     assert [(path[0], path[-1]) for path in paths(plan)] == [((1, 3), (0, 6)), ((0, 0), (1, 3))]
 
 
-def test_a_queue_of_atoms_moves_from_its_front() -> None:
-    atoms, target = in_a_row([1, 1, 1, 0, 0], [0, 0, 1, 1, 1])
-    assert distance(plan_and_check(LSAP, atoms, target)[0]) == 6
-    plan, _ = plan_and_check(SQUARED, atoms, target)
-    assert plan.moves.tolist() == [[0, 2, 0, 4], [0, 1, 0, 3], [0, 0, 0, 2]]
-
-
 def test_compression_fills_from_the_centre_with_the_nearest_atom_outside() -> None:
     atoms, target = in_a_row([1, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 1, 1, 0])
     plan, _ = plan_and_check(COMPRESSION, atoms, target)
@@ -142,8 +115,3 @@ def test_an_atom_in_the_way_goes_into_the_depth_of_a_closed_region() -> None:
     plan, report = plan_and_check(HCA, atoms, target)
     assert report.meets_target
     assert plan.moves[:2].tolist() == [[0, 1, 0, 4], [0, 0, 0, 3]]
-
-
-def test_layers_are_squares_around_the_centre() -> None:
-    order = layers(np.ones((4, 4), np.bool_))
-    assert order[:8].tolist() == [5, 6, 9, 10, 0, 3, 12, 15]

@@ -10,19 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
-from labseq_spcm_sim import M4I6631, SampleSpan, SimulatedCard, install, registers as r
+from hypothesis import given, strategies as st
+from labseq_spcm_sim import M4I6631, SampleSpan, SimulatedCard, registers as r
 from labseq_spcm_sim.fifo_kernels import N_WORDS
 from labseq_spcm_sim.library import CardOutputs
 from labseq_spcm_sim.modes import Buffer, Fifo
 from numpy.typing import NDArray
 
-from labseq import DeviceError
 from labseq.model import RfSamples, RfSpan, RfTones
 from labseq.testing.fakes import FakeClock
 
 RATE_HZ = 625e6
-DELAY_S = 238.5 / RATE_HZ + 16e-9
 BUS = M4I6631.bus_bytes_per_s
 START = r.M2CMD_CARD_START | r.M2CMD_CARD_ENABLETRIGGER
 Samples = NDArray[np.int16]
@@ -98,85 +96,6 @@ def test_the_real_package_opens_the_card_and_knows_it(bench: Any) -> None:
     assert bench.card.sn() == 12345
 
 
-@pytest.mark.parametrize(
-    ("name", "bad"),
-    [
-        ("SPC_MEMSIZE", 1000),
-        ("SPC_MEMSIZE", 1024**3 + 32),
-        ("SPC_SAMPLERATE", 2_000_000_000),
-        ("SPC_SAMPLERATE", 753_000_000),
-        ("SPC_AMP0", 79),
-        ("SPC_AMP1", 2001),
-        ("SPC_CHENABLE", 4),
-        ("SPC_LOOPS", 2**32),
-        ("SPC_TRIG_EXT0_LEVEL0", 10_010),
-        ("SPC_DATA_OUTBUFSIZE", 3000),
-    ],
-)
-def test_a_value_out_of_range_is_refused_and_the_old_one_stays(name: str, bad: int) -> None:
-    card, register = Card(), getattr(r, name)
-    before = card.read(register)
-    assert card.write(register, bad) == r.ERR_VALUE
-    assert name in card.take_error().text
-    assert card.read(register) == before
-
-
-@settings(max_examples=30)
-@given(st.integers(50_000_000, 700_000_000))
-def test_an_inexact_sample_rate_is_rounded_to_8_hz_without_a_report(rate_hz: int) -> None:
-    card = SimulatedCard(FakeClock())
-    assert card.write(r.SPC_SAMPLERATE, rate_hz) == 0
-    code, found = card.read(r.SPC_SAMPLERATE)
-    assert (code, found % 8) == (0, 0)
-    assert abs(found - rate_hz) <= 4
-
-
-def test_the_first_error_locks_the_driver_until_it_is_read() -> None:
-    card = Card()
-    assert card.write(r.SPC_AMP0, 9000) == r.ERR_VALUE
-    assert card.write(r.SPC_AMP0, 600) == r.ERR_LASTERR
-    assert card.read(r.SPC_AMP0) == (r.ERR_LASTERR, 0)
-    error = card.take_error()
-    assert (error.code, error.register, error.value) == (r.ERR_VALUE, r.SPC_AMP0, 9000)
-    assert card.read(r.SPC_AMP0) == (0, 500)
-
-
-def test_kinds_of_refusals_are_told_apart() -> None:
-    card = Card()
-    assert card.refusal(999_999, 1) == r.ERR_REG
-    assert card.read(999_999)[0] == r.ERR_REG
-    card.take_error()
-    assert card.refusal(r.SPC_PCIMEMSIZE, 1) == r.ERR_NOWRITEALLOWED
-    assert card.refusal(r.SPC_CARDMODE, r.SPC_REP_STD_MULTI) == r.ERR_FNCNOTSUPPORTED
-    assert card.refusal(r.SPC_M2CMD, r.M2CMD_CARD_WAITREADY) == r.ERR_FNCNOTSUPPORTED
-    card.command(r.M2CMD_CARD_START)
-    assert card.refusal(r.SPC_SAMPLERATE, 500_000_000) == r.ERR_RUNNING
-    assert card.refusal(r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP) == r.ERR_RUNNING
-    assert card.refusal(r.SPC_M2CMD, r.M2CMD_CARD_START) == r.ERR_SEQUENCE
-    card.set(SPC_AMP0=600)  # the amplitude can change while it runs
-    card.command(r.M2CMD_CARD_STOP)
-    card.command(r.M2CMD_CARD_WRITESETUP)
-
-
-def test_a_reset_puts_everything_back_and_the_outputs_off() -> None:
-    card = Card()
-    card.command(r.M2CMD_CARD_START)
-    assert card.outputs_on == (True, True)
-    card.command(r.M2CMD_CARD_RESET)
-    assert not card.running
-    assert card.outputs_on == (False, False)
-    assert card.read(r.SPC_AMP0) == (0, 1000)
-    last = card.log[-1]
-    assert (last.time_s, last.register, last.value) == (0.02, r.SPC_M2CMD, r.M2CMD_CARD_RESET)
-
-
-def test_names_of_real_devices_and_names_that_are_taken_are_refused(bench: Any) -> None:
-    with pytest.raises(DeviceError, match="does not begin with 'simulated'"):
-        install(SimulatedCard(bench.clock), "/dev/spcm0")
-    with pytest.raises(DeviceError, match="is taken"):
-        install(SimulatedCard(bench.clock), bench.name)
-
-
 def test_a_fault_of_the_simulator_is_reported(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(bench.sim, "write", lambda *_: 1 / 0)
@@ -240,73 +159,6 @@ def test_real_and_simulated_cards_work_in_one_process() -> None:
     assert (done.stdout, done.returncode) == ("done\n", 0), done.stderr
 
 
-def test_the_samples_of_two_channels_are_played_after_the_delay_of_the_trigger() -> None:
-    card, samples = Card(), sines(6400)
-    card.upload(samples)
-    assert np.array_equal(card.memory, samples)
-    start_s = card.clock.now()
-    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
-    card.clock.sleep(DELAY_S + 6400 / RATE_HZ - 1e-9)
-    assert card.running
-    card.clock.sleep(2e-9)
-    assert card.status() & r.M2STAT_CARD_READY
-    for channel in (0, 1):
-        (span,) = card.spans(channel)
-        assert span.start_s == pytest.approx(start_s + DELAY_S, abs=1e-12)
-        assert span.amplitude_v == 0.5
-        assert np.array_equal(span.values(), samples[:, channel])
-
-
-def test_a_transfer_takes_the_time_of_the_bus_and_its_buffer_is_used_once() -> None:
-    card, n_frames = Card(), 700_000 // 4 * 32
-    assert card.refusal(r.SPC_M2CMD, r.M2CMD_DATA_STARTDMA) == r.ERR_SEQUENCE
-    card.set(SPC_MEMSIZE=n_frames)
-    card.define(n_frames)
-    card.command(r.M2CMD_DATA_STARTDMA)
-    card.clock.sleep(4 * n_frames / BUS - 1e-6)
-    assert not card.status() & r.M2STAT_DATA_END
-    card.clock.sleep(2e-6)
-    assert card.status() & r.M2STAT_DATA_END
-    assert card.refusal(r.SPC_M2CMD, r.M2CMD_DATA_STARTDMA) == r.ERR_SEQUENCE
-
-
-@pytest.mark.parametrize(("n_frames", "notify_bytes"), [(8192, 0), (4096, 1100)])
-def test_a_transfer_longer_than_the_memory_and_an_odd_notify_size_are_refused(
-    n_frames: int, notify_bytes: int
-) -> None:
-    card = Card(SPC_MEMSIZE=4096)
-    assert card.define(n_frames, notify_bytes) in (r.ERR_VALUE, r.ERR_NOTIFYSIZE)
-
-
-def endless() -> Card:
-    """A card that plays until its stop."""
-    card = Card(SPC_LOOPS=0)
-    card.upload(sines(6400))
-    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
-    return card
-
-
-def test_endless_loops_repeat_the_memory_until_the_stop() -> None:
-    card = endless()
-    card.clock.sleep(DELAY_S + 16000 / RATE_HZ)
-    card.command(r.M2CMD_CARD_STOP)
-    card.clock.sleep(1.0)
-    (span,) = card.spans(1)
-    assert span.n_samples in (15999, 16000)
-    assert np.array_equal(span.values(), np.tile(sines(6400)[:, 1], 3)[: span.n_samples])
-
-
-@pytest.mark.parametrize(("voltage_v", "accepted"), [(3.3, True), (1.4, False), (-3.3, False)])
-def test_a_pulse_triggers_only_if_it_crosses_the_level(voltage_v: float, accepted: bool) -> None:
-    card = Card(SPC_TRIG_ORMASK=r.SPC_TMASK_EXT0, SPC_TRIG_EXT0_MODE=r.SPC_TM_POS, SPC_TRIG_EXT0_LEVEL0=1500)
-    card.upload(sines(64))
-    card.command(r.M2CMD_CARD_START)
-    assert not card.trigger(voltage_v)  # not enabled yet
-    card.command(r.M2CMD_CARD_ENABLETRIGGER)
-    assert card.trigger(voltage_v) is accepted
-    assert bool(card.status() & r.M2STAT_CARD_TRIGGER) is accepted
-
-
 def test_a_relay_changes_only_when_the_set_up_is_written_or_the_card_starts() -> None:
     card = Card(SPC_LOOPS=0)
     card.command(r.M2CMD_CARD_RESET)
@@ -330,94 +182,6 @@ def test_a_relay_changes_only_when_the_set_up_is_written_or_the_card_starts() ->
     card.clock.sleep(10e-6)
     assert not card.spans(0)
     assert card.spans(1)
-
-
-@pytest.mark.parametrize(
-    ("steps_mv", "gaps"),
-    [((1000, 480, 420), 0), ((1000, 419), 1), ((400, 480), 0), ((400, 481), 1), ((400, 450, 481, 450), 1)],
-)
-def test_changing_the_amplifier_path_puts_the_output_off_for_10_ms(
-    steps_mv: tuple[int, ...], gaps: int
-) -> None:
-    card = Card(SPC_AMP0=steps_mv[0], SPC_LOOPS=0)
-    card.upload(sines(64))
-    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
-    card.clock.sleep(0.05)
-    for step_mv in steps_mv[1:]:
-        card.set(SPC_AMP0=step_mv)
-        card.clock.sleep(0.05)
-    spans = card.spans()
-    pauses_s = [after.start_s - before.end_s for before, after in itertools.pairwise(spans)]
-    assert [pause_s for pause_s in pauses_s if pause_s > 1e-6] == pytest.approx([10e-3] * gaps)
-    assert spans[-1].amplitude_v == steps_mv[-1] / 1000
-
-
-NOTIFY = 4096
-"""Samples per channel and block of a stream."""
-
-
-class Stream(Card):
-    """A card in FIFO mode and a ring of blocks, filled with a count of the blocks."""
-
-    def __init__(self, n_blocks: int = 8, **setup: int) -> None:
-        super().__init__(r.SPC_REP_FIFO_SINGLE, **({"SPC_LOOPS": 0, "SPC_SAMPLERATE": 500_000_000} | setup))
-        assert self.define(n_blocks * NOTIFY, 4 * NOTIFY) == r.ERR_OK
-        self.n_sent = 0
-
-    @property
-    def n_free(self) -> int:
-        """Blocks that are free."""
-        return int(self.read(r.SPC_DATA_AVAIL_USER_LEN)[1]) // (4 * NOTIFY)
-
-    def fill(self, n_blocks: int) -> None:
-        for _ in range(n_blocks):
-            first = self.n_sent * NOTIFY % len(self.ring)
-            self.n_sent += 1
-            self.ring[first : first + NOTIFY] = self.n_sent
-            self.set(SPC_DATA_AVAIL_CARD_LEN=4 * NOTIFY)
-
-    def start(self, n_blocks: int) -> None:
-        """Play, once so many blocks are on the card."""
-        self.fill(n_blocks)
-        self.command(r.M2CMD_DATA_STARTDMA)
-        self.clock.sleep(n_blocks * 4 * NOTIFY / BUS)
-        self.command(START | r.M2CMD_CARD_FORCETRIGGER)
-
-    def values(self) -> Samples:
-        return np.concatenate([span.values() for span in self.spans()])
-
-
-def test_an_underrun_stops_the_output_until_a_new_stream_is_played() -> None:
-    stream = Stream()
-    stream.start(4)
-    stream.clock.sleep(5e-3)
-    assert stream.status() & (r.M2STAT_DATA_OVERRUN | r.M2STAT_CARD_READY) == (
-        r.M2STAT_DATA_OVERRUN | r.M2STAT_CARD_READY
-    )
-    assert len(stream.values()) == 4 * NOTIFY
-    assert stream.refusal(r.SPC_DATA_AVAIL_CARD_LEN, 4 * NOTIFY) == r.ERR_SEQUENCE
-    assert stream.refusal(r.SPC_M2CMD, START) == r.ERR_SEQUENCE
-    stream.define(8 * NOTIFY, 4 * NOTIFY)
-    assert not stream.status() & r.M2STAT_DATA_OVERRUN
-    stream.n_sent = 0
-    stream.start(8)
-    stream.clock.sleep(5 * NOTIFY / 500e6)
-    assert stream.running
-    assert len(stream.values()) > 8 * NOTIFY
-
-
-def test_the_ring_is_free_again_in_whole_blocks_and_no_more_is_taken_than_is_free() -> None:
-    stream = Stream(SPC_DATA_OUTBUFSIZE=64 * 1024)
-    stream.fill(8)
-    assert stream.n_free == 0
-    assert stream.write(r.SPC_DATA_AVAIL_CARD_LEN, 4 * NOTIFY) == r.ERR_VALUE
-    assert "expected 0 to 0 bytes" in stream.take_error().text
-    stream.command(r.M2CMD_DATA_STARTDMA)
-    stream.clock.sleep(1.5 * 16384 / BUS)
-    assert stream.n_free == 1
-    stream.clock.sleep(1.0)
-    assert stream.n_free == 4
-    assert stream.refusal(r.SPC_M2CMD, r.M2CMD_CARD_START | r.M2CMD_DATA_STARTDMA) == r.ERR_SEQUENCE
 
 
 @given(

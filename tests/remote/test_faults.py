@@ -181,10 +181,10 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
     faulty.is_cut = True
     monkeypatch.setattr(labseq.remote.server, "LOST_S", 0.3)
     for name, device in devices.items():
-        device._link.connect()._lost_s = 0.3
+        device.link.connect()._lost_s = 0.3
         until(lambda name=name: any(f"{name}: the" in text for text in server.told[n_told:]))
         assert "made safe" in next(text for text in server.told[n_told:] if f"{name}: the" in text)
-        until(lambda device=device: bool(device._link.connect().lost))
+        until(lambda device=device: bool(device.link.connect().lost))
         with pytest.raises(DeviceError, match=rf"^{name}: the connection is lost.*127\.0\.0\.2"):
             device.safe_state()
         with suppress(DeviceError):
@@ -197,7 +197,7 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
 
 def test_a_lost_reply_ends_the_connection(server: Served, faulty: Proxy) -> None:
     with instrument(server, PROXY) as device:
-        device._link.connect()._lost_s = 0.5
+        device.link.connect()._lost_s = 0.5
         faulty.reply_fault = lambda message: [] if b"waits" in message[0] else [message]
         with pytest.raises(DeviceError, match="no reply"):
             device.command("open")
@@ -285,7 +285,7 @@ def test_a_server_that_has_ended_is_not_waited_for_again(tmp_path: Path) -> None
         settings = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{one.port}")
         simulation = RemoteSimulation(settings, context)
         simulation.open()
-        connection = simulation._link.connect()
+        connection = simulation.link.connect()
     until(lambda: bool(connection.lost))
     begun_s = time.monotonic()
     with pytest.raises(DeviceError, match="the server has ended"):
@@ -555,7 +555,7 @@ def test_a_device_has_one_server_and_is_switched_off_when_that_is_killed(tmp_pat
     with pytest.raises(DeviceError, match=r"^laser: the connection is lost: the server has ended"):
         [device.read("power") for _ in range(1000)]
     until((tmp_path / "off").exists)
-    device._link.end()
+    device.link.end()
 
 
 def test_a_port_that_is_taken_is_named(server: Served, tmp_path: Path) -> None:
