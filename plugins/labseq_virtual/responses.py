@@ -1,17 +1,16 @@
 """How atoms respond to moves and ramps: tables made from the simulation in three dimensions.
 
 Each table gives the loss and the ratio of the temperatures after and before, on a grid of the axes below. It
-belongs to a static tweezer of :data:`REFERENCE`. Other depths and waists follow by the scaling of Newton's
-equations: lengths in waists, energies in depths, times in periods of the static tweezer. Temperatures are
-those that the atom has in the static tweezer, or would have if it were brought back there adiabatically.
+belongs to a static tweezer of ``DEPTH_K`` and ``WAIST_M``. Other depths and waists follow by the scaling of
+Newton's equations: lengths in waists, energies in depths, times in periods of the static tweezer. Temperatures
+are those that the atom has in the static tweezer, or would have if it were brought back there adiabatically.
 
-``response_tables.py`` makes them.
+``docs/make_response_tables.py`` makes them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -37,29 +36,6 @@ REFERENCE_SPEED_M_S: Final = 0.13
 """The paper's speed."""
 TRANSIT_S: Final = 10e-6
 """Transit time of the sound that the tables belong to."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """The tweezers that the tables belong to; lengths in metres, ``depth`` in kelvin."""
-
-    depth: float = DEPTH_K
-    waist: float = WAIST_M
-    spacing: float = SITE_M
-    static_wavelength: float = 808e-9
-    mobile_wavelength: float = 852e-9
-
-    @property
-    def beams(self) -> Floats:
-        """Waist and Rayleigh length of the static tweezers, then of the mobile ones, (4,)."""
-        static, mobile = (
-            math.pi * self.waist**2 / wavelength
-            for wavelength in (self.static_wavelength, self.mobile_wavelength)
-        )
-        return np.array([self.waist, static, self.waist, mobile])
-
-
-REFERENCE: Final = Reference()
 
 RAMPS_S: Final = (0.0, 10e-6, 20e-6, 40e-6, 60e-6, 80e-6, 160e-6)
 AWAY: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.6, 2.3)

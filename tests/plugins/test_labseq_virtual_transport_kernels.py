@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import event, given, settings, strategies as st
-from labseq_virtual import response_tables, tweezer_kernels as kernels
+from labseq_virtual import tweezer_kernels as kernels
 from labseq_virtual.handover import (
     AT_REST,
     EMPTY,
@@ -29,8 +28,7 @@ from labseq_virtual.handover import (
     pair_survival,
 )
 from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by, relaxed
-from labseq_virtual.response_tables import drop_off, landing, passing, pick_up, transport
-from labseq_virtual.responses import REFERENCE, move_tables
+from labseq_virtual.responses import move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
 from labseq_virtual.transport_kernels import max_drop_offs, one_left
@@ -38,6 +36,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from labseq import MotionSpec, SiteGrid, ToneProgram
+from tests.docs.scripts import load_script
 
 from .rf import ON, ToneProgramBuilder
 
@@ -436,7 +435,9 @@ def test_a_static_tweezer_that_is_off_holds_nothing_back() -> None:
     assert risks(course_of(), static=0.0)[0] == 1.0
 
 
+SCRIPT = load_script("make_response_tables")
 PICK_UP, DROP_OFF, TRANSPORT, LANDING, PASSING, STARTING, STOPPING = range(7)
+"""Stages of a move, in the order of the script."""
 BETWEEN = [
     (PICK_UP, (30e-6, 0.7, 6.0, 17e-6)),
     (PICK_UP, (6e-6, 1.1, 9.0, 23e-6)),
@@ -458,9 +459,7 @@ BETWEEN = [
 
 @pytest.mark.parametrize(("stage", "args"), BETWEEN)
 def test_between_the_points_of_the_tables_atoms_fare_as_newtons_equations_say(stage: int, args: Any) -> None:
-    sudden = (partial(response_tables.at_once, is_stop) for is_stop in (False, True))
-    stages: tuple[Any, ...] = pick_up, drop_off, transport, landing, passing, *sudden
-    lost, warmer = stages[stage](*args, REFERENCE)
+    lost, warmer = [*SCRIPT.STAGES.values()][stage](*args, SCRIPT.REFERENCE)
     first, other, ratio, heat = args
     physics, depth_k, tables = constants_of(static_waist=WAIST_M), 300e-6, move_tables()
     mobile_k = ratio * depth_k

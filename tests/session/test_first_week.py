@@ -36,7 +36,7 @@ IMAGE_HZ = -math.log1p(-0.00314) / 45e-3 + 1 / 33
         ),  # the law is a simple one
         ("transport_speed", "analysis.survival.survival", "step", "centre", 0.35, 0.03),
         ("parking", SURVIVAL, "plateau", "centre", 0.0, 0.01e-6),
-        # the same fit to flights (response_tables.pick_up and drop_off) 0.9 um beside a site, at 15 uK
+        # the same fit to flights (docs/make_response_tables.py) 0.9 um beside a site, at 15 uK
         ("hand_over_ramp", SURVIVAL, "gaussian", "sigma", 24.2e-6, 1e-6),
     ],
 )

@@ -1,6 +1,8 @@
-"""Makes the tables of ``responses.npz`` from atoms moved by Newton's equations: see ``responses.py``.
+"""Make the tables ``responses.npz`` of the virtual lab from atoms moved by Newton's equations.
 
-    python -m labseq_virtual.response_tables [TABLE ...]
+    python docs/make_response_tables.py [TABLE ...]
+
+They are those of ``labseq_virtual/responses.py``.
 
 Each stage of a move is simulated on its own, with the forces of ``flight_kernels.py``: atoms start from the
 thermal distribution of the tweezer that they are in. The sound smooths amplitudes and positions in the AOD as
@@ -15,12 +17,17 @@ import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
 from typing import Any, Final
 
 import numpy as np
+from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
+from labseq_virtual.flight_kernels import GONE, HIGH, VECTOR, energies, move
+from labseq_virtual.responses import AXES, DEPTH_K, SITE_M, START_RAMPS_S, TABLES, TRANSIT_S, WAIST_M
+from labseq_virtual.rf_analysis import HOPS, RfPulse
+from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
 from labseq.plugin import (
@@ -32,13 +39,10 @@ from labseq.plugin import (
     RfSpec,
     SiteGrid,
     ToneProgram,
+    kernel,
     render,
     tone_program,
 )
-from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
-from labseq_virtual.responses import AXES, REFERENCE, START_RAMPS_S, TABLES, TRANSIT_S, Reference
-from labseq_virtual.rf_analysis import HOPS, RfPulse
-from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
 
@@ -62,6 +66,68 @@ LENGTHS: Final = (3, 4, 5, 6)
 """Lengths of the moves in sites: several, as the kicks at start and stop interfere."""
 
 
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The tweezers that the tables belong to; lengths in metres, ``depth`` in kelvin."""
+
+    depth: float = DEPTH_K
+    waist: float = WAIST_M
+    spacing: float = SITE_M
+    static_wavelength: float = 808e-9
+    mobile_wavelength: float = 852e-9
+
+    @property
+    def beams(self) -> Floats:
+        """Waist and Rayleigh length of the static tweezers, then of the mobile ones, (4,)."""
+        static, mobile = (
+            math.pi * self.waist**2 / wavelength
+            for wavelength in (self.static_wavelength, self.mobile_wavelength)
+        )
+        return np.array([self.waist, static, self.waist, mobile])
+
+
+REFERENCE: Final = Reference()
+
+
+@kernel(f"void(float64[:, ::1], {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, float64, int64, float64)")
+def follow_in_row(
+    state: Floats,
+    static: Floats,
+    mobile: Floats,
+    place: Floats,
+    spacing: float,
+    beams: Floats,
+    frame_s: float,
+    n_steps: int,
+    aside: float,
+) -> None:
+    """Follow atoms, each alone, in a row of static tweezers along x and one mobile tweezer that moves along.
+
+    Args:
+        state: The atoms, (n_atoms, 6); changed in place. Those that are far away stop.
+        static: Depth of the static tweezers in each frame (n_frames,).
+        mobile: Depth of the mobile tweezer, likewise.
+        place: Its position, likewise.
+        spacing: Distance of the static tweezers.
+        beams: The beams.
+        frame_s: Time from frame to frame.
+        n_steps: Integration steps from frame to frame.
+        aside: Distance of the mobile tweezer from the row, along y.
+    """
+    site, tweezer = np.zeros(2), np.zeros(9)
+    tweezer[1] = aside
+    for i in range(len(state)):
+        for k in range(len(static) - 1):
+            atom = state[i]
+            site[0] = spacing * round(atom[0] / spacing)
+            tweezer[0], tweezer[2] = place[k], place[k + 1] - place[k]
+            tweezer[4], tweezer[5], tweezer[7] = 1.0, 1.0, mobile[k]
+            tweezer[8] = mobile[k + 1] - mobile[k]
+            move(atom, site, 0.5 * (static[k] + static[k + 1]), tweezer, beams, frame_s, n_steps)
+            if abs(atom[2]) > 2.0 * HIGH * beams[1] or abs(atom[1]) > 4.0 * GONE * beams[0]:
+                break
+
+
 def smoothed(course: Floats) -> Floats:
     """A course as the sound of the AOD shows it: averaged over the beam."""
     half = int(4 * SOUND_S / FRAME_S)
@@ -72,16 +138,12 @@ def smoothed(course: Floats) -> Floats:
 
 def fly(state: Floats, static: Floats, mobile: Floats, place: Floats, at: Reference) -> None:
     """Move atoms in a row of static tweezers and a mobile one; depths in kelvin, for each frame."""
-    from labseq_virtual.flight_kernels import follow_in_row
-
     steps = max(1, round(FRAME_S / STEP_S))
     follow_in_row(state, KELVIN * static, KELVIN * mobile, place, at.spacing, at.beams, FRAME_S, steps, 0.0)
 
 
 def energy_k(state: Floats, depth: float, place: float, at: Reference, *, is_mobile: bool) -> Floats:
     """Energy of atoms above the bottom of a tweezer, in kelvin."""
-    from labseq_virtual.flight_kernels import energies
-
     waist, rayleigh = at.beams[2:] if is_mobile else at.beams[:2]
     sites = np.tile([place, 0.0], (len(state), 1))
     total = energies(state, sites, np.full(len(state), KELVIN * depth), waist, rayleigh)
@@ -230,8 +292,6 @@ def transport(
     course: int, speed: float, ratio: float, temperature: float, at: Reference
 ) -> tuple[float, float]:
     """An atom is carried from site to site over empty ones; curved courses over four sites."""
-    from labseq_virtual.flight_kernels import follow_in_row
-
     lengths = LENGTHS if course == FrequencyCourse.LINEAR else (4,)
     before, after = list[Floats](), list[Floats]()
     whole = (1 + ratio) * at.depth
@@ -257,8 +317,6 @@ def sudden(
     ramps_s: tuple[float, float], speed: float, ratio: float, temperature: float, at: Reference
 ) -> tuple[float, float]:
     """An atom is carried over several sites, with ramps directly before and after the move."""
-    from labseq_virtual.flight_kernels import follow_in_row
-
     before, after = list[Floats](), list[Floats]()
     frame_s = TRANSIT_S / HOPS
     for length in LENGTHS:
@@ -323,8 +381,6 @@ def passing(
     speed: float, beside: float, ratio: float, temperature: float, at: Reference
 ) -> tuple[float, float]:
     """A mobile tweezer passes beside an atom, from four waists before it to four behind."""
-    from labseq_virtual.flight_kernels import follow_in_row
-
     far = 4 * at.waist
     n = math.ceil(2 * far / speed / FRAME_S)
     state = np.concatenate([draw(at.depth, temperature, at, seed, is_mobile=False) for seed in range(5)])
