@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -356,6 +356,10 @@ def _too_late(cooling: Cooling, temperature_k: float) -> str:
     return f"{text}; look after its cooling water or fan, or choose a higher temperature"
 
 
+BeginExposure: TypeAlias = Callable[[float | None, float | None], object]
+"""Begins an exposure at a time of the session's clock, None for now, of a length, None for the series'."""
+
+
 class SimulatedSensor:
     """Exposes the simulation for a camera, and knows when each frame could be read.
 
@@ -382,6 +386,7 @@ class SimulatedSensor:
         readout_s: float,
         period_s: float | None = None,
         arm_s: float = 0.0,
+        cycle_s: float = 0.0,
     ) -> None:
         """Get ready for a series; frames not yet taken are dropped.
 
@@ -393,6 +398,7 @@ class SimulatedSensor:
             period_s: With the internal trigger, from one exposure to the next, in seconds; shorter than
                 both together where they overlap.
             arm_s: Time that this takes, in seconds.
+            cycle_s: After the edge that starts a series, from one exposure to the next, in seconds.
         """
         self._clock.sleep(arm_s)
         with self._lock:
@@ -401,6 +407,40 @@ class SimulatedSensor:
             self._period_s = series.exposure_s + readout_s if period_s is None else period_s
             self._n_exposed = 0
             self._armed_s = self._clock.now()
+            self._cycle_s, self._cycles_from_s = cycle_s, math.nan
+
+    def follow_line(self, expose: BeginExposure) -> None:
+        """Have the line at the trigger input start the exposures of the series.
+
+        Args:
+            expose: Begins one, for as long as the series says or, with bulb, as the line is on.
+        """
+
+        def on_pulse(t_s: float, width_s: float) -> None:
+            trigger = "" if self._series is None else self._series.trigger
+            if trigger == "external_start" and math.isnan(self._cycles_from_s):  # later ones do not count
+                self._cycles_from_s = t_s
+            elif trigger in ("external", "bulb"):
+                expose(t_s, width_s if trigger == "bulb" else None)
+
+        self._world.wire("camera", on_pulse)
+
+    def expose_next(self, expose: BeginExposure, timeout_s: float) -> None:
+        """Begin the exposure that the camera times by itself, unless a frame is still to be taken.
+
+        With the internal trigger that is the next one of the series; after the edge that starts a series its
+        time is waited for, for at most ``timeout_s``.
+        """
+        series = self._series
+        if series is None or self._frames or self._n_exposed == series.n_frames:
+            return
+        if series.trigger == "internal":
+            expose(None, None)
+        elif not math.isnan(self._cycles_from_s):
+            t_s = self._cycles_from_s + self._n_exposed * self._cycle_s
+            self._clock.sleep(max(0.0, min(t_s - self._clock.now(), timeout_s)))
+            if t_s <= self._clock.now():
+                expose(t_s, None)
 
     def expose(
         self, late_s: float = 0.0, t_start_s: float | None = None, exposure_s: float | None = None
@@ -459,7 +499,8 @@ class SimulatedSensor:
             self._frames.clear()
             self._series: Series | None = None
             self._mode = SensorMode()
-            self._readout_s = self._period_s = self._armed_s = 0.0
+            self._readout_s = self._period_s = self._armed_s = self._cycle_s = 0.0
+            self._cycles_from_s = math.nan
             self._n_exposed = 0
 
 

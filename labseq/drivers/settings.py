@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_
 
 from labseq.drivers import Cooling
 from labseq.errors import ConfigError, LimitError
-from labseq.model import Flip, Orientation, SensorMode
+from labseq.model import CameraFacts, Flip, Orientation, SensorMode
 from labseq.roles import Context, Simulation, offers
 from labseq.settings import Duration, PositiveDuration, Settings, Temperature
 from labseq.units import ZERO_CELSIUS_K, format_quantity
@@ -23,6 +23,8 @@ class RegionSettings(Settings):
     width: PositiveInt = Field(description="number of columns")
 
 
+TRIGGERS: Final = ("software", "internal", "external", "external_start", "bulb")
+"""All that may start exposures."""
 _ARMING_TIME: Final = (
     "time from arming for a series until it can be triggered, for budgets; simulated cameras take so long"
 )
@@ -84,6 +86,31 @@ class CameraSettings(OrientationSettings):
         if sensor_shape is None and self.region is None:
             return None
         return self.orientation.shape(self.mode.frame_shape(sensor_shape or (0, 0)))
+
+    def facts(
+        self,
+        readout_s: float,
+        frame_shape: tuple[int, int] | None,
+        triggers: tuple[str, ...] = TRIGGERS,
+        **more: float,
+    ) -> CameraFacts:
+        """The facts about the camera: what its driver knows, and the rest from here.
+
+        Args:
+            readout_s: From the end of an exposure until the frame can be read, in seconds.
+            frame_shape: (height, width) of the images; None if not known.
+            triggers: What may start its exposures.
+            **more: Further attributes of :class:`labseq.plugin.CameraFacts`, such as ``em_gain``.
+        """
+        settings = {
+            "max_exposure_s": self.max_exposure,
+            "arm_s": self.arming_time,
+            "cycle_s": self.cycle_time or 0.0,
+        }
+        known = {**settings, **more}
+        return CameraFacts(
+            readout_s, frame_shape=frame_shape, triggers=triggers, line_trigger=self.line_trigger, **known
+        )
 
     def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
         """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""

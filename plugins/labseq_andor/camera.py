@@ -101,17 +101,8 @@ class AndorCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Limits of the camera; the read-out time is an estimate before ``open()``, then the SDK's value."""
         shape = self._settings.frame_shape(self._sensor_shape)
-        settings = self._settings
-        return CameraFacts(
-            self._readout_s,
-            self._max_exposure_s,
-            shape,
-            float(settings.em_gain),
-            self._triggers,
-            arm_s=settings.arming_time,
-            line_trigger=settings.line_trigger,
-            cycle_s=settings.cycle_time or 0.0,
-        )
+        known = {"max_exposure_s": self._max_exposure_s, "em_gain": float(self._settings.em_gain)}
+        return self._settings.facts(self._readout_s, shape, self._triggers, **known)
 
     def warm(self) -> None:
         """Import pylablib, which takes seconds."""

@@ -40,18 +40,8 @@ class GenicamCamera(CameraDriver):
         shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
         known = self._connection.min_exposure_s, self._settings.max_exposure
         shortest_s, longest_s = self._reported.get("exposure_bounds_s", known)
-        longest_s = min(longest_s, self._settings.max_exposure)
-        triggers = ("software", "internal", "external", "external_start", "bulb")
-        return CameraFacts(
-            self._settings.readout,
-            longest_s,
-            shape,
-            triggers=triggers,
-            min_exposure_s=shortest_s,
-            arm_s=self._settings.arming_time,
-            line_trigger=self._settings.line_trigger,
-            cycle_s=self._settings.cycle_time or 0.0,
-        )
+        bounds_s = {"min_exposure_s": shortest_s, "max_exposure_s": min(longest_s, known[1])}
+        return self._settings.facts(self._settings.readout, shape, **bounds_s)
 
     def warm(self) -> None:
         """Do slow work that can be done before the camera is opened."""

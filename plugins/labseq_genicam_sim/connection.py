@@ -62,7 +62,7 @@ class SimulatedConnection(CameraConnection):
         self._series: Series | None = None
         self._edge_s: float | None = None
         self._width_s: float | None = None
-        self._cycles_from_s, self._cycle_s = math.nan, settings.cycle_time or 0.0
+        self._cycle_s = settings.cycle_time or 0.0
         self._due: Frame | None = None
         self._n_exposed = self._n_due = 0
 
@@ -97,9 +97,9 @@ class SimulatedConnection(CameraConnection):
         self._series, self._acquisition = series, acquisition
         arm_s = 0.0 if acquisition.is_running else self._arm_s
         own_period_s = None if math.isnan(period_s) else period_s
-        self._sensor.arm(series, self._mode, self._readout_s, own_period_s, arm_s)
+        self._sensor.arm(series, self._mode, self._readout_s, own_period_s, arm_s, self._cycle_s)
         if series.trigger not in ("software", "internal"):
-            self._world.wire("camera", self._on_pulse)
+            self._sensor.follow_line(self._fire_at)
 
     def fire(self, acquisition: Acquisition) -> None:
         """Trigger an exposure, and return when it has begun on the session's clock.
@@ -128,7 +128,6 @@ class SimulatedConnection(CameraConnection):
         self._sensor.clear()
         self._made.clear()
         self._series = self._edge_s = self._width_s = self._due = None
-        self._cycles_from_s = math.nan
         self._n_exposed = self._n_due = 0
 
     def _wait_until_due(self, timeout_s: float) -> float | None:
@@ -139,13 +138,7 @@ class SimulatedConnection(CameraConnection):
         if self.trigger_of(series) != "software":
             return timeout_s  # only the camera knows when it exposes
         start_s = self._clock.now()
-        if series.trigger == "internal" and self._n_exposed == self._n_due:
-            self.fire(self._acquisition)
-        elif not math.isnan(self._cycles_from_s) and self._n_exposed == self._n_due < series.n_frames:
-            self._edge_s = self._cycles_from_s + self._n_exposed * self._cycle_s
-            self._clock.sleep(max(0.0, min(self._edge_s - start_s, timeout_s)))
-            if self._edge_s <= self._clock.now():
-                self.fire(self._acquisition)
+        self._sensor.expose_next(self._fire_at, timeout_s)
         timeout_s = max(0.0, timeout_s - (self._clock.now() - start_s))
         if self._due is None:
             self._take(timeout_s)
@@ -162,13 +155,10 @@ class SimulatedConnection(CameraConnection):
         self._due = self._sensor.take(timeout_s)
         self._n_due += self._due is not None
 
-    def _on_pulse(self, t_s: float, width_s: float) -> None:
-        """A pulse of the line that is connected to the trigger input; the start of a series counts once."""
-        trigger = "" if self._series is None else self._series.trigger
-        if trigger == "external_start" and math.isnan(self._cycles_from_s):
-            self._cycles_from_s = t_s
-        elif trigger in ("external", "bulb") and self._acquisition is not None:
-            self._edge_s, self._width_s = t_s, width_s if trigger == "bulb" else None
+    def _fire_at(self, t_s: float | None, exposure_s: float | None) -> None:
+        """Begin an exposure at a time of the session's clock, None for now or its turn."""
+        if self._acquisition is not None:
+            self._edge_s, self._width_s = t_s, exposure_s
             self.fire(self._acquisition)
 
     def _expose(self, exposure: Exposure) -> NDArray[np.uint16]:

@@ -37,17 +37,7 @@ class PylonCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Read-out time and longest exposure of the settings; shape of the frames as soon as it is known."""
         shape = self._reported.get("frame_shape") or self._settings.frame_shape(self._connection.sensor_shape)
-        triggers = ("software", "internal", "external", "external_start", "bulb")
-        settings = self._settings
-        times = settings.readout, settings.max_exposure
-        return CameraFacts(
-            *times,
-            shape,
-            triggers=triggers,
-            arm_s=settings.arming_time,
-            line_trigger=settings.line_trigger,
-            cycle_s=settings.cycle_time or 0.0,
-        )
+        return self._settings.facts(self._settings.readout, shape)
 
     def warm(self) -> None:
         """Import pylon, which takes seconds."""

@@ -8,7 +8,6 @@ is what that exposure sees. A file that was read is not read again in the same s
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import struct
@@ -68,8 +67,7 @@ class EmulatedCamera(CameraConnection):
         self._nodes: Nodes | None = None
         self._bits = 16
         self._trigger: Trigger = "software"
-        self._cycles_from_s, self._cycle_s = math.nan, settings.cycle_time or 0.0
-        self._n_exposed = self._n_due = self._n_frames = 0
+        self._n_exposed = self._n_frames = 0
         self._is_wired = trigger_line(context.lines, "camera") is not None
 
     def warm(self) -> None:
@@ -109,7 +107,7 @@ class EmulatedCamera(CameraConnection):
         """
         assert self._nodes is not None
         nodes, self._bits, self._trigger = self._nodes, BITS[pixel_format], series.trigger
-        self._n_exposed, self._n_due, self._n_frames = 0, 0, series.n_frames
+        self._n_exposed, self._n_frames = 0, series.n_frames
         for number in range(series.n_frames):
             self._path(number).touch()
         nodes.get("image file", "ImageFilename").SetValue(str(self._path(0).parent))
@@ -117,17 +115,10 @@ class EmulatedCamera(CameraConnection):
         node = nodes.get("exposure", "ExposureTimeAbs")
         own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
         node.SetValue(node.Min if self._clock.virtual else own_us)
-        self._cycles_from_s = math.nan
         if series.trigger not in ("software", "internal"):
-            self._world.wire("camera", partial(self._on_pulse, acquisition))
-        self._sensor.arm(series, self._mode, self._readout_s, arm_s=self._settings.arming_time)
-
-    def _on_pulse(self, acquisition: Acquisition, t_s: float, width_s: float) -> None:
-        """A pulse of the line at the trigger input; the start of a series counts once."""
-        if self._trigger != "external_start":
-            self.fire(acquisition, t_s, width_s if self._trigger == "bulb" else None)
-        elif math.isnan(self._cycles_from_s):
-            self._cycles_from_s = t_s
+            self._sensor.follow_line(partial(self.fire, acquisition))
+        arm_s, cycle_s = self._settings.arming_time, self._settings.cycle_time or 0.0
+        self._sensor.arm(series, self._mode, self._readout_s, arm_s=arm_s, cycle_s=cycle_s)
 
     def fire(
         self, acquisition: Acquisition, t_s: float | None = None, exposure_s: float | None = None
@@ -147,17 +138,10 @@ class EmulatedCamera(CameraConnection):
         if self._trigger not in ("software", "internal") and not self._is_wired:
             return super().wait(acquisition, timeout_s)
         start_s = self._clock.now()
-        if self._trigger == "internal" and self._n_exposed == self._n_due:
-            self.fire(acquisition)
-        elif not math.isnan(self._cycles_from_s) and self._n_exposed == self._n_due:
-            due_s = self._cycles_from_s + self._n_exposed * self._cycle_s
-            self._clock.sleep(max(0.0, min(due_s - start_s, timeout_s)))
-            if due_s <= self._clock.now():
-                self.fire(acquisition, due_s)
+        self._sensor.expose_next(partial(self.fire, acquisition), timeout_s)
         frame = self._sensor.take(max(0.0, timeout_s - (self._clock.now() - start_s)))
         if frame is None:
             return None
-        self._n_due += 1
         taken = wait_for(acquisition.poll, MAX_WAIT_S, self._clock)
         if taken is None:
             return None

@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, Final
 
 from labseq.plugin import (
@@ -19,7 +18,6 @@ from labseq.plugin import (
     SensorMode,
     Series,
     SimulatedSensor,
-    Trigger,
     offers,
     settle,
     trigger_line,
@@ -108,8 +106,6 @@ class VirtualCamera(CameraDriver):
         self._cooling = None if cooling is None else cooling.spec()
         self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)
         self._opened_s = 0.0
-        self._is_internal = False
-        self._cycles_from_s = math.nan
         self._pending: deque[tuple[int, bool]] = deque()
         self._n_seen = 0
 
@@ -117,18 +113,8 @@ class VirtualCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Read-out time (less for a part of the sensor), longest exposure, shape of the frames, EM gain."""
         em_gain = 1.0 if self._settings.em_gain is None else self._settings.em_gain
-        settings = self._settings
         triggers = "software", "internal", *(("external", "external_start", "bulb") if self._is_wired else ())
-        times = self._readout_s, settings.max_exposure
-        return CameraFacts(
-            *times,
-            self._frame_shape,
-            em_gain,
-            triggers,
-            arm_s=settings.arming_time,
-            line_trigger=settings.line_trigger,
-            cycle_s=settings.cycle_time or 0.0,
-        )
+        return self._settings.facts(self._readout_s, self._frame_shape, triggers, em_gain=em_gain)
 
     def warm(self) -> None:
         """Compute what all frames have in common, and compile or load their kernels."""
@@ -173,13 +159,12 @@ class VirtualCamera(CameraDriver):
 
     def _start(self, series: Series) -> None:
         self._current = self._mode_of(series)
-        self._sensor.arm(series, self._current, self._readout_s, arm_s=self._settings.arming_time)
-        self._is_internal = series.trigger == "internal"
+        arm_s, cycle_s = self._settings.arming_time, self._settings.cycle_time or 0.0
+        self._sensor.arm(series, self._current, self._readout_s, arm_s=arm_s, cycle_s=cycle_s)
         self._pending.clear()
         self._n_seen = 0
-        self._cycles_from_s = math.nan
         if series.trigger in ("external", "external_start", "bulb"):
-            self._simulation.wire("camera", partial(self._on_pulse, series.trigger))
+            self._sensor.follow_line(self._expose)
 
     def _fire(self) -> None:
         if self._happens(self._settings.faults.missed_trigger):
@@ -190,10 +175,7 @@ class VirtualCamera(CameraDriver):
     def _take(self, timeout_s: float) -> ExposureResult | None:
         until_s = self._clock.now() + timeout_s
         while True:
-            if self._is_internal and not self._pending:
-                self._expose()
-            if not math.isnan(self._cycles_from_s) and not self._pending:
-                self._expose(self._cycles_from_s + self._n_seen * (self._settings.cycle_time or 0.0))
+            self._sensor.expose_next(self._expose, max(0.0, until_s - self._clock.now()))
             frame = self._sensor.take(max(0.0, until_s - self._clock.now()))
             if frame is None:
                 return None
@@ -210,15 +192,7 @@ class VirtualCamera(CameraDriver):
     def _stop(self) -> None:
         self._sensor.clear()
         self._pending.clear()
-        self._is_internal, self._cycles_from_s = False, math.nan
         self._current = self._idle
-
-    def _on_pulse(self, trigger: Trigger, t_s: float, width_s: float) -> None:
-        """The line at the trigger input switches on, for a time; the start of a series counts only once."""
-        if trigger != "external_start":
-            self._expose(t_s, width_s if trigger == "bulb" else None)
-        elif math.isnan(self._cycles_from_s):
-            self._cycles_from_s = t_s
 
     def _expose(self, t_start_s: float | None = None, exposure_s: float | None = None) -> None:
         """Begin the next exposure; where the camera times it by itself, only when a frame is read."""

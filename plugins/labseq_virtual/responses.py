@@ -2,8 +2,9 @@
 
 Each table gives the loss and the ratio of the temperatures after and before, on a grid of the axes below. It
 belongs to a static tweezer of ``DEPTH_K`` and ``WAIST_M``. Other depths and waists follow by the scaling of
-Newton's equations: lengths in waists, energies in depths, times in periods of the static tweezer. Temperatures
-are those that the atom has in the static tweezer, or would have if it were brought back there adiabatically.
+Newton's equations: lengths in waists, energies in depths, times in periods of the static tweezer. A
+temperature is that which the atom has in the static tweezer, or would have if it were brought back there
+adiabatically.
 
 ``docs/make_response_tables.py`` makes them.
 """
