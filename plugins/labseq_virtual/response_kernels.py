@@ -1,7 +1,13 @@
 """Kernels that look up how atoms respond to the stages of a move (``responses.py``), and to time.
 
-``tables``: the tables of a move, one after the other, see
-:func:`labseq_virtual.responses.move_tables`.
+Arguments that occur in several kernels:
+
+- ``tables``: the tables of a move, one after the other, see :func:`labseq_virtual.responses.move_tables`.
+- ``static``, ``mobile``: depth of the static tweezer, and greatest depth of the mobile one, in kelvin.
+- ``heat``: temperature of the atom in a static tweezer of the nominal depth.
+- ``constants``: see :func:`labseq_virtual.handover.constants`.
+
+All return the loss, and the ratio of the temperatures after and before.
 """
 
 from __future__ import annotations
@@ -14,18 +20,13 @@ from numpy.typing import NDArray
 from labseq.plugin import const, helper_kernel
 from labseq_virtual.handover import COOLING_HZ, NOISE_HZ, STATIC_DEPTH, STATIC_WAIST, TEMPERATURE
 from labseq_virtual.responses import (
-    AWAY,
-    BESIDE,
+    AXES,
     DEPTH_K,
-    LANDING_SPEEDS,
     LEAST_LOSS,
-    PASSING_SPEEDS,
-    RAMPS_S,
+    MOVE_TABLES,
     RATIOS,
     SITE_M,
-    SPEEDS,
     START_RAMPS_S,
-    START_SPEEDS,
     TEMPERATURES,
     WAIST_M,
 )
@@ -33,21 +34,19 @@ from labseq_virtual.responses import (
 Floats = NDArray[np.float64]
 
 VECTOR = const("float64", 1)
+RESPONSE = "UniTuple(float64, 2)"
 
-RAMP_AXIS, AWAY_AXIS, SPEED_AXIS = np.array(RAMPS_S), np.array(AWAY), np.array(SPEEDS)
+TRANSPORT, LANDING, PASSING, STARTING = range(2, 6)
+"""Places in ``MOVE_TABLES``; those of pick-up and drop-off are 0 and 1, that of stopping follows STARTING."""
 RATIO_AXIS, TEMPERATURE_AXIS = np.array(RATIOS), np.array(TEMPERATURES)
-N_RAMP = len(RAMPS_S) * len(AWAY) * len(RATIOS) * len(TEMPERATURES)
-LANDING_AXIS, PASSING_AXIS, BESIDE_AXIS = np.array(LANDING_SPEEDS), np.array(PASSING_SPEEDS), np.array(BESIDE)
-N_LANDING = len(LANDING_SPEEDS) * len(RAMPS_S) * len(RATIOS) * len(TEMPERATURES)
-N_PASSING = len(PASSING_SPEEDS) * len(BESIDE) * len(RATIOS) * len(TEMPERATURES)
-N_TRANSPORT = 3 * len(SPEEDS) * len(RATIOS) * len(TEMPERATURES)
-START_RAMP_AXIS, START_SPEED_AXIS = np.array(START_RAMPS_S), np.array(START_SPEEDS)
-N_START = len(START_RAMPS_S) * len(START_SPEEDS) * len(RATIOS) * len(TEMPERATURES)
-TRANSPORT_AT = 4 * N_RAMP
-LANDING_AT = TRANSPORT_AT + 2 * N_TRANSPORT
-PASSING_AT = LANDING_AT + 2 * N_LANDING
-START_AT = PASSING_AT + 2 * N_PASSING
-"""Where the tables after those of pick-up and drop-off begin."""
+AXIS_LENGTH = np.array([[len(axis) for axis in AXES[name][:2]] for name in MOVE_TABLES])
+AXIS_VALUES = np.concatenate([np.array(axis, np.float64) for name in MOVE_TABLES for axis in AXES[name][:2]])
+"""The first and the second axis of each table, one after the other."""
+AXIS_AT = np.concatenate([[0], np.cumsum(AXIS_LENGTH.ravel())])[:-1].reshape(-1, 2)
+N_POINTS = AXIS_LENGTH.prod(axis=1) * len(RATIOS) * len(TEMPERATURES)
+TABLE_AT = 2 * np.concatenate([[0], np.cumsum(N_POINTS)])[:-1]
+"""Where each table begins: first its losses, then its ratios of temperatures."""
+LONGEST_START_S = START_RAMPS_S[-1]
 CURVED_SITES = 4.0
 """Length of the moves in the table of a curved course, in sites."""
 
@@ -63,35 +62,27 @@ def locate(axis: Floats, x: float) -> tuple[int, float]:
     return len(axis) - 2, 1.0
 
 
-@helper_kernel(
-    f"UniTuple(float64, 2)({VECTOR}, int64, int64, float64, float64, {VECTOR}, float64, float64, float64)"
-)
+@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, {VECTOR})")
 def respond(
-    tables: Floats,
-    first: int,
-    n: int,
-    one: float,
-    x: float,
-    axis: Floats,
-    ratio: float,
-    temperature: float,
-    steps: float,
+    table: int, first: float, second: float, ratio: float, temperature: float, tables: Floats
 ) -> tuple[float, float]:
-    """Loss, and ratio of the temperatures after and before, by linear interpolation.
+    """Interpolate a table linearly.
 
     Args:
-        tables: The tables.
-        first: Where the table starts.
-        n: Number of its points.
-        one: Place on its first axis, in steps.
-        x: Value on its second one, ``axis``.
-        axis: That axis.
+        table: Which.
+        first: Value on its first axis.
+        second: Value on its second one.
         ratio: Mobile over static depth.
         temperature: In the static tweezer of the tables.
-        steps: Number of points on the first axis.
+        tables: The tables.
     """
-    i, a = int(min(one, steps - 2.0)), one - int(min(one, steps - 2.0))
-    j, b = locate(axis, x)
+    n_first, n_second = AXIS_LENGTH[table, 0], AXIS_LENGTH[table, 1]
+    firsts = AXIS_VALUES[AXIS_AT[table, 0] : AXIS_AT[table, 0] + n_first]
+    seconds = AXIS_VALUES[AXIS_AT[table, 1] : AXIS_AT[table, 1] + n_second]
+    i, part = locate(firsts, first)
+    one = i + part
+    i, a = int(min(one, n_first - 2.0)), one - int(min(one, n_first - 2.0))
+    j, b = locate(seconds, second)
     k, c = locate(RATIO_AXIS, ratio)
     m, d = locate(TEMPERATURE_AXIS, temperature)
     loss = warmer = 0.0
@@ -99,166 +90,117 @@ def respond(
         p, q, r, s = corner & 1, (corner >> 1) & 1, (corner >> 2) & 1, corner >> 3
         weight = (a if p else 1 - a) * (b if q else 1 - b) * (c if r else 1 - c) * (d if s else 1 - d)
         if weight > 0.0:
-            at = (((i + p) * len(axis) + j + q) * len(RATIO_AXIS) + k + r) * len(TEMPERATURE_AXIS) + m + s
-            loss += weight * tables[first + at]
-            warmer += weight * tables[first + n + at]
-    return loss, warmer
+            at = (((i + p) * n_second + j + q) * len(RATIO_AXIS) + k + r) * len(TEMPERATURE_AXIS) + m + s
+            loss += weight * tables[TABLE_AT[table] + at]
+            warmer += weight * tables[TABLE_AT[table] + N_POINTS[table] + at]
+    return float(loss), float(warmer)
 
 
 @helper_kernel(f"float64(float64, {VECTOR})")
 def quicker(static: float, constants: Floats) -> float:
-    """Trap frequency of a static tweezer relative to that of the tables; ``static``: its depth in kelvin."""
+    """Trap frequency of a static tweezer relative to that of the tables."""
     return math.sqrt(static / DEPTH_K) * WAIST_M / constants[STATIC_WAIST]
 
 
-@helper_kernel(
-    f"UniTuple(float64, 2)(int64, float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})"
-)
+@helper_kernel(f"float64(float64, float64, {VECTOR})")
+def speed_in_table(speed_m_s: float, static: float, constants: Floats) -> float:
+    """The speed that does in the tables' tweezer what this one does in a static tweezer."""
+    return speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
+
+
+@helper_kernel(f"float64(float64, float64, {VECTOR})")
+def temperature_in_table(heat: float, static: float, constants: Floats) -> float:
+    """The temperature that an atom has in the tables' tweezer."""
+    return heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
+
+
+@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
 def hand_over(
-    stage: int,
-    static: float,
-    mobile: float,
-    away_m: float,
-    ramp_s: float,
-    heat: float,
-    constants: Floats,
-    tables: Floats,
-) -> tuple[float, float]:
-    """Loss and ratio of temperatures at pick-up (stage 0) or drop-off (stage 1).
+    stage: int, static: float, mobile: float, away_m: float, ramp_s: float, heat: float,
+    constants: Floats, tables: Floats,
+) -> tuple[float, float]:  # fmt: skip
+    """Response to pick-up (stage 0) or drop-off (stage 1).
 
     Args:
         stage: Which.
-        static: Depth of the static tweezer, in kelvin.
+        static: Depth of the static tweezer.
         mobile: Greatest depth of the mobile one.
         away_m: Distance between both, in metres.
         ramp_s: Duration of the ramp.
-        heat: Temperature of the atom in a static tweezer of the nominal depth.
+        heat: Temperature of the atom.
         constants: The constants.
         tables: The tables.
     """
     if not static > 0.0:
         return 1.0, 1.0
-    temperature = heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
-    i, part = locate(RAMP_AXIS, ramp_s * quicker(static, constants))
-    away = away_m / constants[STATIC_WAIST]
-    first = 2 * N_RAMP * stage
-    return respond(
-        tables, first, N_RAMP, i + part, away, AWAY_AXIS, mobile / static, temperature, len(RAMP_AXIS)
-    )
+    temperature = temperature_in_table(heat, static, constants)
+    ramp, away = ramp_s * quicker(static, constants), away_m / constants[STATIC_WAIST]
+    return respond(stage, ramp, away, mobile / static, temperature, tables)
 
 
-@helper_kernel(f"UniTuple(float64, 2)(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
 def carry(
-    course: int,
-    speed_m_s: float,
-    length_m: float,
-    mobile: float,
-    heat: float,
-    constants: Floats,
+    course: int, speed_m_s: float, length_m: float, mobile: float, heat: float, constants: Floats,
     tables: Floats,
-) -> tuple[float, float]:
-    """Loss and ratio of temperatures of a move; ``speed_m_s``: the mean one over ``length_m``."""
+) -> tuple[float, float]:  # fmt: skip
+    """Response to a move over empty sites; ``speed_m_s``: the mean one over ``length_m``."""
     static = constants[STATIC_DEPTH]
-    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
+    speed = speed_in_table(speed_m_s, static, constants)
     if course > 0:  # what counts is the acceleration
         speed *= math.sqrt(CURVED_SITES * SITE_M / max(length_m, 0.1 * SITE_M))
-    temperature = heat * DEPTH_K / static
-    return respond(
-        tables, TRANSPORT_AT, N_TRANSPORT, float(course), speed, SPEED_AXIS, mobile / static, temperature, 3.0
-    )
+    return respond(TRANSPORT, float(course), speed, mobile / static, heat * DEPTH_K / static, tables)
 
 
-@helper_kernel(f"UniTuple(float64, 2)(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel(f"{RESPONSE}(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
 def land_on(
-    static: float,
-    mobile: float,
-    speed_m_s: float,
-    ramp_s: float,
-    heat: float,
-    constants: Floats,
+    static: float, mobile: float, speed_m_s: float, ramp_s: float, heat: float, constants: Floats,
     tables: Floats,
-) -> tuple[float, float]:
-    """Loss and ratio of temperatures of an atom on which an empty tweezer lands and goes off.
-
-    Args:
-        static: Depth of its static tweezer, in kelvin.
-        mobile: Greatest depth of the mobile one.
-        speed_m_s: Speed at which this one came.
-        ramp_s: Duration of its ramp.
-        heat: Temperature of the atom in a static tweezer of the nominal depth.
-        constants: The constants.
-        tables: The tables.
-    """
+) -> tuple[float, float]:  # fmt: skip
+    """Response of an atom on which an empty tweezer lands at a speed, and goes off in a ramp."""
     if not static > 0.0:
         return 1.0, 1.0
-    temperature = heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
-    faster = quicker(static, constants)
-    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / faster
-    i, part = locate(LANDING_AXIS, speed)
-    return respond(
-        tables, LANDING_AT, N_LANDING, i + part, ramp_s * faster, RAMP_AXIS,
-        mobile / static, temperature, len(LANDING_AXIS),
-    )  # fmt: skip
+    temperature = temperature_in_table(heat, static, constants)
+    speed, ramp = speed_in_table(speed_m_s, static, constants), ramp_s * quicker(static, constants)
+    return respond(LANDING, speed, ramp, mobile / static, temperature, tables)
 
 
-@helper_kernel(f"UniTuple(float64, 2)(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel(f"{RESPONSE}(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
 def pass_by(
-    static: float,
-    mobile: float,
-    speed_m_s: float,
-    away_m: float,
-    heat: float,
-    constants: Floats,
+    static: float, mobile: float, speed_m_s: float, away_m: float, heat: float, constants: Floats,
     tables: Floats,
-) -> tuple[float, float]:
-    """Loss and ratio of temperatures of an atom that a tweezer passes; ``away_m``: its nearest distance.
-
-    The other arguments are those of :func:`land_on`.
-    """
+) -> tuple[float, float]:  # fmt: skip
+    """Response of an atom that a tweezer passes; ``away_m``: its nearest distance."""
     if not static > 0.0:
         return 1.0, 1.0
-    temperature = heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
-    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
-    i, part = locate(PASSING_AXIS, speed)
-    log_loss, warmer = respond(
-        tables, PASSING_AT, N_PASSING, i + part,
-        away_m / constants[STATIC_WAIST], BESIDE_AXIS, mobile / static, temperature, len(PASSING_AXIS),
-    )  # fmt: skip
+    temperature = temperature_in_table(heat, static, constants)
+    speed, away = speed_in_table(speed_m_s, static, constants), away_m / constants[STATIC_WAIST]
+    log_loss, warmer = respond(PASSING, speed, away, mobile / static, temperature, tables)
     loss = math.exp(log_loss)
     return (loss if loss > 2 * LEAST_LOSS else 0.0), warmer
 
 
-@helper_kernel(f"UniTuple(float64, 2)(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
 def at_once(
-    stage: int,
-    mobile: float,
-    speed_m_s: float,
-    ramp_s: float,
-    heat: float,
-    constants: Floats,
-    tables: Floats,
+    stage: int, mobile: float, speed_m_s: float, ramp_s: float, heat: float, constants: Floats, tables: Floats
 ) -> tuple[float, float]:
-    """Further loss, and ratio of temperatures, where a start follows a ramp at once, or a ramp a stop.
+    """Further response where a start follows a ramp at once (stage 0), or a ramp a stop (stage 1).
 
     Args:
-        stage: 0 for a start, 1 for a stop.
-        mobile: Greatest depth of the mobile tweezer, in kelvin.
+        stage: Which.
+        mobile: Greatest depth of the mobile tweezer.
         speed_m_s: Speed of the move, constant.
-        ramp_s: Time from the beginning of the ramp to the start, or from the stop to the end of the ramp.
-        heat: Temperature of the atom before the move, in a static tweezer of the nominal depth.
+        ramp_s: Time from the beginning of the ramp to the start, or from the stop to the end of the ramp:
+            compared with the transit time of the sound, which does not scale.
+        heat: Temperature of the atom before the move.
         constants: The constants.
         tables: The tables.
     """
-    if not ramp_s < START_RAMP_AXIS[-1]:
+    if not ramp_s < LONGEST_START_S:
         return 0.0, 1.0
     static = constants[STATIC_DEPTH]
-    speed = speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
-    i, part = locate(START_RAMP_AXIS, ramp_s)  # compared with the sound, whose transit does not scale
-    first = START_AT + 2 * N_START * stage
-    return respond(
-        tables, first, N_START, i + part, speed, START_SPEED_AXIS, mobile / static, heat * DEPTH_K / static,
-        len(START_RAMP_AXIS),
-    )  # fmt: skip
+    speed = speed_in_table(speed_m_s, static, constants)
+    temperature = heat * DEPTH_K / static
+    return respond(STARTING + stage, ramp_s, speed, mobile / static, temperature, tables)
 
 
 @helper_kernel(f"float64(float64, float64, {VECTOR})")
