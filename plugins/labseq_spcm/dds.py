@@ -23,6 +23,7 @@ from labseq.plugin import (
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard
 from labseq_spcm.keep_warm import KeepWarm
+from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
 
 ENTRY: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<i8")])
@@ -235,8 +236,8 @@ def _too_many_tones(name: str, program: ToneProgram, cores: Cores, segment: int)
     return LimitError(what, f"{n_row} and {n_column}", limit, "lower max_row_tones and max_column_tones")
 
 
-class Dds:
-    """Queues a program's blocks, of which each waits for a tick of the timer. See ``PlayMode``.
+class Dds(PlayMode):
+    """Mode ``dds``: queues a program's blocks, of which each waits for a tick of the timer.
 
     Commands go to the card by DMA. Before each portion is sent the queue must have room for it; the
     rest is sent while the program plays. The card sets a flag if a block comes too late.
@@ -251,10 +252,9 @@ class Dds:
 
     max_wait_s = POLL_S
     beginning_s = BEGINNING_S
-    render_s = 0.0
 
     def __init__(self, card: AwgCard, cores: Cores, keep_warm: KeepWarm | None) -> None:
-        self._card = card
+        super().__init__(card)
         self._cores = cores
         self._keep_warm = keep_warm
         self._is_idle = False
@@ -324,9 +324,6 @@ class Dds:
         self._start_triggered(spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER)
         card.command(spcm.M2CMD_CARD_DISABLETRIGGER, "disabling the trigger")
         self._is_idle = True
-
-    def halt(self) -> None:
-        """Nothing supplies the card beside the calls."""
 
     def _start_triggered(self, command: int) -> None:
         """Start the card if it stands still; enable triggers only when the first block waits for one."""

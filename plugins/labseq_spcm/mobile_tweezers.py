@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from labseq.plugin import (
     ConfigError,
@@ -37,6 +37,7 @@ from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.dds import Dds, choose_cores, compile_commands, worst_distance_m
 from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
+from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output, versions
 from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
@@ -51,62 +52,6 @@ RECOVERY: Final = 2
 """Type of the firmware with which a card starts if its own cannot be loaded."""
 TEST_SAMPLES: Final = 1 << 16
 """Samples of both outputs, all 0, that the self test sends to the card's memory."""
-
-
-class PlayMode(Protocol):
-    """How a program gets to the outputs.
-
-    Attributes:
-        max_wait_s: Longest time between two calls of ``finished`` while a program plays, in seconds; 0:
-            call it again at once; inf: the card needs none until the end.
-        render_s: Time for rendering in the last ``prepare``, on this computer's clock.
-        beginning_s: Playing time after which a program can be cut; inf: only whole programs are played.
-    """
-
-    max_wait_s: float
-    render_s: float
-    beginning_s: float
-
-    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:
-        """Transfer a program, or the beginning of one, to the card; returns the playing time in seconds.
-
-        Raises:
-            LimitError: The mode cannot play it.
-            DeviceTimeoutError: The card does not take the data.
-        """
-        ...
-
-    def start(self, command: int) -> None:
-        """Start the card with this command."""
-        ...
-
-    def append(self, program: ToneProgram) -> float:
-        """Have the rest of a program follow its beginning; returns its playing time in seconds.
-
-        Raises:
-            LimitError: The mode cannot play it.
-        """
-        ...
-
-    def triggered(self) -> bool:
-        """Whether the program has begun."""
-        ...
-
-    def idle(self) -> None:
-        """Start what plays between programs, if anything does."""
-        ...
-
-    def halt(self) -> None:
-        """End what supplies the card beside the calls; the card itself is stopped by the caller."""
-        ...
-
-    def finished(self) -> bool:
-        """Whether the program was played to its end; called repeatedly, it keeps the card supplied.
-
-        Raises:
-            TransientError: The card ran out of data.
-        """
-        ...
 
 
 class SpcmMobileTweezers(MobileTweezers):

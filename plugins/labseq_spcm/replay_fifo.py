@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from abc import abstractmethod
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, Renderer,
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, Loop
 from labseq_spcm.limits import FRAME_BYTES, SAMPLE_STEP
+from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
 
 CHUNK: Final = 1 << 18
@@ -61,7 +63,7 @@ class InterleavedRenderer:
             interleave(first_words, second_words, frames[first : first + CHUNK])
 
 
-class SampleMode:
+class SampleMode(PlayMode):
     """What ``replay`` and ``fifo`` have in common: rendered samples, and a loop for the keep-warm tones.
 
     Args:
@@ -71,20 +73,17 @@ class SampleMode:
         keep_warm: The tones between programs; None for silence.
     """
 
-    render_s = 0.0
-    beginning_s = math.inf
-
     def __init__(
         self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None
     ) -> None:
-        self._card = card
+        super().__init__(card)
         self._row_channel = settings.row_channel
         self._rate_hz = sample_rate_hz
         self._loop = keep_warm and Loop(card, keep_warm, sample_rate_hz, settings.row_channel)
 
+    @abstractmethod
     def _set_mode(self) -> None:
         """Set up the mode of the programs; the card stands still."""
-        raise NotImplementedError
 
     def idle(self) -> None:
         """Start the keep-warm tones if there are any; the card stands still."""
@@ -93,32 +92,15 @@ class SampleMode:
             self._card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
             self._loop.start()
 
-    def halt(self) -> None:
-        """Nothing supplies the card beside the calls."""
-
     def _stop(self) -> None:
         """Stop what plays, also the keep-warm tones."""
         self._card.stop()
         if self._loop is not None:
             self._set_mode()
 
-    def start(self, command: int) -> None:
-        """Start the card."""
-        self._card.command(command, "start")
-
-    def append(self, program: ToneProgram) -> float:  # noqa: ARG002
-        """Not possible: the card knows before the start how many samples it will play."""
-        raise DeviceError(self._card.name, "this mode plays whole programs only")
-
-    def triggered(self) -> bool:
-        """Whether the program has begun."""
-        return self._card.triggered
-
 
 class Replay(SampleMode):
-    """Mode ``replay``: uploads the whole program, then waits for its end. See ``PlayMode``."""
-
-    max_wait_s = math.inf
+    """Mode ``replay``: uploads the whole program, then waits for its end."""
 
     def __init__(
         self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
@@ -159,7 +141,7 @@ class Replay(SampleMode):
 
 
 class Fifo(SampleMode):
-    """Mode ``fifo``: streams a program while the rest is still being rendered. See ``PlayMode``.
+    """Mode ``fifo``: streams a program while the rest is still being rendered.
 
     Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
     and from there to the outputs. Ring and memory are bounded, so a program is rendered about

@@ -33,6 +33,7 @@ from labseq_spcm import stream_kernels as k
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples
 from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES, SAMPLE_STEP
+from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
 
 READY_SAMPLES: Final = 1 << 19
@@ -138,8 +139,8 @@ def new_scratch() -> NDArray[np.int16]:
     return np.zeros((2, k.CHUNK), np.int16)
 
 
-class Stream:
-    """Keeps the card supplied from ``idle`` to ``halt``. See ``PlayMode``.
+class Stream(PlayMode):
+    """Mode ``stream``: keeps the card supplied from ``idle`` to ``halt``.
 
     Samples go into a ring in the computer, from there over the bus into the card's buffer and its
     output FIFO, and from there to the outputs. The whole ring is handed over at all times, silence where no
@@ -160,12 +161,11 @@ class Stream:
 
     max_wait_s = PLAYING_POLL_S
     beginning_s = BEGINNING_S
-    render_s = 0.0
 
     def __init__(
         self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
     ) -> None:
-        self._card = card
+        super().__init__(card)
         self._rate_hz = sample_rate_hz
         self._row_channel = settings.row_channel
         self._block = block = settings.notify_size // FRAME_BYTES

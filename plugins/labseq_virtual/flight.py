@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
-from labseq_virtual.handover import KELVIN, full_amplitudes, pair_survival
+from labseq_virtual.handover import KELVIN, full_volts, pair_survival
 from labseq_virtual.jumps import JUMPS, find_jumps
 from labseq_virtual.rf_analysis import (
     WINDOW,
-    Band,
     RfPulse,
     Tracks,
+    bands,
     check_resolvable,
     reach_hz,
     track_tones,
@@ -93,8 +93,6 @@ Mask = NDArray[np.bool_]
 
 STEP_S: Final = 0.1e-6
 """Step of the integration, in seconds: a seventieth of a period in a tweezer of 2.1 mK."""
-BAND_HZ: Final = 50e6
-"""Smallest width of the AODs' band (ours)."""
 DARK: Final = 0.1
 """Fraction of the full depth below which the tweezers of a batch have let go of their atoms (ours)."""
 MIN_TONE_DEPTH: Final = 2e-3
@@ -133,14 +131,8 @@ FLIGHTS: Final = np.dtype(
         }
     },
 )
-"""The path of an atom that a mobile tweezer held, or that was lost.
-
-``held_s`` is when it was first held (nan: never), ``offset_m`` how far the tweezer then was from the
-site, ``depth_K`` its greatest depth. ``fate`` is "kept" (on the site ``to``), "ejected" (beyond the
-grid), "collision" (came too near to another atom), "transport" (fell out of its tweezer) or "hand_over"
-(drawn with the probability of the transport loss). ``lost_s`` is when, and ``lost_row`` and ``lost_col``,
-in sites, where.
-"""
+"""The path of an atom that a mobile tweezer held, or that was lost: "ejected" beyond the grid, in a
+"collision" with another, fallen out of its tweezer in "transport", or by the transport loss, "hand_over"."""
 
 
 class RfTransport:
@@ -156,8 +148,8 @@ class RfTransport:
         light = settings.mobile_light
         self._grid, self._motion, self._settings, self._light = grid, motion, settings, light
         self._positions = positions or TonePositions(grid, light)
-        self._full_v = _full_volts(grid, motion, light.tone_voltage)
-        self._bands = _bands(grid)
+        self._full_v = full_volts(grid, motion, light.tone_voltage)
+        self._bands = bands(grid)
         axes_hz = grid.row_frequency_hz, grid.column_frequency_hz
         self.reach_hz = [reach_hz(hz, motion.eject_slots) for hz in axes_hz]
         a1, a2 = grid.axes
@@ -361,19 +353,6 @@ class RfTransport:
         flights["lost_s"][late] = end_s
         flights["lost_row"][late], flights["lost_col"][late] = to_row[late], to_col[late]
         to_row[lost] = to_col[lost] = -1
-
-
-def _full_volts(grid: SiteGrid, motion: MotionSpec, tone_v: float | None) -> list[Floats]:
-    """Peak voltages of the tones that give the full depth: for each axis, one per site."""
-    if tone_v is not None:
-        return [np.full(n, tone_v) for n in grid.shape]
-    return [motion.rf.full_scale_v * full for full in full_amplitudes(grid, motion)]
-
-
-def _bands(grid: SiteGrid) -> list[Band]:
-    axes = (grid.row_frequency_hz, grid.column_frequency_hz)
-    width_hz = max(BAND_HZ, *(1.4 * float(np.ptp(hz)) for hz in axes))  # of both, for common frames
-    return [Band(max(0.0, float(hz.max() + hz.min() - width_hz) / 2), width_hz) for hz in axes]
 
 
 def _lines(tracks: Floats, n_sites: int) -> Mask:

@@ -32,11 +32,7 @@ JUMPS: Final = np.dtype(
         }
     },
 )
-"""A jump: when, of which kind, where in sites, and how large.
-
-A "phase" jump is that of one tone, in rad: of the column's tone where ``row`` is nan, and the other
-way round. A "depth" jump is that of a tweezer, as a fraction of the full depth.
-"""
+"""A jump of the phase of a tone, or of the depth of a tweezer."""
 
 INNER: Final = 3 * HOPS // 4
 OUTER: Final = 2 * HOPS

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, RandomStream, RfSpan, SiteGrid, ToneProgram
-from labseq_virtual.handover import full_amplitudes
-from labseq_virtual.rf_analysis import Band, track_tones
+from labseq_virtual.handover import full_amplitudes, full_volts
+from labseq_virtual.rf_analysis import bands, track_tones
 from labseq_virtual.settings import MobileLightSettings
 from labseq_virtual.tone_positions import TonePositions
 
@@ -23,8 +23,6 @@ MIN_RELATIVE_V: Final = 0.05
 """Voltage of the weakest tone that is found, relative to that of the full depth (ours)."""
 SLEW_HZ: Final = 0.2e6
 """Largest change of frequency of a tone at rest in a transit time (ours)."""
-BAND: Final = 1.4
-"""Width of the analysed band, relative to that of the tones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +72,7 @@ class MobileLight:
     ) -> None:
         self._grid, self._light, self._positions = grid, light, positions
         self._full = full_amplitudes(grid, motion)
-        full_v = motion.rf.full_scale_v
-        self._full_v = [
-            full_v * full if light.tone_voltage is None else np.full(len(full), light.tone_voltage)
-            for full in self._full
-        ]
+        self._full_v = full_volts(grid, motion, light.tone_voltage)
 
     def of_program(self, program: ToneProgram, t_s: float) -> MobileTones | None:
         """The tones of a program at a time from its start; None if none is on."""
@@ -92,11 +86,8 @@ class MobileLight:
     ) -> MobileTones | None:
         """The tones that the outputs have played just before a time; None if there are none."""
         found: list[tuple[Floats, Floats]] = []
-        hz_of_axes = self._grid.row_frequency_hz, self._grid.column_frequency_hz
         transit_s = self._light.transit_time
-        for spans, hz, full_v in zip((rows, columns), hz_of_axes, self._full_v, strict=True):
-            middle_hz, width_hz = float(hz.max() + hz.min()) / 2, max(50e6, BAND * float(np.ptp(hz)))
-            band = Band(max(0.0, middle_hz - width_hz / 2), width_hz)
+        for spans, band, full_v in zip((rows, columns), bands(self._grid), self._full_v, strict=True):
             start_s, min_v = now_s - LOOK_BACK * transit_s, MIN_RELATIVE_V * float(full_v.min())
             tracks = track_tones(spans, start_s, now_s, band, transit_s, min_v, SLEW_HZ)
             frame = len(tracks.t_s) // 2

@@ -34,6 +34,8 @@ EDGE: Final = 0.05
 """Fraction of the band at each end over which the AOD's response falls to 0 (ours)."""
 
 
+BAND_HZ: Final = 50e6
+"""Smallest width of the AODs' band (ours)."""
 BESIDE: Final = 0.25
 """How far beyond the outermost site or ejection slot a resting tone is dark, in tone spacings (ours)."""
 EVERYWHERE: Final = (-math.inf, math.inf)
@@ -68,6 +70,13 @@ class Envelope:
     rate_hz: float
     low_hz: float
     values: NDArray[np.complex64]
+
+
+def bands(grid: SiteGrid) -> list[Band]:
+    """The bands of the AODs of rows and columns: of one width, so that their frames have common times."""
+    axes = (grid.row_frequency_hz, grid.column_frequency_hz)
+    width_hz = max(BAND_HZ, *(1.4 * float(np.ptp(hz)) for hz in axes))
+    return [Band(max(0.0, float(hz.max() + hz.min() - width_hz) / 2), width_hz) for hz in axes]
 
 
 def reach_hz(sites_hz: NDArray[np.float64], eject_slots: int) -> tuple[float, float]:

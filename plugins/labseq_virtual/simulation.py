@@ -322,9 +322,8 @@ class VirtualSimulation(Simulation):
         playing, self._playing = self._playing, None
         n_played = playing.n_segments_until(until_s + ROUNDING_S)
         start_s, end_s = playing.t_start_s, min(playing.t_end_s, until_s)
-        factor = self._loss_factor * self._heating(start_s, end_s)
+        cooled, factor = self._cooling(start_s, end_s)
         depth, rng = self._static.depth, self._random.shot
-        cooled = self._lights.fraction_on("cooling", start_s, end_s)
         self._lost += self._transport.carry(
             self._occupied, playing.program, n_played, depth, rng, factor, self._thermal, start_s, cooled
         )
@@ -337,10 +336,9 @@ class VirtualSimulation(Simulation):
                 text = f"the mobile tweezers were on at {pulse.start_s:.6f} s, together with something else"
                 raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
             self._lose_to_vacuum(pulse.start_s)
-            factor = self._loss_factor * self._heating(pulse.start_s, pulse.end_s)
+            cooled, factor = self._cooling(pulse.start_s, pulse.end_s)
             depth, rng = self._static.depth, self._random.shot
             if self._occupied.any():
-                cooled = self._lights.fraction_on("cooling", pulse.start_s, pulse.end_s)
                 relax = partial(self._relaxed, cooled=cooled)
                 pairs = None if cooled > 0 else 0.0
                 self._lost += self._flight.carry(
@@ -349,10 +347,11 @@ class VirtualSimulation(Simulation):
             self._lose_to_vacuum(pulse.end_s)
         self._lost += self._static.receive_until(until_s, self._occupied, self._random.shot)
 
-    def _heating(self, start_s: float, end_s: float) -> float:
-        """Factor on the transport loss: above 1 if the cooling light is off part of the time."""
+    def _cooling(self, start_s: float, end_s: float) -> tuple[float, float]:
+        """Fraction of the time with cooling light, and the factor on the transport loss: more without it."""
         cooled = self._lights.fraction_on("cooling", start_s, end_s)
-        return cooled + (1.0 - cooled) * self._settings.uncooled_transport
+        uncooled = (1.0 - cooled) * self._settings.uncooled_transport
+        return cooled, self._loss_factor * (cooled + uncooled)
 
     def _begin_event(self, t_s: float, what: str) -> None:
         """Simulate everything before an event; refuse one that comes before the end of another."""

@@ -1,0 +1,70 @@
+"""How a program gets to the outputs: what the modes of the card have in common."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+from labseq.plugin import DeviceError, ToneProgram
+from labseq_spcm.card import AwgCard
+
+
+class PlayMode(ABC):
+    """A mode of the card. A subclass says what differs from a card that plays whole programs at a trigger.
+
+    Args:
+        card: The open card.
+
+    Attributes:
+        max_wait_s: Longest time between two calls of ``finished`` while a program plays, in seconds; 0:
+            call it again at once; inf: the card needs none until the end.
+        render_s: Time for rendering in the last ``prepare``, on this computer's clock.
+        beginning_s: Playing time after which a program can be cut; inf: only whole programs are played.
+    """
+
+    max_wait_s = math.inf
+    render_s = 0.0
+    beginning_s = math.inf
+
+    def __init__(self, card: AwgCard) -> None:
+        self._card = card
+
+    @abstractmethod
+    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:
+        """Transfer a program, or the beginning of one, to the card; returns the playing time in seconds.
+
+        Raises:
+            LimitError: The mode cannot play it.
+            DeviceTimeoutError: The card does not take the data.
+        """
+
+    @abstractmethod
+    def finished(self) -> bool:
+        """Whether the program was played to its end; called repeatedly, it keeps the card supplied.
+
+        Raises:
+            TransientError: The card ran out of data.
+        """
+
+    def start(self, command: int) -> None:
+        """Start the card with this command."""
+        self._card.command(command, "start")
+
+    def append(self, program: ToneProgram) -> float:  # noqa: ARG002 - the card knows how much it will play
+        """Have the rest of a program follow its beginning; returns its playing time in seconds.
+
+        Raises:
+            DeviceError: The mode plays whole programs only.
+            LimitError: It cannot play this one.
+        """
+        raise DeviceError(self._card.name, "this mode plays whole programs only")
+
+    def triggered(self) -> bool:
+        """Whether the program has begun."""
+        return self._card.triggered
+
+    def idle(self) -> None:
+        """Start what plays between programs, if anything does."""
+
+    def halt(self) -> None:
+        """End what supplies the card beside the calls; the card itself is stopped by the caller."""
