@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from labseq_andor.camera import AndorCamera
 from labseq_andor.codes import Code
+from labseq_andor.heads import HEADS
 from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
+from labseq_andor_sim import SimulatedSdk
+from labseq_andor_sim.library import FUNCTIONS
 
 from labseq import DeviceError, DeviceTimeoutError, LimitError
 from labseq.plugin import Context
@@ -197,3 +200,23 @@ def test_a_cycle_shorter_than_exposure_and_read_out_is_refused() -> None:
         with pytest.raises(LimitError, match=least):
             lab.camera.arm(2, 0.0119, "external_start")
         lab.camera.arm(2, 5e-3, "external_start")
+
+
+def test_the_codes_are_those_of_andors_header() -> None:
+    names = load_pylablib("camera").DRV_STATUS
+    for code in Code:
+        assert names[f"DRV_{code.name}"] == code
+
+
+def test_every_function_of_the_simulator_is_one_that_the_library_has() -> None:
+    define_functions = load_pylablib("camera").atmcd32d_lib.define_functions
+    sdk: Any = SimulatedSdk(define_functions)
+    define_functions(sdk)
+    for name in FUNCTIONS:
+        assert isinstance(getattr(sdk, name).argnames, list), name
+
+
+@pytest.mark.parametrize("head", HEADS, ids=lambda head: head.model)
+def test_heads_are_listed_from_fast_to_slow(head: Any) -> None:
+    assert list(head.em_rates_hz) == sorted(head.em_rates_hz, reverse=True)
+    assert list(head.shifts_s) == sorted(head.shifts_s)

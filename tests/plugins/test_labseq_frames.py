@@ -233,12 +233,3 @@ def test_the_size_of_the_frames_is_known_before_they_are_opened(tmp_path: Path) 
     assert player.camera.facts.frame_shape is None
     with pytest.raises(ConfigError, match="no such file"):
         player.open()
-
-
-def test_it_says_what_it_plays(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run", [stack_of(1)] * 2)
-    about = Player(run).open().camera.describe()
-    assert (about["source"], about["n_shots"], about["frame_shape"]) == ("run", 2, (4, 6))
-    about = Player(write_tiff(tmp_path / "x.tif", stack_of(3))).open().camera.describe()
-    assert (about["source"], about["n_files"], about["n_frames"], about["images"]) == ("TIFF", 1, 3, "all")
-    assert Player(write_pngs(tmp_path / "png", stack_of(3))).open().camera.describe()["n_files"] == 3

@@ -68,19 +68,6 @@ def test_each_change_of_the_amplitudes_is_reported_once_also_a_dip_that_is_over(
         assert simulation.changes()[0].row == pytest.approx(ROWS / 2, abs=1e-6)
 
 
-def test_equal_runs_are_equal_to_the_last_digit() -> None:
-    found: list[list[tuple[bytes, bytes]]] = []
-    for _ in range(2):
-        simulation = ReceivingSimulation()
-        with opened(simulation=simulation) as rig:
-            rig.tweezers.start()
-            for depth in (0.3, 1.0):
-                rig.tweezers.ramp(depth, 0.001)
-            found.append([(one.row.tobytes(), one.column.tobytes()) for one in simulation.changes()])
-    assert found[0] == found[1]
-    assert len(found[0]) == 3
-
-
 def kill(rig: Rig) -> None:
     os.kill(int(rig.tweezers._link.pid), signal.SIGKILL)  # pyright: ignore[reportOptionalMemberAccess]
     until(lambda: not rig.ring.is_playing)

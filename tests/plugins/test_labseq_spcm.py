@@ -160,26 +160,6 @@ def test_the_relays_close_once_and_settle_before_a_program(driver: Any, mode: st
         assert started.time_s >= written.time_s + M4I6631.output_relay_s
 
 
-def test_an_external_clock_and_trigger_are_set_up(driver: Any) -> None:
-    trigger = {
-        "trigger": "external",
-        "trigger_level": -1.234,
-        "trigger_edge": "falling",
-        "trigger_50_ohm": True,
-    }
-    with driver(reference_clock=20e6, **trigger) as lab:
-        found = {name: lab.card.read(getattr(registers, name))[1] for name in EXTERNAL}
-        assert found == EXTERNAL
-        assert lab.tweezers.describe()["trigger_level_mv"] == -1230
-
-
-EXTERNAL = {
-    "SPC_CLOCKMODE": registers.SPC_CM_EXTREFCLOCK,
-    "SPC_REFERENCECLOCK": 20_000_000,
-    "SPC_TRIG_ORMASK": registers.SPC_TMASK_EXT0,
-    "SPC_TRIG_EXT0_MODE": registers.SPC_TM_NEG,
-    "SPC_TRIG_TERM": 1,
-}
 MOTION = MotionSpec(max_row_tones=16, max_column_tones=5)
 DDS_CMD, EXEC_AT_TRG, WRITE_TO_CARD = 608003, 2, 8
 
@@ -260,31 +240,6 @@ class TestKeepWarm:
             dark = [after.start_s - before.end_s for before, after in pairwise(spans)]
             assert max(dark) < 200e-6
             assert sum(gap_s > 1e-9 for gap_s in dark) == 1, "only where a prepared program was dropped"
-
-    @pytest.mark.parametrize("mode", MODES)
-    def test_plays_the_same_programs(self, driver: Any, mode: str) -> None:
-        played = []
-        for warm in (None, PARKED):
-            with driver(mode, keep_warm=warm) as lab:
-                lab.play(lab.program(1))
-                lab.card.forget(lab.clock.now())
-                begun_s = lab.clock.now()
-                lab.play(lab.program(12))
-                if mode == "dds":
-                    spans = [span for span in lab.card.played(0) if span.start_s >= begun_s]
-                    tones = [
-                        sorted((round(t.frequency_hz), round(t.amplitude, 4)) for t in span.tones)
-                        for span in spans
-                        if isinstance(span, ToneSpan)
-                    ]
-                    played.append([t for t in tones if t and t[0][0] != 82_200_000])
-                else:
-                    program = np.trim_zeros(render(lab.program(12), lab.rate_hz).samples[0])
-                    samples = lab.samples(0)
-                    starts = (samples == program[0]).nonzero()[0]
-                    stretches = (samples[start : start + len(program)] for start in starts)
-                    played.append([sum(np.array_equal(stretch, program) for stretch in stretches)])
-        assert played[0] == played[1]
 
     def test_of_which_the_trigger_never_comes_says_so(self, driver: Any) -> None:
         with driver("dds", keep_warm=PARKED, trigger="external") as lab:
@@ -453,15 +408,6 @@ class TestTones:
                 lab.tweezers.wait(1.0)
             assert lab.card.outputs_on == (False, False)
 
-    def test_that_come_too_late_are_an_error(self, driver: Any) -> None:
-        with driver("dds") as lab:
-            lab.tweezers.prepare(lab.program(50))
-            lab.tweezers.play()
-            lab.clock.sleep(0.5)
-            with pytest.raises(TransientError, match="no commands in time"):
-                lab.tweezers.wait(1.0)
-            assert lab.card.outputs_on == (False, False)
-
     def test_jump_in_phase_where_the_program_does(self, driver: Any) -> None:
         with driver("dds") as lab:
             program = lab.program(1)
@@ -491,19 +437,6 @@ class TestNumberOfTones:
         motion = MotionSpec(max_row_tones=rows, max_column_tones=columns)
         with pytest.raises(ConfigError, match=r"20 \+ 1 or 16 \+ 5"):
             SpcmMobileTweezers(settings, Context(motion=motion))
-
-    @pytest.mark.parametrize(
-        ("rows", "columns", "row_channel"), [(20, 1, 0), (16, 5, 0), (5, 16, 1), (1, 20, 1)]
-    )
-    def test_profiles_within_its_tones_are_taken(
-        self, driver: Any, rows: int, columns: int, row_channel: int
-    ) -> None:
-        motion = MotionSpec(max_row_tones=rows, max_column_tones=columns)
-        with driver("dds", motion=motion, row_channel=row_channel) as lab:
-            plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
-            lab.play(tone_program(plan, motion=motion))
-            assert lab.card.played(0)
-            assert lab.card.played(1)
 
     def test_of_programs_are_refused_beyond_those_it_has(self, driver: Any) -> None:
         with driver("dds") as lab:
@@ -591,20 +524,6 @@ def test_a_slot_that_is_slower_than_the_output_is_an_underrun_also_at_the_end(
         assert lab.card.outputs_on == (False, False)
 
 
-@pytest.mark.parametrize("creep_s", [1e-3, 10e-3])
-def test_an_underrun_in_the_middle_of_feeding_is_an_underrun(driver: Any, creep_s: float) -> None:
-    clock = CreepingClock()
-    with driver("fifo", clock=clock, fill=1e-3) as lab:
-        lab.tweezers.prepare(lab.program(40))
-        lab.tweezers.play()
-        clock.creep_s = creep_s
-        with pytest.raises(TransientError, match="underrun"):
-            lab.tweezers.wait(5.0)
-        clock.creep_s = 0.0
-        assert lab.card.outputs_on == (False, False)
-        assert not lab.card.running
-
-
 @pytest.mark.parametrize("row_channel", [0, 1])
 def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) -> None:
     program = tone_program(Plan.from_batches([([(0, 0)], [(0, 3)]), ([(2, 1)], [(4, 1)])]))
@@ -658,17 +577,6 @@ def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> No
     with driver() as lab:
         lab.card.write(20000, 100_000_000)
         with pytest.raises(DeviceError, match="the sample rate is 100 MHz; expected 250 MHz"):
-            lab.tweezers.self_test()
-
-
-def test_a_closed_or_playing_card_is_not_tested(driver: Any) -> None:
-    with driver() as lab:
-        lab.tweezers.prepare(lab.program(1))
-        lab.tweezers.play()
-        with pytest.raises(DeviceError, match=r"self_test\(\) while a program plays"):
-            lab.tweezers.self_test()
-        lab.tweezers.close()
-        with pytest.raises(DeviceError, match="not open"):
             lab.tweezers.self_test()
 
 

@@ -128,19 +128,6 @@ def test_a_wait_during_which_another_thread_makes_the_card_safe_is_no_end_of_the
 
 class TestSettings:
     @pytest.mark.parametrize(
-        ("rate_hz", "text"),
-        [
-            (751e6, r"a gap from .*; expected a rate outside of it"),
-            (1.13e9, r"a gap from .*; expected a rate outside of it"),
-            (49e6, r"expected 50 MHz to 1\.25 GHz"),
-            (1.26e9, r"expected 50 MHz to 1\.25 GHz"),
-        ],
-    )
-    def test_sample_rates_that_the_clock_cannot_make_are_refused(self, rate_hz: float, text: str) -> None:
-        with pytest.raises(ValueError, match=text):
-            SpcmSettings(sample_rate=rate_hz)
-
-    @pytest.mark.parametrize(
         ("full_scale_v", "max_peak_v", "text"),
         [
             (2.1, 3.0, "2000 mV"),

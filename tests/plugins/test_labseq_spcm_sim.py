@@ -1,4 +1,4 @@
-"""The simulated Spectrum card: registers, errors, replay, FIFO, and its place beside the vendor's library."""
+"""The simulated Spectrum card: its place beside the vendor's library, and what the simulation receives."""
 
 from __future__ import annotations
 
@@ -11,75 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from labseq_spcm_sim import M4I6631, SampleSpan, SimulatedCard, registers as r
+from labseq_spcm_sim import M4I6631
 from labseq_spcm_sim.fifo_kernels import N_WORDS
 from labseq_spcm_sim.library import CardOutputs
 from labseq_spcm_sim.modes import Buffer, Fifo
 from numpy.typing import NDArray
 
 from labseq.model import RfSamples, RfSpan, RfTones
-from labseq.testing.fakes import FakeClock
 
-RATE_HZ = 625e6
 BUS = M4I6631.bus_bytes_per_s
-START = r.M2CMD_CARD_START | r.M2CMD_CARD_ENABLETRIGGER
 Samples = NDArray[np.int16]
-
-
-class Card(SimulatedCard):
-    """A card with its outputs on at 0.5 V, and a clock of its own."""
-
-    def __init__(self, mode: int = r.SPC_REP_STD_SINGLE, **setup: int) -> None:
-        self.clock = FakeClock()
-        super().__init__(self.clock)
-        self.ring = np.zeros(0, np.int16)
-        defaults = {"SPC_SAMPLERATE": int(RATE_HZ), "SPC_AMP0": 500, "SPC_AMP1": 500}
-        on = {"SPC_ENABLEOUT0": 1, "SPC_ENABLEOUT1": 1}
-        self.set(SPC_CARDMODE=mode, **(defaults | setup | on))
-        self.command(r.M2CMD_CARD_WRITESETUP)
-        self.clock.sleep(0.02)  # the relays of the amplifiers settle
-
-    def set(self, **values: int) -> None:
-        """Write registers, which the card takes."""
-        for name, value in values.items():
-            assert self.write(getattr(r, name), value) == r.ERR_OK, self.take_error()
-
-    def command(self, command: int) -> None:
-        self.set(SPC_M2CMD=command)
-
-    def refusal(self, register: int, value: int) -> int:
-        """The error code of a write."""
-        code = self.write(register, value)
-        self.take_error()
-        return code
-
-    def define(self, n_frames: int, notify_bytes: int = 0) -> int:
-        """Name a new buffer in the computer for samples of both channels; returns the error code."""
-        self.ring = np.frombuffer(mmap.mmap(-1, 4 * n_frames), np.int16).reshape(-1, 2)
-        address = self.ring.ctypes.data
-        return self.define_transfer(r.SPCM_BUF_DATA, 0, 0, Buffer(address, 4 * n_frames, notify_bytes))
-
-    def upload(self, samples: Samples) -> None:
-        """Send samples, int16 (n, 2), to the memory and wait until they have arrived."""
-        self.set(SPC_MEMSIZE=len(samples))
-        assert self.define(len(samples)) == r.ERR_OK
-        self.ring[:] = samples
-        self.command(r.M2CMD_DATA_STARTDMA)
-        self.clock.sleep(4 * len(samples) / BUS)
-
-    def spans(self, channel: int = 0) -> list[SampleSpan]:
-        spans = self.played(channel)
-        assert all(isinstance(span, SampleSpan) for span in spans)
-        return spans  # pyright: ignore[reportReturnType]
-
-    def status(self) -> int:
-        return int(self.read(r.SPC_M2STATUS)[1])
-
-
-def sines(n_samples: int) -> Samples:
-    """Tones of 80 MHz and 100 MHz, int16 (n_samples, 2)."""
-    t_s = np.arange(n_samples) / RATE_HZ
-    return (30000 * np.sin(2 * np.pi * np.outer(t_s, [80e6, 100e6]))).astype(np.int16)
 
 
 def test_the_real_package_opens_the_card_and_knows_it(bench: Any) -> None:
@@ -157,31 +98,6 @@ def test_real_and_simulated_cards_work_in_one_process() -> None:
     command = [sys.executable, "-c", SIDE_BY_SIDE]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.stdout, done.returncode) == ("done\n", 0), done.stderr
-
-
-def test_a_relay_changes_only_when_the_set_up_is_written_or_the_card_starts() -> None:
-    card = Card(SPC_LOOPS=0)
-    card.command(r.M2CMD_CARD_RESET)
-    card.set(SPC_ENABLEOUT0=1, SPC_ENABLEOUT1=1, SPC_LOOPS=0, SPC_SAMPLERATE=int(RATE_HZ))
-    assert card.outputs_on == (False, False), "not written yet"
-    card.upload(sines(6400))
-    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
-    started_s = card.clock.now()
-    card.set(SPC_ENABLEOUT0=0)
-    card.clock.sleep(10e-3 + 10e-6)
-    assert card.spans(0)[0].start_s == pytest.approx(started_s + 10e-3, abs=2 / RATE_HZ), "a relay settles"
-    assert card.outputs_on == (True, True), "the register reads 0, and the output is on"
-    assert card.spans(0)[0].end_s == pytest.approx(card.clock.now(), abs=2 / RATE_HZ)
-    assert card.refusal(r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP) == r.ERR_RUNNING
-    card.command(r.M2CMD_CARD_STOP)
-    assert card.outputs_on == (True, True)
-    card.command(r.M2CMD_CARD_WRITESETUP)
-    assert card.outputs_on == (False, True)
-    card.command(START | r.M2CMD_CARD_FORCETRIGGER)
-    card.forget(card.clock.now())
-    card.clock.sleep(10e-6)
-    assert not card.spans(0)
-    assert card.spans(1)
 
 
 @given(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import entry_points
@@ -19,7 +18,7 @@ from labseq_ttl.settings import TtlSettings
 from pydantic import ValidationError
 
 from labseq import ConfigError, LineProgram, LineSpec, Run, Session
-from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, StopRequested
+from labseq.errors import DeviceError, LimitError, StopRequested
 from labseq.plugin import Context
 from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
@@ -50,19 +49,6 @@ class TestFirmware(LinesContract):
 
 
 @SIMULATED
-def test_the_simulation_receives_what_the_box_plays(simulated_by: str) -> None:
-    with rig(simulated_by=simulated_by) as lab:
-        lab.clock.sleep(1.5)
-        program = lab.fire("load", 0.5)
-        played, t_start_s = lab.played[-1]
-        assert (t_start_s, lab.clock.now()) == (1.5, 1.5)
-        np.testing.assert_allclose(played.t_s, program.t_s, atol=1e-12)
-        np.testing.assert_array_equal(played.on, program.on)
-        lab.lines.wait(1.0)
-        assert lab.clock.now() == pytest.approx(1.5 + program.duration_s)
-
-
-@SIMULATED
 def test_the_self_test_changes_no_line(simulated_by: str) -> None:
     with rig(simulated_by=simulated_by) as lab:
         lab.lines.idle()
@@ -72,18 +58,6 @@ def test_the_self_test_changes_no_line(simulated_by: str) -> None:
         assert lab.driver_box.state().on == 1 << 2  # cooling
         lab.fire()
         lab.lines.wait(1.0)
-
-
-@SIMULATED
-def test_it_says_what_it_is(simulated_by: str) -> None:
-    with rig(simulated_by=simulated_by) as lab:
-        about = json.loads(json.dumps(dict(lab.lines.describe()), allow_nan=False))
-    assert (about["firmware"], about["serial_number"], about["started_by"]) == (
-        "protocol 2",
-        0,
-        "power-up",
-    )
-    assert about["lines"] == {"cooling": 2, "mot": 3, "imaging": 4, "camera": 5, "shutter": 6}
 
 
 def test_a_known_program_is_sent_again_only_after_one_not_used_for_longest_gave_way(
@@ -183,16 +157,6 @@ def test_a_wait_looks_for_a_request_to_stop() -> None:
         with lab.clock.stop.held():
             lab.lines.safe_state()
             lab.lines.close()
-
-
-def test_a_program_without_an_end_in_time_is_too_late() -> None:
-    with rig() as lab:
-        lab.fire("load", 3.0)
-        with pytest.raises(DeviceTimeoutError, match="not over after 1 s"):
-            lab.lines.wait(1.0)
-        assert lab.clock.now() == pytest.approx(1.0)
-        lab.lines.safe_state()
-        assert not lab.played[-1][0].on.any()
 
 
 ROOT = Path(__file__).parents[2]

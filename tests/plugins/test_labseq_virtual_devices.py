@@ -252,14 +252,6 @@ def test_virtual_hardware_needs_a_simulation() -> None:
         VirtualCamera(CameraSettings(), Context("camera"))
 
 
-def test_the_self_tests_of_the_tweezers_pass_and_change_nothing(lab: Lab) -> None:
-    for device in (lab.static, lab.mobile):
-        before = device.describe()
-        device.self_test()
-        assert device.describe() == before
-    assert lab.n_atoms == 6
-
-
 def test_the_static_tweezers_refuse_calibrated_amplitudes_beyond_a_limit(lab: Lab) -> None:
     settings = StaticTweezersSettings(max_amplitude_sum=0.5)
     static = VirtualStaticTweezers(settings, lab.context("static_tweezers"))
@@ -560,15 +552,6 @@ def test_a_blinding_line_in_an_exposure_with_em_gain_is_refused_before_the_run(t
     lines = LINES.replace("on: [load], lag", "on: [load, image], lag")
     with pytest.raises(ConfigError, match="'mot' is blinding and on during `image`, with an EM gain of 300"):
         run(tmp_path, lines, "profile.camera.em_gain=300")
-
-
-def test_a_device_remembers_its_commands() -> None:
-    device = VirtualDevice(DeviceSettings(values={"power": 1.5}), Context("shutter"))
-    device.open()
-    device.command("open", power=2.5)
-    assert (device.read("state"), device.read("power")) == ("open", 2.5)
-    device.safe_state()
-    assert device.read("state") == "safe"
 
 
 SPOTS = SiteGrid(12, 15)

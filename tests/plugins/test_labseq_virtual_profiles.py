@@ -17,7 +17,6 @@ from labseq_virtual.settings import (
     StaticTweezersSettings,
 )
 
-from labseq.builtin.patterns import BitmapSettings, CompactSettings
 from labseq.config.profile import MOTION_KEYS, load_profile
 from labseq.detection.threshold import ThresholdSettings
 from labseq.plugin import MotionSpec, RfSpec, Settings, SiteGrid
@@ -85,12 +84,6 @@ def test_the_grid_and_its_ejection_slots_fit_into_the_aods_band() -> None:
         assert reach <= limits.band_half_width
 
 
-@pytest.mark.parametrize("model", [*MODELS.values(), DeviceSettings, CompactSettings, BitmapSettings])
-def test_every_setting_is_described(model: type[Settings]) -> None:
-    for name, described in fields(model).items():
-        assert described, f"{model.__name__}.{name} has no description"
-
-
 def fields(model: type[Settings]) -> dict[str, str | None]:
     found: dict[str, str | None] = {}
     for name, info in model.model_fields.items():
@@ -98,11 +91,3 @@ def fields(model: type[Settings]) -> dict[str, str | None]:
         if isinstance(info.annotation, type) and issubclass(info.annotation, Settings):
             found |= {f"{name}.{key}": text for key, text in fields(info.annotation).items()}
     return found
-
-
-@pytest.mark.parametrize(
-    "name", [name for name in flat(SimulationSettings().model_dump()) if name != "image"]
-)
-def test_every_constant_of_the_simulation_says_where_it_comes_from(name: str) -> None:
-    description = fields(SimulationSettings)[name] or ""
-    assert any(source in description for source in ("paper", "derived", "ours"))
