@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import RfTransport
 from labseq_virtual.rf_analysis import PulseReceiver
 from labseq_virtual.settings import MobileLightSettings, SimulationSettings
@@ -126,8 +127,9 @@ def losses(point: Point | Empty) -> tuple[int, int, int]:
     for _ in range(repeats):
         occupied = np.zeros((2, *GRID.shape), np.bool_)
         occupied[(slice(None), *np.transpose(sources))] = True
-        fast.carry(occupied[0], program, program.n_segments, depth, rng, 1.0)
-        slow.carry(occupied[1], pulse, depth, rng, 1.0)
+        fast_atoms, slow_atoms = (Atoms(one, settings.temperature) for one in occupied)
+        fast.carry(fast_atoms, program, program.n_segments, depth, rng, 1.0)
+        slow.carry(slow_atoms, pulse, depth, rng, 1.0)
         kept = [n + int(one[tuple(np.transpose(goals))].sum()) for n, one in zip(kept, occupied, strict=True)]
     n = repeats * len(sources)
     return n - kept[0], n - kept[1], n

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.handover import KELVIN, full_volts, pair_survival
 from labseq_virtual.jumps import JUMPS, find_jumps
 from labseq_virtual.rf_analysis import (
@@ -188,25 +189,22 @@ class RfTransport:
 
     def carry(
         self,
-        occupied: Mask,
+        atoms: Atoms,
         pulse: RfPulse,
         depth: Floats,
         rng: np.random.Generator,
         loss_factor: float,
-        thermal: Floats | None = None,
         relax: Callable[[Floats, Floats], Floats] = lambda heat, _elapsed_s: heat,
         pairs: float | None = None,
     ) -> Counter[str]:
         """Move the atoms in the light of a pulse.
 
         Args:
-            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            atoms: The atoms; changed in place.
             pulse: The output that was played.
             depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
             rng: Random numbers of the shot.
             loss_factor: The shot's factor on the transport loss.
-            thermal: float64 (2, n_rows, n_cols), temperatures of the atoms, as they would be at the nominal
-                depth, and the times that they belong to; changed in place. By default that of the settings.
             relax: Temperatures after a time without moves, in s.
             pairs: Probability that one of two atoms that meet is left. By default that of the settings.
 
@@ -215,27 +213,22 @@ class RfTransport:
         """
         lost: Counter[str] = Counter()
         pairs = pair_survival(self._settings) if pairs is None else pairs
-        if thermal is None:
-            thermal = np.stack(
-                [np.full(occupied.shape, self._settings.temperature), np.zeros(occupied.shape)]
-            )
         for tones, t_s in self.find_tones(pulse):
             bright = np.flatnonzero(_light([tones[1], tones[3]]) > DARK)
             on_s, off_s = t_s[bright[[0, -1]]] if len(bright) else t_s[[0, -1]]
-            thermal[0] = relax(thermal[0], np.maximum(0.0, on_s - thermal[1]))
-            thermal[1] = on_s
-            lost += self._carry_batch(occupied, tones, t_s, depth, rng, loss_factor, thermal, off_s, pairs)
+            atoms.heat = relax(atoms.heat, np.maximum(0.0, on_s - atoms.since_s))
+            atoms.since_s[...] = on_s
+            lost += self._carry_batch(atoms, tones, t_s, depth, rng, loss_factor, off_s, pairs)
         return lost
 
     def _carry_batch(
         self,
-        occupied: Mask,
+        atoms: Atoms,
         tones: tuple[Floats, ...],
         t_s: Floats,
         depth: Floats,
         rng: np.random.Generator,
         loss_factor: float,
-        thermal: Floats,
         off_s: float,
         pairs: float,
     ) -> Counter[str]:
@@ -250,10 +243,9 @@ class RfTransport:
         )
 
         rows, row_depth, cols, col_depth = tones
-        heat, since_s = thermal
-        row, col = np.nonzero(occupied & self._near(rows, cols) & (depth > 0))
+        row, col = np.nonzero(atoms.occupied & self._near(rows, cols) & (depth > 0))
         static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
-        kt = KELVIN * heat[row, col] * np.sqrt(depth[row, col])
+        kt = KELVIN * atoms.heat[row, col] * np.sqrt(depth[row, col])
         state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
         state[:, :2] += self._grid.positions_m[row, col]
         alive = np.ones(len(row), np.bool_)
@@ -279,12 +271,12 @@ class RfTransport:
         unlucky = held & (rng.random(len(row)) < loss * loss_factor)
         self._assign_fates(flights, alive, record[:, COLLIDED] == 1, bound, unlucky, float(t_s[-1]))
         kept = flights["fate"] == b"kept"
-        occupied[row, col] = False
-        occupied[to_row[kept], to_col[kept]] = True
+        atoms.occupied[row, col] = False
+        atoms.occupied[to_row[kept], to_col[kept]] = True
         moved = kept & held
         at = to_row[moved], to_col[moved]
-        heat[at] = (energy[moved] + static[at]) / 3 / KELVIN / np.sqrt(depth[at])
-        since_s[at] = off_s
+        atoms.heat[at] = (energy[moved] + static[at]) / 3 / KELVIN / np.sqrt(depth[at])
+        atoms.since_s[at] = off_s
         self._flights.append(flights[held | ~kept])
         return Counter(fate.decode() for fate in flights["fate"][~kept].tolist())
 

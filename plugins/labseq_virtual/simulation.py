@@ -30,6 +30,7 @@ from labseq.plugin import (
     ToneSource,
     TweezerAmplitudes,
 )
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import RfTransport
 from labseq_virtual.handover import noise_hz, recoil_heat
 from labseq_virtual.images import Exposure
@@ -161,10 +162,10 @@ class VirtualSimulation(Simulation):
         reload_probability = -math.expm1(-on_s / self._settings.loading_time)
         draws = self._random.shot.random((2, *self._grid.shape))
         reloaded = (draws[0] < reload_probability) & self._static.holds()
-        self._occupied = np.where(reloaded, draws[1] < self._settings.loading, self._occupied)
+        self._atoms.occupied[reloaded] = (draws[1] < self._settings.loading)[reloaded]
         self._now_s = t_start_s + duration_s
-        self._thermal[0][reloaded] = self._at_nominal(self._settings.temperature)[reloaded]
-        self._thermal[1] = self._now_s
+        self._atoms.heat[reloaded] = self._at_nominal(self._settings.temperature)[reloaded]
+        self._atoms.since_s[...] = self._now_s
 
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
         """Apply a device's output to the atoms, from ``t_start_s`` on.
@@ -186,7 +187,7 @@ class VirtualSimulation(Simulation):
             spans, stay_off = self._lights.tweezers_off(signal)
             for start_s, end_s in spans:
                 self._release(t_start_s + start_s, end_s - start_s)
-            self._lost["light"] += self._static.block(self._occupied, is_blocked=stay_off)
+            self._lost["light"] += self._static.block(self._atoms, is_blocked=stay_off)
         else:
             text = f"'{role}' played a {type(signal).__name__}; expected 'mobile_tweezers' with a ToneProgram"
             text += ", 'static_tweezers' with a DepthRamp or TweezerAmplitudes, or 'lines' with a LineProgram"
@@ -231,21 +232,20 @@ class VirtualSimulation(Simulation):
         self._evaporate()
         light_on = self._lights.fraction_on("imaging", t_start_s, t_start_s + exposure_s)
         power, rng = self._static.depth, self._random.shot
-        image, lost = self._exposure.take(self._occupied, exposure_s, rng, mode, light_on, power)
+        image, lost = self._exposure.take(self._atoms.occupied, exposure_s, rng, mode, light_on, power)
         self._lost += lost
         self._now_s = t_start_s + exposure_s
         aim = self._at_nominal(self._settings.temperature + recoil_heat(self._settings))
-        self._thermal[0] = aim + (self._thermal[0] - aim) * math.exp(
-            -exposure_s * light_on / self._settings.cooling_time
-        )
-        self._thermal[1] = self._now_s
+        left = math.exp(-exposure_s * light_on / self._settings.cooling_time)
+        self._atoms.heat = aim + (self._atoms.heat - aim) * left
+        self._atoms.since_s[...] = self._now_s
         return Frame(image, exposure_s, t_start_s)
 
     def truth(self) -> Occupancy:
         """The true occupancy after the running program, bool (n_rows, n_cols)."""
         self._finish_program()
         self._apply_output(self._clock.now())
-        return self._occupied.copy()
+        return self._atoms.occupied.copy()
 
     def losses(self) -> Mapping[str, int]:
         """Atoms lost since the shot began, by cause."""
@@ -275,7 +275,7 @@ class VirtualSimulation(Simulation):
         rows, columns, is_on = self._pulse_receiver.look(now_s)
         if not is_on:
             return self.spot_powers(), None
-        self._lost += self._static.receive_until(now_s, self._occupied, self._random.shot)
+        self._lost += self._static.receive_until(now_s, self._atoms, self._random.shot)
         return self._static.depth, self._mobile_light.of_outputs(rows, columns, now_s)
 
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
@@ -305,15 +305,14 @@ class VirtualSimulation(Simulation):
         self._finish_program()
         self._apply_output(t_start_s)
         self._begin_event(max(t_start_s, self._now_s), "a ramp of the static tweezers")
-        self._lost["light"] += self._static.ramp(ramp, self._occupied, self._random.shot, self._thermal[0])
+        self._lost["light"] += self._static.ramp(ramp, self._atoms, self._random.shot)
         self._now_s += ramp.duration_s
 
     def _release(self, t_start_s: float, dark_s: float) -> None:
         self._begin_event(t_start_s, "a release")
-        rng, heat = self._random.shot, self._thermal[0]
-        self._lost["release"] += self._static.release(dark_s, self._occupied, rng, heat)
+        self._lost["release"] += self._static.release(dark_s, self._atoms, self._random.shot)
         self._now_s = t_start_s + dark_s
-        self._thermal[1] = self._now_s
+        self._atoms.since_s[...] = self._now_s
 
     def _finish_program(self, until_s: float = math.inf) -> None:
         """Carry out the running program up to a time."""
@@ -325,7 +324,7 @@ class VirtualSimulation(Simulation):
         cooled, factor = self._cooling(start_s, end_s)
         depth, rng = self._static.depth, self._random.shot
         self._lost += self._transport.carry(
-            self._occupied, playing.program, n_played, depth, rng, factor, self._thermal, start_s, cooled
+            self._atoms, playing.program, n_played, depth, rng, factor, start_s, cooled
         )
         self._lose_to_vacuum(max(playing.t_start_s, min(playing.t_end_s, until_s)))
 
@@ -338,14 +337,12 @@ class VirtualSimulation(Simulation):
             self._lose_to_vacuum(pulse.start_s)
             cooled, factor = self._cooling(pulse.start_s, pulse.end_s)
             depth, rng = self._static.depth, self._random.shot
-            if self._occupied.any():
+            if self._atoms.occupied.any():
                 relax = partial(self._relaxed, cooled=cooled)
                 pairs = None if cooled > 0 else 0.0
-                self._lost += self._flight.carry(
-                    self._occupied, pulse, depth, rng, factor, self._thermal, relax, pairs
-                )
+                self._lost += self._flight.carry(self._atoms, pulse, depth, rng, factor, relax, pairs)
             self._lose_to_vacuum(pulse.end_s)
-        self._lost += self._static.receive_until(until_s, self._occupied, self._random.shot)
+        self._lost += self._static.receive_until(until_s, self._atoms, self._random.shot)
 
     def _cooling(self, start_s: float, end_s: float) -> tuple[float, float]:
         """Fraction of the time with cooling light, and the factor on the transport loss: more without it."""
@@ -369,17 +366,14 @@ class VirtualSimulation(Simulation):
         """Advance the time to ``t_s``; atoms are lost at the rate of the vacuum lifetime."""
         elapsed_s = max(0.0, t_s - self._now_s)
         self._now_s = max(self._now_s, t_s)
-        if not self._occupied.any():  # includes the first event, before which elapsed_s is infinite
+        if not self._atoms.occupied.any():  # includes the first event, before which elapsed_s is infinite
             return
         cooled = self._lights.fraction_on("cooling", self._now_s - elapsed_s, self._now_s)
-        self._thermal[0] = self._relaxed(
-            self._thermal[0], np.maximum(0.0, self._now_s - self._thermal[1]), cooled
-        )
-        self._thermal[1] = self._now_s
+        waited_s = np.maximum(0.0, self._now_s - self._atoms.since_s)
+        self._atoms.heat = self._relaxed(self._atoms.heat, waited_s, cooled)
+        self._atoms.since_s[...] = self._now_s
         stays = math.exp(-elapsed_s / self._settings.lifetime)
-        gone = self._occupied & (self._random.shot.random(self._grid.shape) >= stays)
-        self._lost["vacuum"] += int(np.count_nonzero(gone))
-        self._occupied &= ~gone
+        self._lost["vacuum"] += self._atoms.lose(self._random.shot.random(self._grid.shape) >= stays)
 
     def _relaxed(self, heat: NDArray[np.float64], elapsed_s: NDArray[np.float64], cooled: float) -> Any:
         """Temperatures after times in the static tweezers: cooled, or heated by noise of the intensity."""
@@ -397,18 +391,13 @@ class VirtualSimulation(Simulation):
         if self._noise_hz == 0:
             return
         depth = self._settings.static_depth * np.maximum(self._static.depth, MIN_LEVEL)
-        x = np.minimum(np.sqrt(depth * self._settings.static_depth) / self._thermal[0], 500.0)
-        risk = np.exp(-x) * (1 + x + x**2 / 2) * self._occupied
-        if risk.max() < NO_RISK:
-            return
-        gone = self._random.shot.random(self._grid.shape) < risk
-        self._lost["heat"] += int(np.count_nonzero(gone))
-        self._occupied &= ~gone
+        x = np.minimum(np.sqrt(depth * self._settings.static_depth) / self._atoms.heat, 500.0)
+        risk = np.exp(-x) * (1 + x + x**2 / 2) * self._atoms.occupied
+        if risk.max() >= NO_RISK:
+            self._lost["heat"] += self._atoms.lose(self._random.shot.random(self._grid.shape) < risk)
 
     def _reset(self) -> None:
-        self._occupied: Occupancy = np.zeros(self._grid.shape, np.bool_)
-        self._thermal = np.zeros((2, *self._grid.shape))
-        self._thermal[0] = self._settings.temperature
+        self._atoms = Atoms(np.zeros(self._grid.shape, np.bool_), self._settings.temperature)
         self._playing: RunningProgram | None = None
         self._now_s = -math.inf
         self._loss_factor = 1.0

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import DepthRamp, SiteGrid, ToneSource, TweezerAmplitudes
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import KELVIN, draw_atoms
 from labseq_virtual.responses import lowering
 from labseq_virtual.settings import SimulationSettings
@@ -66,10 +67,8 @@ class StaticArray:
         self._power = np.zeros(rows), np.zeros(cols)
         self._source, self._level = source, 1.0
 
-    def receive_until(
-        self, until_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator
-    ) -> Counter[str]:
-        """Apply the output played until a time; atoms that are lost leave ``occupied``.
+    def receive_until(self, until_s: float, atoms: Atoms, rng: np.random.Generator) -> Counter[str]:
+        """Apply the output played until a time; in a release of it atoms have the temperature of cooled ones.
 
         Returns:
             Number of atoms lost in tweezers that were too shallow ("light"), and in releases ("release").
@@ -77,11 +76,10 @@ class StaticArray:
         lost: Counter[str] = Counter()
         for amplitudes in () if self._source is None else self._source.played(until_s):
             if amplitudes.dark_s:
-                lost["release"] += self.release(amplitudes.dark_s, occupied, rng)
+                cooled = Atoms(atoms.occupied, self._settings.temperature)
+                lost["release"] += self.release(amplitudes.dark_s, cooled, rng)
             self.drive(amplitudes)
-            before = np.count_nonzero(occupied)
-            occupied &= self.holds()
-            lost["light"] += int(before - np.count_nonzero(occupied))
+            lost["light"] += atoms.lose(~self.holds())
         return lost
 
     def drive(self, amplitudes: TweezerAmplitudes) -> None:
@@ -89,7 +87,7 @@ class StaticArray:
         rows, cols = amplitudes.row, amplitudes.column
         self._power = (rows * len(rows)) ** 2, (cols * len(cols)) ** 2
 
-    def block(self, occupied: NDArray[np.bool_], *, is_blocked: bool) -> int:
+    def block(self, atoms: Atoms, *, is_blocked: bool) -> int:
         """Block the light by a line that turns it off, or let it pass.
 
         Returns:
@@ -97,31 +95,24 @@ class StaticArray:
         """
         if is_blocked == self._is_blocked:
             return 0
-        before, self._is_blocked = np.count_nonzero(occupied), is_blocked
-        occupied &= self.holds()
-        return int(before - np.count_nonzero(occupied))
+        self._is_blocked = is_blocked
+        return atoms.lose(~self.holds())
 
-    def release(
-        self, dark_s: float, occupied: NDArray[np.bool_], rng: np.random.Generator, heat: Floats | None = None
-    ) -> int:
+    def release(self, dark_s: float, atoms: Atoms, rng: np.random.Generator) -> int:
         """Let the atoms fly while the light is off, and recapture those that the same tweezer then binds.
 
         Atoms fly straight on: gravity and neighbouring tweezers are left out.
 
         Args:
             dark_s: How long the light is off.
-            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            atoms: The atoms; changed in place.
             rng: Random numbers of the shot.
-            heat: float64 (n_rows, n_cols), temperatures of the atoms, as they would be at the nominal depth;
-                changed in place. By default that of the settings.
 
         Returns:
             Number of atoms lost.
         """
-        settings = self._settings
-        if heat is None:
-            heat = np.full(self._grid.shape, settings.temperature)
-        row, col = np.nonzero(occupied & (self.depth > 0))
+        settings, heat = self._settings, atoms.heat
+        row, col = np.nonzero(atoms.occupied & (self.depth > 0))
         level = self.depth[row, col]
         depth = KELVIN * settings.static_depth * level
         waist = settings.static_waist
@@ -132,30 +123,13 @@ class StaticArray:
         light = depth / width * np.exp(-2 * (x**2 + y**2) / (waist**2 * width))
         kinetic = 0.5 * (state[:, 3:] ** 2).sum(axis=1)
         bound = kinetic < light
-        occupied[row, col] = bound
+        atoms.occupied[row, col] = bound
         heat[row, col] = np.maximum(kinetic + depth - light, 0.0) / 3 / KELVIN / np.sqrt(level)
         return int(np.count_nonzero(~bound))
 
-    def ramp(
-        self,
-        ramp: DepthRamp,
-        occupied: NDArray[np.bool_],
-        rng: np.random.Generator,
-        heat: Floats | None = None,
-    ) -> int:
-        """Change the depth; atoms too hot for tweezers that become shallower leave ``occupied``.
-
-        Args:
-            ramp: The ramp.
-            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
-            rng: Random numbers of the shot.
-            heat: As for :meth:`release`.
-
-        Returns:
-            Number of atoms lost.
-        """
-        if heat is None:
-            heat = np.full(self._grid.shape, self._settings.temperature)
+    def ramp(self, ramp: DepthRamp, atoms: Atoms, rng: np.random.Generator) -> int:
+        """Change the depth; atoms too hot for tweezers that become shallower are lost; returns how many."""
+        occupied, heat = atoms.occupied, atoms.heat
         before = np.count_nonzero(occupied)
         for start, end, duration_s in (
             (self._level, ramp.start, 0.0),

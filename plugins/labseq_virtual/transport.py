@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.handover import (
     ATOM,
     ATOM_HEAT,
@@ -54,7 +55,6 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import TonePositions
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CAUSES: Final[tuple[str, ...]] = ("hand_over", "transport", "collision", "ejected", "program")
 """Causes of losses in transport. "program": the tweezer switched off or jumped."""
@@ -106,27 +106,24 @@ class Transport:
 
     def carry(
         self,
-        occupied: Mask,
+        atoms: Atoms,
         program: ToneProgram,
         n_segments: int,
         depth: Floats,
         rng: np.random.Generator,
         loss_factor: float,
-        thermal: Floats | None = None,
         start_s: float = 0.0,
         cooled: float = 1.0,
     ) -> Counter[str]:
         """Carry out the first segments of a program.
 
         Args:
-            occupied: bool (n_rows, n_cols), C-contiguous, sites that hold an atom; changed in place.
+            atoms: The atoms; changed in place.
             program: The program.
             n_segments: Number of segments played; atoms held after them are lost.
             depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
             rng: Random numbers of the shot; the number of draws depends on the program alone.
             loss_factor: The shot's factor on the transport loss.
-            thermal: float64 (2, n_rows, n_cols), temperatures of the atoms, as they would be at the nominal
-                depth, and the times that they belong to; changed in place. By default that of the settings.
             start_s: When the program starts.
             cooled: Fraction of the time with cooling light.
 
@@ -141,22 +138,17 @@ class Transport:
         draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), 3))
         self._constants[COOLING_HZ] = cooled / self._settings.cooling_time
         self._constants[PAIR_SURVIVAL] = pair_survival(self._settings) if cooled > 0 else 0.0
-        sites = np.zeros((*occupied.shape, N_SITE))
-        sites[..., ATOM], sites[..., TRAP_DEPTH] = occupied, depth * self._settings.static_depth
-        sites[..., ATOM_HEAT] = self._settings.temperature
-        if thermal is not None:
-            sites[..., ATOM_HEAT], sites[..., HEAT_AT_S] = thermal
+        sites = np.zeros((*depth.shape, N_SITE))
+        sites[..., ATOM], sites[..., TRAP_DEPTH] = atoms.occupied, depth * self._settings.static_depth
+        sites[..., ATOM_HEAT], sites[..., HEAT_AT_S] = atoms.heat, atoms.since_s
         lost = carry_atoms(
             sites, start_s, rows, offsets[0], cols, offsets[1], program.duration_s, program.course,
             n_segments, loss_factor, draws, self._constants, self._merging, move_tables(),
         )  # fmt: skip
-        occupied[...] = sites[..., ATOM] > 0
-        if thermal is not None:
-            thermal[0], thermal[1] = sites[..., ATOM_HEAT], sites[..., HEAT_AT_S]
+        atoms.occupied[...] = sites[..., ATOM] > 0
+        atoms.heat[...], atoms.since_s[...] = sites[..., ATOM_HEAT], sites[..., HEAT_AT_S]
         if sites[..., HAZARD].any():
-            taken = occupied & (rng.random(occupied.shape) < -np.expm1(-sites[..., HAZARD]))
-            occupied &= ~taken
-            lost[COLLISION] += np.count_nonzero(taken)
+            lost[COLLISION] += atoms.lose(rng.random(depth.shape) < -np.expm1(-sites[..., HAZARD]))
         by_cause: Counter[str] = Counter(dict(zip(CAUSES, lost.tolist(), strict=True)))
         return +by_cause
 

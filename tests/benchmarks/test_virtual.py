@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.images import Images
 from labseq_virtual.settings import ImageSettings, SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
@@ -63,7 +64,9 @@ def test_carrying_atoms_through_40_batches(benchmark: Any) -> None:
     transport, rng = Transport(GRID, MotionSpec(), SimulationSettings()), np.random.default_rng(0)
     depth = np.ones(GRID.shape)
     occupied = rng.random(GRID.shape) < 0.75
-    benchmark(lambda: transport.carry(occupied.copy(), program, program.n_segments, depth, rng, 1.0))
+    benchmark(
+        lambda: transport.carry(Atoms(occupied.copy(), 15e-6), program, program.n_segments, depth, rng, 1.0)
+    )
 
 
 def _shift(line: int, *, along_row: bool) -> tuple[Any, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.camera import COLDEST_K, ROOM_K, Cooler, VirtualCamera
+from labseq_virtual.camera import ROOM_K, Cooler, VirtualCamera
 from labseq_virtual.settings import CameraSettings, SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
@@ -128,14 +128,6 @@ def test_a_frame_lost_in_a_series_leaves_a_gap_in_the_numbers() -> None:
     assert n_reported == sum(b - a > 1 for a, b in zip([-1, *numbers], numbers, strict=False))
 
 
-def test_when_all_frames_are_lost_none_comes() -> None:
-    lossy = DarkLab(faults={"lost_in_series": 1.0})
-    lossy.camera.arm(2, 1e-3, "internal")
-    with pytest.raises(DeviceTimeoutError, match="frame 0 is not ready"):
-        lossy.camera.read(1.0)
-    assert lossy.clock.now() == pytest.approx(1.0)
-
-
 def test_a_late_frame_can_be_read_later() -> None:
     late = DarkLab(faults={"late": 1.0, "late_by": "3 s"})
     late.fire(1)
@@ -143,23 +135,6 @@ def test_a_late_frame_can_be_read_later() -> None:
         late.camera.read(2.0)
     assert late.camera.read(2.0).t_start_s == 0.0
     assert late.clock.now() == pytest.approx(3.006)
-
-
-def test_the_self_test_takes_a_frame_and_leaves_none(dark: DarkLab) -> None:
-    assert offers(dark.camera, "self_test")
-    dark.camera.self_test()
-    assert dark.clock.now() == pytest.approx(15e-3)
-    dark.camera.arm(1, 10e-3, "software")
-    with pytest.raises(DeviceTimeoutError, match="was not triggered"):
-        dark.camera.read(0.1)
-
-
-@pytest.mark.parametrize(
-    ("fault", "error"), [("missed_trigger", DeviceTimeoutError), ("transient", TransientError)]
-)
-def test_the_self_test_fails_when_no_frame_comes(fault: str, error: type[Exception]) -> None:
-    with pytest.raises(error, match="frame"):
-        DarkLab(faults={fault: 1.0}).camera.self_test()
 
 
 EXPOSURE_S = 45e-3
@@ -335,12 +310,3 @@ def test_it_stays_cold_in_the_safe_state_and_while_it_is_closed() -> None:
     start_s = lab.clock.now()
     lab.camera.settle()
     assert lab.clock.now() - start_s == 5.0
-
-
-def test_a_set_point_that_the_cooler_does_not_reach_times_out() -> None:
-    lab = Lab(cooling={"temperature": "-100 degC", "timeout": "20 min"})
-    with pytest.raises(
-        DeviceTimeoutError, match=r"the sensor is at -90.0 degC after 1200 s; expected -100.0"
-    ):
-        lab.camera.settle()
-    assert lab.said("temperature_k") == pytest.approx(COLDEST_K, abs=0.01)

@@ -207,7 +207,7 @@ def test_what_exceeds_a_limit_is_refused_and_moves_nothing(lab: Lab) -> None:
 
 def test_mobile_tweezers_carry_an_atom(lab: Lab) -> None:
     lab.simulation.truth()
-    lab.simulation._occupied[0, 1:] = False
+    lab.simulation._atoms.occupied[0, 1:] = False
     assert lab.mobile.prepare(program()) == pytest.approx(3e-3)
     start_s = lab.clock.now()
     lab.mobile.play()

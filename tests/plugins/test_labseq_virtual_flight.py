@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
 from labseq_virtual.flight_kernels import (
     COLLIDED,
@@ -193,9 +194,9 @@ def fly(
     occupied = np.zeros(GRID.shape, np.bool_)
     for site in atoms:
         occupied[site] = True
-    rng = np.random.default_rng(1)
+    held, rng = Atoms(occupied, settings.temperature), np.random.default_rng(1)
     for pulse in PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 10.0):
-        flight.carry(occupied, pulse, np.ones(GRID.shape), rng, loss_factor)
+        flight.carry(held, pulse, np.ones(GRID.shape), rng, loss_factor)
     tables = flight.tables(START_S)
     return {(int(row), int(col)) for row, col in np.argwhere(occupied)}, tables["flights"], tables["jumps"]
 
@@ -238,7 +239,8 @@ def test_an_atom_is_cooled_between_batches() -> None:
     (pulse,) = PulseReceiver(PlayedRfSource(played(program)), 1e-3).receive_until(START_S + 10.0)
     occupied = np.zeros(GRID.shape, np.bool_)
     occupied[[5, 9], [2, 2]] = True
-    thermal = np.stack([np.full(GRID.shape, 15e-6), np.full(GRID.shape, START_S - 1.0)])
+    atoms = Atoms(occupied, 15e-6)
+    atoms.since_s[...] = START_S - 1.0
     waited: list[float] = []
 
     def relax(heat: NDArray[np.float64], elapsed_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -246,7 +248,7 @@ def test_an_atom_is_cooled_between_batches() -> None:
         return heat
 
     RfTransport(GRID, spec(), SURE).carry(
-        occupied, pulse, np.ones(GRID.shape), np.random.default_rng(1), 1.0, thermal, relax
+        atoms, pulse, np.ones(GRID.shape), np.random.default_rng(1), 1.0, relax
     )
     assert waited[1] == pytest.approx(0.5e-3, abs=0.05e-3)
 
@@ -346,7 +348,8 @@ def test_rows_are_put_down_one_after_the_other() -> None:
     assert set(flights["fate"].tolist()) == {b"kept"}
     assert len(jumps) == 0
     transport = Transport(GRID, spec(), SURE)
-    transport.carry(occupied, program, program.n_segments, np.ones(GRID.shape), np.random.default_rng(1), 1.0)
+    held, rng = Atoms(occupied, 15e-6), np.random.default_rng(1)
+    transport.carry(held, program, program.n_segments, np.ones(GRID.shape), rng, 1.0)
     assert np.array_equal(occupied, report.predicted)
 
 
@@ -464,8 +467,9 @@ def simulated_loss(case: Broken) -> tuple[int, NDArray[Any], NDArray[Any]]:
     for _ in range(n_rows):
         occupied = np.zeros(GRID.shape, np.bool_)
         occupied[ROW, columns] = True
+        atoms = Atoms(occupied, HOT_K)
         for pulse in pulses:
-            flight.carry(occupied, pulse, np.ones(GRID.shape), rng, 1.0)
+            flight.carry(atoms, pulse, np.ones(GRID.shape), rng, 1.0)
         n_kept += int(np.count_nonzero(occupied[ROW, columns + WAY]))
     tables = flight.tables(START_S)
     return n_rows * len(columns) - n_kept, tables["flights"], tables["jumps"]

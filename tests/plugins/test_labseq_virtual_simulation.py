@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.static_array import StaticArray
@@ -168,7 +169,7 @@ def test_atoms_shine_until_they_are_lost() -> None:
     for lifetime in (2e6, 5e-3):
         simulation = new_simulation(loading=1.0, lifetime=lifetime, image=dark)
         simulation.load(0.0, 0.5)
-        simulation._occupied[...] = True
+        simulation._atoms.occupied[...] = True
         light.append(float(simulation.expose(0.5, 45e-3).image.astype(float).sum() - 500 * 512**2))
     assert light[1] / light[0] == pytest.approx(5 / 45, rel=0.25)
 
@@ -201,7 +202,7 @@ def test_silence_cuts_a_program_short_and_atoms_in_flight_are_lost(t_cut_s: floa
     simulation = new_simulation(loading=1.0)
     simulation.load(0.0, 0.5)
     for col in range(1, 20):
-        simulation._occupied[0, col] = False
+        simulation._atoms.occupied[0, col] = False
     simulation.play("mobile_tweezers", carry_row_0(19), 1.0)
     simulation.play("mobile_tweezers", SILENCE, t_cut_s)
     truth = simulation.truth()
@@ -268,7 +269,9 @@ def array(level: float = 1.0, **physics: float) -> StaticArray:
     """An array with the light on."""
     static = StaticArray(ARRAY_GRID, SimulationSettings.model_validate({"depth_disorder": 0.0} | physics))
     static.draw(np.random.default_rng(3))
-    static.ramp(DepthRamp(0.0, level), np.zeros(ARRAY_GRID.shape, np.bool_), np.random.default_rng(1))
+    static.ramp(
+        DepthRamp(0.0, level), Atoms(np.zeros(ARRAY_GRID.shape, np.bool_), 15e-6), np.random.default_rng(1)
+    )
     return static
 
 
@@ -296,9 +299,10 @@ def test_the_response_of_the_tones_is_undone_by_amplitudes() -> None:
 def test_atoms_are_lost_where_the_light_is_too_weak() -> None:
     static, rng = array(depth_disorder=0.2, temperature=30e-6), np.random.default_rng(1)
     occupied = np.ones(ARRAY_GRID.shape, np.bool_)
-    assert static.ramp(DepthRamp(1.0, 1.0), occupied, rng) == 0
+    atoms = Atoms(occupied, 30e-6)
+    assert static.ramp(DepthRamp(1.0, 1.0), atoms, rng) == 0
     depth = static.depth
-    n_lost = static.ramp(DepthRamp(1.0, 0.1, 5e-3), occupied, rng)
+    n_lost = static.ramp(DepthRamp(1.0, 0.1, 5e-3), atoms, rng)
     assert 0 < n_lost == np.count_nonzero(~occupied)
     assert depth[~occupied].mean() < depth[occupied].mean()
     static.switch_off()
@@ -319,24 +323,24 @@ class PlayedAmplitudes:
 def test_connected_outputs_alone_set_the_light() -> None:
     static, outputs = array(), PlayedAmplitudes()
     static.connect_outputs(outputs)
-    occupied = np.zeros(ARRAY_GRID.shape, np.bool_)
-    assert not static.receive_until(0.0, occupied, np.random.default_rng(1)).total()
+    atoms = Atoms(np.zeros(ARRAY_GRID.shape, np.bool_), 15e-6)
+    assert not static.receive_until(0.0, atoms, np.random.default_rng(1)).total()
     assert not static.holds().any()
     outputs.queued = [equal()]
-    static.receive_until(1.0, occupied, np.random.default_rng(1))
+    static.receive_until(1.0, atoms, np.random.default_rng(1))
     np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
-    static.receive_until(2.0, occupied, np.random.default_rng(1))
+    static.receive_until(2.0, atoms, np.random.default_rng(1))
     np.testing.assert_allclose(static.depth, np.ones(ARRAY_GRID.shape))
 
 
 def test_atoms_are_lost_in_a_dark_moment_between_two_reads_of_the_outputs() -> None:
     static, outputs = array(), PlayedAmplitudes()
     static.connect_outputs(outputs)
-    occupied = np.ones(ARRAY_GRID.shape, np.bool_)
+    atoms = Atoms(np.ones(ARRAY_GRID.shape, np.bool_), 15e-6)
     outputs.queued = [equal(), equal(0.9)]
-    assert not static.receive_until(0.0, occupied, np.random.default_rng(1)).total()
+    assert not static.receive_until(0.0, atoms, np.random.default_rng(1)).total()
     outputs.queued = [equal(0.0), equal()]
-    assert static.receive_until(1.0, occupied, np.random.default_rng(1))["light"] == 12 * 15
+    assert static.receive_until(1.0, atoms, np.random.default_rng(1))["light"] == 12 * 15
     assert static.holds().all()
 
 
@@ -365,7 +369,7 @@ def test_outputs_are_ignored_after_the_light_was_switched_off() -> None:
     static.connect_outputs(outputs)
     static.switch_off()
     outputs.queued = [equal()]
-    static.receive_until(0.0, np.zeros(ARRAY_GRID.shape, np.bool_), np.random.default_rng(1))
+    static.receive_until(0.0, Atoms(np.zeros(ARRAY_GRID.shape, np.bool_), 15e-6), np.random.default_rng(1))
     assert not static.holds().any()
 
 

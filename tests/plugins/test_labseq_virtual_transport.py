@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import FrequencyMap, TonePositions
 from labseq_virtual.transport import Transport
@@ -88,7 +89,14 @@ def after(
     settings = SimulationSettings.model_validate(QUIET | physics)
     transport = Transport(tape.grid, MotionSpec(), settings)
     n = len(tape.segments) if n_segments is None else n_segments
-    transport.carry(occupied, tape.program(), n, np.ones(tape.grid.shape), np.random.default_rng(0), 1.0)
+    transport.carry(
+        Atoms(occupied, settings.temperature),
+        tape.program(),
+        n,
+        np.ones(tape.grid.shape),
+        np.random.default_rng(0),
+        1.0,
+    )
     return {(int(r), int(c)) for r, c in np.argwhere(occupied)}
 
 
@@ -223,7 +231,7 @@ def survivors(n_repeats: int, n_tones: int, **physics: float) -> int:
     rng, total = np.random.default_rng(2), 0
     for _ in range(n_repeats):
         occupied = atoms(*((r, 0) for r in range(5)))
-        transport.carry(occupied, program, 3, FULL, rng, 1.0)
+        transport.carry(Atoms(occupied, 15e-6), program, 3, FULL, rng, 1.0)
         total += int(occupied.sum())
     return total
 
@@ -262,7 +270,9 @@ def test_every_loss_has_its_cause(
     settings = SimulationSettings.model_validate(QUIET | physics)
     occupied = atoms(*before)
     n, rng = len(tape.segments), np.random.default_rng(0)
-    lost = Transport(GRID, MotionSpec(), settings).carry(occupied, tape.program(), n, FULL, rng, 1.0)
+    lost = Transport(GRID, MotionSpec(), settings).carry(
+        Atoms(occupied, settings.temperature), tape.program(), n, FULL, rng, 1.0
+    )
     assert lost == expected
     assert occupied.sum() == len(before) - sum(lost.values())
 
@@ -271,7 +281,7 @@ def test_a_shallow_tweezer_at_full_speed_loses_its_atom_on_the_way() -> None:
     settings = SimulationSettings.model_validate({"transport_loss": 0.0, "mobile_light": SURE_LOSS})
     program = move(FROM_0, [(0, 2)]).program(segment_s=2 * GRID.spacing_m / 0.13)
     transport = Transport(GRID, MotionSpec(), settings)
-    lost = transport.carry(atoms((0, 0)), program, 3, FULL, np.random.default_rng(0), 1.0)
+    lost = transport.carry(Atoms(atoms((0, 0)), 15e-6), program, 3, FULL, np.random.default_rng(0), 1.0)
     assert lost == {"transport": 1}
 
 
@@ -292,7 +302,7 @@ def test_pick_up_and_drop_off_beside_the_site_keeps_what_the_energy_allows(
     rng, total = np.random.default_rng(3), 0
     for _ in range(20):
         occupied = np.ones(GRID.shape, np.bool_)
-        transport.carry(occupied, tape.program(), 2, FULL, rng, 1.0)
+        transport.carry(Atoms(occupied, 15e-6), tape.program(), 2, FULL, rng, 1.0)
         total += int(occupied.sum())
     n = 20 * 30
     assert abs(total - n * kept) <= 4 * np.sqrt(n * kept * (1 - kept)) + 0.01 * n
@@ -305,7 +315,8 @@ def carried(plan: Plan, occupied: NDArray[np.bool_], profile: SpeedProfile = "co
     program = tone_program(plan, grid=PLANE, motion=MotionSpec(speed_profile=profile))
     result = occupied.copy()
     transport = Transport(PLANE, MotionSpec(), SimulationSettings(transport_loss=0.0))
-    transport.carry(result, program, program.n_segments, np.ones(PLANE.shape), np.random.default_rng(0), 1.0)
+    atoms_ = Atoms(result, 15e-6)
+    transport.carry(atoms_, program, program.n_segments, np.ones(PLANE.shape), np.random.default_rng(0), 1.0)
     return result
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import event, given, settings, strategies as st
 from labseq_virtual import tweezer_kernels as kernels
+from labseq_virtual.atoms import Atoms
 from labseq_virtual.handover import (
     AT_REST,
     EMPTY,
@@ -380,7 +381,9 @@ def test_the_kernels_agree_with_the_naive_transport(
     naive = NaiveTransport(transport, physics, np.random.default_rng(seed).random((2000, 3)))
     expected, result = occupied.copy(), occupied.copy()
     lost_naively = naive.carry(expected, program, n_segments, depth, 1.3)
-    lost = transport.carry(result, program, n_segments, depth, np.random.default_rng(seed), 1.3)
+    lost = transport.carry(
+        Atoms(result, physics.temperature), program, n_segments, depth, np.random.default_rng(seed), 1.3
+    )
     for cause in lost:
         event(cause)
     event(f"atoms set down: {min(naive.n_drawn, 3)}")
