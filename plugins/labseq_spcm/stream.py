@@ -431,14 +431,15 @@ class Stream(PlayMode):
                 raise error
             if k.look(box) == k.FAILED:
                 raise self._error()
-        start, end, fetched = (int(box[word]) for word in (k.START, k.END, k.FETCHED))
+        start, made, end, fetched = (int(box[word]) for word in (k.START, k.MADE, k.END, k.FETCHED))
+        is_unfinished = made < end or fetched < end  # silence after what was made may have been fetched
         # only whole blocks are reported as fetched: a part of the first one may have been played
-        may_have_begun = start <= fetched and start < box[k.MADE]
-        if code == k.LATE or (may_have_begun and fetched < end):
-            played = max(0, min(fetched, int(box[k.MADE])) - start) / (end - start)
+        may_have_begun = start <= fetched and start < made
+        if code == k.LATE or (may_have_begun and is_unfinished):
+            played = max(0, min(fetched, made) - start) / (end - start)
             length = format_quantity((end - start) / self._rate_hz, "time")
             share = f"{played:.0%} of a part of {length} was played"
-            was_full = box[k.MADE] - start >= len(self._ring) - self._ahead
+            was_full = made - start >= len(self._ring) - self._ahead
             remedy = (
                 f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode replay"
             )
@@ -446,7 +447,7 @@ class Stream(PlayMode):
                 f"underrun: the card ran out of samples ({share}); {remedy}", self._card.name
             )
         self.n_underruns += 1
-        if fetched < end:
+        if is_unfinished:
             box[k.TAKEN] -= 1
         self._begin(is_silent=self._ring_is_silent())
 

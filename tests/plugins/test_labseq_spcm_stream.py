@@ -148,6 +148,41 @@ def test_an_underrun_in_silence_is_counted_and_the_stream_begins_again(driver: A
             assert lab.card.running
 
 
+@pytest.mark.parametrize("n_batches", [1, 400])
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_a_card_that_ran_dry_before_a_program_was_written_plays_it_and_one_in_its_middle_is_an_error(
+    driver: Any, n_batches: int, is_begun: bool
+) -> None:
+    with driver("stream") as lab:
+        lab.tweezers.settle()
+        lab.clock.sleep(1e-3)
+        stream: Any = lab.tweezers._mode
+        box, held = stream._box, list[float]()
+
+        def held_step() -> float | None:
+            pause_s = stream._virtual_step()
+            is_now = box[k.START] < box[k.MADE] < box[k.END] if is_begun else box[k.START] == box[k.MADE]
+            if box[k.TAKEN] == 1 and is_now and not held:
+                held.append(25e-3)  # longer than what is in the ring
+                return held[0]
+            return pause_s
+
+        step = lab.tweezers.library.call_in_virtual_time
+        lab.tweezers.library.call_in_virtual_time = lambda _: step(held_step)
+        program = lab.program(n_batches)
+        lab.tweezers.prepare(program)
+        lab.card.forget(lab.clock.now())
+        lab.tweezers.play()
+        if is_begun:
+            with pytest.raises(TransientError, match=r"underrun: .* of a part of .* was played"):
+                lab.tweezers.wait(1.0)
+        else:
+            lab.tweezers.wait(1.0)
+            start_s(lab, program)
+            assert lab.tweezers.describe()["silent_underruns"] == 1
+        assert held
+
+
 def test_a_program_of_which_a_part_may_have_been_played_is_not_played_again(driver: Any) -> None:
     with driver("stream") as lab:
         stream: Any = lab.tweezers._mode
