@@ -19,8 +19,6 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from markdown_it import MarkdownIt
-
 ROOT: Final = Path(__file__).parents[2]
 PAGES: Final = sorted(
     [
@@ -30,6 +28,8 @@ PAGES: Final = sorted(
     ]
 )
 COMMENT: Final = re.compile(r"<!-- (file|output|run with|exit code|not run)\b(.*) -->")
+FENCE: Final = re.compile(r"^( *)(`{3,})([^`\n]*)\n(.*?)^ *\2`*[ ]*$", re.DOTALL | re.MULTILINE)
+"""A block of code: its indentation, its fence, its language, its text."""
 _GENERATED: Final = re.compile(r"<!-- reference: .*?<!-- end -->", re.DOTALL)
 _NOT_RUN: Final = re.compile(r"(?: \((.+?)\))?: (.+)")
 
@@ -84,18 +84,19 @@ def blocks_of(page: Path) -> list[Block]:
     text, name = written(page), page.relative_to(ROOT).as_posix()
     lines = text.splitlines()
     found: list[Block] = []
-    for token in MarkdownIt().parse(text):
-        if token.type not in ("fence", "code_block") or token.info.startswith("{"):
+    for fence in FENCE.finditer(text):
+        indent, _, language, code = fence.groups()
+        if language.startswith("{"):
             continue
-        assert token.map is not None
-        start = token.map[0]
+        start = text.count("\n", 0, fence.start())
         comments: dict[str, str] = {}
         for line in reversed(lines[:start]):
             comment = COMMENT.fullmatch(line.strip())
             if comment is None:
                 break
             comments[comment[1]] = comment[2] if comment[1] == "not run" else comment[2].lstrip(":, ")
-        found.append(Block(name, start + 1, token.info.strip(), token.content, comments))
+        code = re.sub(rf"^ {{0,{len(indent)}}}", "", code, flags=re.MULTILINE)
+        found.append(Block(name, start + 1, language.strip(), code, comments))
     return found
 
 

@@ -189,36 +189,44 @@ def test_tests_that_run_a_block_elsewhere_are_there() -> None:
     assert [path for path in sorted(named) if not (ROOT / path).is_file()] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_every_block_is_in_a_fence_and_every_comment_belongs_to_one(page: Path) -> None:
-    text = page.read_text("utf-8")
-    tokens = MarkdownIt().parse(text)
-    assert [token.map for token in tokens if token.type == "code_block"] == [], "indented code: use a fence"
-    assert not re.search(r"^ *~~~", text, re.MULTILINE), "fences are made of backticks"
-    n_comments = sum(COMMENT.fullmatch(line.strip()) is not None for line in text.splitlines())
-    name = page.relative_to(ROOT).as_posix()
-    assert n_comments == sum(len(block.comments) for block in BLOCKS if block.page == name)
+def test_every_block_is_in_a_fence_and_every_comment_belongs_to_one() -> None:
+    for page in PAGES:
+        text, name = page.read_text("utf-8"), page.relative_to(ROOT).as_posix()
+        tokens = MarkdownIt().parse(text)
+        assert [token.map for token in tokens if token.type == "code_block"] == [], f"{name}: use a fence"
+        assert not re.search(r"^ *~~~", text, re.MULTILINE), f"{name}: fences are made of backticks"
+        n_comments = sum(COMMENT.fullmatch(line.strip()) is not None for line in text.splitlines())
+        assert n_comments == sum(len(block.comments) for block in BLOCKS if block.page == name), name
 
 
 NEEDS_SERVER = "needs a server of devices"
 VALIDATED = [block for block in of("yaml") if block.reason != NEEDS_SERVER]
 
 
-@pytest.mark.parametrize("block", VALIDATED, ids=str)
-def test_every_yaml_example_is_valid(block: Block, tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", sorted({block.page for block in VALIDATED}))
+def test_every_yaml_example_is_valid(page: str, tmp_path: Path) -> None:
+    for block in VALIDATED:
+        if block.page == page:
+            folder = tmp_path / str(block.line)
+            folder.mkdir()
+            validate(block, folder)
+
+
+def validate(block: Block, folder: Path) -> None:
+    """Open a session with an example and what it leaves out."""
     for file in (ROOT / "sequences").glob("*.txt"):  # drawings that examples name
-        shutil.copy(file, tmp_path)
-    write_plugins(block, tmp_path)
+        shutil.copy(file, folder)
+    write_plugins(block, folder)
     node = compose(block.text, str(block))
     keys = {*node.plain()} if node is not None else set[str]()
     is_sequence = keys <= {*SequenceSpec.model_fields}
     assert is_sequence or keys <= {*ProfileSpec.model_fields}, f"neither sequence nor profile: {keys}"
-    sequence, profile = tmp_path / "sequence.yaml", tmp_path / "profile.yaml"
+    sequence, profile = folder / "sequence.yaml", folder / "profile.yaml"
     own = keys | ({"shots"} if "scan" in keys else set())  # they follow from the scan
     write(sequence, SEQUENCE, block.text if is_sequence else "", own if is_sequence else set())
     write(profile, PROFILE, "" if is_sequence else block.text, set() if is_sequence else keys)
     with labseq.Session.open(sequence, profile=str(profile)) as session:
-        assert timelines(session)
+        assert timelines(session), block
 
 
 def write(path: Path, rest: dict[str, str], text: str, keys: set[str]) -> None:
@@ -236,8 +244,16 @@ def write_plugins(block: Block, folder: Path) -> None:
                 (folder / file).write_text(other.text)
 
 
-@pytest.mark.parametrize(("block", "line"), LINES, ids=[f"{block}: {line}" for block, line in LINES])
-def test_every_command_line_can_be_parsed(block: Block, line: str) -> None:
+def test_every_command_line_can_be_parsed() -> None:
+    for block, line in LINES:
+        try:
+            parse(line, is_prose=block.language == "inline")
+        except Exception as error:
+            error.add_note(f"{block}: {line}")
+            raise
+
+
+def parse(line: str, *, is_prose: bool) -> None:
     words = [word for word in arrange(shlex.split(line)[1:]) if word != "--debug"]
     command = COMMAND
     while hasattr(command, "commands"):
@@ -246,7 +262,7 @@ def test_every_command_line_can_be_parsed(block: Block, line: str) -> None:
         command = command.commands[words.pop(0)]
     if "--help" in words:
         return
-    if words or block.language != "inline":  # prose may name a command without its arguments
+    if words or not is_prose:  # prose may name a command without its arguments
         command.make_context(line, words)
 
 
