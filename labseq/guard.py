@@ -11,6 +11,7 @@ frame and the moves.
 from __future__ import annotations
 
 import math
+import os
 import queue
 import signal
 import threading
@@ -239,7 +240,13 @@ class _Worker:
     def __init__(self, name: str) -> None:
         self._calls: queue.SimpleQueue[GuardedCall | None] = queue.SimpleQueue()
         self._current: GuardedCall | None = None
-        threading.Thread(target=self._loop, name=f"labseq {name}", daemon=True).start()
+        self._thread = threading.Thread(target=self._loop, name=f"labseq {name}", daemon=True)
+        self._thread.start()
+
+    def rename(self, name: str) -> None:
+        """Serve another owner from now on."""
+        self._current = None
+        self._thread.name = f"labseq {name}"
 
     @property
     def busy(self) -> bool:
@@ -255,6 +262,13 @@ class _Worker:
     def _loop(self) -> None:
         while (call := self._calls.get()) is not None:
             call.run()
+            del call  # an idle thread keeps nothing alive
+
+
+_idle_workers: Final[list[_Worker]] = []
+"""Threads for further short calls: starting one takes longer than most of these calls."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_idle_workers.clear)  # a forked process has none of these threads
 
 
 class Guard:
@@ -266,14 +280,17 @@ class Guard:
 
     Args:
         stop: The request to stop; without one, calls are never stopped.
+        reuses_threads: Whether its threads may have served other guards before, and may do so later. Those of
+            devices must not: vendor libraries keep a state for each thread.
 
     Attributes:
         direct: Owners whose calls a shot makes in the thread of its steps. If one of these hangs, the shot is
             abandoned.
     """
 
-    def __init__(self, stop: StopFlag | None = None) -> None:
+    def __init__(self, stop: StopFlag | None = None, *, reuses_threads: bool = False) -> None:
         self._stop = stop or StopFlag()
+        self._reuses_threads = reuses_threads
         self._workers: dict[str, _Worker] = {}
         self.direct: frozenset[str] = frozenset()
 
@@ -412,7 +429,11 @@ class Guard:
     def end(self) -> None:
         """End the idle threads; one that hangs is left to the end of the process."""
         for worker in self._workers.values():
-            worker.end()
+            if self._reuses_threads and not worker.busy:
+                worker.rename("idle")
+                _idle_workers.append(worker)
+            else:
+                worker.end()
         self._workers.clear()
 
     def _worker(self, owner: str) -> _Worker:
@@ -421,7 +442,17 @@ class Guard:
             worker.end()  # its call hangs
             worker = None
         if worker is None:
-            worker = self._workers[owner] = _Worker(owner)
+            worker = self._workers[owner] = self._new_worker(owner)
+        return worker
+
+    def _new_worker(self, owner: str) -> _Worker:
+        try:
+            worker = _idle_workers.pop() if self._reuses_threads else None
+        except IndexError:
+            worker = None
+        if worker is None:
+            return _Worker(owner)
+        worker.rename(owner)
         return worker
 
     def _named(

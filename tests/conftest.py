@@ -20,7 +20,6 @@ from typing import Any
 
 import pytest
 import typer
-from _pytest.doctest import DoctestModule
 from hypothesis import settings
 
 from labseq.files import cache_root
@@ -66,12 +65,6 @@ def pytest_xdist_auto_num_workers() -> int:
     return 2 * (os.cpu_count() or 1)
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Leave out doctests of the web pages without their packages; the hooks below see `tests` only."""
-    if "starlette" in _MISSING:
-        config.option.ignore = [*(config.option.ignore or []), str(_REPOSITORY / "labseq" / "web")]
-
-
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile all kernels before the whole suite begins: its processes would each compile the same ones."""
     config = session.config
@@ -86,17 +79,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         f"import importlib, labseq.kernel as k; [*map(importlib.import_module, {names!r})]; k.load_kernels()"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_collect_file(file_path: Path) -> Generator[None, list[Any], list[Any]]:
-    """To look for examples where there are none would be a quarter of the collection."""
-    found = yield
-    if found and (
-        file_path.is_relative_to(_REPOSITORY / "tests") or ">>>" not in file_path.read_text("utf-8")
-    ):
-        return [one for one in found if not isinstance(one, DoctestModule)]
-    return found
 
 
 def pytest_collection_finish() -> None:

@@ -197,3 +197,21 @@ def test_an_error_of_a_direct_call_is_named(guard):
 
     with pytest.raises(DeviceError, match=r"detector: detect\(\) raised ZeroDivisionError"):
         guard.run_shot(partial(guard.call, "detector", 10.0, detect))
+
+
+def test_a_thread_that_was_used_serves_others_unless_it_hangs():
+    def serve(owner, work):
+        guard = Guard(reuses_threads=True)
+        try:
+            call = guard.run(owner, 0.05, partial(work))
+            return None if call is None else call.result
+        finally:
+            guard.end()
+
+    threads = [serve(owner, threading.current_thread) for owner in ("plugin a", "plugin b")]
+    assert threads[0] is threads[1]
+    release = threading.Event()
+    assert serve("plugin hanging", release.wait) is None
+    other = serve("plugin c", threading.current_thread)
+    release.set()
+    assert other not in (None, threads[0])

@@ -53,13 +53,18 @@ SHORT_S = 0.05
 @pytest.fixture
 def gate() -> Iterator[threading.Event]:
     """What a plugin that hangs waits for: opened when the test is over, so that its thread ends."""
-    event, before = threading.Event(), {*threading.enumerate()}
+    event = threading.Event()
     sys.modules["gate"] = SimpleNamespace(event=event)  # pyright: ignore[reportArgumentType]
     yield event
     event.set()
-    for thread in {*threading.enumerate()} - before:
+    for thread in threads_of_mine():
         thread.join(10.0)
     del sys.modules["gate"]
+
+
+def threads_of_mine() -> list[threading.Thread]:
+    """The threads in which code of the plugin still runs."""
+    return [thread for thread in threading.enumerate() if thread.name == "labseq plugin mine"]
 
 
 @pytest.fixture(autouse=True)
@@ -163,9 +168,8 @@ class TestHanging:
 
     def test_what_wakes_up_later_registers_nothing(self, tmp_path: Path, gate: threading.Event) -> None:
         code = GOOD.replace("# registration", "").replace(HOOK, f"{HOOK}\n    import gate; gate.event.wait()")
-        before = {*threading.enumerate()}
         host, _ = loaded(tmp_path, code, SHORT_S)
-        (thread,) = {*threading.enumerate()} - before
+        (thread,) = threads_of_mine()
         gate.set()
         thread.join(10.0)
         assert host.registry.entries() == []

@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from contextvars import Context
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -28,7 +29,7 @@ LOCAL_PACKAGE: Final = "labseq_local"
 def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     """Run code of a plugin, and name the plugin in any error.
 
-    The code runs in a separate thread: if it hangs it is abandoned after ``owner.max_wait_s``, and a
+    The code runs in another thread: if it hangs it is abandoned after ``owner.max_wait_s``, and a
     ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. Its prints go to stderr,
     because a program may read JSON from stdout, and is recorded with the owner.
 
@@ -42,10 +43,11 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
         PluginLoadError: The code raised, or did not return in time.
         LabseqError: The code raised one of labseq's own errors.
     """
-    guard, printed = Guard(), _PrintsToStderr(sys.stdout)
+    guard, printed = Guard(reuses_threads=True), _PrintsToStderr(sys.stdout)
     try:
         with redirect_stdout(cast("Any", printed)):
-            call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(work))
+            # a context of its own: what code sets there, such as decimal's precision, ends with the call
+            call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(Context().run, work))
     finally:
         guard.end()
         if text := printed.end():
