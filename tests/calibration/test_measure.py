@@ -44,7 +44,7 @@ def lab(tmp_path: Path, make_lab: Any) -> Any:
 def measured(tmp_path_factory: pytest.TempPathFactory, make_lab: Any) -> Any:
     """Such a lab after calibrations of sites and thresholds, for reading only."""
     lab = make_lab(tmp_path_factory.mktemp("measured") / "lab", PROFILE)
-    lab.sites, lab.thresholds = lab.calibrate("sites", shots=40), lab.calibrate("thresholds", shots=60)
+    lab.sites, lab.thresholds = lab.calibrate("sites", shots=40), lab.calibrate("thresholds", shots=40)
     return lab
 
 
@@ -98,7 +98,7 @@ def test_a_run_may_be_analysed_again(measured: Any, copied: Any) -> None:
 
 def test_the_change_since_the_last_calibration_is_reported(copied: Any) -> None:
     copied.write_profile(PROFILE.replace("centre_px: [77.3, 90.8]", "centre_px: [77.8, 90.6]"))
-    changes = copied.calibrate("sites", shots=20).changes
+    changes = copied.calibrate("sites", shots=15).changes
     positions = next(change for change in changes if change.name == "positions_px")
     assert positions.mean == pytest.approx((0.5, -0.2), abs=0.05)
 

@@ -26,9 +26,9 @@ from labseq.plugin import Context, DepthRamp, RandomStream, Run, TweezerAmplitud
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).parents[2]
-SHOTS = {"tweezers": 1, "sites": 10, "thresholds": 60, "frequencies": 58, "overlay": 29}
+SHOTS = {"tweezers": 1, "sites": 8, "thresholds": 60, "frequencies": 29, "overlay": 29}
 """Kinds in the order of the morning, and fewer shots than usual."""
-N_FRESH = 30
+N_FRESH = 15
 COSTS = np.array([3.0, 1.0])
 """Of an atom that is missed and of one that is imagined, as thresholds are fitted."""
 LADDER = np.arange(-2000.0, 14_384.0, 2.0)

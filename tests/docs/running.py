@@ -25,13 +25,14 @@ FEW: Final = {
     "run": "--shots 1 --seed 1",
     "queue add": "--shots 1",
     "bench planners": "--loadings 2 --workers 1",
-    "bench latency": "--loadings 2",
+    "bench latency": "--loadings 1",
     "bench waveform": "--repeats 1",
     "calibrate amplitudes": "",
     "calibrate tweezers": "",
     "calibrate sites": "--shots 8 --seed 1",
     "calibrate timing": "--shots 5 --seed 1",
-    "calibrate": "--shots 30 --seed 1",
+    "calibrate thresholds": "--shots 30 --seed 1",
+    "calibrate": "--shots 29 --seed 1",
 }
 """Commands that take long -> what makes them short where the page says nothing else."""
 RUN: Final = re.compile(r"data/(\d{4}-\d\d-\d\d/\d{4})_([a-z0-9-]+)")

@@ -45,7 +45,7 @@ def test_the_fitted_value_is_that_of_the_simulation(
 ) -> None:
     sequence = ROOT / "sequences" / f"{name}.yaml"
     with labseq.Session.open(
-        sequence, seed=3, output=tmp_path, overrides=["repeats=2", *SMALL_FRAMES]
+        sequence, seed=3, output=tmp_path, overrides=["repeats=1", *SMALL_FRAMES]
     ) as session:
         run = session.run()
     given = ("centre=0",) if name == "hand_over_ramp" else ()
