@@ -64,9 +64,9 @@ def test_seed_and_settings_change_the_plans(report: LatencyReport) -> None:
     assert parallel.n_batches < report.n_batches
 
 
-@pytest.mark.parametrize(("mode", "modelled"), [("replay", (2e-3, 10e-3)), ("stream", (0.2e-3, 0.25e-3))])
+@pytest.mark.parametrize(("mode", "modelled"), [("replay", (1e-3, 5e-3)), ("stream", (0.2e-3, 0.5e-3))])
 def test_a_simulated_card_takes_modelled_time_too(mode: str, modelled: tuple[float, float]) -> None:
-    settings = ("sample_rate=624 MHz", f"mode={mode}")
+    settings = ("sample_rate=312 MHz", f"mode={mode}")
     report = measure(
         *(f"profile.mobile_tweezers.{one}" for one in settings), profile="bench_awg", n_loadings=1
     )
@@ -74,7 +74,7 @@ def test_a_simulated_card_takes_modelled_time_too(mode: str, modelled: tuple[flo
     low_s, high_s = modelled  # replay: the transfer; stream: the silence ahead of the outputs
     assert low_s < report.light.modelled_s < high_s
     if mode == "replay":
-        n_bytes = 4 * 624e6 * report.playing_s
+        n_bytes = 4 * 312e6 * report.playing_s
         assert report.light.modelled_s == pytest.approx(n_bytes / 2.8e9, rel=0.1)
     assert report.delay_s <= report.light.modelled_s
 
