@@ -61,8 +61,8 @@ _REPOSITORY = Path(__file__).parents[1]
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Two processes for each core: a third of the time, tests wait for processes and devices."""
-    return 2 * (os.cpu_count() or 1)
+    """Three processes for two cores: a quarter of the time, tests wait for processes and devices."""
+    return max(2, 3 * (os.cpu_count() or 1) // 2)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -63,7 +63,7 @@ def test_the_mean_of_the_curve_is_that_of_the_law(em_register: bool) -> None:
         assert mean == pytest.approx((law(sensor, float(light)) * found.curve[:N]).sum(), rel=0.02)
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(
     darkest=st.floats(1e-4, 10),
     more=st.floats(0.01, 30),

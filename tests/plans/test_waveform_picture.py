@@ -58,7 +58,7 @@ def count(pixels: np.ndarray[Any, Any], colour: Any) -> int:
 
 
 def test_a_long_program_with_pauses_can_be_drawn(tmp_path: Path) -> None:
-    pixels = save(tmp_path, drawing(there_and_back(40)))
+    pixels = save(tmp_path, drawing(there_and_back(16)))
     assert pixels.shape[:2] == (round(SIZE_IN[1] * DPI), round(SIZE_IN[0] * DPI))
     assert all(count(pixels, colour) > 500 for _, colour in KINDS.values())
     assert count(pixels, INTENDED) > 200

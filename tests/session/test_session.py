@@ -37,6 +37,7 @@ def test_the_same_seed_gives_the_same_data(tmp_path):
 def test_the_lab_in_a_dry_run_gives_the_same_data_for_the_same_seed(tmp_path):
     seen = RecordingObserver()
     few = ["profile.timeouts.call=120 s", "shot.2.rearrange.cycles=1"]  # the first open() imports a package
+    few.append("profile.mobile_tweezers.sample_rate=312.5 MHz")
     options: dict[str, Any] = {"profile": "lab", "dry_run": "full", "overrides": few, "shots": 1, "seed": 11}
     first, again = (run(tmp_path, observer=seen, **options) for _ in range(2))
     assert contents(first) == contents(again)
