@@ -89,7 +89,7 @@ def pytest_collection_finish() -> None:
     written need not outlive the machine; a process that is killed loses nothing of what it wrote. What is
     installed, the state of this repository and the command line stay the same: each run would read a hundred
     files for the first, start five processes for the second, and construct a parser for the last. Runs and
-    checks plan for a quarter of the random loadings.
+    checks plan for a twentieth of the random loadings.
     """
     from labseq.session import check, provenance, session
 
@@ -99,7 +99,7 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(100_000, 20, 20)
     patch = pytest.MonkeyPatch()
     patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
-    patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 4)
+    patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
     patch.setattr(os, "fsync", os.fstat)
     patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
     patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))
