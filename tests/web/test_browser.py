@@ -221,7 +221,7 @@ def test_token_is_asked_for(tmp_path: Path, watched: Watched, browser: Any) -> N
         server.stop()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def full(tmp_path_factory: pytest.TempPathFactory) -> Generator[Server]:
     """A data folder with something for every page: a real scan, hostile texts, a queue, calibrations."""
     home = tmp_path_factory.mktemp("lab")
@@ -268,10 +268,20 @@ def settled(page: Any) -> None:
     expect(page.locator("main[aria-busy='false'] h1").first).to_be_visible()
 
 
-def test_every_page_in_both_themes_and_three_sizes(full: Server, watched: Watched) -> None:
+def test_pages_of_a_folder_with_something_for_each(full: Server, watched: Watched) -> None:
+    """In one test, because several processes would each start the browser and take the runs."""
+    page = watched.page
+    page.goto(full.address)
+    check_every_page_in_both_themes_and_three_sizes(full, page)
+    assert watched.faults == []
+    run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
+    check_that_a_link_leads_to_the_same_shot_with_its_images_and_moves(full, page, run)
+    check_that_a_comment_is_kept_and_found(full, page, run)
+
+
+def check_every_page_in_both_themes_and_three_sizes(full: Server, page: Any) -> None:
     """No overflow, no request elsewhere, no markup from a file, and nothing that axe finds serious."""
-    page, axe = watched.page, (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
-    page.goto(f"{full.address}")
+    axe = (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
     for path in pages_of(full.data):
         page.goto(f"http://127.0.0.1:{full.port}{path}")
         settled(page)
@@ -284,7 +294,7 @@ def test_every_page_in_both_themes_and_three_sizes(full: Server, watched: Watche
             page.emulate_media(color_scheme=theme)
             assert serious(page, theme) == [], (path, theme)
         assert page.locator("main img[src='x'], main b").count() == 0, path
-    assert watched.faults == []
+    page.emulate_media(color_scheme="no-preference")
 
 
 AXE = """async rules => (await axe.run(document, {resultTypes: ['violations'], runOnly: rules})).violations
@@ -298,10 +308,9 @@ def serious(page: Any, theme: str) -> list[str]:
     return page.evaluate(AXE, rules)
 
 
-def test_a_link_leads_to_the_same_shot_with_its_images_and_moves(full: Server, watched: Watched) -> None:
-    page = watched.page
-    page.goto(full.address)
-    run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
+def check_that_a_link_leads_to_the_same_shot_with_its_images_and_moves(
+    full: Server, page: Any, run: Path
+) -> None:
     shot = open_run(run).shots[1]
     page.goto(f"http://127.0.0.1:{full.port}/runs/{run.parent.name}/{run.name}")
     page.get_by_role("link", name="1", exact=True).click()
@@ -318,10 +327,7 @@ def test_a_link_leads_to_the_same_shot_with_its_images_and_moves(full: Server, w
     expect(page.get_by_role("heading", name="Shot 1")).to_be_visible()
 
 
-def test_a_comment_is_kept_and_found(full: Server, watched: Watched) -> None:
-    page = watched.page
-    page.goto(full.address)
-    run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
+def check_that_a_comment_is_kept_and_found(full: Server, page: Any, run: Path) -> None:
     page.goto(f"http://127.0.0.1:{full.port}/runs/{run.parent.name}/{run.name}")
     page.get_by_label("Comment", exact=True).last.fill("a new lens")
     page.get_by_role("button", name="Keep").click()
