@@ -37,9 +37,9 @@ NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
 }
 """Page -> what loads the libraries of the system that its simulated simulators need."""
 SHOTS: Final = {
-    "compact-225": ("sequences/compact_225.yaml", 9),
+    "compact-225": ("sequences/compact_225.yaml", 4),
     "scan-dop": ("sequences/scan_dop.yaml", 8),
-    "look": ("look.yaml", 5),
+    "look": ("look.yaml", 3),
     "figure5-multicycle": ("sequences/figure5_multicycle.yaml", 2),
 }
 """Name of a run on a page -> its sequence and number of shots."""
