@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -179,6 +179,7 @@ def _draws() -> Floats:
     return np.random.default_rng(0).random((6, N_ATOMS))
 
 
+@lru_cache(maxsize=2)  # a fit comes back to the temperature after a step of another parameter
 def _bound_atoms(eta: float) -> tuple[Floats, Floats]:
     """Atoms of the Boltzmann distribution in a Gaussian beam, restricted to bound ones.
 

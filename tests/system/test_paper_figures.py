@@ -28,7 +28,7 @@ sys.modules[spec.name] = script
 spec.loader.exec_module(script)
 
 SEQUENCES = Path(__file__).parents[2] / "sequences"
-N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "40"))
+N_SHOTS = int(os.environ.get("LABSEQ_FIGURE_SHOTS", "24"))
 MISSED = 5e-5
 """Atoms that the detector misses, as docs/explanation/virtual-images.md has them."""
 
