@@ -25,7 +25,7 @@ from hypothesis import settings
 from labseq.files import cache_root
 
 # A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
-settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=40)
+settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=30)
 settings.register_profile("search", deadline=None)
 settings.load_profile("labseq")
 
@@ -58,6 +58,8 @@ _ENTRY_POINTS: Callable[..., Any] = importlib.metadata.entry_points
 _READ_TEXT = importlib.metadata.PathDistribution.read_text
 _GIT: dict[tuple[Path | str | None, ...], str | None] = {}
 _REPOSITORY = Path(__file__).parents[1]
+LONGEST = ("tests/web/test_browser.py", "tests/docs/test_blocks.py")
+"""Files whose tests take longest; each also prepares much that its tests share in one process."""
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -79,6 +81,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         f"import importlib, labseq.kernel as k; [*map(importlib.import_module, {names!r})]; k.load_kernels()"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests come first: begun last, one would keep a process busy when the others have ended."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 
 def pytest_collection_finish() -> None:
