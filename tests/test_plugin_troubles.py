@@ -5,6 +5,7 @@ Each failure is a small plugin of its own. Failures in a run are in tests/sessio
 
 from __future__ import annotations
 
+import decimal
 import importlib.metadata
 import json
 import sys
@@ -361,3 +362,9 @@ def test_a_program_without_stdout(monkeypatch: pytest.MonkeyPatch) -> None:
     (note,) = owner.notes
     assert note.startswith("in pattern 'x' it printed ('no reader')")
     assert sys.stdout is None
+
+
+def test_what_code_sets_for_its_context_is_not_seen_by_other_plugins() -> None:
+    owner = Owner("mine")
+    call_plugin(owner, "a", lambda: decimal.setcontext(decimal.Context(prec=3)))
+    assert call_plugin(owner, "b", lambda: decimal.getcontext().prec) == decimal.DefaultContext.prec
