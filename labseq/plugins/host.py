@@ -165,6 +165,15 @@ class PluginInfo:
     notes: list[str] = field(default_factory=list[str])
 
 
+class _HookManager(pluggy.PluginManager):
+    """Looks for hooks only among what bears their mark; to examine all of a module takes longer."""
+
+    def parse_hookimpl_opts(self, plugin: object, name: str) -> pluggy.HookimplOpts | None:
+        if getattr(vars(plugin).get(name), _MARK, None) is None:
+            return None
+        return super().parse_hookimpl_opts(plugin, name)
+
+
 class PluginHost:
     """The plugins of one session, in a separate plugin manager.
 
@@ -179,7 +188,7 @@ class PluginHost:
         self.registry = Registry(call_plugin)
         self._patience_s = max_wait_s
         self._used: set[str] = set()
-        self._pluggy = pluggy.PluginManager("labseq")
+        self._pluggy = _HookManager("labseq")
         self._pluggy.add_hookspecs(hookspecs)
         self._infos: dict[str, PluginInfo] = {}
 
