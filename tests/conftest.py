@@ -103,7 +103,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.enable()
-    gc.set_threshold(100_000, 20, 20)
+    gc.set_threshold(100_000, 20, 20)  # what tests make is rarely garbage in cycles
     patch = pytest.MonkeyPatch()
     patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
     patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
