@@ -63,8 +63,8 @@ LONGEST = ("tests/web/test_browser.py", "tests/docs/test_blocks.py")
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Three processes for two cores: a quarter of the time, tests wait for processes and devices."""
-    return max(2, 3 * (os.cpu_count() or 1) // 2)
+    """Two processes for each core: a quarter of the time, tests wait for processes and devices."""
+    return 2 * (os.cpu_count() or 1)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
