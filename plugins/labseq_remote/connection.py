@@ -276,8 +276,8 @@ class Connection:
                     if not (reply := _read([frame.buffer for frame in frames])):
                         self._lose(f"the reply to {name}() cannot be read")
                     if reply.get("n") in (self._number, 0):
-                        if why is not None and "error" in reply:
-                            raise why  # of which that error is only a consequence
+                        if why is not None:
+                            raise why  # the device may have been made safe beside the call, which ended it
                         return reply
                     continue
                 if self._is_missing(sent_s):

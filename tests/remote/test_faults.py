@@ -27,6 +27,7 @@ from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
 from labseq_remote.simulation import RemoteSimulation
 from labseq_virtual.devices import VirtualDevice
 
+import labseq.remote.served
 import labseq.remote.server
 from labseq import wire
 from labseq.guard import StopFlag
@@ -231,9 +232,11 @@ def test_a_device_is_made_safe_beside_a_call_that_hangs(
         caller.join(5.0)
 
 
+@pytest.mark.parametrize("grace_s", [0.05, 0.5], ids=["made safe before", "made safe after"])
 def test_a_call_that_was_given_up_delays_neither_the_safe_state_nor_the_end(
-    server: Served, monkeypatch: pytest.MonkeyPatch
+    server: Served, monkeypatch: pytest.MonkeyPatch, grace_s: float
 ) -> None:
+    monkeypatch.setattr(labseq.remote.served, "GRACE_S", grace_s)
     released, entered = threading.Event(), threading.Semaphore(0)
     inside, together = 0, 0
 
