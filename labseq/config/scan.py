@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias
 
@@ -542,9 +542,6 @@ def _number(node: Node) -> Number:
 _VALUES: Final = "a list such as [3, 5, 7], {linspace: [50 um/ms, 200 um/ms, 4]} or {range: [0, 20, 5]}"
 
 
-_FORMS: Final = {"linspace": "[first, last, number of values]", "range": "[start, stop, step]"}
-
-
 _TOLERANCE: Final = 1e-9  # of a step: rounding must not drop the last value of a range
 
 
@@ -567,17 +564,17 @@ def values_of(node: Node, address: str) -> list[Node]:
         what = f"the scan of '{clean(address)}' is {shown(node.plain(), node.raw)}"
         raise node.mark.error(what, _VALUES)
     kind, given = next(iter(node.value.items()))
-    if kind not in _FORMS:
+    if kind not in FORMS:
         what = f"'{clean(kind)}' is not a way to give values"
-        raise node.keys[kind].error(what, listing(_FORMS), did_you_mean(kind, _FORMS))
+        raise node.keys[kind].error(what, listing(FORMS), did_you_mean(kind, FORMS))
+    expected, amounts_of = FORMS[kind]
     if not isinstance(given.value, list) or len(given.value) != 3:
-        raise given.mark.error(f"{kind} is {shown(given.plain(), given.raw)}", _FORMS[kind])
-    limits = given.value
-    amounts, first = _linspace(limits) if kind == "linspace" else _range(given.mark, limits)
+        raise given.mark.error(f"{kind} is {shown(given.plain(), given.raw)}", expected)
+    amounts, first = amounts_of(given.mark, given.value)
     return [_written_node(float(f"{amount:.12g}"), first, given.mark) for amount in amounts]
 
 
-def _linspace(limits: list[Node]) -> tuple[list[float], Number]:
+def _linspace(_: Mark, limits: list[Node]) -> tuple[list[float], Number]:
     """The values of a ``linspace``, in the unit of the first; integers if both ends are integers."""
     (first, last), count = numbers_of(limits[:2]), limits[2]
     if type(count.value) is not int or not 2 <= count.value <= MAX_POINTS:
@@ -598,6 +595,13 @@ def _range(mark: Mark, limits: list[Node]) -> tuple[list[float], Number]:
         raise mark.error(f"the range has {n_steps:.3g} values", f"at most {MAX_POINTS}")
     amounts = [start.amount + i * step.amount for i in range(math.floor(n_steps + _TOLERANCE) + 1)]
     return amounts, start._replace(is_whole=start.is_whole and step.is_whole)
+
+
+FORMS: Final[Mapping[str, tuple[str, Callable[[Mark, list[Node]], tuple[list[float], Number]]]]] = {
+    "linspace": ("[first, last, number of values]", _linspace),
+    "range": ("[start, stop, step]", _range),
+}
+"""How three numbers give the values of an address: name -> what the numbers are, and the values' function."""
 
 
 def _written_node(amount: float, like: Number, mark: Mark) -> Node:

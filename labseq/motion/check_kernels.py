@@ -187,7 +187,7 @@ def check_tones(
 
 
 @helper_kernel(f"{FAULT}({ATOMS}, {STAMPS}, int64, int64[::1], int64[::1])")
-def check_paths(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column_goal: Ints) -> Fault:
+def check_line_moves(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column_goal: Ints) -> Fault:
     """Test that no crossing of two tones, named or not, meets an atom that stands.
 
     All tones that move do so along one axis, so a crossing goes straight.
@@ -285,7 +285,7 @@ def check_sources(batch: Moves, n_rows: int, n_cols: int) -> Fault:
     f"{FAULT}({MOVES}, {POSITIONS}, {KNOTS}, UniTuple(int64, 3), {ATOMS}, {STAMPS}, {STAMPS}, {STAMPS},"
     f" int64, int64, int64, int64, int64, {POSITIONS})"
 )
-def check_paths_of_batch(
+def check_path_batch(
     batch: Moves,
     positions: Floats,
     off: Stamps,
@@ -353,7 +353,7 @@ def check_lines_of_batch(
     counted = check_tones(batch, row_goal, column_goal, max_tweezers, max_row_tones, max_column_tones)
     if counted[0] != RIGHT:
         return counted
-    fault = check_paths(atoms, lifted, stamp, row_goal, column_goal)
+    fault = check_line_moves(atoms, lifted, stamp, row_goal, column_goal)
     return fault if fault[0] != RIGHT else counted
 
 
@@ -436,7 +436,7 @@ def check(
         had_paths = shape[0] + shape[1] + shape[2] > 0
         if had_paths:
             start, off_start = start + len(positions), off_start + len(off)
-            fault = check_paths_of_batch(
+            fault = check_path_batch(
                 batch, positions, off, shape, atoms, lifted, goals, dropped, stamp,
                 max_tweezers, max_row_tones, max_column_tones, slots, geometry,
             )  # fmt: skip

@@ -17,7 +17,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from labseq.config.profile import DeviceChoice, LinesChoice, MobileTweezersChoice, ProfileSpec
-from labseq.config.scan import AdaptiveChoice
+from labseq.config.scan import FORMS, AdaptiveChoice
 from labseq.config.sequence import AnalysisChoice, SequenceSpec, StepPolicySettings
 from labseq.files import whole_file
 from labseq.registry import Entry, Registry
@@ -371,7 +371,7 @@ def _grid_scan() -> JsonSchema:
     """Addresses and the values that each takes, or a list of such mappings."""
     three = {"type": "array", "minItems": 3, "maxItems": 3}
     forms: list[JsonSchema] = [{"type": "array", "minItems": 1}]
-    for form in ("linspace", "range"):
+    for form in FORMS:
         one = {"type": "object", "required": [form], "properties": {form: three}}
         forms.append({**one, "additionalProperties": False})
     mapping = {"type": "object", "additionalProperties": {"anyOf": forms}}
