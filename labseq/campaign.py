@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SCHEDULER_FILE: Final = "scheduler.pem"
 WORKER_FILE: Final = "worker.pem"
-_NAMES: Final = {SCHEDULER_FILE: "scheduler", WORKER_FILE: "worker", "client.pem": "client"}
+_NAMES: Final = {SCHEDULER_FILE: "scheduler", WORKER_FILE: "worker"}
 DAYS: Final = 730
 """How long the certificates are valid."""
 
@@ -71,11 +71,11 @@ def run_file(
     if netcdf is not None:
         check_installed("xarray", "h5netcdf")
         check_writable(netcdf)
-    campaign = Campaign.read(file)
-    runs = run_campaign(partial(run_session, as_json=False), campaign, folder.expanduser(), workers)
-    rows: list[tuple[Any, ...]] = [(*campaign.axes, "shots", "filling", "run")]
-    for point, run in zip(campaign.points(), runs, strict=True):
-        values = [campaign.axes[address][i] for address, i in zip(campaign.axes, point, strict=True)]
+    wanted = Campaign.read(file)
+    runs = run_campaign(partial(run_session, as_json=False), wanted, folder.expanduser(), workers)
+    rows: list[tuple[Any, ...]] = [(*wanted.axes, "shots", "filling", "run")]
+    for point, run in zip(wanted.points(), runs, strict=True):
+        values = [wanted.axes[address][i] for address, i in zip(wanted.axes, point, strict=True)]
         known = [one for shot in run.shots if not math.isnan(one := shot.filling_fraction)]
         filling = f"{100 * sum(known) / len(known):.2f} %" if known else "-"
         rows.append((*values, str(len(run.shots)), filling, f"{run.path.parent.name}/{run.path.name}"))
@@ -98,7 +98,7 @@ def make_keys(folder: Path) -> list[Path]:
         ConfigError: One of the files exists, or the extra is not installed.
         RecordingError: The folder cannot be written to.
     """
-    from labseq.cluster import CA_FILE
+    from labseq.cluster import CA_FILE, CLIENT_FILE
 
     try:
         import cryptography  # noqa: F401  # pyright: ignore[reportUnusedImport]
@@ -107,7 +107,8 @@ def make_keys(folder: Path) -> list[Path]:
     except ModuleNotFoundError as error:
         what = "certificates need the Python package 'cryptography', which is not installed"
         raise ConfigError(Problem(what, hint=install_hint("campaign"))) from error
-    paths = [folder / name for name in (CA_FILE, *_NAMES)]
+    roles = {**_NAMES, CLIENT_FILE: "client"}
+    paths = [folder / name for name in (CA_FILE, *roles)]
     if taken := [path for path in paths if path.exists()]:
         what = "this file already exists; nothing was written"
         raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without certificates"))
@@ -118,7 +119,7 @@ def make_keys(folder: Path) -> list[Path]:
     authority = ec.generate_private_key(ec.SECP256R1())
     root = _certificate("labseq campaign", authority, None, None)
     _write(folder / CA_FILE, root.public_bytes(encoding))
-    for file, name in _NAMES.items():
+    for file, name in roles.items():
         key = ec.generate_private_key(ec.SECP256R1())
         secret = key.private_bytes(encoding, serialization.PrivateFormat.PKCS8, plain)
         _write(folder / file, secret + _certificate(name, key, authority, root).public_bytes(encoding))

@@ -240,13 +240,11 @@ class _Worker:
     def __init__(self, name: str) -> None:
         self._calls: queue.SimpleQueue[GuardedCall | None] = queue.SimpleQueue()
         self._current: GuardedCall | None = None
-        self._thread = threading.Thread(target=self._loop, name=f"labseq {name}", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._loop, name=f"labseq {name}", daemon=True).start()
 
-    def rename(self, name: str) -> None:
-        """Serve another owner from now on."""
+    def forget(self) -> None:
+        """Keep nothing of the last call alive."""
         self._current = None
-        self._thread.name = f"labseq {name}"
 
     @property
     def busy(self) -> bool:
@@ -265,8 +263,8 @@ class _Worker:
             del call  # an idle thread keeps nothing alive
 
 
-_idle_workers: Final[list[_Worker]] = []
-"""Threads for further short calls: starting one takes longer than most of these calls."""
+_idle_workers: Final[dict[str, list[_Worker]]] = {}
+"""Owner -> threads for its further short calls: starting one takes longer than most of these calls."""
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_idle_workers.clear)  # a forked process has none of these threads
 
@@ -280,8 +278,8 @@ class Guard:
 
     Args:
         stop: The request to stop; without one, calls are never stopped.
-        reuses_threads: Whether its threads may have served other guards before, and may do so later. Those of
-            devices must not: vendor libraries keep a state for each thread.
+        reuses_threads: Whether the threads of an owner may have served other guards before, and may do so
+            later. Those of devices must not: vendor libraries keep a state for each thread.
 
     Attributes:
         direct: Owners whose calls a shot makes in the thread of its steps. If one of these hangs, the shot is
@@ -428,10 +426,10 @@ class Guard:
 
     def end(self) -> None:
         """End the idle threads; one that hangs is left to the end of the process."""
-        for worker in self._workers.values():
+        for owner, worker in self._workers.items():
             if self._reuses_threads and not worker.busy:
-                worker.rename("idle")
-                _idle_workers.append(worker)
+                worker.forget()
+                _idle_workers.setdefault(owner, []).append(worker)
             else:
                 worker.end()
         self._workers.clear()
@@ -442,17 +440,12 @@ class Guard:
             worker.end()  # its call hangs
             worker = None
         if worker is None:
-            worker = self._workers[owner] = self._new_worker(owner)
-        return worker
-
-    def _new_worker(self, owner: str) -> _Worker:
-        try:
-            worker = _idle_workers.pop() if self._reuses_threads else None
-        except IndexError:
-            worker = None
-        if worker is None:
-            return _Worker(owner)
-        worker.rename(owner)
+            idle = _idle_workers.get(owner, []) if self._reuses_threads else []
+            try:
+                worker = idle.pop()
+            except IndexError:  # another thread may have taken the last
+                worker = _Worker(owner)
+            self._workers[owner] = worker
         return worker
 
     def _named(

@@ -50,12 +50,12 @@ _FUNCTION: Final = ctypes.CFUNCTYPE(ctypes.c_uint32, *[ctypes.c_int64] * 3)
 
 
 def _call(address: int, a: int, b: int, c: int) -> int:
-    return int(_FUNCTION(address)(a, b, c))
+    return int(_FUNCTION(int(address))(int(a), int(b), int(c)))
 
 
 def _array(address: int, shape: Any, dtype: Any) -> NDArray[Any]:
     n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    memory: Any = (ctypes.c_char * n_bytes).from_address(address)
+    memory: Any = (ctypes.c_char * n_bytes).from_address(int(address))
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
@@ -64,7 +64,7 @@ def _pointer(address: int) -> int:
 
 
 def _swap(address: int, value: int) -> int:
-    word = ctypes.c_int64.from_address(address)
+    word = ctypes.c_int64.from_address(int(address))
     before, word.value = word.value, value
     return before
 

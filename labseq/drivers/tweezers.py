@@ -60,19 +60,17 @@ def _excess(
     name: str, word: str, axis: AxisTones, batch: NDArray[np.int32], band_hz: tuple[float, float], most: float
 ) -> LimitError:
     """The error for the first tone that is out of its limits, or for amplitudes too high together."""
-    low, high = band_hz[0] / 1e6, band_hz[1] / 1e6
-    band = f"the AOD's band, {low:.6g} to {high:.6g} MHz"
+    band = f"the AOD's band, {band_hz[0] / 1e6:.6g} to {band_hz[1] / 1e6:.6g} MHz"
     full_scale = f"0 to {most:g} of full scale"
-    for quantity, start, end, least, greatest, unit, limit in (
-        ("frequency", axis.start_hz / 1e6, axis.end_hz / 1e6, low, high, "MHz", band),
-        ("phase", axis.phase_rad, axis.phase_rad, -math.inf, math.inf, "rad", "a finite number of radians"),
+    phases, radians = (-math.inf, math.inf, 1.0, "rad"), "a finite number of radians"
+    for quantity, start, end, (least, greatest, scale, unit), limit in (
+        ("frequency", axis.start_hz, axis.end_hz, (*band_hz, 1e6, "MHz"), band),
+        ("phase", axis.phase_rad, axis.phase_rad, phases, radians),
         (
             "amplitude",
             axis.start_amplitude,
             axis.end_amplitude,
-            0.0,
-            most + ROUNDING,
-            "of full scale",
+            (0.0, most + ROUNDING, 1.0, "of full scale"),
             full_scale,
         ),
     ):
@@ -84,7 +82,7 @@ def _excess(
             where = (
                 f"{word} tone {tone - axis.offsets[segment]} in segment {segment} (batch {batch[segment]})"
             )
-            value = f"{values[tone, end_of_tone]:.9g} {unit}"
+            value = f"{values[tone, end_of_tone] / scale:.9g} {unit}"
             return LimitError(f"{name}: {quantity} of {where}", value, limit)
     both = np.stack([axis.start_amplitude, axis.end_amplitude])
     sums = np.diff(np.pad(np.cumsum(both, axis=1), ((0, 0), (1, 0)))[:, axis.offsets]).max(axis=0)

@@ -46,7 +46,8 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     guard, printed = Guard(reuses_threads=True), _PrintsToStderr(sys.stdout)
     try:
         with redirect_stdout(cast("Any", printed)):
-            # a context of its own: what code sets there, such as decimal's precision, ends with the call
+            # a context of its own: what code sets there, such as decimal's precision, ends with the call;
+            # what it keeps in the thread itself lasts until its own next call
             call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(Context().run, work))
     finally:
         guard.end()

@@ -144,7 +144,7 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
             f"it is in use as the calibration '{kind}'; "
             f"'labseq calibration use {kind}=off --profile {quote(document.name)}' puts it aside"
             if pin is None
-            else f"asked for by the key 'calibrations.use.{kind}' of {where or document.name}"
+            else f"asked for by the key 'calibrations.use.{kind}' of {where}"
         )
         raise ConfigError([replace(one, notes=(*one.notes, note)) for one in error.problems]) from error
 

@@ -341,6 +341,8 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
         numbers: dict[_PointCheck, set[int]] = {first: {0}}
         for known in session.scan_run.known_points():
             numbers.setdefault(checks.of(known.settings), set()).add(known.number)
+        # the first points first, in whatever order the shots take them
+        numbers = dict(sorted(numbers.items(), key=lambda item: min(item[1])))
         asks = (
             _PointCheck.ask_steps,
             _PointCheck.ask_timeline,

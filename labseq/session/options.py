@@ -8,10 +8,24 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from labseq.config.addresses import Override
+from labseq.errors import ConfigError, Problem
+from labseq.messages import clean
 from labseq.session.chosen import DryRun
 
 NOT_SET: Final = ("profile", "dry_run")
 """Options that do not replace a value of the sequence."""
+
+
+def path_of(value: Any, name: str) -> Path:
+    """Convert a caller's argument to a path.
+
+    Raises:
+        ConfigError: The argument is not a path.
+    """
+    try:
+        return Path(value)
+    except TypeError:
+        raise ConfigError(Problem(f"{name} is {clean(repr(value))}", expected="a path")) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +61,11 @@ class Options:
     def has_workers(self) -> bool:
         """Whether other processes take the shots."""
         return self.workers != 1 or self.scheduler is not None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]
+            what = f"profile is {clean(repr(self.profile))}"
+            raise ConfigError(Problem(what, expected="the name or the path of a hardware profile"))
 
     @classmethod
     def of(cls, changes: Mapping[str, Any], *, realtime: bool = False) -> Self:

@@ -29,7 +29,7 @@ from labseq.session.chosen import DryRun
 from labseq.session.lab import build_lab, clock_for, warm
 from labseq.session.locks import lock_devices
 from labseq.session.observers import Observers
-from labseq.session.options import Options
+from labseq.session.options import Options, path_of
 from labseq.session.policies import Checks
 from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import make_safe_after_crash
@@ -117,11 +117,11 @@ class Session:
             UnknownPluginError: A plugin that is named does not exist.
             PluginLoadError: A plugin that is named failed to load.
         """
-        folder = None if output is None else Path(output)
+        folder = None if output is None else path_of(output, "output")
         options = Options(
             profile, shots, seed, overrides, folder, dry_run, realtime, workers, scheduler, keys
         )
-        return cls(assemble(Path(sequence), options), options, observer)
+        return cls(assemble(path_of(sequence, "sequence"), options), options, observer)
 
     @classmethod
     def resume(
@@ -156,7 +156,9 @@ class Session:
         """
         from labseq.session.resume import reopened
 
-        assembly, options, earlier = reopened(Path(run), accept_changes=accept_changes, realtime=realtime)
+        assembly, options, earlier = reopened(
+            path_of(run, "run"), accept_changes=accept_changes, realtime=realtime
+        )
         return cls(
             assembly, replace(options, workers=workers, scheduler=scheduler, keys=keys), observer, earlier
         )

@@ -34,7 +34,7 @@ from labseq_remote.simulation import RemoteSimulation
 def checked(name: str) -> Any:
     """A check by the driver at the server, if it has it; the device need not be open."""
 
-    def method(driver: RemoteHardware, *args: Any, **named: Any) -> None:
+    def method(driver: RemoteHardware, /, *args: Any, **named: Any) -> None:
         if name in driver.link.about["abilities"]:
             driver.link.connect().call(name, *args, **named)
 

@@ -149,7 +149,7 @@ class Linked(Protocol):
 def called(name: str) -> Any:
     """A method that is carried out at the server; its meaning is that of the role."""
 
-    def method(driver: Linked, *args: Any, **named: Any) -> Any:
+    def method(driver: Linked, /, *args: Any, **named: Any) -> Any:
         return driver.call(name, *args, **named)
 
     method.__name__ = name

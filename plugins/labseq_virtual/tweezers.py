@@ -131,7 +131,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         """Check a program and keep it for the next ``play``.
 
         Returns:
-            RunningProgram time in seconds.
+            Playing time in seconds.
 
         Raises:
             LimitError: It has no length, leaves the AOD's band, or clips.

@@ -48,6 +48,13 @@ def test_a_tone_beyond_its_limits_is_named(axis: str, name: str, value: float, t
         check_tone_program("awg", changed(axis, name, value), *BANDS)
 
 
+def test_a_tone_is_named_that_is_beyond_the_band_by_rounding() -> None:
+    end_hz = 128.3e6  # the next number is the same in MHz
+    beyond = changed("row", "start_hz", np.nextafter(end_hz, np.inf))
+    with pytest.raises(LimitError, match="frequency of row tone"):
+        check_tone_program("awg", beyond, (82e6, end_hz), BANDS[1])
+
+
 @pytest.mark.parametrize("name", ["start_amplitude", "end_amplitude"])
 def test_tones_that_clip_only_together_are_refused(name: str) -> None:
     n_tones = np.diff(PROGRAM.column.offsets)

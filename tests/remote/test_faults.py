@@ -204,6 +204,14 @@ def test_a_lost_reply_ends_the_connection(server: Served, faulty: Proxy) -> None
             device.command("open")
 
 
+def test_arguments_of_any_name_travel(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    got: dict[str, Any] = {}
+    monkeypatch.setattr(VirtualDevice, "command", lambda _, __, **named: got.update(named))
+    with instrument(server) as device:
+        device.command("set", driver=1, device=2)
+    assert got == {"driver": 1, "device": 2}
+
+
 def test_a_second_client_may_look_but_not_act(server: Served) -> None:
     with instrument(server) as first:
         first.command("open")

@@ -12,9 +12,17 @@ from labseq.session.session import Session
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 
 
+@pytest.mark.parametrize("sequence", [None, b"a.yaml"])
+def test_the_sequence_is_a_path(sequence: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^sequence is .*; expected a path$"):
+        Session.open(sequence)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
+        ({"output": 5}, "output is 5; expected a path"),
+        ({"profile": 5}, "profile is 5; expected the name or the path of a hardware profile"),
         ({"shots": "many"}, "--shots many: shots is 'many'; expected a whole number"),
         ({"dry_run": "slow"}, "dry_run is 'slow'; expected one of 'off', 'full', 'fast'"),
         ({"overrides": "shots=5"}, "overrides is 'shots=5'; expected a list of texts such as ['shots=5']"),
