@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from labseq.session.options import Options
 
 
-SCHEDULER_FILE: Final = "scheduler.pem"
-WORKER_FILE: Final = "worker.pem"
-_NAMES: Final = {SCHEDULER_FILE: "scheduler", WORKER_FILE: "worker"}
 DAYS: Final = 730
 """How long the certificates are valid."""
 
@@ -107,7 +104,7 @@ def make_keys(folder: Path) -> list[Path]:
     except ModuleNotFoundError as error:
         what = "certificates need the Python package 'cryptography', which is not installed"
         raise ConfigError(Problem(what, hint=install_hint("campaign"))) from error
-    roles = {**_NAMES, CLIENT_FILE: "client"}
+    roles = {"scheduler.pem": "scheduler", "worker.pem": "worker", CLIENT_FILE: "client"}
     paths = [folder / name for name in (CA_FILE, *roles)]
     if taken := [path for path in paths if path.exists()]:
         what = "this file already exists; nothing was written"

@@ -61,34 +61,27 @@ def _excess(
 ) -> LimitError:
     """The error for the first tone that is out of its limits, or for amplitudes too high together."""
     band = f"the AOD's band, {band_hz[0] / 1e6:.6g} to {band_hz[1] / 1e6:.6g} MHz"
-    full_scale = f"0 to {most:g} of full scale"
-    phases, radians = (-math.inf, math.inf, 1.0, "rad"), "a finite number of radians"
-    for quantity, start, end, (least, greatest, scale, unit), limit in (
-        ("frequency", axis.start_hz, axis.end_hz, (*band_hz, 1e6, "MHz"), band),
-        ("phase", axis.phase_rad, axis.phase_rad, phases, radians),
-        (
-            "amplitude",
-            axis.start_amplitude,
-            axis.end_amplitude,
-            (0.0, most + ROUNDING, 1.0, "of full scale"),
-            full_scale,
-        ),
+    amplitudes, full = (axis.start_amplitude, axis.end_amplitude), "of full scale"
+    for quantity, values_at_ends, (least, greatest), scale, unit, limit in (
+        ("frequency", (axis.start_hz, axis.end_hz), band_hz, 1e6, "MHz", band),
+        ("phase", (axis.phase_rad,), (-math.inf, math.inf), 1.0, "rad", "a finite number of radians"),
+        ("amplitude", amplitudes, (0.0, most + ROUNDING), 1.0, full, f"0 to {most:g} {full}"),
     ):
-        values = np.stack([start, end], axis=1)
+        values = np.stack(values_at_ends, axis=1)
         wrong = ~(np.isfinite(values) & (values >= least) & (values <= greatest))
         if wrong.any():
-            tone, end_of_tone = np.argwhere(wrong)[0]
+            tone, end = np.argwhere(wrong)[0]
             segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
             where = (
                 f"{word} tone {tone - axis.offsets[segment]} in segment {segment} (batch {batch[segment]})"
             )
-            value = f"{values[tone, end_of_tone] / scale:.9g} {unit}"
+            value = f"{values[tone, end] / scale:.9g} {unit}"
             return LimitError(f"{name}: {quantity} of {where}", value, limit)
-    both = np.stack([axis.start_amplitude, axis.end_amplitude])
-    sums = np.diff(np.pad(np.cumsum(both, axis=1), ((0, 0), (1, 0)))[:, axis.offsets]).max(axis=0)
+    running = np.pad(np.cumsum(amplitudes, axis=1), ((0, 0), (1, 0)))
+    sums = np.diff(running[:, axis.offsets]).max(axis=0)
     segment = int(sums.argmax())
     what = f"{name}: sum of the {word} amplitudes in segment {segment} (batch {batch[segment]})"
-    return LimitError(what, f"{sums[segment]:.9g} of full scale", f"{most:g}: the output would clip")
+    return LimitError(what, f"{sums[segment]:.9g} {full}", f"{most:g}: the output would clip")
 
 
 @kernel(
