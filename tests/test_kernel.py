@@ -3,6 +3,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib
+import importlib.util
 import os
 import pickle
 import subprocess
@@ -80,7 +81,10 @@ class Package:
         self.write("top", TOP.format(package=name))
 
     def write(self, module: str, text: str) -> None:
-        (self.folder / f"{module}.py").write_text(textwrap.dedent(text), encoding="utf-8")
+        path = self.folder / f"{module}.py"
+        path.write_text(textwrap.dedent(text), encoding="utf-8")
+        # bytecode of a file of the same size from the same second would be taken for up to date
+        Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
 
     def define(self) -> ModuleType:
         for module in [name for name in sys.modules if name.split(".")[0] == self.name]:
