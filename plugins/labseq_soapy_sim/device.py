@@ -71,7 +71,7 @@ class Radio:
         clock: Clock by which it plays.
 
     Raises:
-        RuntimeError: It is lost, or another process has it open. Every method raises this for what it refuses.
+        RuntimeError: It is lost, or another process has it open. Methods raise this for what they refuse.
     """
 
     def __init__(self, arguments: Mapping[str, str], clock: Clock) -> None:
@@ -238,10 +238,9 @@ class Radio:
         n = self._wait_for_room(n, timeout_s)
         if n == 0:
             return TIMEOUT
-        if self._drops(Fault.LOST_PACKET, "sequence_errors") or self._drops(
-            Fault.LATE_PACKET, "late_packets"
-        ):
-            return n
+        for fault, count in ((Fault.LOST_PACKET, "sequence_errors"), (Fault.LATE_PACKET, "late_packets")):
+            if self._drops(fault, count):
+                return n
         self._keep([row[:n] for row in rows], n)
         return n
 
@@ -332,7 +331,7 @@ class Radio:
                 return n
             if left_s <= 0.0:
                 return int(free)
-            wait_s = PAUSE_S if is_stalled else (n - free) / self._speed_hz
+            wait_s = PAUSE_S if is_stalled else max(1.0, n - free) / self._speed_hz
             self._clock.sleep(min(wait_s, left_s, 0.05))
 
     def _keep(self, rows: Sequence[NDArray[np.uint64]], n: int) -> None:

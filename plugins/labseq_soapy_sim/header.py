@@ -93,6 +93,7 @@ class StructFunction:
         self.argtypes: Sequence[Any] = ()
 
     def __call__(self, *arguments: Any) -> Any:
+        """Call it; the structure is the one that the caller declared."""
         if ctypes.sizeof(self.restype) != self._n_bytes:
             raise MisuseError(f"{self.restype} has another size than in the header")
         result, function = self.restype(), bare(self._callback)

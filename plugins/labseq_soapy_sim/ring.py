@@ -1,4 +1,4 @@
-"""The file that a simulated radio shares with other processes: its state, and the samples that it received."""
+"""The file that a simulated radio shares with other processes: its state, and the samples it received."""
 
 from __future__ import annotations
 

@@ -344,9 +344,17 @@ class Stream:
         return found
 
     def close(self) -> None:
-        """Stop playing and close the stream."""
-        _call("deactivateStream", *self._place, 0, 0)
-        _call("closeStream", *self._place)
+        """Stop playing and close the stream.
+
+        Raises:
+            SoapyError: The radio does not obey: its transmitters may still be on.
+        """
+        try:
+            code = _call("deactivateStream", *self._place, 0, 0)
+        finally:
+            _call("closeStream", *self._place)
+        if code:
+            raise _stream_error("stopping the stream", code)
 
 
 def open_radio(setup: Setup) -> Radio:

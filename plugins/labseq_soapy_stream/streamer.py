@@ -26,7 +26,7 @@ import numpy as np
 
 from labseq_soapy_stream.messages import Setup, received, send
 from labseq_soapy_stream.output import BLOCK, Output, Samples
-from labseq_soapy_stream.soapysdr import SoapyError, Stream, lower_gains, open_radio, read_back, set_up
+from labseq_soapy_stream.soapysdr import Radio, SoapyError, Stream, lower_gains, open_radio, read_back, set_up
 
 STALL_S: Final = 2.0
 """A stream that takes no samples for so long is dead."""
@@ -238,6 +238,7 @@ def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -
     opened = Path(setup.marker).with_suffix(".opened")  # it stays if this process is killed
     with contextlib.suppress(OSError):
         opened.write_text(str(os.getpid()), "ascii")
+    is_off = True
     try:
         samples = set_up(radio, setup)
         try:
@@ -249,13 +250,19 @@ def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -
             messages.post({"facts": asdict(replace(facts, starts_together=samples.starts_together))})
             streamer.run()
         finally:
-            with contextlib.suppress(SoapyError):  # the first error is reported
-                samples.close()
+            is_off = closed(samples)
     finally:
-        with contextlib.suppress(SoapyError):
-            radio.close()
+        if closed(radio) and is_off:
             remove_own(opened)
         remove_own(Path(setup.marker))
+
+
+def closed(part: Radio | Stream) -> bool:
+    """Close a radio or its stream; returns whether it obeyed. An error that came before is reported."""
+    with contextlib.suppress(SoapyError):
+        part.close()
+        return True
+    return False
 
 
 def remove_own(file: Path) -> None:
