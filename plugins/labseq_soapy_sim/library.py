@@ -66,7 +66,9 @@ class SimulatedLibrary:
     def _exported(self, name: str) -> Any:
         result, arguments = HEADER[name]
         is_struct = result in {Range, Kwargs}
-        types = (None, POINTER(result), *arguments) if is_struct else (result, *arguments)
+        types: tuple[Any, ...] = (result, *arguments)
+        if is_struct:
+            types = None, POINTER(result), *arguments
         callback = ctypes.CFUNCTYPE(*types)(self._caught(name, result))
         self._callbacks.append(callback)
         return StructFunction(callback, ctypes.sizeof(result)) if is_struct else bare(callback)
@@ -297,7 +299,7 @@ class SimulatedLibrary:
     ) -> int:
         radio = self._streaming(device, stream)
         rows = [
-            np.frombuffer((ctypes.c_uint64 * n_samples).from_address(buffers[i]), np.uint64)
+            np.ctypeslib.as_array((ctypes.c_uint64 * n_samples).from_address(buffers[i]))
             for i in range(self._streams[stream or 0])
         ]
         start_ns = time_ns if flags[0] & HAS_TIME else None
