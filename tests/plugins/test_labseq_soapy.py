@@ -385,15 +385,15 @@ def test_ramps_of_no_duration_switch_from_one_sample_to_the_next(tmp_path: Path)
 def test_a_release_is_silence_for_its_samples_and_the_loop_runs_on(tmp_path: Path) -> None:
     with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
         rig.tweezers.start()
-        assert rig.tweezers.release(50.2e-6) == 60 / 1.2e6
+        assert rig.tweezers.release(50.7e-6) == 61 / 1.2e6
         assert rig.tweezers.describe()["depth"] == 1.0
     samples = recorded(tmp_path)
     full = at_full_depth(samples)
     wave = np.resize(samples[full.start : full.start + SMALL_LOOP], full.stop - full.start)
     kept = samples[full] == wave  # to the last bit: no phase jumps, no other amplitude
     (dark,) = np.flatnonzero(np.diff(np.flatnonzero(np.concatenate([[True], kept, [True]]))) > 1)
-    assert np.count_nonzero(~kept) == 60
-    assert not samples[full][dark : dark + 60].any()
+    assert np.count_nonzero(~kept) == 61
+    assert not samples[full][dark : dark + 61].any()
 
 
 def test_a_ramp_that_comes_during_a_release_starts_from_the_dark_at_once() -> None:

@@ -317,7 +317,9 @@ def test_left_on_after_the_run_the_light_stays_until_the_next_labseq_ends_it(tmp
     with opened(arguments=f"folder={tmp_path},record=10000000", after_run="on") as rig:
         assert not rig.tweezers.leave_on(), "it was not on"
         rig.tweezers.start()
-        assert rig.tweezers.emergency() is not None, "until then the watchdog switches it off"
+        script = rig.tweezers.emergency()
+        assert script is not None, "until then the watchdog switches it off"
+        assert script.arguments["ramp_s"] == pytest.approx(0.01 + 0.02), "also what the radio has buffered"
         assert rig.tweezers.leave_on()
         assert rig.tweezers.emergency() is None
         rig.tweezers.safe_state()

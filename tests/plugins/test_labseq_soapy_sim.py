@@ -62,6 +62,8 @@ def test_each_change_of_the_amplitudes_is_reported_once_also_a_dip_that_is_over(
         nominal = (ROWS[0] * COLUMNS[0]) ** 2
         depths = [(one.row[0] * one.column[0]) ** 2 / nominal for one in simulation.changes()]
         assert depths == pytest.approx([0.25, 1.0], abs=1e-4)
+        rig.tweezers.release(100e-6)
+        assert [one.dark_s for one in simulation.changes()] == pytest.approx([100e-6])
         rig.tweezers.load((ROWS / 2, COLUMNS))
         assert simulation.changes()[0].row == pytest.approx(ROWS / 2, abs=1e-6)
 
