@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
-
-import pytest
 
 import labseq
 from tests.remote.conftest import served
 from tests.session.small_runs import table
-
-pytestmark = pytest.mark.skipif(find_spec("spcm") is None, reason="needs the package spcm")
 
 GRID = "{rows: 6, cols: 6, spacing: 4.49 um, row_frequency: TONES, column_frequency: TONES}".replace(
     "TONES", "{centre: 100 MHz, step: 1.6 MHz}"

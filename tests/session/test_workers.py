@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import distributed
 import pytest
 
 import labseq
@@ -116,7 +117,6 @@ def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
 
 
 def test_a_cluster_takes_the_same_shots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    distributed = pytest.importorskip("distributed")
     sequence, keys = write(tmp_path, "planner"), tmp_path / "keys"
     ca, scheduler, worker, _ = map(str, make_keys(keys))
     files = {"tls_ca_file": ca, "tls_scheduler_cert": scheduler, "tls_scheduler_key": scheduler}
@@ -173,7 +173,6 @@ def test_a_worker_that_an_error_has_ended_takes_none_of_its_other_shots(tmp_path
 def test_a_cluster_that_cannot_be_used(
     address: str, keys: Path | None, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("distributed")
     monkeypatch.setattr("labseq.cluster._ANSWER_S", 0.5)
     with pytest.raises(ConfigError, match=message):
         ClusterWorkers(address, keys, "shot")
