@@ -8,7 +8,7 @@ import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import distributed
 import pytest
@@ -20,6 +20,7 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.session.options import Options
 from labseq.session.workers import Recipe, ShotWorker, TakenShot
 from labseq.testing.fakes import RecordingObserver
+from labseq.workers import ProcessWorkers
 
 from . import test_policies
 from .small_runs import OWN_DEVICE, PROFILE, interrupted, resumed, table, write
@@ -51,10 +52,30 @@ def alone(sequence: Path) -> labseq.Run:
         return session.run()
 
 
-def test_a_scan_that_is_stopped_and_resumed_while_workers_are_killed(tmp_path: Path) -> None:
+class Counting(ProcessWorkers):
+    """Counts the tasks that have been given to workers and are not done."""
+
+    out: ClassVar[list[int]] = []
+
+    def submit(self, task: int, argument: Any) -> None:
+        super().submit(task, argument)
+        self.out.append(sum(self.out[-1:]) + 1)
+
+    def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+        done = super().finished(timeout_s)
+        self.out.append(sum(self.out[-1:]) - len(done))
+        return done
+
+
+def test_a_scan_that_is_stopped_and_resumed_while_workers_are_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labseq.session.workers.ProcessWorkers", Counting)
+    monkeypatch.setattr(Counting, "out", [])
     sequence, observer = write(tmp_path, "planner"), Killing()
     run_dir = interrupted(sequence, "shot_finished", 2, workers=2)
     assert len(labseq.open_run(run_dir).shots) == 2
+    assert max(Counting.out) >= 4, "a worker that ends a shot has to wait for the next"
     run, expected = resumed(run_dir, observer, workers=2), alone(sequence)
     assert observer.n_kills == 2
     assert table(run) == table(expected)
