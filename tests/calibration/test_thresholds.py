@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from labseq.calibration.thresholds import FittedThresholds, Peak, fit_thresholds
+from labseq.calibration.thresholds import FittedThresholds, Peak, analyse_thresholds, fit_thresholds
 from labseq.errors import DeviceError, LimitError
 
 Floats = NDArray[np.float64]
@@ -152,6 +155,33 @@ def test_a_site_with_little_light_and_one_with_a_few_bright_frames_have_one_peak
     found = fit_thresholds(signals)
     assert np.argwhere(found.never_loaded | found.always_loaded).tolist() == [[1, 1], [4, 4]]
     assert found.thresholds[4, 4] == pytest.approx(np.median(found.thresholds), abs=1.0)
+
+
+class Signals:
+    """A detector whose frames are the signals."""
+
+    signal_unit = "counts"
+    sites_px = thresholds = np.zeros((6, 6))
+
+    def signals(self, frame: Floats) -> Floats:
+        return frame
+
+
+@pytest.mark.parametrize(("n_frames", "n_atoms", "n_counted"), [(40, 3, 0), (200, 0, 1)])
+def test_a_site_that_has_few_atoms_by_chance_does_not_count_as_one_without(
+    n_frames: int, n_atoms: int, n_counted: int
+) -> None:
+    rng = np.random.default_rng(6)
+    full = rng.random((n_frames, 6, 6)) < 0.4
+    full[:, 2, 2] = np.arange(n_frames) < n_atoms
+    signals = rng.normal(9.0 * full, 1.0)
+    chosen = SimpleNamespace(entry=SimpleNamespace(name="mine"), dump=dict)
+    data: Any = SimpleNamespace(
+        detector=Signals, frames=lambda: signals, hardware=SimpleNamespace(chosen={"detector": chosen})
+    )
+    found = analyse_thresholds(data)
+    assert found.quality["n_one_peak"] == n_counted
+    assert any("site (2, 2)" in line for line in found.summary_lines)
 
 
 def test_cosmic_rays_hardly_change_the_thresholds() -> None:

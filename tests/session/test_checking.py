@@ -153,6 +153,12 @@ def test_a_rearrangement_is_rehearsed_where_the_one_before_it_ends():
     assert "too short for most plans" in warning.what
 
 
+def test_moves_that_do_not_fit_into_a_window_are_left_to_the_next_rearrangement():
+    windows = ", ".join(f"{{rearrange: {{cycles: 1, window: {window}}}}}" for window in ("1 ms", "25 ms"))
+    found = checked(f"shot=[{{load: {{}}}}, {{image: {{}}}}, {windows}, {{image: {{}}}}]").warnings
+    assert ["too short for most plans" in warning.what for warning in found] == [True, True]
+
+
 def test_sequences_without_a_warning(tmp_path: Path):
     assert not checked("shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 3, stop_when: never}}]").warnings
     assert checked("shot=[{image: {}}]").rehearsal is None
