@@ -172,7 +172,7 @@ def test_a_site_that_has_few_atoms_by_chance_does_not_count_as_one_without(
     n_frames: int, n_atoms: int, n_counted: int
 ) -> None:
     rng = np.random.default_rng(6)
-    full = rng.random((n_frames, 6, 6)) < 0.4
+    full = rng.random((n_frames, 6, 6)) < 0.3
     full[:, 2, 2] = np.arange(n_frames) < n_atoms
     signals = rng.normal(9.0 * full, 1.0)
     chosen = SimpleNamespace(entry=SimpleNamespace(name="mine"), dump=dict)
