@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 import labseq
+import labseq.remote.server
+from labseq import wire
 from tests.remote.conftest import served
 from tests.session.small_runs import table
 
@@ -77,6 +81,13 @@ def run(folder: Path, profile: str) -> labseq.Run:
     (folder / "small.yaml").write_text(SEQUENCE, encoding="utf-8")
     with labseq.Session.open(folder / "small.yaml", seed=5, output=folder / "runs") as session:
         return session.run()
+
+
+@pytest.fixture(autouse=True)
+def _never_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four servers and a run share this process, which may stand still for long."""
+    for module in (wire, labseq.remote.server):
+        monkeypatch.setattr(module, "LOST_S", 60.0)
 
 
 def test_devices_of_several_servers_share_a_simulation(tmp_path: Path) -> None:

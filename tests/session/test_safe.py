@@ -171,10 +171,10 @@ def test_a_command_that_opens_devices_and_is_killed_leaves_them_off(command: str
     plugin.write_text(text.replace("import labseq\n", STAYS, 1).replace("class Mine:", GUARDED), "utf-8")
     labseq = [sys.executable, "-m", "labseq", command, "./p.yaml"]
     with subprocess.Popen(labseq, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        until(lambda: process.poll() is not None or Path("reached").exists())
+        until(lambda: process.poll() is not None or Path("reached").exists(), 120.0)
         assert process.poll() is None, process.communicate()
         process.kill()
-        _, said = process.communicate(timeout=20.0)  # until the watchdog has ended, too
+        _, said = process.communicate(timeout=120.0)  # until the watchdog has ended, too
     assert not Path("on").exists()
     assert f"labseq-watchdog: labseq {command} died; shutter is off after " in said
 
