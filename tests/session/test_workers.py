@@ -145,7 +145,8 @@ def test_a_cluster_takes_the_same_shots(tmp_path: Path, monkeypatch: pytest.Monk
     files |= {"tls_client_cert": worker, "tls_client_key": worker}
     about: dict[str, Any] = {"dashboard_address": ":0", "protocol": "tls", "processes": False}
     about["security"] = distributed.Security(require_encryption=True, **files)
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, **about) as cluster:
+    make_cluster: Any = distributed.LocalCluster
+    with make_cluster(n_workers=1, threads_per_worker=2, **about) as cluster:
         options: dict[str, Any] = {"scheduler": cluster.scheduler_address, "keys": keys}
         options["output"] = tmp_path / "data"
         runs = list[labseq.Run]()
