@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import numpy as np
 
@@ -240,11 +240,11 @@ def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -
         opened.write_text(str(os.getpid()), "ascii")
     try:
         samples = set_up(radio, setup)
-        facts = read_back(radio, setup)
-        samples.activate()
-        streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
-        signal.signal(signal.SIGTERM, streamer.terminate)
         try:
+            facts = read_back(radio, setup)
+            samples.activate()
+            streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
+            signal.signal(signal.SIGTERM, streamer.terminate)
             facts = replace(facts, buffered=streamer.fill(), no_real_time=no_real_time)
             messages.post({"facts": asdict(replace(facts, starts_together=samples.starts_together))})
             streamer.run()
@@ -290,7 +290,12 @@ def main() -> int:
     return 0
 
 
-if __name__ == "__main__":
+def run() -> NoReturn:
+    """Run the process, and end it."""
     code = main()
     sys.stderr.flush()
     os._exit(code)  # the threads wait for labseq
+
+
+if __name__ == "__main__":
+    run()

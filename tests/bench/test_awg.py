@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from labseq_aravis import load_library
-from labseq_soapy_sim import build_module
 from labseq_ttl_sim.simavr import runner
 
 from labseq import Run, Session
@@ -108,7 +107,7 @@ def test_streamed_samples_move_atoms_as_replayed_ones_do(run: RunProfile) -> Non
 
 @pytest.fixture
 def installed() -> None:
-    for load in (load_library, build_module, lambda: runner("lines")):
+    for load in (load_library, lambda: runner("lines")):
         need_library(load)
 
 

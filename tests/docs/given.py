@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import numpy as np
 from labseq_aravis import load_library
-from labseq_soapy_sim import build_module
 from labseq_ttl_sim.simavr import runner
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
@@ -32,8 +31,7 @@ REAL_LAB: Final = ("docs/how-to/rehearse.md",)
 """Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
 NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
-    "docs/how-to/cameras-genicam.md": (load_library, build_module, lambda: runner("lines")),
-    "docs/how-to/rehearse.md": (build_module,),
+    "docs/how-to/cameras-genicam.md": (load_library, lambda: runner("lines")),
 }
 """Page -> what loads the libraries of the system that its simulated simulators need."""
 SHOTS: Final = {

@@ -21,7 +21,7 @@ from labseq.model.grid import centred_comb
 from labseq.plugin import Context, LimitError, SiteGrid
 from labseq.testing import StaticTweezersContract
 
-from .labseq_soapy_rig import GRID, SMALL, depth, made, need_radio, opened, recorded, until
+from .labseq_soapy_rig import GRID, SMALL, depth, made, opened, recorded, until
 
 
 class TestSoapyStaticTweezers(StaticTweezersContract):
@@ -32,7 +32,6 @@ class TestSoapyStaticTweezers(StaticTweezersContract):
 
     @pytest.fixture
     def factory(self) -> Callable[[Context], SoapyStaticTweezers]:
-        need_radio()
         chosen = SoapySettings.model_validate({**SMALL, "switch": 1e-3})
         return partial(SoapyStaticTweezers, chosen)
 

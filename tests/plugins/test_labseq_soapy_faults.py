@@ -91,17 +91,6 @@ def test_without_the_library_the_error_says_how_to_install_it(monkeypatch: pytes
         soapysdr.library()
 
 
-def test_without_a_compiler_the_error_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    rig = made()
-    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    for use in (rig.tweezers.warm, rig.tweezers.open):
-        with pytest.raises(DeviceError, match=r"no C\+\+ compiler here; .* g\+\+ libsoapysdr-dev"):
-            use()
-
-
 DISTURBANCES = [
     (Fault.UNDERFLOW, "underflows", "ran out of samples"),
     (Fault.LOST_PACKET, "sequence_errors", "missed packets"),

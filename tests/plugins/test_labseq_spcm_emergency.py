@@ -25,7 +25,7 @@ from labseq.plugin import Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
 from .emergency import Done, outsider
-from .labseq_soapy_rig import need_radio, until
+from .labseq_soapy_rig import until
 from .small_run import PROFILE, SEQUENCE
 
 LABSEQ = """
@@ -334,7 +334,6 @@ def test_a_card_in_use_elsewhere_is_refused_and_one_that_dies_with_labseq_needs_
 
 def test_a_run_that_is_killed_leaves_card_and_radio_off(tmp_path: Path) -> None:
     """From the command line to the connectors, through the watchdog."""
-    need_radio()
     comb = "{centre: 100 MHz, step: 60 kHz}"
     radio = (
         f"device: 'simulated,speed=1,buffer=0.02,record=100000000,folder={tmp_path}', sample_rate: 1.2 MHz"
