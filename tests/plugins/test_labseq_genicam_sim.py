@@ -9,20 +9,14 @@ import sys
 
 import numpy as np
 import pytest
-from labseq_aravis import AravisError, load_library
+from labseq_aravis import AravisError
 from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
-from .labseq_genicam_rig import WAIT_S, opened, pattern, plugged_in
-from .needs import need_library
+from .labseq_genicam_rig import WAIT_S, needs_aravis, opened, pattern, plugged_in
 
-pytestmark = pytest.mark.usefixtures("aravis")
-
-
-@pytest.fixture
-def aravis() -> None:
-    need_library(load_library)
+pytestmark = needs_aravis
 
 
 def test_an_exposure_that_goes_wrong_fails_its_frame_and_is_reported() -> None:

@@ -17,16 +17,12 @@ from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import BITS, PylonSettings
 
 from .labseq_camera_rig import opened_rig, sensors
-from .needs import need_library
 
+needs_pypylon = pytest.mark.needs("pypylon")
 rig = partial(opened_rig, "pylon")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def pypylon() -> None:
-    need_library(lambda: load_pypylon("camera"))
-
-
+@needs_pypylon
 @settings(max_examples=10)
 @given(sensor=sensors(tuple(BITS)))
 def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(sensor: dict[str, Any]) -> None:
@@ -44,6 +40,7 @@ def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(senso
         np.testing.assert_array_equal(frame.image, np.minimum(shown, 2 ** BITS[sensor["pixel_format"]] - 1))
 
 
+@needs_pypylon
 def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -72,6 +69,7 @@ class Slow:
         return getattr(self._camera, name)
 
 
+@needs_pypylon
 def test_it_says_what_it_is_and_what_it_took() -> None:
     with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2) as lab:
         about = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
@@ -89,12 +87,14 @@ def serial_numbers() -> list[str]:
     return [info.GetSerialNumber() for info in infos]
 
 
+@needs_pypylon
 def test_emulated_cameras_never_stand_among_real_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PYLON_CAMEMU", raising=False)
     with rig():
         assert "0815-0000" not in serial_numbers()
 
 
+@needs_pypylon
 def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with rig() as lab:
@@ -104,6 +104,7 @@ def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert not list(tmp_path.iterdir())
 
 
+@needs_pypylon
 def test_the_camera_reads_its_own_pictures_where_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """As with a real camera: found by its number, whole sensor, all triggers, no simulation."""
     monkeypatch.setenv("PYLON_CAMEMU", "2")
