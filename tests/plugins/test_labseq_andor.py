@@ -28,6 +28,7 @@ COLD: Final[dict[str, Any]] = {"temperature": "-70 degC"}
 
 
 def test_nothing_is_compiled_to_import_pylablib() -> None:
+    load_pylablib("camera")
     from pylablib.devices.Andor.atcore_lib import read_uint12
 
     assert read_uint12.signatures == []

@@ -133,7 +133,7 @@ def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
     """The reason for all of this: outputs on, and in the mode dds for ever."""
     assert set(scope.after_death) == STATES
     assert {scope.after_death[state] for state in ENDLESS} == {(True, (True, True))}
-    assert scope.after_death["replay"] == (True, (True, True))
+    assert scope.after_death["replay"][1] == (True, True), "its relays, whether its program is over or not"
     assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
     assert scope.after_death["stream"][1] == (True, True), "its relays, whether it has run dry or not"
     assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"

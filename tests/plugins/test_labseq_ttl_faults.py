@@ -19,7 +19,7 @@ from labseq_ttl_sim.simavr import runner
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 
 from .emergency import outsider
-from .labseq_ttl_rig import FIRMWARE, FirmwareOnACable, ModelOnACable, Rig, make_rig, rig, works
+from .labseq_ttl_rig import FIRMWARE, MAX_WAIT_S, FirmwareOnACable, ModelOnACable, Rig, make_rig, rig, works
 
 MIDDLE = 10_000
 """Ticks: 5 ms after the first edge."""
@@ -293,8 +293,12 @@ on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pt
 
 
 @pytest.fixture(params=[pytest.param("python", marks=on_a_pty), FIRMWARE])
-def plugged(request: pytest.FixtureRequest, tmp_path: Path) -> Generator[Plugged]:
-    """A box at a serial port of this computer: the model, and the firmware."""
+def plugged(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Generator[Plugged]:
+    """A box at a serial port of this computer: the model, and the firmware. Both answer late under load."""
+    monkeypatch.setattr("labseq_ttl.access.RealBox.max_wait_s", MAX_WAIT_S)
+    monkeypatch.setattr("labseq_ttl.__main__.MAX_WAIT_S", MAX_WAIT_S)
     kind = FirmwareOnACable if request.param == "simavr" else ModelOnACable
     plugged = Plugged(kind(), tmp_path / "ttyACM0")
     yield plugged
@@ -332,12 +336,17 @@ def test_a_port_that_is_not_there_is_named() -> None:
         make_rig(port="socket://here").lines.open()
 
 
-def test_an_external_start_is_waited_for(plugged: Plugged) -> None:
+def test_an_external_start_is_waited_for(plugged: Plugged, monkeypatch: pytest.MonkeyPatch) -> None:
     with rig(port=plugged.name, start="external") as lab:
         lab.fire("load", 20e-3)
-        with pytest.raises(DeviceTimeoutError, match="did the edge at the start input come"):
-            lab.lines.wait(0.05)
+        with monkeypatch.context() as patch:  # it answers no question until the edge
+            patch.setattr(lab.driver_box, "_max_wait_s", 0.1)
+            with pytest.raises(DeviceTimeoutError, match="did the edge at the start input come"):
+                lab.lines.wait(0.05)
         lab.lines.safe_state()
+        n_runs = lab.driver_box.state().runs
+        plugged.start()
+        assert lab.driver_box.state().runs == n_runs, "an edge after safe_state() played the program"
         for _ in range(2):
             lab.fire("load", 20e-3)
             plugged.start()
