@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_genicam.acquisition import LAST_ID, FrameCounter
 from labseq_genicam.settings import FORMATS
+from labseq_genicam.setup import temperature_k
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
@@ -173,6 +175,14 @@ def test_numbers_tell_how_many_frames_never_came(first: int, steps: list[int], i
         if is_ethernet:
             frame_id = (frame_id - 1) % LAST_ID + 1
         assert counter.number(frame_id) == number
+
+
+def test_the_temperature_of_a_camera_that_measures_one_is_in_kelvins() -> None:
+    features = {"DeviceTemperature": 21.5}
+    camera: Any = SimpleNamespace(is_available=features.__contains__, get_float=features.__getitem__)
+    assert temperature_k(camera) == pytest.approx(294.65)
+    features.clear()
+    assert temperature_k(camera) is None
 
 
 @needs_aravis

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,20 +52,23 @@ def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual
             n_waits += 1
             return n_waits > 3 and wait(milliseconds, handling)
 
-        monkeypatch.setattr(lab.camera._opened(), "_camera", Slow(lab.pylon, wait_slowly))
+        monkeypatch.setattr(
+            lab.camera._opened(), "_camera", Changed(lab.pylon, WaitForFrameTriggerReady=wait_slowly)
+        )
         lab.take(1, 0.01)
     assert n_waits == 4
     assert lab.clock.now() == pytest.approx(0.015)
 
 
-class Slow:
-    """pylon's camera, with a wait of its own."""
+class Changed:
+    """An object of pylon's with some attributes replaced."""
 
-    def __init__(self, camera: Any, wait: Callable[[int, Any], bool]) -> None:
-        self._camera, self.WaitForFrameTriggerReady = camera, wait
+    def __init__(self, original: Any, **attributes: Any) -> None:
+        self._original = original
+        vars(self).update(attributes)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
+        return getattr(self._original, name)
 
 
 @needs_pypylon
@@ -79,6 +81,16 @@ def test_it_says_what_it_is_and_what_it_took() -> None:
     assert about["packet_size_now"] == 9000
     assert about["pixel_format"] == "Mono16"
     assert about["frame_shape"] == [48, 64]
+
+
+@needs_pypylon
+def test_time_stamps_of_the_camera_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The emulated camera makes none; others count nanoseconds unless they say otherwise."""
+    with rig() as lab:
+        retrieve = lab.pylon.RetrieveResult
+        stamped = Changed(lab.pylon, RetrieveResult=lambda *_: Changed(retrieve(*_), TimeStamp=2_500_000_000))
+        monkeypatch.setattr(lab.camera._opened(), "_camera", stamped)
+        assert lab.take(1)[0].device_time_s == pytest.approx(2.5)
 
 
 def serial_numbers() -> list[str]:

@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from labseq_ttl import box as box_module
@@ -387,6 +387,23 @@ def test_signs_of_life_go_on_past_a_failure() -> None:
     assert enough.wait(60.0)
     heartbeat.stop()
     assert not heartbeat.is_alive()
+
+
+def test_signs_of_life_come_several_times_within_the_timeout() -> None:
+    class Waits(threading.Event):
+        seconds: ClassVar[list[float]] = []
+
+        def wait(self, timeout: float | None = None) -> bool:
+            assert timeout is not None
+            self.seconds.append(timeout)
+            return len(self.seconds) > 3
+
+    beats: list[None] = []
+    heartbeat = Heartbeat(lambda: beats.append(None), 2.0)
+    heartbeat._stopped = Waits()
+    heartbeat.run()
+    assert len(beats) == 3
+    assert max(Waits.seconds) <= 1.0, "one that is late would turn the lines off"
 
 
 def test_a_box_with_lights_out_hears_signs_of_life_until_it_is_closed(plugged: Plugged) -> None:
