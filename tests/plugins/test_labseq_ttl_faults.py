@@ -17,6 +17,7 @@ from labseq_ttl_sim.model import ModelBox
 from labseq_ttl_sim.simavr import runner
 
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
+from labseq.roles import NeverStopped
 
 from .emergency import outsider
 from .labseq_ttl_rig import FIRMWARE, MAX_WAIT_S, FirmwareOnACable, ModelOnACable, Rig, make_rig, rig, works
@@ -139,6 +140,43 @@ def test_the_safe_state_waits_until_the_box_has_stopped(monkeypatch: pytest.Monk
         monkeypatch.setattr(lab.lines, "_connect", lambda: pytest.fail("it has lost the box"))
         lab.lines.safe_state()
         works(lab)
+
+
+class ReadLate(ModelBox):
+    """What it sends is read only after the stop byte was sent to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_read, self.is_stopped = threading.Event(), threading.Event()
+
+    def read(self, size: int = 1, /) -> bytes:
+        self.is_read.set()
+        assert self.is_stopped.wait(MAX_WAIT_S)
+        return super().read(size)
+
+    def write(self, data: bytes, /) -> int:
+        n_bytes = super().write(data)
+        if data == STOP:
+            self.is_stopped.set()
+        return n_bytes
+
+
+def test_a_wait_in_another_thread_does_not_take_the_message_of_the_stop() -> None:
+    port, ends = ReadLate(), list[object]()
+    box = box_module.Box(port, "lines", NeverStopped(), MAX_WAIT_S)
+
+    def wait() -> None:
+        try:
+            ends.append(box.new_events(MAX_WAIT_S))
+        except DeviceError as error:
+            ends.append(str(error))
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    assert port.is_read.wait(MAX_WAIT_S)
+    box.stop()
+    thread.join(MAX_WAIT_S)
+    assert ends == ["lines: aborted by the safe state"]
 
 
 class KeepsQuiet(ModelBox):
