@@ -14,13 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labseq_aravis import load_library
-from labseq_ttl_sim.simavr import runner
 
 from labseq import Run, Session
 from labseq.cli import main
 from labseq.recording.shot import Shot
-from tests.plugins.needs import need_library
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 N_SHOTS = int(os.environ.get("LABSEQ_SHOTS", "1"))
@@ -105,20 +102,20 @@ def test_streamed_samples_move_atoms_as_replayed_ones_do(run: RunProfile) -> Non
     compare_flights(shot, replayed, but=("held_s", "lost_s"))  # streaming starts earlier
 
 
-@pytest.fixture
-def installed() -> None:
-    for load in (load_library, lambda: runner("lines")):
-        need_library(load)
-
-
-@pytest.mark.usefixtures("installed")
-def test_a_run_through_every_driver_is_the_one_through_virtual_devices(run: RunProfile) -> None:
-    bench, expected = run("bench", shots=1), run("bench_awg", *TRIGGERED, *UNEVEN)
+@pytest.mark.needs("libaravis")
+@pytest.mark.parametrize(
+    "simulated_by", ["python", pytest.param("simavr", marks=pytest.mark.needs("firmware"))]
+)
+def test_a_run_through_every_driver_is_the_one_through_virtual_devices(
+    run: RunProfile, simulated_by: str
+) -> None:
+    bench = run("bench", f"profile.lines.simulated_by={simulated_by}", shots=1)
+    expected = run("bench_awg", *TRIGGERED, *UNEVEN)
     assert bench.simulated
     compare_flights(bench.shots[0], expected.shots[0])  # depths follow what the radio sent
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.needs("libaravis")
 def test_every_device_of_the_bench_profile_passes_its_self_test(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match=r"^0$"):
         main(["devices", "bench", "--json"])

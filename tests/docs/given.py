@@ -11,14 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from labseq_aravis import load_library
-from labseq_ttl_sim.simavr import runner
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
 import labseq as api
 from labseq.plugin import Context
-from tests.plugins.needs import need_library
 
 from .blocks import ROOT, Block, blocks_of
 from .running import RUN, labseq
@@ -30,10 +27,8 @@ OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 REAL_LAB: Final = ("docs/how-to/rehearse.md",)
 """Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
-NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
-    "docs/how-to/cameras-genicam.md": (load_library, lambda: runner("lines")),
-}
-"""Page -> what loads the libraries of the system that its simulated simulators need."""
+NEEDED: Final = {"docs/how-to/cameras-genicam.md": "libaravis"}
+"""Page -> what its simulators need that is not on every machine."""
 SHOTS: Final = {
     "compact-225": ("sequences/compact_225.yaml", 4),
     "scan-dop": ("sequences/scan_dop.yaml", 8),
@@ -113,8 +108,6 @@ def virtual_lab(to: Path) -> None:
 
 def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
     """All that a page takes for granted, in a folder."""
-    for load in NEEDED.get(page, ()):
-        need_library(load)
     copy_repository(to)
     if page not in REAL_LAB:
         virtual_lab(to)
