@@ -389,6 +389,8 @@ class TestSafeState:
             ramp = levels[:-1]  # then the amplitude is set again, with the output off
             assert ramp == sorted(ramp, reverse=True)
             assert len(ramp) > 10
+            at_s = [entry.time_s for entry in lab.card.log if entry.register == AMP0][: len(ramp)]
+            assert 0.2e-3 < at_s[-1] - at_s[0] < 0.4e-3, "slow against the swing of the atoms, and soon over"
             assert min(ramp) == 481
             assert levels[-1] == 1600
             assert not lab.card.running
