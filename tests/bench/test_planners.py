@@ -95,10 +95,9 @@ def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_cluster_finds_what_one_process_finds(report: Report) -> None:
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, protocol="tcp", processes=False, dashboard_address=":0"
-    ) as cluster:
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, protocol="tcp", processes=False, dashboard_address=":0") as cluster:
         where = Where(scheduler=cluster.scheduler_address)
         found = compare(replace(SMALL, planner_entries=TWICE), where)
     assert without_times(found.as_dict()) == without_times(report.as_dict())

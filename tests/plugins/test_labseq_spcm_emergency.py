@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -220,7 +219,7 @@ u32 spcm_dwGetErrorInfo_i32(void *card, u32 *reg, i32 *value, char *text) { retu
 """
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+@pytest.mark.needs("c-compiler")
 def test_the_functions_of_a_c_library_are_called_as_its_header_declares_them(tmp_path: Path) -> None:
     (tmp_path / "spcm.c").write_text(C_LIBRARY)
     library = tmp_path / "libspcm_linux.so"

@@ -49,6 +49,7 @@ def test_their_own_tests_pass(
     assert int(passed[1]) > 100  # promises of seven roles and more: none was left out
 
 
+@pytest.mark.needs("ruff")
 def test_they_are_clean(made: Any) -> None:
     for folder, cwd in (("plugins", made.path), (".", made.package.path)):
         run("ruff", "check", "--isolated", "--extend-select=I,B,UP,RUF,N,SIM", folder, cwd=cwd)
