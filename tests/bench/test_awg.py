@@ -49,7 +49,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunProfile:
     @cache
     def run(profile: str, *overrides: str, shots: int = N_SHOTS) -> Run:
         folder = tmp_path_factory.mktemp(profile)
-        overrides = (*overrides, "shot.2.rearrange.cycles=1", "planner.degree_of_parallelism=15")
+        small = "target.rows=9", "target.cols=9"  # half as many batches, and so samples to look for tones in
+        overrides = (*overrides, *small, "shot.2.rearrange.cycles=1", "planner.degree_of_parallelism=15")
         if profile != "virtual":  # half as many samples to look for tones in
             overrides = (*overrides, f"{MOBILE}.sample_rate=312 MHz")
         with Session.open(
@@ -79,7 +80,7 @@ def test_filling_agrees_with_the_virtual_profile(run: RunProfile, overrides: tup
     for shot in played.shots:
         flights = shot.atom_events["flights"]
         held = flights[~np.isnan(flights["held_s"])]
-        assert len(held) > 100
+        assert len(held) > 30
         assert np.isin(held["fate"], [b"transport", b"collision"]).sum() < 0.02 * len(held)
         assert held["offset_m"].max() < 5e-9
         assert len(shot.atom_events["jumps"]) == 0
