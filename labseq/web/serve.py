@@ -106,8 +106,11 @@ def check_packages() -> None:
     Raises:
         ConfigError: A package is missing.
     """
-    for name in ("starlette", "uvicorn", "httptools", *(() if os.name == "nt" else ("uvloop",))):
-        if find_spec(name) is None:
+    needed = {name: name for name in ("starlette", "uvicorn", "httptools", "uvloop")} | {"PIL": "Pillow"}
+    if os.name == "nt":
+        del needed["uvloop"]
+    for module, name in needed.items():
+        if find_spec(module) is None:
             what = f"showing runs in a browser needs {name}, which is not installed"
             raise ConfigError(Problem(what, hint=install_hint("web")))
 
