@@ -4,16 +4,12 @@ import gc
 import importlib.metadata
 import itertools
 import os
-import re
-import shutil
 import subprocess
 import sys
-import tempfile
 import tomllib
-from collections.abc import Callable, Generator
+from collections import Counter
+from collections.abc import Callable
 from functools import cache, partial
-from importlib.machinery import SourceFileLoader
-from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,44 +18,34 @@ import pytest
 import typer
 from hypothesis import settings
 
-from labseq.files import cache_root
+from tests.needs import NEEDS, is_here
 
 # A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
 settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=30)
 settings.register_profile("search", deadline=None)
 settings.load_profile("labseq")
 
-for _name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH"):  # the user's own must not reach the tests
-    os.environ.pop(_name, None)
-for _name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere
-    os.environ[_name] = os.devnull
-
-gc.disable()  # until all tests are collected, which makes a million objects that stay
-
-if sys.dont_write_bytecode:  # else each process would compile the tests and numba's source again
-    _BYTECODE, _TEMPORARY = cache_root() / "bytecode", Path(tempfile.gettempdir())
-    shutil.rmtree(_BYTECODE / _TEMPORARY.relative_to(_TEMPORARY.anchor), ignore_errors=True)  # of past tests
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(_BYTECODE)
-    sys.dont_write_bytecode = False
-
-OPTIONAL = (
-    *("PIL", "h5netcdf", "hdf5plugin", "matplotlib", "optuna", "pandas", "pyarrow", "pylablib", "pypylon"),
-    *("ruff", "sphinx", "starlette", "tifffile", "uvicorn", "uvloop", "xarray"),
-    *("axe_playwright_python", "httptools", "msgpack", "playwright", "zmq"),
-)
-_MISSING = [] if os.environ.get("LABSEQ_REQUIRE_ALL") else [m for m in OPTIONAL if find_spec(m) is None]
-_NEEDS_MISSING = re.compile(
-    rf"No module named '?({'|'.join(_MISSING)})\b|pip install [^\n]?labseq\[|No such file.*'ruff'"
-)
+REPOSITORY = Path(__file__).parents[1]
 _NUMBERS = itertools.count()
-_WRITE: Callable[..., None] = vars(SourceFileLoader)["_cache_bytecode"]
-_ENTRY_POINTS: Callable[..., Any] = importlib.metadata.entry_points
-_READ_TEXT = importlib.metadata.PathDistribution.read_text
-_GIT: dict[tuple[Path | str | None, ...], str | None] = {}
-_REPOSITORY = Path(__file__).parents[1]
 LONGEST = ("tests/web/test_browser.py", "tests/docs/test_blocks.py")
 """Files whose tests take longest; each also prepares much that its tests share in one process."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--quick``, for whoever runs tests while editing."""
+    parser.addoption("--quick", action="store_true", help="nothing outlives a power cut; less is looked up")
+
+
+def pytest_configure() -> None:
+    """Keep the user's folders, options and terminal from the tests and their processes."""
+    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", "NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES"):
+        os.environ.pop(name, None)
+    os.environ["TERM"] = "xterm-256color"
+    for name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere
+        os.environ[name] = os.devnull
+    # else each process that a test starts would compile numba's source again
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -74,7 +60,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         return
     names = [
         ".".join(path.relative_to(base).with_suffix("").parts)
-        for base, folder in ((_REPOSITORY, "labseq"), (_REPOSITORY / "plugins", "."))
+        for base, folder in ((REPOSITORY, "labseq"), (REPOSITORY / "plugins", "."))
         for path in (base / folder).rglob("*kernels*.py")
     ]
     code = (
@@ -88,76 +74,67 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 
-def pytest_collection_finish() -> None:
-    """What costs time for nothing in a process of thousands of tests.
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Keep what is alive now out of later searches for garbage: the million objects of the tests stay."""
+    gc.collect()
+    gc.freeze()
+    if session.config.getoption("--quick"):
+        _be_quick()
 
-    Each session goes through all objects before its first shot, and keeps those out of later rounds: here
-    it would be a fifth of the time of all runs, for pytest's own and those of other tests. And what is
-    written need not outlive the machine; a process that is killed loses nothing of what it wrote. What is
-    installed, the state of this repository and the command line stay the same: each run would read a hundred
-    files for the first, start five processes for the second, and construct a parser for the last. Runs and
-    checks plan for a twentieth of the random loadings.
+
+def _be_quick() -> None:
+    """Leave out what costs time and is rarely the subject of the tests that one runs while editing.
+
+    Files need not outlive a power cut; what is installed, the state of this repository and the command line
+    stay the same; sessions do not search the tests' own objects for garbage; checks plan for fewer loadings.
     """
     from labseq.session import check, provenance, session
 
-    gc.collect()
-    gc.freeze()
-    gc.enable()
-    gc.set_threshold(100_000, 20, 20)  # what tests make is rarely garbage in cycles
     patch = pytest.MonkeyPatch()
     patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
     patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
     patch.setattr(os, "fsync", os.fstat)
-    patch.setattr(SourceFileLoader, "_cache_bytecode", _cache_bytecode)
-    patch.setattr(importlib.metadata, "entry_points", lambda **which: _entry_points(tuple(sys.path), **which))
-    patch.setattr(importlib.metadata.PathDistribution, "read_text", cache(_READ_TEXT))
+    entry_points, read_text = importlib.metadata.entry_points, importlib.metadata.PathDistribution.read_text
+    installed = cache(lambda _path, **which: entry_points(**which))
+    patch.setattr(importlib.metadata, "entry_points", lambda **which: installed(tuple(sys.path), **which))
+    patch.setattr(importlib.metadata.PathDistribution, "read_text", cache(read_text))
     patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
-    patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"]))
+    patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"], {}))
 
 
-@cache
-def _entry_points(_path: tuple[str, ...], **which: str) -> Any:
-    return _ENTRY_POINTS(**which)
-
-
-def _git_here_once(git: Callable[..., str | None], folder: Path, *arguments: str) -> str | None:
-    if not folder.resolve().is_relative_to(_REPOSITORY):
+def _git_here_once(
+    git: Callable[..., str | None],
+    answers: dict[tuple[Any, ...], str | None],
+    folder: Path,
+    *arguments: str,
+) -> str | None:
+    if not folder.resolve().is_relative_to(REPOSITORY):
         return git(folder, *arguments)
-    asked = (os.environ.get("GIT_DIR"), folder, *arguments)
-    if asked not in _GIT:
-        _GIT[asked] = git(folder, *arguments)
-    return _GIT[asked]
+    question = (os.environ.get("GIT_DIR"), folder, *arguments)
+    if question not in answers:
+        answers[question] = git(folder, *arguments)
+    return answers[question]
 
 
-def _cache_bytecode(
-    loader: SourceFileLoader, source: str, bytecode: str, data: bytes, write: Callable[..., None] = _WRITE
-) -> None:
-    """Write bytecode, except of temporary files: a test may edit them within a second."""
-    if not source.startswith(tempfile.gettempdir()):
-        write(loader, source, bytecode, data)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test that needs what is not here; fail it where everything must be."""
+    needed = [name for marker in item.iter_markers("needs") for name in marker.args]
+    for name in needed:
+        if not is_here(name):
+            reason = f"needs {name}: {NEEDS[name].install}"
+            if os.environ.get("LABSEQ_REQUIRE_ALL"):
+                pytest.fail(reason, pytrace=False)
+            pytest.skip(reason)
 
 
-def _skip_if_something_is_missing(report: pytest.CollectReport | pytest.TestReport) -> None:
-    """A test that fails for want of an optional package is skipped, as `uv run pytest` installs none."""
-    texts = [str(report.longrepr), *(text for _, text in report.sections)]
-    if _MISSING and report.failed and any(_NEEDS_MISSING.search(text) for text in texts):
-        report.outcome = "skipped"
-        path, line, _ = getattr(report, "location", None) or (report.nodeid, 0, "")
-        report.longrepr = (path, line or 0, "Skipped: needs a package of `uv sync --all-extras --all-groups`")
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    report = yield
-    _skip_if_something_is_missing(report)
-    return report
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    report = yield
-    _skip_if_something_is_missing(report)
-    return report
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """One line for each reason why tests were skipped."""
+    reasons = Counter(
+        str(report.longrepr[2]).removeprefix("Skipped: ")
+        for report in terminalreporter.stats.get("skipped", ())
+    )
+    for reason, n in reasons.most_common():
+        terminalreporter.write_line(f"{n} skipped: {reason}")
 
 
 @pytest.fixture(autouse=True)
