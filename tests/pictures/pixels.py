@@ -24,23 +24,23 @@ def decoded(png: bytes, mode: str | None = None) -> Pixels:
 
 
 def is_colour(pixels: Pixels, colour: Any) -> NDArray[np.bool_]:
-    """Where a colour is, or nearly."""
+    """True where a picture has a colour, or nearly."""
     return np.abs(pixels - np.round(255 * np.array(to_rgb(colour)))).max(axis=2) < 12
 
 
 def spots(wanted: NDArray[np.bool_], least: int = 10) -> NDArray[np.float64]:
     """The centres (x, y) of connected pixels, at least so many to a spot."""
-    labels, n = ndimage.label(wanted)
-    kept = [i for i, size in enumerate(np.bincount(labels.ravel(), minlength=n + 1)) if i and size >= least]
+    labels = np.zeros(wanted.shape, np.int64)
+    ndimage.label(wanted, output=labels)
+    kept = [i for i, size in enumerate(np.bincount(labels.ravel()).tolist()) if i and size >= least]
     return np.array(ndimage.center_of_mass(wanted, labels, kept)).reshape(-1, 2)[:, ::-1]
 
 
 def are_at(found: NDArray[np.float64], expected: ArrayLike) -> bool:
-    """Whether spots lie as the expected places (x, y) do, neither turned, mirrored nor stretched."""
+    """True if spots lie as the expected places (x, y) do, neither turned nor mirrored."""
 
     def normalised(places: NDArray[np.float64]) -> NDArray[np.float64]:
-        off = places - places.mean(axis=0)
-        return off / np.sqrt((off**2).sum(axis=1).mean())
+        return (places - places.mean(axis=0)) / places.std(axis=0)
 
     wanted = np.asarray(expected, np.float64)
     if len(found) != len(wanted):
