@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from .blocks import PAGES, ROOT, blocks_of
-from .given import Store, prepare
+from .given import NEEDS, Store, prepare
 from .running import Reader
 
 
@@ -48,7 +48,9 @@ def with_blocks() -> list[str]:
     return [name for name in names if any(b.is_run and b.language != "yaml" for b in blocks_of(ROOT / name))]
 
 
-@pytest.mark.parametrize("page", with_blocks())
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=pytest.mark.needs(*NEEDS.get(page, ()))) for page in with_blocks()]
+)
 def test_a_page_can_be_followed(
     page: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

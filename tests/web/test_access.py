@@ -179,6 +179,8 @@ def test_too_many_requests_are_refused(tmp_path: Path, clock: Clock) -> None:
     clock.now_s += 1.0
     assert [client.get("/static/icon.svg").status_code for _ in range(301)] == [200] * 300 + [429]
     assert [other.post("/api/v1/queue/pause", {}).status_code for _ in range(3)] == [200, 200, 429]
+    clock.now_s += 1e6  # however long nothing was asked for
+    assert [client.get("/static/icon.svg").status_code for _ in range(601)] == codes
 
 
 def test_addresses_that_are_not_remembered_begin_again() -> None:
