@@ -193,7 +193,7 @@ def start_beside(root: Path) -> str:
 def _serves(address: str, root: Path) -> bool:
     """Whether a server of this data folder answers there."""
     address = f"{address}api/v1/server"
-    with suppress(OSError, ValueError, KeyError), urllib.request.urlopen(address, timeout=0.5) as answer:  # noqa: S310 - loopback
+    with suppress(OSError, ValueError, KeyError), urllib.request.urlopen(address, timeout=2.0) as answer:  # noqa: S310 - loopback
         return bool(json.loads(answer.read(10_000))["data"] == visible(str(root)))
     return False
 
