@@ -19,7 +19,6 @@ from labseq.errors import ConfigError
 from labseq.model import StageTiming
 from labseq.recording import RunWriter, open_run
 
-
 NO_TERMINAL = pytest.mark.usefixtures("capsys")
 """Tables are as wide as the terminal."""
 
