@@ -48,7 +48,7 @@ def test_a_frame_lies_under_its_sites_however_the_camera_is_turned(tmp_path: Pat
     grid = SiteGrid(*SHAPE, lattice="square")
     rows, cols = np.indices(SHAPE)
     sites_px = np.stack([20 * cols + 15, 95 - 20 * rows], axis=-1).astype(np.float64)
-    lit = [(0, 1), (2, 3), (3, 0)]
+    lit = [(0, 1), (1, 3), (3, 0)]
     frame = np.full((110, 120), 100, np.uint16)
     frame[:6, :6] = 1000
     for y, x in sites_px[tuple(np.transpose(lit))].astype(int):

@@ -42,7 +42,7 @@ def test_each_shot_has_a_point_at_its_filling(write: Write, tmp_path: Path) -> N
 
 
 def test_loading_is_shown_site_by_site(write: Write, tmp_path: Path) -> None:
-    sites = [(0, 1), (2, 3), (3, 0)]
+    sites = [(0, 1), (1, 3), (3, 0)]
     atoms = np.zeros(SHAPE, np.bool_)
     atoms[tuple(np.transpose(sites))] = True
     run = write([make_shot(0, n_cycles=0, images=[image(atoms, 1, -1, 0.5)])])
