@@ -38,7 +38,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure() -> None:
     """Keep the user's folders, options and terminal from the tests and their processes."""
-    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", "NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES"):
+    terminal = ("NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES", "TTY_COMPATIBLE", "TTY_INTERACTIVE")
+    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", *terminal):
         os.environ.pop(name, None)
     os.environ["TERM"] = "xterm-256color"
     for name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere
@@ -164,15 +165,12 @@ def pretend_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
 
 
 @pytest.fixture
-def call(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., tuple[int, str, str]]:
+def call(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Runs a command in this process; returns its exit code, stdout and stderr."""
 
     from labseq.cli import main
 
     def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "stdout", sys.stdout)
         stdout, descriptor = sys.stdout, os.dup(1)  # --json redirects both for the rest of the process
         try:
             with pytest.raises(SystemExit) as leaving:

@@ -66,6 +66,7 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("web", "uvicorn", "uvicorn"): check_packages,
     ("web", "httptools", "httptools"): check_packages,
     ("web", "uvloop", "uvloop"): check_packages,
+    ("web", "pillow", "PIL"): check_packages,
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -49,11 +49,6 @@ class NoisyWorld(RecordingSimulation):
         self.shown: list[NDArray[np.uint16]] = []
         self.modes: list[SensorMode] = []
         self.exposures: list[tuple[float, float]] = []
-        self.pulse: Callable[[float, float], object] = lambda _t_s, _width_s: None
-
-    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
-        assert role == "camera"
-        self.pulse = on_pulse
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         frame = super().expose(t_start_s, exposure_s, mode)

@@ -130,13 +130,13 @@ def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure(driver: str) -
         for _ in range(2):
             lab.camera.arm(2, 0.01, "external")
             start_s = lab.clock.now()
-            lab.world.pulse(start_s + 0.002, 1e-3)
-            lab.world.pulse(start_s + 0.1, 1e-3)
+            lab.world.pulse("camera", start_s + 0.002, 1e-3)
+            lab.world.pulse("camera", start_s + 0.1, 1e-3)
             frames = [lab.camera.read(1.0) for _ in range(2)]
             assert [frame.t_start_s - start_s for frame in frames] == pytest.approx([0.002, 0.1])
             assert lab.clock.now() - start_s == pytest.approx(0.11 + lab.camera.facts.readout_s)
             assert_shown(frames, lab)
-            lab.world.pulse(lab.clock.now(), 1e-3)
+            lab.world.pulse("camera", lab.clock.now(), 1e-3)
             assert_shown(frames, lab)
             del lab.world.shown[:]
 
@@ -148,7 +148,7 @@ def test_bulb_exposes_as_long_as_the_line_is_on(driver: str) -> None:
             lab.camera.arm(2, 0.01, "bulb")
             start_s = lab.clock.now()
             for n, width_s in enumerate(widths_s):
-                lab.world.pulse(start_s + 0.1 * n, width_s)
+                lab.world.pulse("camera", start_s + 0.1 * n, width_s)
             frames = [lab.camera.read(1.0) for _ in range(2)]
             assert lab.clock.now() - start_s == pytest.approx(0.1 + widths_s[1] + lab.camera.facts.readout_s)
             made = [(start_s, widths_s[0]), (start_s + 0.1, widths_s[1])]
@@ -167,9 +167,9 @@ def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver
             start_s = lab.clock.now()
             with pytest.raises(DeviceTimeoutError, match="frame 0 waits for its external trigger"):
                 lab.camera.read(0.1)
-            lab.world.pulse(start_s + 0.12, 1e-3)
+            lab.world.pulse("camera", start_s + 0.12, 1e-3)
             frames = [lab.camera.read(1.0)]
-            lab.world.pulse(lab.clock.now(), 1e-3)
+            lab.world.pulse("camera", lab.clock.now(), 1e-3)
             with pytest.raises(DeviceTimeoutError, match="frame 1 is not ready"):
                 lab.camera.read(1e-3)
             frames += [lab.camera.read(1.0) for _ in range(2)]
