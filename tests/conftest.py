@@ -1,6 +1,5 @@
 """What all tests share."""
 
-import gc
 import importlib.metadata
 import itertools
 import os
@@ -11,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -76,9 +74,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Keep what is alive now out of later searches for garbage: the million objects of the tests stay."""
-    gc.collect()
-    gc.freeze()
     if session.config.getoption("--quick"):
         _be_quick()
 
@@ -87,12 +82,11 @@ def _be_quick() -> None:
     """Leave out what costs time and is rarely the subject of the tests that one runs while editing.
 
     Files need not outlive a power cut; what is installed, the state of this repository and the command line
-    stay the same; sessions do not search the tests' own objects for garbage; checks plan for fewer loadings.
+    stay the same; checks plan for fewer loadings.
     """
-    from labseq.session import check, provenance, session
+    from labseq.session import check, provenance
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
     patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
     patch.setattr(os, "fsync", os.fstat)
     entry_points, read_text = importlib.metadata.entry_points, importlib.metadata.PathDistribution.read_text
