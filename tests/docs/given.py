@@ -27,7 +27,7 @@ OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 REAL_LAB: Final = ("docs/how-to/rehearse.md",)
 """Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
-NEEDED: Final = {"docs/how-to/cameras-genicam.md": "libaravis"}
+NEEDED: Final = {"docs/how-to/calibrate.md": "libaravis", "docs/how-to/cameras-genicam.md": "libaravis"}
 """Page -> what its simulators need that is not on every machine."""
 SHOTS: Final = {
     "compact-225": ("sequences/compact_225.yaml", 4),
@@ -96,10 +96,6 @@ def copy_repository(to: Path) -> None:
     shutil.copytree(ROOT / "sequences", to / "sequences")
     shutil.copytree(
         ROOT / "hardware_profiles", to / "hardware_profiles", ignore=shutil.ignore_patterns("calibrations")
-    )
-    bench = to / "hardware_profiles" / "bench.yaml"  # tests of the timing box run its firmware
-    bench.write_text(
-        bench.read_text("utf-8").replace("simulated_by: simavr", "simulated_by: python"), "utf-8"
     )
 
 
