@@ -17,11 +17,20 @@ from typing import Any, Final
 
 import labseq
 from labseq.config.addresses import profile_overrides
-from labseq.errors import ConfigError, DeviceError, LabseqError, Problem, StopRequested, one_of
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    LabseqError,
+    Problem,
+    RecordingError,
+    StopRequested,
+    one_of,
+)
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
 from labseq.messages import clean, format_error
 from labseq.plain import now
+from labseq.recording import clear_active
 from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
 from labseq.remote.simulation import ServedSimulation
 from labseq.roles import offers
@@ -119,6 +128,8 @@ def serving(
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
         report(f"tests {', '.join(hardware.chosen)}")
         _test(hardware, simulation, report)
+        with suppress(RecordingError):  # all are safe now
+            clear_active(hardware.key, hardware.identities)
         if "simulation" in how.devices:
             _warm_simulation(hardware)
         server = Server(hardware, simulation, host, port, keys, report)
@@ -221,7 +232,8 @@ class Server:
             for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
                 socket = server_socket(self._zmq, host, port + number, keys)
                 served = ServedSimulation if chosen.entry.kind == "simulation" else ServedDevice
-                device = served(name, chosen, socket, self.is_known, self._report, simulation)
+                own = [identity for identity, role in hardware.identities.items() if role == name]
+                device = served(name, chosen, socket, self.is_known, self._report, simulation, own)
                 self.devices[name] = device
         except ConfigError:
             self._zmq.destroy(linger=0)
