@@ -22,7 +22,10 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from labseq.processes import Pulse
 
 WATCHDOG_LOG: Final = "watchdog.jsonl"
 """Name of its log in the folder of a run."""
@@ -32,6 +35,8 @@ HUNG_S: Final = 0.6
 """A run without a heartbeat for so long hangs; no call of a run holds the interpreter nearly as long."""
 WAITS_S: Final = 10.0
 """The same while a thread waits for a disk, for memory that was swapped out, or for the processor."""
+STUCK_S: Final = 10.0
+"""A run whose thread that takes the shots has neither waited nor got on for so long counts as dead."""
 TERM_S: Final = 0.1
 """How long a run that hangs may take to end after SIGTERM; then comes SIGKILL."""
 NEXT_S: Final = 0.05
@@ -161,6 +166,10 @@ class _Process:
                 self._answer("")
         elif "forget" in order:
             self._devices.pop(order["forget"], None)
+        elif "stuck" in order:
+            self._end_run()
+            self._switch_off(f"made no progress for {order['stuck']:.0f} s", time.monotonic())
+            return False
         else:  # the end; devices that are left could not be made safe
             self._switch_off("could not make its devices safe", time.monotonic())
             return False
@@ -293,9 +302,11 @@ class Watchdog:
     Args:
         what: What the watchdog calls the run in its messages.
         log: File to which it adds a line for each device that it switches off; None for none.
+        pulse: Progress of the thread that adds the first device; without any, the run counts as dead to the
+            watchdog. None if there is no such thread.
     """
 
-    def __init__(self, what: str = "the run", log: Path | None = None) -> None:
+    def __init__(self, what: str = "the run", log: Path | None = None, pulse: Pulse | None = None) -> None:
         self._about = {"run": what, "log": None if log is None else str(log.absolute()), "path": sys.path}
         self._devices: dict[str, dict[str, Any]] = {}
         self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -304,6 +315,7 @@ class Watchdog:
         self._sending = threading.RLock()
         self._ended = threading.Event()
         self._is_started = False
+        self._pulse = pulse
 
     def add(self, name: str, order: int, script: Path, arguments: object) -> None:
         """Have it switch a device off after the death of this process; the first one starts it.
@@ -317,6 +329,8 @@ class Watchdog:
         if not self._is_started:
             self._is_started = True
             self._launch()
+            if self._pulse is not None:
+                self._pulse.begin()
             threading.Thread(target=self._beat, name="labseq heartbeat", daemon=True).start()
         device = {"device": name, "order": order, "script": str(script), "arguments": arguments}
         with self._sending:
@@ -408,8 +422,9 @@ class Watchdog:
 
     def _beat(self) -> None:
         """Send heartbeats; start the watchdog again if it is gone."""
-        n_starts = 1
+        n_starts, looked_s = 1, time.monotonic()
         while not self._ended.wait(BEAT_S):
+            looked_s = self._check_progress(looked_s)
             if self._send(None) or self._ended.is_set():
                 continue
             if n_starts == 3:
@@ -420,6 +435,18 @@ class Watchdog:
             with self._sending:
                 if not self._ended.is_set():
                     self._launch()
+
+    def _check_progress(self, looked_s: float) -> float:
+        """Have the run ended if its thread makes no progress; returns when it looked.
+
+        While this thread does not run either, the computer stands still: of that time little counts.
+        """
+        now_s = time.monotonic()
+        if self._pulse is not None:
+            silent_s = self._pulse.silent_s(min(now_s - looked_s, 2 * BEAT_S))
+            if silent_s > STUCK_S:
+                self._send({"stuck": silent_s})
+        return now_s
 
     def _note(self, text: str) -> None:
         self._notes.put(f"the watchdog that switches the outputs off if labseq dies {text}")

@@ -76,7 +76,8 @@ def make_each_safe(
         Device name -> why it is not safe, or None. A device that is safe but
         cannot be closed is only reported to the observer, as at the end of a run.
     """
-    guard, watchdog = Guard(), Watchdog("labseq safe")
+    stop = StopFlag()
+    guard, watchdog = Guard(stop), Watchdog("labseq safe", pulse=stop.pulse)
     outcome: dict[str, LabseqError | None] = {}
     if simulation is not None and (
         failure := attempt(guard, "simulation", timeouts.call_s, simulation, "open")

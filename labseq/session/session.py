@@ -247,7 +247,8 @@ class Session:
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
             error = failure
         unsafe = self._shut_down(ended_well=error is None)
-        self._try(self._analyses.finish)
+        if not writer.is_given_up:
+            self._try(self._analyses.finish)
         if error is None and self.scan_run.is_adaptive:
             self._try(self._report_best, writer.run_dir)
         if error is None and unsafe:
@@ -263,7 +264,8 @@ class Session:
 
     def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
-        watchdog = Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG)
+        log, pulse = writer.run_dir / WATCHDOG_LOG, self.stop_flag.pulse
+        watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse)
         first, policy = self.scan_run.first, self.assembly.policy
         own = OwnShots(lab, first, record, policy, self.stop_flag, writer, self._observers, watchdog)
         sequencer = self._sequencer = own.sequencer
@@ -305,9 +307,10 @@ class Session:
         changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
         record = run_record(self.assembly, self.seed, changes, scan, self._folder)
         if earlier is None:
-            writer = RunWriter.create(root, record, copies(self.assembly.hardware.calibrations))
+            extra_files = copies(self.assembly.hardware.calibrations)
+            writer = RunWriter.create(root, record, extra_files, self.stop_flag)
         else:
-            writer = earlier.reopen(record, next(iter(self.scan_run.shots), None))
+            writer = earlier.reopen(record, next(iter(self.scan_run.shots), None), self.stop_flag)
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
         if earlier is None and (day := later_day(writer.run_dir)):
