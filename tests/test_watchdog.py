@@ -34,10 +34,12 @@ def off(name, then=""):
 RUN = """
 import ctypes, os, signal, sys, threading, time
 from pathlib import Path
+from labseq import watchdog
+from labseq.processes import Pulse
 from labseq.watchdog import Watchdog
 
 folder = Path(sys.argv[1])
-dog = Watchdog("the run", folder / "watchdog.jsonl")
+dog = Watchdog("the run", folder / "watchdog.jsonl", Pulse())
 for order, name in (2, "second"), (1, "first"):
     (folder / name).touch()
     dog.add(name, order, folder / "emergency.py", {"name": str(folder / name)})
@@ -62,6 +64,7 @@ ENDS = {  # what the process does -> the cause that the watchdog names
     "a closed terminal": ("lose_terminal()", "died"),
     "fork": ("if os.fork(): os.kill(os.getpid(), signal.SIGKILL)\ntime.sleep(1)", "died"),
     "stopped": ("os.kill(os.getpid(), signal.SIGSTOP)", "hung"),
+    "no progress": ("watchdog.STUCK_S = 0.3; time.sleep(30)", "made no progress for 0 s"),
     "a C call": ("ctypes.PyDLL(None).sleep(30)", "hung"),
     "unsafe": ("dog.forget(['other']); dog.end()", "could not make its devices safe"),
 }

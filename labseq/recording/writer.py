@@ -43,7 +43,7 @@ class RunWriter:
     in the index are intact even after a kill or a full disk.
 
     The disk is written to in a thread of its own. If it does not answer within ANSWER_S, or the run is asked
-    to stop twice, that thread is abandoned, so that the devices are made safe. Nothing is written from then on.
+    to stop twice, that thread is abandoned, so that the devices are made safe. Nothing is written then.
 
     Attributes:
         run_dir: The run's folder.

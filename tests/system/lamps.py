@@ -60,7 +60,12 @@ def labseq_register(registry):
     registry.device("lamp", Lamp, Settings)
 """
 EMERGENCY: Final = """
-import pathlib, time
+import os, pathlib, time
+
+def prepare(folder):
+    if pathlib.Path(folder, "no watchdog").exists():
+        os._exit(1)
+    pathlib.Path(folder, "watchdog").write_text(str(os.getpid()))
 
 def off(folder):
     on = pathlib.Path(folder, "on")
@@ -73,21 +78,31 @@ FAULTS: Final = """
 import os, pathlib, resource, signal, time
 
 FOLDER, FSYNC = pathlib.Path(os.environ["LAMPS_FOLDER"]), os.fsync
+FULL = []
 
 
 def fsync(fd):
     fault = FOLDER / "fault"
     what = fault.read_text() if fault.exists() else ""
-    if what == "disk" or what.startswith("memory"):
-        fault.unlink()
+    if what:
         (FOLDER / "began").write_text(str(time.monotonic()))
+    if what not in ("", "slow"):
+        fault.unlink()
     if what == "disk":  # as in the kernel: this thread returns never, and no signal reaches it
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         os.read(os.pipe()[0], 1)
     if what.startswith("memory"):
         size = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        size += int(what.split()[1])
         resource.setrlimit(resource.RLIMIT_AS, (size, size))
+        for n_bytes in (1 << 20, 1 << 14, 1 << 9):
+            try:
+                while True:
+                    FULL.append(bytes(n_bytes))
+            except MemoryError:
+                pass
+        left = int(what.split()[1])
+        while left > 0:
+            left -= len(FULL.pop(0))
     if what == "slow":
         time.sleep(2.0)
     return FSYNC(fd)
@@ -197,6 +212,23 @@ class Lamps:
         """Shots that were written."""
         return sum(path.read_bytes().count(b"\n") for path in self.folder.glob("data/*/*/index.jsonl"))
 
+    @property
+    def watchdog(self) -> int:
+        """The process of the watchdog that was the last one to be ready."""
+        return int((self.folder / "watchdog").read_text() or 0)
+
+    def replaced_after_s(self, number: int) -> float:
+        """Send a signal to the watchdog; returns after how long another one is ready."""
+        before, begun_s = self.watchdog, time.monotonic()
+        os.kill(before, number)
+        until(lambda: self.watchdog not in (0, before))
+        return time.monotonic() - begun_s
+
+    def interrupt(self, process: subprocess.Popen[str]) -> int:
+        """Ctrl-C; returns the exit code."""
+        process.send_signal(signal.SIGINT)
+        return process.wait(60.0)
+
     def fault(self, what: str) -> float:
         """Have a fault happen in the run; returns when it did."""
         (self.folder / "began").unlink(missing_ok=True)
@@ -229,22 +261,6 @@ def until(condition: Callable[[], bool], limit_s: float = 60.0) -> None:
         time.sleep(0.002)
 
 
-def watchdog_of(process: subprocess.Popen[str]) -> int:
-    """The process of a run's watchdog.
-
-    Raises:
-        AssertionError: It has none now.
-    """
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == process.pid and b"watchdog.py" in (path / "cmdline").read_bytes():
-                return int(path.name)
-        except (OSError, ValueError):  # it has ended
-            continue
-    raise AssertionError("the run has no watchdog")
-
-
 def disk_hangs(lamps: Lamps, process: subprocess.Popen[str]) -> float:
     """The disk does not answer any more."""
     return lamps.fault("disk")
@@ -261,38 +277,47 @@ def _disk_hangs_then(number: int, n: int) -> Callable[[Lamps, subprocess.Popen[s
     return act
 
 
-def no_memory(lamps: Lamps, process: subprocess.Popen[str]) -> float:
-    """The system gives the run no more memory, except a little."""
-    return lamps.fault(f"memory {9 << 20}")
+def _no_memory(left: int) -> Callable[[Lamps, subprocess.Popen[str]], float]:
+    """The system gives the run no more memory; if it goes on with what it has, Ctrl-C comes."""
 
-
-def _watchdog_first(before_s: float, number: int) -> Callable[[Lamps, subprocess.Popen[str]], float]:
     def act(lamps: Lamps, process: subprocess.Popen[str]) -> float:
-        os.kill(watchdog_of(process), number)
-        time.sleep(before_s)
-        begun_s = time.monotonic()
-        process.kill()
+        n_before = lamps.n_shots
+        begun_s = lamps.fault(f"memory {left}")
+        until(lambda: not lamps.is_on or lamps.n_shots > n_before + 5)
+        if lamps.is_on:
+            process.send_signal(signal.SIGINT)
+            return time.monotonic()
         return begun_s
 
     return act
 
 
-def watchdog_killed_often(lamps: Lamps, process: subprocess.Popen[str]) -> float:
-    """The watchdog is killed again and again, then the run."""
-    for _ in range(5):
-        until(lambda: _has_watchdog(process))
-        os.kill(watchdog_of(process), signal.SIGKILL)
-        time.sleep(0.5)
+def _watchdog_first(before_s: float) -> Callable[[Lamps, subprocess.Popen[str]], float]:
+    """The watchdog is killed, and soon after it the run."""
+
+    def act(lamps: Lamps, process: subprocess.Popen[str]) -> float:
+        os.kill(lamps.watchdog, signal.SIGKILL)
+        time.sleep(before_s)
+        return _kill(process)
+
+    return act
+
+
+def _watchdogs_first(number: int, n: int) -> Callable[[Lamps, subprocess.Popen[str]], float]:
+    """Watchdogs are killed or stopped; once another one has taken the place of the last, the run."""
+
+    def act(lamps: Lamps, process: subprocess.Popen[str]) -> float:
+        for _ in range(n):
+            lamps.replaced_after_s(number)
+        return _kill(process)
+
+    return act
+
+
+def _kill(process: subprocess.Popen[str]) -> float:
     begun_s = time.monotonic()
     process.kill()
     return begun_s
-
-
-def _has_watchdog(process: subprocess.Popen[str]) -> bool:
-    try:
-        return watchdog_of(process) > 0
-    except AssertionError:
-        return False
 
 
 Cause = Callable[[Lamps, subprocess.Popen[str]], float]
@@ -302,11 +327,17 @@ CAUSES: Final[dict[str, Cause]] = {
     "the disk hangs": disk_hangs,
     "the disk hangs, Ctrl-C twice": _disk_hangs_then(signal.SIGINT, 2),
     "the disk hangs, SIGTERM twice": _disk_hangs_then(signal.SIGTERM, 2),
-    "no memory": no_memory,
-    "watchdog killed 0.2 s before the run": _watchdog_first(0.2, signal.SIGKILL),
-    "watchdog stopped 0.8 s before the run is killed": _watchdog_first(0.8, signal.SIGSTOP),
-    "watchdog killed five times, then the run": watchdog_killed_often,
+    "no memory": _no_memory(0),
+    "no memory beyond 100 kB": _no_memory(100_000),
+    "no memory beyond 9 MB": _no_memory(9_000_000),
+    "watchdog replaced after SIGKILL, then the run": _watchdogs_first(signal.SIGKILL, 5),
+    "watchdog replaced after SIGSTOP, then the run": _watchdogs_first(signal.SIGSTOP, 1),
 }
+TOO_SOON: Final = {
+    f"watchdog killed {1e3 * before_s:.0f} ms before the run": _watchdog_first(before_s)
+    for before_s in (0.0, 0.05, 0.1, 0.2, 0.5)
+}
+"""What a single watchdog cannot cover: both processes die within the time that another one takes to start."""
 
 
 @contextmanager
@@ -316,18 +347,32 @@ def lamps() -> Generator[Lamps]:
         yield Lamps(Path(folder))
 
 
+def print_replacements(repeats: int) -> None:
+    """Print how long it takes until another watchdog is ready."""
+    with lamps() as lab, lab.run():
+        for number in (signal.SIGKILL, signal.SIGSTOP):
+            times = sorted(lab.replaced_after_s(number) for _ in range(repeats))
+            print(
+                f"{number.name}: {times[len(times) // 2]:.3f} {times[-1]:.3f} s (median, worst of {repeats})"
+            )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--causes", nargs="+", choices=[*CAUSES], default=[*CAUSES])
+    parser.add_argument("--replacements", action="store_true", help="how long they take instead")
+    parser.add_argument("--causes", nargs="+", choices=[*CAUSES, *TOO_SOON], default=[*CAUSES])
     options = parser.parse_args()
+    if options.replacements:
+        print_replacements(options.repeats)
+        return
     for cause in options.causes:
         times: list[float] = []
         with lamps() as lab:
             for _ in range(options.repeats):
                 with lab.run() as process:
                     try:
-                        times.append(lab.off_after_s(CAUSES[cause](lab, process)))
+                        times.append(lab.off_after_s({**CAUSES, **TOO_SOON}[cause](lab, process)))
                     except AssertionError:
                         (lab.folder / "on").unlink(missing_ok=True)
         times.sort()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Generator
@@ -23,16 +24,52 @@ def lab() -> Generator[Lamps]:
         yield one
 
 
+@pytest.mark.parametrize(
+    "cause",
+    [
+        "the disk hangs",
+        "the disk hangs, Ctrl-C twice",
+        "no memory",
+        "watchdog replaced after SIGKILL, then the run",
+        "watchdog replaced after SIGSTOP, then the run",
+    ],
+)
+def test_the_lamp_goes_off(lab: Lamps, cause: str) -> None:
+    with lab.run() as run:
+        lab.off_after_s(lamps.CAUSES[cause](lab, run), 60.0)
+
+
+def test_a_slow_disk_is_no_failure(lab: Lamps) -> None:
+    """Each time that a shot is flushed to the disk takes 2 s; there are three."""
+    with lab.run() as run:
+        watchdog = lab.watchdog
+        lab.fault("slow")
+        n_before = lab.n_shots
+        until(lambda: lab.n_shots > n_before or run.poll() is not None)
+        (lab.folder / "fault").unlink()
+        assert lab.is_on
+        assert lab.interrupt(run) == 130
+    assert lab.watchdog == watchdog
+    assert not list(lab.folder.glob("data/*/*/watchdog.jsonl"))
+
+
+def test_a_run_whose_watchdog_cannot_be_replaced_ends_safely(lab: Lamps) -> None:
+    with lab.run() as run:
+        (lab.folder / "no watchdog").touch()
+        os.kill(lab.watchdog, signal.SIGKILL)
+        assert run.wait(60.0) == 3
+        assert not lab.is_on
+    assert "watchdog: there is no watchdog any more" in lab.output
+
+
 def test_a_served_device_whose_safe_state_fails_is_switched_off_and_stays_known(lab: Lamps) -> None:
     with lab.served() as server:
         with lab.run("--profile", "far.yaml") as run:
             (lab.folder / "refuses").touch()
-            run.send_signal(signal.SIGINT)
-            run.wait(60.0)
+            lab.interrupt(run)
             until(lambda: not lab.is_on)
         assert "NOT SAFE" in lab.output
-        server.send_signal(signal.SIGINT)
-        server.wait(60.0)
+        lab.interrupt(server)
     (lab.folder / "refuses").unlink()
     assert lab.start("devices", "lamps.yaml").wait(60.0) == 0
     assert "died; 'labseq safe lamps.yaml' makes all of them safe" in " ".join(lab.output.split())
