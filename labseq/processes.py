@@ -121,7 +121,8 @@ def _start_since_boot(pid: int) -> float | None:
     """The same on Linux, by proc(5), whose times do not follow the clock."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
-        return None if fields[0] in "ZXx" else int(fields[19]) / os.sysconf("SC_CLK_TCK")
+        has_ended = fields[0] in "ZXx" and int(fields[17]) <= 1  # other threads still hold its files
+        return None if has_ended else int(fields[19]) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError):
         try:
             os.kill(pid, 0)
