@@ -30,7 +30,7 @@ from labseq.sequencer.lab import method_of
 from labseq.session.chosen import ChosenPlugin
 from labseq.session.lab import construct
 from labseq.watchdog import Watchdog
-from labseq.wire import MessageError, pack, report_error, unpack
+from labseq.wire import MAX_CONNECTIONS, Connections, MessageError, pack, report_error, unpack
 
 LOOK_S: Final = 0.03
 """How often threads that wait look for what else there is to do."""
@@ -222,6 +222,7 @@ class ServedDevice:
         sessions: Token -> session.
         ended: Token -> why that session ended, of the last ones.
         is_busy: Whether its thread does something else than wait for messages.
+        failure: What ended its thread, or None.
 
     Args:
         name: Its role, or its name in the profile.
@@ -249,6 +250,7 @@ class ServedDevice:
         self.sessions: dict[bytes, Session] = {}
         self.ended: dict[bytes, str] = {}
         self.is_busy = False
+        self.failure: BaseException | None = None
         self._chosen = chosen
         self._socket = socket
         self._is_known = is_known
@@ -265,13 +267,16 @@ class ServedDevice:
         """Start its thread."""
         self._thread.start()
 
-    def end(self, timeout_s: float) -> bool:
-        """End all sessions, the device safe and closed; whether that was done in time."""
+    def begin_end(self) -> None:
+        """Begin to end all sessions, the device safe and closed, and then its thread."""
         for session in list(self.sessions.values()):
             self.end_session(session, "the server ends")
         self._ended.set()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether its thread runs."""
+        return self._thread.is_alive()
 
     def end_session(self, session: Session, why: str) -> None:
         """Have a session ended by the device's thread, at once or after the call in progress."""
@@ -289,8 +294,12 @@ class ServedDevice:
             session.aborted_s = min(session.aborted_s, time.monotonic())
             session.abort.request()
 
-    def rescue_if_stuck(self, session: Session) -> None:
+    def rescue_stuck(self) -> None:
         """Make the device safe in another thread if a call does not end after it was aborted."""
+        for session in list(self.sessions.values()):
+            self._rescue_if_stuck(session)
+
+    def _rescue_if_stuck(self, session: Session) -> None:
         with session.changing:
             if session.rescue or not session.is_running or time.monotonic() < session.aborted_s + GRACE_S:
                 return
@@ -322,9 +331,22 @@ class ServedDevice:
         import zmq
 
         self._socket.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
-        while not (self._ended.is_set() and not self.sessions):
-            self._step()
-        self._socket.close()
+        connections, looked_s = Connections(self._socket), time.monotonic()
+        try:
+            while not (self._ended.is_set() and not self.sessions):
+                if time.monotonic() - looked_s > LOOK_S:
+                    connections.ended()  # nothing asks which
+                    connections.limit(0 if self._ended.is_set() else MAX_CONNECTIONS)
+                    looked_s = time.monotonic()
+                self._step()
+        except BaseException as error:  # noqa: BLE001 - the main thread ends the server
+            self.failure = error
+        finally:
+            for session in list(self.sessions.values()):
+                self.end_session(session, "the server failed")
+                self._close(session)
+            connections.close()
+            self._socket.close()
 
     def _step(self) -> None:
         """Answer the next message, if one comes within LOOK_S, and close sessions that have ended."""
@@ -541,7 +563,7 @@ class ServedDevice:
         def attempt(method: Callable[[], object], what: str) -> None:
             try:
                 method()
-            except Exception as error:  # noqa: BLE001 - of the driver's class
+            except BaseException as error:  # noqa: BLE001 - of the driver's class
                 failures.append(f"{what} failed: {format_error(error)}")
 
         with session.abort.held():

@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
+from labseq.wire import new_keys
 from tests.remote.conftest import free_port
 
 PLUGIN: Final = """
@@ -110,6 +113,24 @@ def fsync(fd):
 
 os.fsync = fsync
 """
+STRANGERS: Final = """
+import socket, sys, time
+port, n = int(sys.argv[1]), int(sys.argv[2])
+made = [None] * n
+while True:
+    for k in range(n):
+        try:
+            if made[k] is None:
+                made[k] = socket.create_connection(("127.0.0.1", port + k % 2), timeout=0.2)
+                made[k].setblocking(False)
+            elif not made[k].recv(100):
+                made[k] = None
+        except BlockingIOError:
+            pass
+        except OSError:
+            made[k] = None
+    time.sleep(0.01)
+"""
 PROFILE: Final = """
 labseq: 1
 name: lamps
@@ -140,6 +161,7 @@ class Lamps:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.port = 0
         (folder / "plugins").mkdir()
         (folder / "faults").mkdir()
         files = {"plugins/lamp.py": PLUGIN, "emergency.py": EMERGENCY, "faults/sitecustomize.py": FAULTS}
@@ -155,8 +177,19 @@ class Lamps:
             "PYTHONPATH": str(folder / "faults"),
         }
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        """Start a command."""
+    def start(
+        self, *arguments: str, limits: Mapping[str, tuple[int, int]] = MappingProxyType({})
+    ) -> subprocess.Popen[str]:
+        """Start a command, with limits of its resources."""
+
+        def prepare() -> None:
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(
+                    number, signal.SIG_DFL
+                )  # a process that ignored one would have its child ignore it
+            for name, limit in limits.items():
+                resource.setrlimit(getattr(resource, name), limit)
+
         with (self.folder / "output").open("a") as output:  # a stopped watchdog keeps a pipe open
             return subprocess.Popen(
                 [sys.executable, "-m", "labseq", *arguments],
@@ -166,7 +199,7 @@ class Lamps:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                preexec_fn=_with_signals,  # noqa: PLW1509 - no threads hold locks that it needs
+                preexec_fn=prepare,  # noqa: PLW1509 - no threads hold locks that it needs
             )
 
     @contextmanager
@@ -183,19 +216,42 @@ class Lamps:
             (self.folder / "fault").unlink(missing_ok=True)
 
     @contextmanager
-    def served(self) -> Generator[subprocess.Popen[str]]:
-        """A server of the lamp; ``far.yaml`` is a profile that uses it."""
-        port = free_port(4)
-        address = f"tcp://127.0.0.1:{port}"
-        far = PROFILE.replace("{use: lamp}", f"{{use: remote, address: '{address}', device: lamp}}")
+    def served(self, *, keys: bool = False, n_files: int = 0) -> Generator[subprocess.Popen[str]]:
+        """A server of the lamp; ``far.yaml`` is a profile that uses it.
+
+        Args:
+            keys: Whether it has keys.
+            n_files: Number of files that it may open; 0 for the computer's limit.
+        """
+        self.port = free_port(4)
+        address, key = f"tcp://127.0.0.1:{self.port}", ", server_key: here" if keys else ""
+        far = PROFILE.replace("{use: lamp}", f"{{use: remote, address: '{address}', device: lamp{key}}}")
         (self.folder / "far.yaml").write_text(far, encoding="utf-8")
-        process = self.start("serve-devices", "lamps.yaml", "--plain", "--bind", address)
+        limit = {"RLIMIT_NOFILE": (n_files, n_files)} if n_files else {}
+        options = [] if keys else ["--plain"]
+        process = self.start("serve-devices", "lamps.yaml", "--bind", address, *options, limits=limit)
         try:
             until(lambda: process.poll() is not None or "Ctrl-C ends it" in self.output)
             yield process
         finally:
             process.kill()
             process.wait()
+
+    def make_keys(self, folder: Path) -> None:
+        """Make the key of this computer, which knows itself."""
+        _, public = new_keys("here", folder)
+        (folder / "known" / "here.key").write_bytes(public.read_bytes())
+        self.environment["LABSEQ_KEYS"] = str(folder)
+
+    @contextmanager
+    def strangers(self, n: int) -> Generator[None]:
+        """Connections to the ports of the server that say nothing, made again when they are closed."""
+        with subprocess.Popen([sys.executable, "-c", STRANGERS, str(self.port), str(n)]) as process:
+            time.sleep(1.0)
+            try:
+                yield
+            finally:
+                process.kill()
 
     @property
     def output(self) -> str:
@@ -245,12 +301,6 @@ class Lamps:
         """
         until(lambda: not self.is_on, limit_s)
         return float((self.folder / "off").read_text()) - begun_s
-
-
-def _with_signals() -> None:
-    """A process that ignored a signal would have its child ignore it."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
 
 
 def until(condition: Callable[[], bool], limit_s: float = 60.0) -> None:

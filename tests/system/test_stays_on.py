@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Generator
+from pathlib import Path
 
 import pytest
 
@@ -88,3 +89,19 @@ def test_safe_ends_the_run_that_holds_the_port_of_a_device(lab: Lamps) -> None:
         assert lab.start("safe", "lamps.yaml").wait(60.0) == 0, lab.output
         assert not lab.is_on
         assert run.wait(60.0) == 143
+
+
+def test_connections_without_a_key_keep_neither_a_server_nor_its_devices_from_their_work(
+    lab: Lamps, tmp_path: Path
+) -> None:
+    lab.make_keys(tmp_path)
+    with lab.served(keys=True, n_files=300) as server, lab.run("--profile", "far.yaml") as run:
+        with lab.strangers(1000):
+            n_before = lab.n_shots
+            until(lambda: lab.n_shots > n_before + 5 or run.poll() is not None)
+            assert run.poll() is None, lab.output
+            assert lab.interrupt(run) == 130, lab.output
+            assert not lab.is_on
+        with lab.run("--profile", "far.yaml"), lab.strangers(1000):
+            assert lab.interrupt(server) == 0, lab.output
+            until(lambda: not lab.is_on)
