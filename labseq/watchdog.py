@@ -47,7 +47,7 @@ TRY_AGAIN_S: Final = 5.0
 """How long switching off is tried again if it fails: a dying process may hold the device a little longer."""
 HANGS_S: Final = 1.0
 """How long after that it counts as hanging."""
-ANSWER_S: Final = 5.0
+ANSWER_S: Final = 10.0
 """How long a run waits for an answer of the watchdog, which may have to load a vendor's library."""
 SILENT_S: Final = 0.4
 """A watchdog without a sign of life for so long is replaced."""
@@ -126,7 +126,7 @@ class _Process:
     def watch(self) -> None:
         """Watch until the run ends, dies or hangs."""
         threading.Thread(target=self._read, daemon=True).start()
-        looked_s = time.monotonic()
+        looked_s = told_s = time.monotonic()
         while True:
             try:
                 line = self._lines.get(timeout=BEAT_S)
@@ -134,7 +134,9 @@ class _Process:
                 line = b""
             else:
                 self._beat_s = time.monotonic()
-            self._tell(b"\n")
+            if time.monotonic() - told_s > 1.5 * BEAT_S:
+                told_s = time.monotonic()
+                self._tell(b"\n")
             if line is None or self._is_orphan():
                 return self._switch_off("died", time.monotonic())
             if line.strip() and not self._obey(json.loads(line)):
@@ -486,6 +488,7 @@ class Watchdog:
                 n_failed = 0
             elif (n_failed := n_failed + 1) == STARTS:
                 self._note("cannot be started again; the run ends")
+                self._kill()  # without a heartbeat it would end the run before the devices are safe
                 self._lost("there is no watchdog any more that would switch the outputs off")
                 return
 
@@ -495,16 +498,22 @@ class Watchdog:
             if self._ended.is_set():
                 return True
             self._note(f"{why}, and is started again")
-            if self._process is not None:
-                with suppress(OSError):
-                    self._process.kill()
-                self._process.wait()
-                if self._process.stdin is not None:
-                    self._process.stdin.close()
+            self._kill()
             return self._launch()
 
+    def _kill(self) -> None:
+        """Kill the process, if there is one."""
+        if self._process is not None:
+            with suppress(OSError):
+                self._process.kill()
+            self._process.wait()
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+
     def _check_progress(self, passed_s: float) -> None:
-        if self._pulse is not None and (silent_s := self._pulse.silent_s(passed_s)) > STUCK_S:
+        if self._pulse is None or self._n_awaited:  # the thread may be waiting for an answer
+            return
+        if (silent_s := self._pulse.silent_s(passed_s)) > STUCK_S:
             self._send({"stuck": silent_s})
 
     def _note(self, text: str) -> None:

@@ -202,6 +202,20 @@ class Lamps:
                 preexec_fn=prepare,  # noqa: PLW1509 - no threads hold locks that it needs
             )
 
+    def in_terminal(self, typed: str, *arguments: str) -> tuple[int, str]:
+        """Carry out a command in a terminal; returns its exit code, and what it printed."""
+        ours, theirs = os.openpty()
+        os.write(ours, typed.encode())
+        command = [sys.executable, "-m", "labseq", *arguments]
+        with subprocess.Popen(
+            command, cwd=self.folder, env=self.environment, stdin=theirs, stdout=theirs, stderr=theirs
+        ) as process:
+            os.close(theirs)
+            code = process.wait(60.0)
+        said = os.read(ours, 1 << 16).decode()
+        os.close(ours)
+        return code, said
+
     @contextmanager
     def run(self, *arguments: str) -> Generator[subprocess.Popen[str]]:
         """A run that has turned the lamp on and written a shot."""

@@ -83,9 +83,10 @@ def test_a_served_device_whose_safe_state_fails_is_switched_off_and_stays_known(
 def test_safe_ends_the_run_that_holds_the_port_of_a_device(lab: Lamps) -> None:
     lab.environment["LAMPS_HOLDS_PORT"] = "yes"
     with lab.run() as run:
-        assert lab.start("safe", "lamps.yaml", "--no-end").wait(60.0) == 3
-        assert lab.is_on
-        assert "'labseq safe lamps.yaml --end' ends that process first" in " ".join(lab.output.split())
+        code, said = lab.in_terminal("n\n", "safe", "lamps.yaml")
+        assert (code, lab.is_on) == (3, True)
+        assert "[Y/n]" in said
+        assert "'labseq safe lamps.yaml --end' ends that process first" in " ".join(said.split())
         assert lab.start("safe", "lamps.yaml").wait(60.0) == 0, lab.output
         assert not lab.is_on
         assert run.wait(60.0) == 143
