@@ -446,7 +446,7 @@ class Watchdog:
         try:
             if not self._send(message):
                 return False
-            answer = self._answers.get(timeout=ANSWER_S)
+            answer = self._await_answer()
             failure = json.loads(answer)["failure"] if answer else "it ended"
         except queue.Empty:
             failure = "it does not answer"
@@ -458,6 +458,19 @@ class Watchdog:
             name = message.get("device")
             self._note(f"cannot switch off '{name}': {failure}" if name else failure)
         return answer != b""
+
+    def _await_answer(self) -> bytes:
+        """Wait for an answer, unless the process was stopped."""
+        answers, process, deadline_s = self._answers, self._process, time.monotonic() + ANSWER_S
+        while True:
+            if self._pulse is not None:
+                self._pulse.beat()  # it may be the thread that takes the shots that waits here
+            try:
+                return answers.get(timeout=BEAT_S)
+            except queue.Empty:
+                is_stopped = process is not None and "T" in _threads(process.pid)[0]
+                if is_stopped or time.monotonic() > deadline_s:
+                    raise
 
     def _send(self, message: dict[str, Any] | None) -> bool:
         """Send a message, or a heartbeat; returns whether it could be sent."""
@@ -488,7 +501,8 @@ class Watchdog:
                 n_failed = 0
             elif (n_failed := n_failed + 1) == STARTS:
                 self._note("cannot be started again; the run ends")
-                self._kill()  # without a heartbeat it would end the run before the devices are safe
+                with self._sending:
+                    self._kill()  # without a heartbeat it would end the run before the devices are safe
                 self._lost("there is no watchdog any more that would switch the outputs off")
                 return
 
@@ -511,9 +525,7 @@ class Watchdog:
                 self._process.stdin.close()
 
     def _check_progress(self, passed_s: float) -> None:
-        if self._pulse is None or self._n_awaited:  # the thread may be waiting for an answer
-            return
-        if (silent_s := self._pulse.silent_s(passed_s)) > STUCK_S:
+        if self._pulse is not None and (silent_s := self._pulse.silent_s(passed_s)) > STUCK_S:
             self._send({"stuck": silent_s})
 
     def _note(self, text: str) -> None:
