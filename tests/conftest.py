@@ -1,6 +1,5 @@
 """What all tests share."""
 
-import gc
 import importlib.metadata
 import itertools
 import os
@@ -11,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -38,7 +36,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure() -> None:
     """Keep the user's folders, options and terminal from the tests and their processes."""
-    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", "NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES"):
+    terminal = ("NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES", "TTY_COMPATIBLE", "TTY_INTERACTIVE")
+    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", *terminal):
         os.environ.pop(name, None)
     os.environ["TERM"] = "xterm-256color"
     for name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere
@@ -75,9 +74,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Keep what is alive now out of later searches for garbage: the million objects of the tests stay."""
-    gc.collect()
-    gc.freeze()
     if session.config.getoption("--quick"):
         _be_quick()
 
@@ -86,12 +82,11 @@ def _be_quick() -> None:
     """Leave out what costs time and is rarely the subject of the tests that one runs while editing.
 
     Files need not outlive a power cut; what is installed, the state of this repository and the command line
-    stay the same; sessions do not search the tests' own objects for garbage; checks plan for fewer loadings.
+    stay the same; checks plan for fewer loadings.
     """
-    from labseq.session import check, provenance, session
+    from labseq.session import check, provenance
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(session, "gc", SimpleNamespace(collect=int, freeze=int, get_freeze_count=int, unfreeze=int))
     patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
     patch.setattr(os, "fsync", os.fstat)
     entry_points, read_text = importlib.metadata.entry_points, importlib.metadata.PathDistribution.read_text
@@ -164,15 +159,12 @@ def pretend_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
 
 
 @pytest.fixture
-def call(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., tuple[int, str, str]]:
+def call(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Runs a command in this process; returns its exit code, stdout and stderr."""
 
     from labseq.cli import main
 
     def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "stdout", sys.stdout)
         stdout, descriptor = sys.stdout, os.dup(1)  # --json redirects both for the rest of the process
         try:
             with pytest.raises(SystemExit) as leaving:

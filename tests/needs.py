@@ -75,6 +75,9 @@ NEEDS = {
         lambda: all(map(shutil.which, ("avr-gcc", "make"))), "apt-get install gcc-avr avr-libc make"
     ),
     "c-compiler": Need(lambda: _compiles("cc", ".c", "stdio.h"), "apt-get install gcc libc6-dev"),
+    "downloads": Need(
+        lambda: bool(os.environ.get("LABSEQ_WHEEL")), "LABSEQ_WHEEL=1, which fetches all that labseq needs"
+    ),
     "emccd-frames": Need(
         EMCCD_FRAMES.is_dir, "LABSEQ_EMCCD_DATA=FOLDER, with files of github.com/fatmac78/EMCCD-calibration"
     ),

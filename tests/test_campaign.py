@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from labseq.analysis.campaigns import campaign_picture, combined
+from labseq.campaign import run_file
 from labseq.cli import main
 from labseq.errors import ConfigError, StopRequested
 from labseq.session.campaign import Campaign, recorded_runs, run_campaign
@@ -82,6 +85,21 @@ def test_a_campaign_that_is_stopped_goes_on_and_its_results_are_combined(file: P
     file.write_text(FILE.replace("seed: 3", "seed: 4"), encoding="utf-8")
     with pytest.raises(ConfigError, match="this run belongs to no point of the campaign"):
         run_campaign(running(9), Campaign.read(file), folder, Options())
+
+
+def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fillings = [[0.5, math.nan, 1.0], [0.9], [math.nan], []]
+    runs = [
+        SimpleNamespace(path=Path(f"day/{n}"), shots=[SimpleNamespace(filling_fraction=one) for one in own])
+        for n, own in enumerate(fillings)
+    ]
+    monkeypatch.setattr("labseq.session.campaign.run_campaign", lambda *_: runs)
+    run_file(lambda *_, **__: None, file, file.parent, None, Options())
+    rows = [line for line in capsys.readouterr().out.splitlines() if "day/" in line]
+    assert [row.split("%")[1].split()[-2:] for row in rows[:2]] == [["3", "75.00"], ["1", "90.00"]]
+    assert all(" - " in row for row in rows[2:])
 
 
 @pytest.mark.parametrize(

@@ -48,24 +48,34 @@ def labseq_register(registry):
     registry.planner("mine", Mine)  # registration
 '''
 MAX_WAIT_S = 60.0
-SHORT_S = 0.05
+SHORT_S = 0.5
+
+
+class Gate:
+    """What a plugin that hangs waits for."""
+
+    def __init__(self) -> None:
+        self._opened = threading.Event()
+        self.waiting: list[threading.Thread] = []
+
+    def wait(self) -> None:
+        self.waiting.append(threading.current_thread())
+        self._opened.wait()
+
+    def open(self) -> None:
+        """Let the threads that wait go on, until they end."""
+        self._opened.set()
+        for thread in self.waiting:
+            thread.join()
 
 
 @pytest.fixture
-def gate() -> Iterator[threading.Event]:
-    """What a plugin that hangs waits for: opened when the test is over, so that its thread ends."""
-    event = threading.Event()
-    sys.modules["gate"] = SimpleNamespace(event=event)  # pyright: ignore[reportArgumentType]
-    yield event
-    event.set()
-    for thread in threads_of_mine():
-        thread.join(10.0)
+def gate() -> Iterator[Gate]:
+    gate = Gate()
+    sys.modules["gate"] = gate  # pyright: ignore[reportArgumentType]
+    yield gate
+    gate.open()
     del sys.modules["gate"]
-
-
-def threads_of_mine() -> list[threading.Thread]:
-    """The threads in which code of the plugin still runs."""
-    return [thread for thread in threading.enumerate() if thread.name == "labseq plugin mine"]
 
 
 @pytest.fixture(autouse=True)
@@ -155,28 +165,26 @@ def test_a_plugin_that_fails_to_load_is_contained(tmp_path: Path, old: str, new:
 
 
 class TestHanging:
-    def test_at_import(self, tmp_path: Path, gate: threading.Event) -> None:
-        code = GOOD.replace("# at the top", "print(1)\nimport gate; gate.event.wait()")
+    def test_at_import(self, tmp_path: Path, gate: Gate) -> None:
+        code = GOOD.replace("# at the top", "print(1)\nimport gate; gate.wait()")
         stdout = sys.stdout
         _, info = loaded(tmp_path, code, SHORT_S)
         assert info.reason == (
-            "it did not finish loading within 0.05 s and was abandoned; if it is only slow, raise "
+            "it did not finish loading within 0.5 s and was abandoned; if it is only slow, raise "
             "'timeouts: {load: ...}' in the profile"
         )
         assert sys.stdout is stdout
         assert "it printed ('1')" in info.notes[0]
         assert f"{LOCAL_PACKAGE}.mine" not in sys.modules
 
-    def test_what_wakes_up_later_registers_nothing(self, tmp_path: Path, gate: threading.Event) -> None:
-        code = GOOD.replace("# registration", "").replace(HOOK, f"{HOOK}\n    import gate; gate.event.wait()")
+    def test_what_wakes_up_later_registers_nothing(self, tmp_path: Path, gate: Gate) -> None:
+        code = GOOD.replace("# registration", "").replace(HOOK, f"{HOOK}\n    import gate; gate.wait()")
         host, _ = loaded(tmp_path, code, SHORT_S)
-        (thread,) = threads_of_mine()
-        gate.set()
-        thread.join(10.0)
+        gate.open()
         assert host.registry.entries() == []
 
-    def test_in_the_constructor(self, tmp_path: Path, gate: threading.Event) -> None:
-        code = GOOD.replace("pass  # constructor", "import gate; gate.event.wait()")
+    def test_in_the_constructor(self, tmp_path: Path, gate: Gate) -> None:
+        code = GOOD.replace("pass  # constructor", "import gate; gate.wait()")
         host, info = loaded(tmp_path, code)
         assert info.state == "loaded"
         message = (
@@ -242,12 +250,10 @@ class Odd(Settings):
     ("code", "message"),
     [
         ("raise SystemExit(0)", "the settings model of planner 'mine' raised SystemExit: 0 ("),
-        ("import gate; gate.event.wait()", "the settings model of planner 'mine' did not return within "),
+        ("import gate; gate.wait()", "the settings model of planner 'mine' did not return within "),
     ],
 )
-def test_a_settings_model_that_fails_is_named(
-    code: str, message: str, tmp_path: Path, gate: threading.Event
-) -> None:
+def test_a_settings_model_that_fails_is_named(code: str, message: str, tmp_path: Path, gate: Gate) -> None:
     code = GOOD.replace("# at the top", SETTINGS.replace("TROUBLE", code)).replace(
         "Mine)  #", "Mine, Odd)  #"
     )

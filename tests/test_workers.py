@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -48,6 +49,35 @@ def test_tasks_of_a_lost_worker_are_done_by_others_and_a_task_that_ends_all_ends
         with pytest.raises(LabseqError, match=f"{MAX_LOST} worker processes have died of job 3 .exit code 7"):
             finished(workers, 1)
     assert (tmp_path / "3").read_text() == "x" * MAX_LOST
+
+
+def make_by_its_process(_: None) -> Callable[[int], int]:
+    return lambda _: os.getpid()
+
+
+def test_tasks_are_shared_out_evenly() -> None:
+    with closing(ProcessWorkers(2, "job")) as workers:
+        workers.prepare(make_by_its_process, None)
+        for number in range(6):
+            workers.submit(number, number)
+        assert sorted(Counter(finished(workers, 6).values()).values()) == [3, 3]
+
+
+def make_at_the_third_attempt(folder: Path) -> Callable[[int], int]:
+    """Two of three workers die of their start; task 1 ends its worker once."""
+    n_before = len([*folder.glob("start*")])
+    (folder / f"start{n_before}").touch()
+    if n_before % 3 < 2:
+        os._exit(7)
+    return make(folder)
+
+
+def test_starts_that_fail_count_until_one_succeeds(tmp_path: Path) -> None:
+    with closing(ProcessWorkers(1, "job")) as workers:
+        workers.prepare(make_at_the_third_attempt, tmp_path)
+        workers.submit(1, 1)
+        assert finished(workers, 1) == {1: 1}
+    assert len([*tmp_path.glob("start*")]) == 6
 
 
 def test_a_worker_that_cannot_be_prepared_is_an_error_of_its_own_kind() -> None:

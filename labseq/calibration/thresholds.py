@@ -263,7 +263,7 @@ def _site_peaks(by_site: Floats) -> _SitePeaks:
     parts = [_moments(by_site, part) for part in (by_site <= cut[:, None], by_site > cut[:, None])]
     (empty, width_empty, n_empty), (full, width_full, n_full) = parts
     apart = (full - empty) / np.maximum(np.hypot(width_empty, width_full), 1e-300)
-    few = np.minimum(n_empty, n_full) < max(MIN_IN_PEAK, 0.02 * by_site.shape[1])
+    few = np.minimum(n_empty, n_full) < MIN_IN_PEAK
     two = np.isfinite(apart) & (apart > APART) & ~few
     if two.any():
         two &= full - empty > FAINT * np.median((full - empty)[two])

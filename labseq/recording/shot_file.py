@@ -71,7 +71,8 @@ class ShotEncoder:
             where = f"shot {shot.shot_index} (attempt {shot.attempt})"
             what = f"cannot be laid out as a file: {format_error(error)}"
             raise RecordingError(where, f"{what}; see the plugin that made it") from error
-        return buffer.getbuffer()
+        # of the bytes, which are not copied: the buffer's own view would keep it from being closed
+        return memoryview(buffer.getvalue())
 
     def _write_shot(self, entry: Any, shot: ShotRecord) -> None:
         kept = self._frames_to_keep(shot.images)

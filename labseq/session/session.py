@@ -219,10 +219,8 @@ class Session:
             self.warm(lab := self.build_lab(first))
             for point in others:
                 self.warm(self.build_lab(point))
-            if gc.get_freeze_count():  # by an earlier run in this process
-                gc.unfreeze()
-                gc.collect()
             gc.freeze()  # loaded modules stay: searching them for garbage would take 0.1 s of a shot
+            stack.callback(gc.unfreeze)
             return self._run(lab, root, warnings)
 
     def build_lab(self, point: Point | None = None) -> Lab:

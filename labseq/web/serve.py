@@ -106,8 +106,11 @@ def check_packages() -> None:
     Raises:
         ConfigError: A package is missing.
     """
-    for name in ("starlette", "uvicorn", "httptools", *(() if os.name == "nt" else ("uvloop",))):
-        if find_spec(name) is None:
+    needed = {name: name for name in ("starlette", "uvicorn", "httptools", "uvloop")} | {"PIL": "Pillow"}
+    if os.name == "nt":
+        del needed["uvloop"]
+    for module, name in needed.items():
+        if find_spec(module) is None:
             what = f"showing runs in a browser needs {name}, which is not installed"
             raise ConfigError(Problem(what, hint=install_hint("web")))
 
@@ -190,7 +193,7 @@ def start_beside(root: Path) -> str:
 def _serves(address: str, root: Path) -> bool:
     """Whether a server of this data folder answers there."""
     address = f"{address}api/v1/server"
-    with suppress(OSError, ValueError, KeyError), urllib.request.urlopen(address, timeout=0.5) as answer:  # noqa: S310 - loopback
+    with suppress(OSError, ValueError, KeyError), urllib.request.urlopen(address, timeout=2.0) as answer:  # noqa: S310 - loopback
         return bool(json.loads(answer.read(10_000))["data"] == visible(str(root)))
     return False
 

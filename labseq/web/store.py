@@ -72,8 +72,7 @@ def calibration_picture(catalogue: Catalogue, store: str, file: str) -> bytes | 
     if known is None or Path(file).name != file:
         return None
     path = known[1] / f"{file}.png"
-    png = read_file(path, _MAX_PICTURE) if path.is_file() else b""
-    return png if png.startswith(b"\x89PNG") else None
+    return read_file(path, _MAX_PICTURE) if path.is_file() else None
 
 
 def _stores(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:

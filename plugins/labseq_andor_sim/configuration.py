@@ -23,7 +23,8 @@ BIT_DEPTH: Final = 16
 MIN_GAIN, MAX_GAIN, MAX_ADVANCED_GAIN = 2, 300, 1000
 """Real EM gains that can be set, and the largest with SetEMAdvanced (ours, as cameras of this kind)."""
 SHUTTER_MS: Final = 27
-"""Time that the shutter takes to open or close (ours, as cameras of this kind)."""
+CLOSING_MS: Final = 20
+"""Time that the shutter takes to open, and to close (ours, as cameras of this kind)."""
 MIN_EXPOSURE_S: Final = 10e-6
 """Shortest exposure without frame transfer; with it, that is the read-out (ours)."""
 MAX_EXPOSURE_S: Final = 1000.0
@@ -191,7 +192,7 @@ class Optics:
 
     getters: ClassVar[Mapping[str, Callable[[Any], object]]] = {
         "GetDetector": lambda self: self._detector[::-1],
-        "GetShutterMinTimes": lambda _: (SHUTTER_MS, SHUTTER_MS),
+        "GetShutterMinTimes": lambda _: (CLOSING_MS, SHUTTER_MS),
     }
 
     def __init__(self, sensor_shape: tuple[int, int], clock: Clock) -> None:

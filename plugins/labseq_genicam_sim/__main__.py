@@ -46,8 +46,9 @@ STREAM_PORT: Final = 0xD00
 STREAM_ADDRESS: Final = 0xD18
 """Bootstrap registers of GigE Vision: its own address, and the destination of frames."""
 
-START_TIMEOUT_S: Final = 5.0
-"""How long it waits for the address at which each simulated camera starts."""
+START_TIMEOUT_S: Final = 20.0
+"""How long it waits for the address at which each simulated camera starts. Each has it for some milliseconds,
+but a busy computer may start many."""
 
 FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32

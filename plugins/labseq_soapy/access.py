@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 import threading
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -18,7 +16,7 @@ from labseq.plugin import Clock, Context, DeviceError, Process, state_root, wait
 from labseq_soapy.settings import SoapySettings
 
 if TYPE_CHECKING:
-    from labseq_soapy_sim import SimulatedRadio
+    from labseq_soapy_sim.radio import SimulatedRadio
 
 END_S: Final = 10.0
 """How long a process that was left behind may take to ramp down and close its radio."""
@@ -37,16 +35,13 @@ class RealRadio:
     outlives_run = True
     """Whether it can stay on when labseq has ended."""
 
-    def warm(self) -> None:
-        """Do what takes long before the first shot: nothing."""
-
-    def connect(self) -> tuple[str, Mapping[str, str], Path]:
+    def connect(self) -> tuple[str, str, Path]:
         """Make the radio available.
 
         Returns:
-            The arguments that open it, the environment of the streaming process, and a folder for logs.
+            The arguments that open it, the module that streams to it, and a folder for logs.
         """
-        return self._device, os.environ, state_folder()
+        return self._device, "labseq_soapy_stream.streamer", state_folder()
 
     def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """The radio streams these tones of rows and columns."""
@@ -61,14 +56,14 @@ class RealRadio:
         """The radio was closed; no effect if it is not connected."""
 
 
-def choose_radio(name: str, settings: SoapySettings, context: Context) -> RealRadio | SimulatedRadio:
+def choose_radio(settings: SoapySettings, context: Context) -> RealRadio | SimulatedRadio:
     """The radio that the setting ``device`` names."""
     if not settings.is_simulated:
         return RealRadio(settings.device)
-    from labseq_soapy_sim import SimulatedRadio
+    from labseq_soapy_sim.radio import SimulatedRadio
 
     channels = settings.row_channel, settings.column_channel
-    return SimulatedRadio(name, settings.device, channels, context.simulation)
+    return SimulatedRadio(settings.device, channels, context.simulation)
 
 
 def state_folder() -> Path:

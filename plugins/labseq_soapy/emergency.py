@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def off(
     ramp_s: float,
     device: str,
     channels: Sequence[int],
-    environment: Mapping[str, str],
+    program: str,
 ) -> str:
     """End the streaming process, and switch the transmitters off if it did not; can be repeated.
 
@@ -64,7 +64,7 @@ def off(
         ramp_s: How long its ramp to zero takes, with what the radio has buffered.
         device: Arguments that open the radio.
         channels: Channels that transmit.
-        environment: Variables with which SoapySDR finds the radio.
+        program: Module that streams to it.
 
     Returns:
         What was done.
@@ -77,7 +77,7 @@ def off(
     is_killed = _end(pid, started, ramp_s)
     if not _left_open(opened, pid):
         return "streaming process ended, radio ramped down and closed"
-    done = _switch_off_again(device, channels, environment)
+    done = _switch_off_again(device, channels, program)
     Path(opened).unlink(missing_ok=True)
     how = "hung and was killed" if is_killed else "ended without closing its radio"
     return f"streaming process {how}; {done}"
@@ -145,14 +145,12 @@ def _runs_windows(pid: int) -> bool:
         kernel.CloseHandle(handle)
 
 
-def _switch_off_again(device: str, channels: Sequence[int], environment: Mapping[str, str]) -> str:
+def _switch_off_again(device: str, channels: Sequence[int], program: str) -> str:
     """Open the radio in a process of its own, set the lowest gains, close it."""
-    program = "labseq_soapy_stream.streamer"
     command = [sys.executable, "-P", "-m", program, "--off", device, *map(str, channels)]
     try:
         done = subprocess.run(  # noqa: S603 - our own module
             command,
-            env={**os.environ, **environment},
             capture_output=True,
             text=True,
             errors="replace",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import sys
 import tempfile
@@ -38,8 +37,9 @@ class Link:
     Args:
         name: Name of the device, for messages.
         clock: The session's clock.
-        setup: The first message to the process, which also gets the ``environment`` and ``options``.
+        setup: The first message to the process.
         log: File for the output of the radio's module.
+        program: Module that streams, which gets the ``options``.
 
     Attributes:
         pid: Number of the process.
@@ -53,10 +53,11 @@ class Link:
         clock: Clock,
         setup: Setup,
         log: Path,
-        environment: Mapping[str, str],
+        program: str,
         options: Sequence[str] = (),
     ) -> None:
         self._name, self._clock, self._setup, self._log = name, clock, setup, log
+        self._program = program
         self._news = threading.Condition()
         self._sending = threading.Lock()
         self._ended = ""
@@ -65,15 +66,13 @@ class Link:
         self._received_s = time.monotonic()
         self._closing = threading.Event()
         self.facts: Facts | None = None
-        self._environment = {key: value for key, value in environment.items() if os.environ.get(key) != value}
         with log.open("wb") as file:
             self._process = subprocess.Popen(  # noqa: S603 - our own module
-                [sys.executable, "-P", "-m", "labseq_soapy_stream.streamer", *options],
+                [sys.executable, "-P", "-m", program, *options],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,
                 bufsize=0,
-                env=dict(environment),
                 start_new_session=True,  # so that Ctrl-C in a terminal does not end it before labseq
             )
         self.pid = self._process.pid
@@ -107,7 +106,7 @@ class Link:
             "ramp_s": self._setup.ramp_s + buffered_s,
             "device": self._setup.device,
             "channels": list(self._setup.channels),
-            "environment": self._environment,
+            "program": self._program,
         }
 
     def wait_open(self) -> Facts:

@@ -116,7 +116,7 @@ class SoapySettings(Settings):
     @model_validator(mode="after")
     def _check_simulated_radio(self) -> Self:
         if self.is_simulated:
-            from labseq_soapy_sim import read_arguments
+            from labseq_soapy_sim.radio import read_arguments
 
             read_arguments(self.device)
         return self

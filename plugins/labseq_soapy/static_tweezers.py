@@ -49,14 +49,6 @@ NO_REAL_TIME: Final = (
 )
 
 
-def simulated_settings() -> dict[str, str] | str:
-    """Settings of a simulated radio, or why it cannot be compiled here."""
-    from labseq_soapy_sim import can_build
-
-    without = "the simulated radio needs a C++ compiler and SoapySDR's headers (libsoapysdr-dev)"
-    return {"device": "simulated"} if can_build() else without
-
-
 class SoapyStaticTweezers(StaticTweezers):
     """Plays a loop of tones for each AOD on two outputs of a radio.
 
@@ -91,16 +83,12 @@ class SoapyStaticTweezers(StaticTweezers):
         self._link: Link | None = None
         self._facts: Facts | None = None
         self._is_loaded = False
-        self.radio = choose_radio(self._name, settings, context)
+        self.radio = choose_radio(settings, context)
 
     @property
     def facts(self) -> TweezersFacts:
         """Ramps and releases are timed by the radio's sample clock."""
         return TweezersFacts(1 / self._settings.sample_rate, SHORTEST_RELEASE_S, LATENCY_S)
-
-    def warm(self) -> None:
-        """Do what takes long before the first shot."""
-        self.radio.warm()
 
     def open(self) -> None:
         """Open the radio and stream silence; no effect if it is open.
@@ -293,7 +281,7 @@ class SoapyStaticTweezers(StaticTweezers):
         settings = self._settings
         marker = marker_of(settings.device)
         end_stale_process(self._name, marker, self._clock)
-        device, environment, folder = self.radio.connect()
+        device, program, folder = self.radio.connect()
         setup = Setup(
             device=device,
             stream=settings.stream,
@@ -311,7 +299,7 @@ class SoapyStaticTweezers(StaticTweezers):
             marker=str(marker),
         )
         options = [] if settings.is_simulated else ["--real-time"]
-        return Link(self._name, self._clock, setup, folder / f"{marker.stem}.log", environment, options)
+        return Link(self._name, self._clock, setup, folder / f"{marker.stem}.log", program, options)
 
     def _load(self, amplitudes: Amplitudes | None) -> None:
         loop = self._tones.samples(self._calibrated if amplitudes is None else amplitudes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import ReceivesOutput, Simulation, clean, closest, one_of, setting_error
-from labseq_soapy_sim.build import build_module
 from labseq_soapy_sim.outputs import CapturedOutputs
 from labseq_soapy_sim.ring import Ring
 
@@ -32,10 +30,17 @@ LEAST: Final[Mapping[str, float]] = {
     "time": 0.0,
     "delay": 0.0,
     "components": 1.0,
+    "detune": -1e9,
 }
 """Arguments that are numbers, and their lowest values."""
-WORDS: Final[Mapping[str, tuple[str, ...]]] = {"fault": ("absent",), "folder": (), "unlocked": ("ref", "lo")}
+WORDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "fault": ("absent", "inactive"),
+    "folder": (),
+    "unlocked": ("ref", "lo"),
+}
 """Arguments that are texts, and their allowed values; none: any."""
+STREAMER: Final = "labseq_soapy_sim.streamer"
+"""The streaming process, with the simulated library."""
 
 
 def read_arguments(device: str) -> dict[str, str]:
@@ -75,7 +80,6 @@ class SimulatedRadio:
     """One simulated radio and its files; the driver opens it instead of a real one.
 
     Args:
-        name: Name of the device, for messages.
         device: ``simulated``, with arguments of the radio after a comma.
         channels: Channel of the rows and of the columns.
         simulation: Receives the tones' amplitudes, if it implements ``ReceivesOutput``.
@@ -84,10 +88,7 @@ class SimulatedRadio:
         folder: Folder of the radio's files, while it is open.
     """
 
-    def __init__(
-        self, name: str, device: str, channels: tuple[int, int], simulation: Simulation | None
-    ) -> None:
-        self._name = name
+    def __init__(self, device: str, channels: tuple[int, int], simulation: Simulation | None) -> None:
         self._arguments = read_arguments(device)
         self._channels = channels
         self._simulation = simulation
@@ -101,25 +102,20 @@ class SimulatedRadio:
         assert self.folder is not None
         return Ring(self.folder)
 
-    def warm(self) -> None:
-        """Compile it."""
-        build_module(self._name)
-
     @property
     def outlives_run(self) -> bool:
         """Whether it can stay on when labseq has ended: only if its files are in a folder that stays."""
         return self._given
 
-    def connect(self) -> tuple[str, Mapping[str, str], Path]:
+    def connect(self) -> tuple[str, str, Path]:
         """Make the radio available.
 
         Returns:
-            The arguments that open it, the environment in which SoapySDR finds it, and a folder for logs.
+            The arguments that open it, the module that streams to it, and a folder for logs.
         """
-        environment = {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(build_module(self._name))}
         self.folder = Path(self._arguments["folder"] if self._given else tempfile.mkdtemp(prefix="labseq-"))
         arguments = {"driver": "capture", **DEFAULTS, **self._arguments, "folder": str(self.folder)}
-        return ",".join(f"{key}={value}" for key, value in arguments.items()), environment, self.folder
+        return ",".join(f"{key}={value}" for key, value in arguments.items()), STREAMER, self.folder
 
     def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """The radio streams: let the simulation receive these tones of rows and columns from now on."""

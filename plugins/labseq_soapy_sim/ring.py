@@ -1,4 +1,4 @@
-"""The samples that the simulated radio received, in the file that it shares."""
+"""The file that a simulated radio shares with other processes: its state, and the samples it received."""
 
 from __future__ import annotations
 
@@ -8,35 +8,45 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-MAGIC: Final = 0x3370616371657362
+MAGIC: Final = 0x3471616371657362
+"""Changes with the layout of the header."""
 CHANNELS: Final = 2
+SAMPLES: Final = 1 << 18
+"""Length of the ring of each channel."""
 
-_COUNTS: Final = (
-    *("magic", "ring", "sent", "underflows", "is_active", "fault", "silent", "silence"),
-    *("sequence_errors", "late_packets"),
-)
-_HEADER: Final = np.dtype(
+HEADER: Final = np.dtype(
     [
-        *((name, np.uint64) for name in _COUNTS),
-        *((name, np.float64) for name in ("rate_hz", "speed", "max_wait_s", "t0_s", "leakage")),
+        *((name, np.uint64) for name in ("magic", "sent", "is_active", "fault")),
+        *((name, np.uint64) for name in ("underflows", "sequence_errors", "late_packets")),
+        *((name, np.uint64) for name in ("silent", "silence")),
+        *((name, np.float64) for name in ("rate_hz", "speed", "patience_s", "t0_s", "leakage")),
         *((name, np.float64, CHANNELS) for name in ("frequency_hz", "gain_db", "oscillator_hz", "start_s")),
     ]
 )
+"""State of the radio: samples received, whether it transmits, errors, settings.
+
+``silent``: samples of silence up to now, ``silence``: those of the last silence that is over. Sample n is
+played at t0_s + n / (rate_hz speed) of ``time.monotonic``. ``frequency_hz``: zero of the samples;
+``oscillator_hz``: where it leaks; ``start_s``: when the first sample of a channel was played.
+"""
 
 
 class Fault(enum.IntFlag):
     """Faults of the radio while they are set; an underflow, and a lost or late packet, happen once."""
 
     NONE = 0
-    UNDERFLOW = 1
-    STREAM_ERROR = 2
-    MUTE_0 = 4
-    MUTE_1 = 8
-    STALL = 16
-    LOST_PACKET = 32
-    LATE_PACKET = 64
+    UNDERFLOW = enum.auto()
+    STREAM_ERROR = enum.auto()
+    MUTE_0 = enum.auto()
+    MUTE_1 = enum.auto()
+    STALL = enum.auto()
+    LOST_PACKET = enum.auto()
+    LATE_PACKET = enum.auto()
+    HANG = enum.auto()
+    GONE = enum.auto()
 
 
 def read_trace(folder: Path) -> list[tuple[float, str, float, float]]:
@@ -49,6 +59,25 @@ def read_trace(folder: Path) -> list[tuple[float, str, float, float]]:
     return [(float(time_s), name, float(first), float(second)) for time_s, name, first, second in lines]
 
 
+def radio_lock(folder: Path) -> FileLock:
+    """The lock that a process holds while it has the radio open."""
+    return FileLock(folder / "lock")
+
+
+def create(folder: Path) -> tuple[Any, NDArray[np.uint64]]:
+    """Create the file, or empty it; gives its header and its samples, uint64 (2, SAMPLES), to be written."""
+    n_bytes = HEADER.itemsize + CHANNELS * SAMPLES * 8
+    path = folder / "ring"
+    path.touch(0o600)
+    with path.open("r+b") as file:
+        file.truncate(n_bytes)
+    memory = np.memmap(path, np.uint8, "r+")
+    memory[:] = 0
+    header = memory[: HEADER.itemsize].view(HEADER)[0]
+    header["magic"] = MAGIC
+    return header, memory[HEADER.itemsize :].view(np.uint64).reshape(CHANNELS, SAMPLES)
+
+
 class Ring:
     """The latest samples of both channels.
 
@@ -57,16 +86,17 @@ class Ring:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / "ring"
-        memory = np.memmap(self._path, np.uint8, "r+")
-        self._header: Any = memory[: _HEADER.itemsize].view(_HEADER)[0]
+        path = folder / "ring"
+        self._lock = radio_lock(folder)
+        memory = np.memmap(path, np.uint8, "r+")
+        self._header: Any = memory[: HEADER.itemsize].view(HEADER)[0]
         if self._header["magic"] != MAGIC:
-            raise ValueError(f"{self._path} was written by another version of labseq_soapy_sim")
-        samples = memory[_HEADER.itemsize :].view(np.complex64)
-        self._samples: NDArray[np.complex64] = samples.reshape(CHANNELS, int(self._header["ring"]))
+            raise ValueError(f"{path} was written by another version of labseq_soapy_sim")
+        samples = memory[HEADER.itemsize :].view(np.complex64)
+        self._samples: NDArray[np.complex64] = samples.reshape(CHANNELS, SAMPLES)
 
     def __getitem__(self, name: str) -> Any:
-        """A value of the header; see ``struct Header`` in capture.cpp."""
+        """A value of the :data:`HEADER`."""
         return self._header[name]
 
     def set_fault(self, fault: Fault) -> None:
@@ -85,16 +115,15 @@ class Ring:
         if not header["is_active"] or not self._is_held():
             return False
         late_s = time.monotonic() - header["t0_s"] - header["sent"] / (header["rate_hz"] * header["speed"])
-        return bool(late_s <= header["max_wait_s"])
+        return bool(late_s <= header["patience_s"])
 
     def latest(self, n: int) -> NDArray[np.complex64]:
         """The latest samples that it received, complex64 (2, n); fewer if there were fewer."""
-        size = self._samples.shape[1]
         while True:
             end = int(self._header["sent"])
-            places = np.arange(max(0, end - n), end) % size
+            places = np.arange(max(0, end - n), end) % SAMPLES
             found = self._samples[:, places]
-            if int(self._header["sent"]) - end < size - n - (1 << 16):  # not overwritten meanwhile
+            if int(self._header["sent"]) - end < SAMPLES - n - (1 << 16):  # not overwritten meanwhile
                 return found
 
     def output(self, n: int) -> NDArray[np.complex64]:
@@ -106,11 +135,8 @@ class Ring:
         return samples + (self._header["leakage"] * waves).astype(np.complex64)
 
     def _is_held(self) -> bool:
-        import fcntl
-
-        with self._path.open("rb") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-            return False
+        try:
+            with self._lock.acquire(timeout=0):
+                return False
+        except Timeout:
+            return True

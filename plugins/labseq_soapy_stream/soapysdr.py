@@ -273,8 +273,13 @@ class Stream:
         self.starts_together = False
 
     def activate(self) -> None:
-        """Let the first samples start to play: on all channels at one time, if the radio has a clock."""
-        _call("activateStream", *self._place, 0, 0, 0)
+        """Let the first samples start to play: on all channels at one time, if the radio has a clock.
+
+        Raises:
+            SoapyError: The radio refuses to transmit.
+        """
+        if code := _call("activateStream", *self._place, 0, 0, 0):
+            raise _stream_error("starting the stream", code)
         self.starts_together = bool(_call("hasHardwareTime", self._place[0], b""))
         if self.starts_together:
             now_ns = _call("getHardwareTime", self._place[0], b"")
@@ -339,9 +344,17 @@ class Stream:
         return found
 
     def close(self) -> None:
-        """Stop playing and close the stream."""
-        _call("deactivateStream", *self._place, 0, 0)
-        _call("closeStream", *self._place)
+        """Stop playing and close the stream.
+
+        Raises:
+            SoapyError: The radio does not obey: its transmitters may still be on.
+        """
+        try:
+            code = _call("deactivateStream", *self._place, 0, 0)
+        finally:
+            _call("closeStream", *self._place)
+        if code:
+            raise _stream_error("stopping the stream", code)
 
 
 def open_radio(setup: Setup) -> Radio:

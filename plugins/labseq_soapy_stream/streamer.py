@@ -20,13 +20,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import numpy as np
 
 from labseq_soapy_stream.messages import Setup, received, send
 from labseq_soapy_stream.output import BLOCK, Output, Samples
-from labseq_soapy_stream.soapysdr import SoapyError, Stream, lower_gains, open_radio, read_back, set_up
+from labseq_soapy_stream.soapysdr import Radio, SoapyError, Stream, lower_gains, open_radio, read_back, set_up
 
 STALL_S: Final = 2.0
 """A stream that takes no samples for so long is dead."""
@@ -238,24 +238,31 @@ def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -
     opened = Path(setup.marker).with_suffix(".opened")  # it stays if this process is killed
     with contextlib.suppress(OSError):
         opened.write_text(str(os.getpid()), "ascii")
+    is_off = True
     try:
         samples = set_up(radio, setup)
-        facts = read_back(radio, setup)
-        samples.activate()
-        streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
-        signal.signal(signal.SIGTERM, streamer.terminate)
         try:
+            facts = read_back(radio, setup)
+            samples.activate()
+            streamer = Streamer(samples, facts.rate_hz, commands, messages.post)
+            signal.signal(signal.SIGTERM, streamer.terminate)
             facts = replace(facts, buffered=streamer.fill(), no_real_time=no_real_time)
             messages.post({"facts": asdict(replace(facts, starts_together=samples.starts_together))})
             streamer.run()
         finally:
-            with contextlib.suppress(SoapyError):  # the first error is reported
-                samples.close()
+            is_off = closed(samples)
     finally:
-        with contextlib.suppress(SoapyError):
-            radio.close()
+        if closed(radio) and is_off:
             remove_own(opened)
         remove_own(Path(setup.marker))
+
+
+def closed(part: Radio | Stream) -> bool:
+    """Close a radio or its stream; returns whether it obeyed. An error that came before is reported."""
+    with contextlib.suppress(SoapyError):
+        part.close()
+        return True
+    return False
 
 
 def remove_own(file: Path) -> None:
@@ -290,7 +297,12 @@ def main() -> int:
     return 0
 
 
-if __name__ == "__main__":
+def run() -> NoReturn:
+    """Run the process, and end it."""
     code = main()
     sys.stderr.flush()
     os._exit(code)  # the threads wait for labseq
+
+
+if __name__ == "__main__":
+    run()

@@ -66,7 +66,7 @@ class Conversation:
         self._device = device
         self._clock = clock
         self._max_wait_s = max_wait_s
-        self._aborted = False
+        self._n_stops = 0
         self._n_asked = 0
         self._came = bytearray()
         self._noise = b""
@@ -119,16 +119,12 @@ class Conversation:
 
     def stop(self) -> None:
         """Turn all lines off, whatever the box is doing, and end the waits of other threads."""
-        self._aborted = True
-        try:
-            self.send(STOP)
-            with self.lock:
-                self._aborted = False
-                # until the box has said so, it drops what it receives
-                self._wait(lambda: ["off"] in [event[:1] for event in self._news] or None, self._max_wait_s)
-                self.ask("off", tries=1)
-        finally:
-            self._aborted = False
+        self._n_stops += 1
+        self.send(STOP)
+        with self.lock:
+            # until the box has said so, it drops what it receives
+            self._wait(lambda: ["off"] in [event[:1] for event in self._news] or None, self._max_wait_s)
+            self.ask("off", tries=1)
 
     def emergency(self) -> Emergency | None:
         """How another process turns all lines off; None without a real port."""
@@ -145,15 +141,20 @@ class Conversation:
             self._port.write(data)
 
     def _wait(self, look: Callable[[], T | None], timeout_s: float) -> T | None:
+        n_stops = self._n_stops
+
+        def unless_stopped() -> T | None:
+            if self._n_stops != n_stops:  # also the message of the stop is not for this wait
+                raise DeviceError(self._device, "aborted by the safe state")
+            return look()
+
         def poll(slice_s: float) -> T | None:
             with self.lock:
-                found = look()
+                found = unless_stopped()
                 if found is None:
                     self._pump(wait=slice_s > 0)
-                    found = look()
-            if found is None and self._aborted:
-                raise DeviceError(self._device, "aborted by the safe state")
-            return found
+                    found = unless_stopped()
+                return found
 
         return wait_for(poll, timeout_s, self._clock)
 

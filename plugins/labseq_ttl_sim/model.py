@@ -1,6 +1,6 @@
 """A model of the box: the same answers to the same lines, without its firmware.
 
-It plays a program in no time at all, and answers at once.
+It plays a program in no time at all, from its command or the edge at the start input on, and answers at once.
 """
 
 from __future__ import annotations
@@ -195,8 +195,11 @@ class ModelBox:
             self._boot(RESET_INPUT)
 
     def start(self) -> None:
-        """A rising edge at the start input."""
-        if self._leader.rise():
+        """A rising edge at the start input: the start of a program that waits for it, or a leader's `go`."""
+        if self._waits:
+            self._leader.level = 1
+            self._play()
+        elif self._leader.rise():
             self._send(f"!go {self._boots:04x} {self._leader.n_go_signals:04x}")
 
     def lower(self) -> None:
@@ -224,6 +227,7 @@ class ModelBox:
         self._line = bytearray()
         self._slots: list[list[Edge]] = [[] for _ in range(SLOTS)]
         self._armed: int | None = None
+        self._is_due = self._waits = False
         self._runs = self.on = 0
         self._leader = LeaderInput()
         self._send(f"!boot {self._boots:04x} {cause:02x}")
@@ -233,6 +237,8 @@ class ModelBox:
             self._off()
             self._line.clear()
             self._send(f"!off {self._boots:04x}")
+        elif self._waits:
+            pass
         elif byte == ord("\n"):
             if self._line:
                 self._answer()
@@ -246,7 +252,6 @@ class ModelBox:
             self._send("? no damaged")
             return
         name, *words = said[2:].split(" ")
-        new_events = self._runs
         try:
             if name not in self._commands:
                 raise RefusedError("unknown")
@@ -258,10 +263,8 @@ class ModelBox:
         except RefusedError as refusal:
             answer = f"{said[0]} no {refusal}"
         self._send(answer)
-        if self._runs != new_events:
-            self._send(f"!done {self._boots:04x} {self._runs:04x}")
-        elif name in ("fire", "await") and " ok" in answer:  # reset in the middle
-            self._boot(RESET_INPUT)
+        if self._is_due:
+            self._play()
 
     def _send(self, text: str) -> None:
         self._out += framed(text)
@@ -306,24 +309,36 @@ class ModelBox:
         return f"{self._boots:04x}"
 
     def _fire(self) -> None:
+        self._check_armed()
+        self._is_due = True
+
+    def _await(self) -> None:
+        if self._leader.state != DEAF:
+            raise RefusedError("led")
+        self._check_armed()
+        self._waits = True
+
+    def _check_armed(self) -> None:
         if self._armed is None:
             raise RefusedError("unarmed")
+
+    def _play(self) -> None:
+        """Play the armed program; a reset that is due in its middle ends it."""
+        assert self._armed is not None
         edges, self._armed = self._slots[self._armed], None
         until, self._reset_after = self._reset_after, None
+        self._is_due = self._waits = False
         self._edges, tick = [], 0
         for ticks, mask in edges:
             tick += ticks
             if until is not None and tick >= until:
                 self._edges.append((until, 0))
+                self._boot(RESET_INPUT)
                 return
             self._edges.append((tick, mask))
             self.on = mask
         self._runs = (self._runs + 1) & 0xFFFF
-
-    def _await(self) -> None:
-        if self._leader.state != DEAF:
-            raise RefusedError("led")
-        self._fire()
+        self._send(f"!done {self._boots:04x} {self._runs:04x}")
 
     def _begin_leading(self, busy: int, ready: int, failed: int, _deadline_ms: int) -> str:
         self._leader.begin(busy, ready, failed)
@@ -343,3 +358,4 @@ class ModelBox:
 
     def _off(self) -> None:
         self._armed, self.on = None, 0
+        self._waits = False

@@ -105,10 +105,12 @@ def test_points_are_means_with_their_intervals() -> None:
 
 def test_curves_are_drawn_in_per_cent_with_error_bars() -> None:
     axes = make_figure(3.0, 3.0).add_subplot()
-    curves()(axes)
+    curves(curves={"": points_of([1, 2], [Estimate(0.2, 0.1), Rate(1, 10)])})(axes)
     (line, _, (bars,)), *_ = axes.containers
-    assert line.get_ydata().tolist() == pytest.approx((100 * points()[1]).tolist())
+    assert line.get_ydata().tolist() == pytest.approx([20, 10])
+    low, high = jeffreys(1, 10)
     assert bars.get_segments()[0][:, 1].tolist() == pytest.approx([10.0, 30.0])
+    assert bars.get_segments()[1][:, 1].tolist() == pytest.approx([100 * low, 100 * high])
 
 
 def test_a_stage_has_its_median_and_its_budget() -> None:

@@ -174,7 +174,7 @@ def test_the_commands_show_write_and_draw_the_same_points(
         ]
     header, first, *rest = (tmp_path / "points.csv").read_text().splitlines()
     assert header.startswith('shot.hold.duration,shots,"survival:before,after","survival:before,after low"')
-    assert float(first.split(",")[2]) == rate.value
+    assert [float(number) for number in first.split(",")[2:]] == [rate.value, *rate.interval]
     assert len(rest) == 5
     (tmp_path / "scan.png").touch()
     assert printed("plot", run, *scan, "--fit", "exponential") == "written: scan_1.png\n"
@@ -223,6 +223,22 @@ def test_each_model_finds_its_parameters_from_its_own_starting_values(model: str
         one = found.values[name]
         assert abs(one.value - true) < 3 * one.error < 0.5 * abs(true)
     assert 0.3 < found.chi2 < 2.5
+
+
+def test_points_count_by_their_errors() -> None:
+    """Against the formulas of a weighted straight line; and all errors ten times larger change no value."""
+    x, y = np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.1, 0.9, 2.2, 9.0])
+    errors = np.array([0.1, 0.05, 0.1, 2.0])
+    weights = errors**-2
+    x_mean, y_mean = np.average(x, weights=weights), np.average(y, weights=weights)
+    spread = (weights * (x - x_mean) ** 2).sum()
+    slope = (weights * (x - x_mean) * (y - y_mean)).sum() / spread
+    for scale in (1.0, 10.0):
+        values = [Estimate(*one) for one in zip(y.tolist(), (scale * errors).tolist(), strict=True)]
+        found = fit_points("linear", x.tolist(), values, ("s", "%")).values
+        assert found["slope"].value == pytest.approx(slope, rel=1e-4)
+        assert found["slope"].error == pytest.approx(scale * spread**-0.5, rel=1e-3)
+        assert found["intercept"].value == pytest.approx(y_mean - slope * x_mean, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from labseq.analysis.shot import save_shot, shot_picture
+from labseq.analysis.shot import DPI, ShotDrawing, ShotPanel, save_shot, shot_picture
 from labseq.errors import ConfigError
+from labseq.model import SiteGrid, TargetPattern
+from labseq.pictures.figures import HEAD_IN
+from labseq.pictures.plans import ATOM_LOOK
 from labseq.recording import Run
+from tests.pictures.pixels import are_at, decoded, is_colour, on_lattice, spots
 
-from .records import make_shot
-
-Write = Callable[..., Run]
+from .records import SHAPE, Write, image, make_shot, target
 
 
 def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> None:
@@ -31,9 +33,34 @@ def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> N
     assert drawing.sites_px.shape == (20, 20, 2)
 
 
-def test_frames_lie_under_the_sites(compact: Run, tmp_path: Path) -> None:
-    save_shot(tmp_path / "shot.png", shot_picture(compact, 1, cycle=0))
-    assert (tmp_path / "shot.png").read_bytes().startswith(b"\x89PNG")
+def test_atoms_are_drawn_on_their_sites(write: Write, tmp_path: Path) -> None:
+    atoms = target().fill.copy()
+    atoms[1, 1], atoms[3, 4] = False, True
+    run = write([make_shot(0, n_cycles=0, images=[image(atoms, 1, -1, 0.5)])])
+    save_shot(tmp_path / "shot.png", shot_picture(run, 0))
+    pixels = decoded((tmp_path / "shot.png").read_bytes(), "RGB")[int(HEAD_IN * DPI) :]
+    on_target = spots(is_colour(pixels, ATOM_LOOK.face), least=300)  # those of the key are smaller
+    assert are_at(on_target, on_lattice(np.argwhere(atoms & target().fill)))
+
+
+def test_a_frame_lies_under_its_sites_however_the_camera_is_turned(tmp_path: Path) -> None:
+    """The camera sees rows from right to left, and columns downwards."""
+    grid = SiteGrid(*SHAPE, lattice="square")
+    rows, cols = np.indices(SHAPE)
+    sites_px = np.stack([20 * cols + 15, 95 - 20 * rows], axis=-1).astype(np.float64)
+    lit = [(0, 1), (1, 3), (3, 0)]
+    frame = np.full((110, 120), 100, np.uint16)
+    frame[:6, :6] = 1000
+    for y, x in sites_px[tuple(np.transpose(lit))].astype(int):
+        frame[y - 3 : y + 4, x - 3 : x + 4] = 550
+    nothing = np.zeros(SHAPE, np.bool_)
+    panel = ShotPanel("image", nothing, frame, np.empty((0, 4), np.int16), np.empty(0, np.int64))
+    save_shot(
+        tmp_path / "shot.png",
+        ShotDrawing("", "", grid, TargetPattern(nothing, nothing), sites_px, (panel,)),
+    )
+    pixels = decoded((tmp_path / "shot.png").read_bytes(), "RGB")[int(HEAD_IN * DPI) :]
+    assert are_at(spots(is_colour(pixels, "0.5"), least=100), [(col, row) for row, col in lit])
 
 
 def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.analysis.overview import evenly
-from labseq.analysis.timing import timing_of, writing_s
+from labseq.analysis.timing import quantiles, timing_of, writing_s
 from labseq.recording import Run, open_run
 
 from .records import make_shot
@@ -53,6 +53,10 @@ def test_a_model_knows_nothing_of_writing(write: Write) -> None:
         (stage,) = (one for one in timing_of(run, run.shots).stages if one.stage == "write")
         assert math.isnan(stage.session_s[0]) is simulated
         assert stage.host_s[0] > 0
+
+
+def test_the_long_end_is_the_99th_percentile() -> None:
+    assert quantiles([float(i) for i in range(201)]) == pytest.approx((100, 198))
 
 
 @given(st.integers(0, 50), st.integers(1, 20))

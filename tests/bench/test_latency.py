@@ -95,7 +95,6 @@ def test_a_sequence_without_an_image_is_refused(tmp_path: Path) -> None:
 def test_the_command_prints_a_table_and_writes_json_and_a_histogram(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("matplotlib")
     path, picture = tmp_path / "latency.json", tmp_path / "latency.png"
     options = ["--loadings", "2", "--seed", "3", "--json", str(path), "--picture", str(picture)]
     with pytest.raises(SystemExit, match=r"^0$"):

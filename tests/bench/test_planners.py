@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import json
 from dataclasses import replace
@@ -95,7 +96,7 @@ def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_cluster_finds_what_one_process_finds(report: Report) -> None:
-    distributed = pytest.importorskip("distributed")
+    distributed: Any = importlib.import_module("distributed")
     with distributed.LocalCluster(
         n_workers=1, protocol="tcp", processes=False, dashboard_address=":0"
     ) as cluster:

@@ -12,19 +12,15 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from labseq_andor.camera import AndorCamera
-from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
-from labseq_aravis import load_library
 from labseq_genicam.camera import GenicamCamera
 from labseq_genicam.settings import GenicamSettings
 from labseq_pylon.camera import PylonCamera
-from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 
 from labseq.plugin import CameraDriver, Context, Frame, SensorMode, SiteGrid
 from labseq.roles import WHOLE_SENSOR, NeverStopped
 from labseq.testing.fakes import RecordingSimulation
-from tests.plugins.needs import need_library
 
 N_FRAMES: Final = int(os.environ.get("LABSEQ_FRAMES", "5"))
 EXPOSURE_S: Final = 1e-3
@@ -41,22 +37,26 @@ class StillWorld(RecordingSimulation):
 
 
 def andor(context: Context) -> CameraDriver:
-    need_library(lambda: load_pylablib("camera"))
     return AndorCamera(AndorSettings.model_validate({"camera": "simulated"}), context)
 
 
 def genicam(context: Context) -> CameraDriver:
-    need_library(load_library)
     settings = {"camera": "simulated", "readout": "0 ms", "frame_rate": "100 Hz"}
     return GenicamCamera(GenicamSettings.model_validate(settings), context)
 
 
 def pylon(context: Context) -> CameraDriver:
-    need_library(lambda: load_pypylon("camera"))
     return PylonCamera(PylonSettings.model_validate({"camera": "simulated", "readout": "0 ms"}), context)
 
 
-@pytest.fixture(scope="module", params=[andor, genicam, pylon], ids=lambda make: make.__name__)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(andor, id="andor"),
+        pytest.param(genicam, id="genicam", marks=pytest.mark.needs("libaravis")),
+        pytest.param(pylon, id="pylon", marks=pytest.mark.needs("pypylon")),
+    ],
+)
 def camera(request: pytest.FixtureRequest) -> Generator[CameraDriver]:
     make: Callable[[Context], CameraDriver] = request.param
     context = Context("camera", SiteGrid(), clock=NeverStopped(), simulation=StillWorld())

@@ -112,7 +112,6 @@ def test_open_a_long_run(benchmark: BenchmarkFixture, long_run: tuple[Path, int]
 
 
 def test_table_of_a_long_run(benchmark: BenchmarkFixture, long_run: tuple[Path, int]) -> None:
-    pytest.importorskip("pandas")
     run_dir, n_shots = long_run
     table = benchmark.pedantic(open_run(run_dir).to_dataframe, rounds=5, warmup_rounds=1)
     assert len(table) == n_shots

@@ -15,10 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("zmq")
-pytest.importorskip("msgpack")
-
 import zmq
 from labseq_psca.planner import PscaPlanner, PscaSettings
 from labseq_remote.drivers import RemoteCamera, RemoteDevice, RemoteHardware, RemoteMobileTweezers

@@ -11,6 +11,13 @@ from labseq.sequencer.lab import Timeouts
 from labseq.testing.fakes import RecordingLines
 from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
 
+
+@pytest.fixture(autouse=True)
+def busy_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that begins late must not let the next device go first."""
+    monkeypatch.setattr("labseq.sequencer.lab.NEXT_S", 60.0)
+
+
 LOWER = ("ramp", RampStep(given(depth=0.5, duration=5e-3)))
 RAISE = ("ramp", RampStep(given(depth=1.0, duration=2e-3)))
 

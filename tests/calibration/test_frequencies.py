@@ -61,6 +61,17 @@ def test_errors_cover_the_truth_as_often_as_they_should(atoms: Any) -> None:
     assert 0.55 < np.mean(np.abs(pulls) < 1) < 0.8
 
 
+def test_losses_common_to_a_shot_widen_the_errors_of_rows_and_columns(atoms: Any) -> None:
+    errors_m: list[float] = []
+    for least in (1.0, 0.75):  # survival of the shots, for any other reason
+        rng = np.random.default_rng(3)
+        offset, n, k = probe(atoms, *hidden(rng, 25e-9), 10, rng)
+        k = rng.binomial(k, rng.uniform(least, 1.0, len(offset))[:, None, None])
+        fit = fit_frequencies(offset, n, k, GRID, MOTION)
+        errors_m.append(float(np.mean([*fit.row_error_m, *fit.column_error_m])))
+    assert errors_m[1] > 1.28 * errors_m[0]  # 1.17 by the fewer atoms alone
+
+
 def test_a_row_without_atoms_takes_the_place_of_its_neighbours(atoms: Any) -> None:
     rng = np.random.default_rng(5)
     rows, cols = hidden(rng, 5e-9)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from labseq.calibration.thresholds import FittedThresholds, Peak, fit_thresholds
+from labseq.calibration.thresholds import FittedThresholds, Peak, analyse_thresholds, fit_thresholds
 from labseq.errors import DeviceError, LimitError
 
 Floats = NDArray[np.float64]
@@ -133,6 +137,118 @@ def test_sites_with_one_peak_are_listed_and_get_the_others_threshold() -> None:
         assert found.thresholds.ravel()[site] == pytest.approx(others, rel=0.15)
     assert found.loading.ravel()[7] < 0.02
     assert found.loading.ravel()[90] > 0.98
+
+
+def gaussian(n_frames: int = 200, seed: int = 10) -> tuple[Floats, NDArray[np.bool_]]:
+    """Signals of 6 x 6 equal sites, 9 widths between the peaks; and which atoms there were."""
+    rng = np.random.default_rng(seed)
+    full = rng.random((n_frames, 6, 6)) < 0.6
+    return rng.normal(9.0 * full, 1.0), full
+
+
+def test_a_site_with_little_light_and_one_with_a_few_bright_frames_have_one_peak() -> None:
+    signals, full = gaussian(100)
+    full[:, 1, 1] = full[:, 4, 4] = False
+    signals[:, 1, 1] = np.random.default_rng(1).normal(np.where(full[:, 1, 2], 1.8, 0.0), 0.2)
+    signals[:, 4, 4] = np.random.default_rng(2).normal(0.0, 1.0, 100)
+    signals[::30, 4, 4] += 9.0  # cosmic rays
+    found = fit_thresholds(signals)
+    assert np.argwhere(found.never_loaded | found.always_loaded).tolist() == [[1, 1], [4, 4]]
+    assert found.thresholds[4, 4] == pytest.approx(np.median(found.thresholds), abs=1.0)
+
+
+class Signals:
+    """A detector whose frames are the signals."""
+
+    signal_unit = "counts"
+    sites_px = thresholds = np.zeros((6, 6))
+
+    def signals(self, frame: Floats) -> Floats:
+        return frame
+
+
+@pytest.mark.parametrize(("n_frames", "n_atoms", "n_counted"), [(40, 3, 0), (200, 0, 1)])
+def test_a_site_that_has_few_atoms_by_chance_does_not_count_as_one_without(
+    n_frames: int, n_atoms: int, n_counted: int
+) -> None:
+    rng = np.random.default_rng(6)
+    full = rng.random((n_frames, 6, 6)) < 0.3
+    full[:, 2, 2] = np.arange(n_frames) < n_atoms
+    signals = rng.normal(9.0 * full, 1.0)
+    chosen = SimpleNamespace(entry=SimpleNamespace(name="mine"), dump=dict)
+    data: Any = SimpleNamespace(
+        detector=Signals, frames=lambda: signals, hardware=SimpleNamespace(chosen={"detector": chosen})
+    )
+    found = analyse_thresholds(data)
+    assert found.quality["n_one_peak"] == n_counted
+    assert any("site (2, 2)" in line for line in found.summary_lines)
+
+
+def test_cosmic_rays_hardly_change_the_thresholds() -> None:
+    signals, full = gaussian()
+    before = fit_thresholds(signals).thresholds
+    for row, col in np.ndindex(6, 6):
+        signals[np.flatnonzero(full[:, row, col])[:2], row, col] = 300.0
+    np.testing.assert_allclose(fit_thresholds(signals).thresholds, before, atol=0.3)
+
+
+def test_what_is_on_the_outer_side_of_a_peak_hardly_changes_the_thresholds() -> None:
+    """A tenth of the atoms is much brighter, as where two are in a tweezer."""
+    rng = np.random.default_rng(0)
+    full, bright = rng.random((300, N_SITES)) < 0.6, rng.random((300, N_SITES)) < 0.1
+    found = fitted(rng.normal(np.where(full, np.where(bright, 16.0, 10.0), 0.0), np.where(full, 2.0, 1.0)))
+    assert cost(found.thresholds, 10.0, 2.0, 1.0) < 1.7 * best(10.0, 2.0, 1.0)[0]
+
+
+def test_each_site_has_a_threshold_for_its_own_noise() -> None:
+    rng = np.random.default_rng(1)
+    width = np.tile([1.0, 2.5], N_SITES // 2)  # of the empty site
+    full = rng.random((300, N_SITES)) < 0.6
+    thresholds = fitted(rng.normal(np.where(full, 14.0, 0.0), np.where(full, 2.0, width))).thresholds.ravel()
+    narrow, wide = (float(np.median(thresholds[width == own])) for own in (1.0, 2.5))
+    best_narrow, best_wide = (best(14.0, 2.0, own)[1] for own in (1.0, 2.5))
+    assert wide - narrow == pytest.approx(best_wide - best_narrow, rel=0.5)
+
+
+def cost(at: Floats, full: float, width_full: float, width_empty: float) -> float:
+    """Mean cost of thresholds between Gaussians at 0 and ``full``, a missed atom counted three times."""
+    missed, imagined = ndtr((at - full) / width_full), ndtr(-at / width_empty)
+    return float(np.mean(3 * missed + imagined))
+
+
+def best(full: float, width_full: float, width_empty: float) -> tuple[float, float]:
+    """The lowest cost, and the threshold with it."""
+    ladder = np.linspace(0, full, 1000)
+    return min((cost(np.array(at), full, width_full, width_empty), float(at)) for at in ladder)
+
+
+def test_the_one_site_that_differs_from_all_others_keeps_its_own_threshold() -> None:
+    signals, _ = gaussian()
+    expected = fit_thresholds(signals).thresholds[3, 2] + 2.0
+    signals[:, 3, 2] += 2.0  # stray light
+    assert fit_thresholds(signals).thresholds[3, 2] == pytest.approx(expected, abs=0.5)
+
+
+def test_a_site_without_atoms_but_with_stray_light_has_a_higher_threshold() -> None:
+    signals, _ = gaussian()
+    signals[:, 3, 2] = np.random.default_rng(3).normal(2.0, 1.0, 200)
+    found = fit_thresholds(signals)
+    assert found.never_loaded[3, 2]
+    assert found.thresholds[3, 2] == pytest.approx(2.0 + np.median(found.thresholds), abs=0.5)
+
+
+def test_a_fifth_of_the_sites_may_have_one_peak() -> None:
+    signals, _ = gaussian()
+    dark = np.random.default_rng(4).normal(0.0, 1.0, signals.shape)
+    for n_dark in (7, 8):
+        mixed = np.where(np.arange(36).reshape(6, 6) < n_dark, dark, signals)
+        if n_dark == 7:
+            assert np.count_nonzero(fit_thresholds(mixed).never_loaded) == 7
+        else:
+            with pytest.raises(DeviceError, match="8 of 36 sites"):
+                fit_thresholds(mixed)
+    mixed = np.where(np.arange(4).reshape(2, 2) < 1, dark[:, :2, :2], signals[:, :2, :2])
+    assert np.count_nonzero(fit_thresholds(mixed).never_loaded) == 1  # one is always allowed
 
 
 @pytest.mark.parametrize("loading", [0.0, 1.0])

@@ -35,12 +35,6 @@ def test_arrange(
     assert arrange(given_arguments) == expected
 
 
-@given(st.lists(st.sampled_from(["run", "a.yaml", "--dry-run", "--debug", "--", "--set", "x=1"])))
-def test_arranging_twice_changes_nothing_more(arguments: list[str]) -> None:
-    once = arrange(arguments)
-    assert arrange(once) == once
-
-
 @given(st.lists(st.text(max_size=5).filter(lambda text: text not in {"--dry-run", "--debug"})))
 def test_other_arguments_pass_as_they_are(arguments: list[str]) -> None:
     assert arrange(arguments) == arguments

@@ -27,7 +27,7 @@ def leave(tmp_path: Path, command: str, *, daemon: bool) -> subprocess.Completed
     environment.pop("PYTHONUNBUFFERED", None)
     arguments = [sys.executable, "-m", "labseq", *command.split()]
     return subprocess.run(
-        arguments, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+        arguments, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600
     )
 
 

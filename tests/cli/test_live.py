@@ -15,6 +15,13 @@ from labseq.console.events import LogLines
 from labseq.model import ShotRecord, StageTiming
 
 
+@pytest.fixture(autouse=True)
+def own_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view that a test leaves open keeps stdout and stderr, but no longer than the test."""
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    monkeypatch.setattr(sys, "stderr", sys.stderr)
+
+
 class Screen(io.TextIOWrapper):
     """A terminal of any encoding that counts how often it is drawn to."""
 

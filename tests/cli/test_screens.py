@@ -61,5 +61,7 @@ def test_no_word_and_no_number_is_broken(
     monkeypatch.setattr(type(sys.stdout), "isatty", lambda _: True)
     _, narrow, _ = call(*arguments)
     assert [line for line in narrow.splitlines() if len(line) > 80 and str(taken) not in line] == []
+    if command == "check":  # it measures how long planning takes
+        wide, narrow = (re.sub(r"\d+", "0", text) for text in (wide, narrow))
     words = [{*re.findall(r"[\w.,()\[\]-]+", text)} for text in (wide, narrow)]
     assert words[0] <= words[1]

@@ -19,6 +19,9 @@ from labseq.errors import ConfigError
 from labseq.model import StageTiming
 from labseq.recording import RunWriter, open_run
 
+NO_TERMINAL = pytest.mark.usefixtures("capsys")
+"""Tables are as wide as the terminal."""
+
 
 def write_run(root: Path, fake: Any, shots: Any, n_shots: int = 3) -> Path:
     writer = RunWriter.create(root, fake.run(n_shots=n_shots))
@@ -107,12 +110,14 @@ def test_show_finds_the_newest_run_itself(
     assert json.loads(capsys.readouterr().out)["run_dir"] == str(folder)
 
 
+@NO_TERMINAL
 def test_why_a_run_failed_is_reported(fake: Any, tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, fake.run())
     writer.finish("failed", "DeviceError: camera: mute")
     assert "status            failed: DeviceError: camera: mute" in summary_lines(open_run(writer.run_dir))
 
 
+@NO_TERMINAL
 def test_damaged_lines_are_reported(fake: Any, tmp_path: Path) -> None:
     folder = write_run(tmp_path, fake, [fake.shot(0)])
     index = folder / "index.jsonl"

@@ -13,6 +13,7 @@ from labseq.analysis.statistics import CycleStatistics, Statistics
 from labseq.cli.summary import NOT_JUDGED, cycle_table, statistics_rows
 from labseq.model.estimate import Estimate, Rate
 
+pytestmark = pytest.mark.usefixtures("capsys")  # tables are as wide as the terminal
 UNKNOWN = Estimate(math.nan, math.nan)
 CYCLE = CycleStatistics(
     cycle=0,

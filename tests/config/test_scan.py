@@ -14,6 +14,7 @@ from labseq.config.document import Document
 from labseq.config.scan import MAX_POINTS, Scan, read_scan, values_of
 from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
+from labseq.units import split_quantity
 
 REST = """labseq: 1
 name: s
@@ -108,6 +109,29 @@ def test_each_round_of_a_shuffled_scan_takes_every_point_once(n: int, repeats: i
     order = scan.points_of_shots(seed)
     assert np.array_equal(np.sort(order.reshape(repeats, n), axis=1), np.tile(np.arange(n), (repeats, 1)))
     assert np.array_equal(order, scan.points_of_shots(seed))
+
+
+def test_no_point_of_a_shuffled_scan_comes_early_more_often_than_others() -> None:
+    n, repeats = 5, 400
+    scan = scan_of(
+        f"scan: {{shot.sort.window: {{range: [1 ms, {n} ms, 1 ms]}}}}\nrepeats: {repeats}\norder: shuffled\n"
+    )
+    position = np.argsort(scan.points_of_shots(3).reshape(repeats, n), axis=1).mean(axis=0)
+    error = np.sqrt((n**2 - 1) / 12 / repeats)
+    np.testing.assert_allclose(position, (n - 1) / 2, atol=4.5 * error)
+
+
+@given(st.floats(1.0, 1e3), st.floats(-6, 2), st.floats(0, 1))
+def test_a_value_that_a_scanner_chooses_is_rounded_by_less_than_a_thousandth_of_its_range(
+    low: float, log_width: float, part: float
+) -> None:
+    low, width = round(low, 3), float(f"{10**log_width:.3g}")
+    over = f"{{shot.sort.window: {{from: {low!r} ms, to: {low + width!r} ms}}}}"
+    scan = scan_of(f"scan: {{use: climb, over: {over}, maximise: success, points: 3}}\n")
+    ((_, node),) = scan.at([1e-3 * (low + part * width)]).values(0)
+    amount, unit = split_quantity(str(node.value))
+    assert unit == "ms"
+    assert amount == pytest.approx(low + part * width, abs=1e-3 * width)
 
 
 def test_a_sequential_scan_takes_all_shots_of_a_point_before_the_next() -> None:

@@ -39,13 +39,13 @@ def detector(grid: SiteGrid = GRID, **settings: Any) -> WeightedDetector:
     return WeightedDetector(WeightedSettings(**SMALL | settings), Context("detector", grid))
 
 
-def mean_image(atoms: Bools, grid: SiteGrid = GRID) -> Images:
+def mean_image(atoms: Bools, grid: SiteGrid = GRID, light: float = LIGHT) -> Images:
     """Mean counts, without noise."""
     y, x = np.indices((60, 90))
     image = np.full((60, 90), 500 + 0.375 * 60)
     for place_y, place_x in site_pixels(grid, 0.35e-6, (29.5, 44.5))[atoms]:
         spot = np.exp(-((y - place_y) ** 2 + (x - place_x) ** 2) / (2 * 1.2**2))
-        image += LIGHT * spot / spot.sum()
+        image += light * spot / spot.sum()
     return image.astype(np.uint16)
 
 
@@ -105,6 +105,18 @@ def test_neighbours_light_is_undone() -> None:
     from_neighbours = weights.effects[weights.starts[5] : weights.starts[6]]
     assert len(from_neighbours) == 6
     assert abs(many - few) < from_neighbours.sum() / 4
+
+
+def test_the_log_odds_of_dim_overlapping_spots_are_right_on_average() -> None:
+    """At one width and a half apart, each site has as many atoms as the probabilities promise."""
+    grid, n, rng = SiteGrid(3, 4, spacing_m=1.2e-6), 100, np.random.default_rng(3)
+    known = detector(grid, filling=0.5, photoelectrons=20.0)
+    surplus: list[float] = []
+    for _ in range(n):
+        atoms = rng.random(grid.shape) < 0.5
+        image = noisy(mean_image(atoms, grid, LIGHT / 3), rng)
+        surplus.append(float((1 / (1 + np.exp(-known.signals(frame(image)))) - atoms).mean()))
+    assert abs(np.mean(surplus)) < 4 * np.std(surplus) / np.sqrt(n)
 
 
 def test_the_place_between_the_pixels_counts() -> None:

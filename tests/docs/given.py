@@ -11,15 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from labseq_aravis import load_library
-from labseq_soapy_sim import build_module
-from labseq_ttl_sim.simavr import runner
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
 import labseq as api
 from labseq.plugin import Context
-from tests.plugins.needs import need_library
 
 from .blocks import ROOT, Block, blocks_of
 from .running import RUN, labseq
@@ -31,11 +27,8 @@ OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 REAL_LAB: Final = ("docs/how-to/rehearse.md",)
 """Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
 
-NEEDED: Final[dict[str, tuple[Callable[[], object], ...]]] = {
-    "docs/how-to/cameras-genicam.md": (load_library, build_module, lambda: runner("lines")),
-    "docs/how-to/rehearse.md": (build_module,),
-}
-"""Page -> what loads the libraries of the system that its simulated simulators need."""
+NEEDED: Final = {"docs/how-to/cameras-genicam.md": "libaravis"}
+"""Page -> what its simulators need that is not on every machine."""
 SHOTS: Final = {
     "compact-225": ("sequences/compact_225.yaml", 4),
     "scan-dop": ("sequences/scan_dop.yaml", 8),
@@ -104,6 +97,10 @@ def copy_repository(to: Path) -> None:
     shutil.copytree(
         ROOT / "hardware_profiles", to / "hardware_profiles", ignore=shutil.ignore_patterns("calibrations")
     )
+    bench = to / "hardware_profiles" / "bench.yaml"  # tests of the timing box run its firmware
+    bench.write_text(
+        bench.read_text("utf-8").replace("simulated_by: simavr", "simulated_by: python"), "utf-8"
+    )
 
 
 def virtual_lab(to: Path) -> None:
@@ -115,8 +112,6 @@ def virtual_lab(to: Path) -> None:
 
 def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
     """All that a page takes for granted, in a folder."""
-    for load in NEEDED.get(page, ()):
-        need_library(load)
     copy_repository(to)
     if page not in REAL_LAB:
         virtual_lab(to)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 from matplotlib.figure import Figure
 
 from .blocks import PAGES, ROOT, blocks_of
-from .given import Store, prepare
+from .given import NEEDED, Store, prepare
 from .running import Reader
 
 
@@ -48,7 +48,11 @@ def with_blocks() -> list[str]:
     return [name for name in names if any(b.is_run and b.language != "yaml" for b in blocks_of(ROOT / name))]
 
 
-@pytest.mark.parametrize("page", with_blocks())
+def page_param(page: str) -> Any:
+    return pytest.param(page, marks=[pytest.mark.needs(NEEDED[page])] if page in NEEDED else [])
+
+
+@pytest.mark.parametrize("page", [*map(page_param, with_blocks())])
 def test_a_page_can_be_followed(
     page: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -12,6 +13,7 @@ from labseq.bench.planners import Where, compare
 from labseq.bench.report import Report, save_histogram
 from labseq.errors import ConfigError
 from labseq.pictures.figures import make_figure
+from tests.pictures.pixels import decoded, is_colour
 
 from .scripts import load_script
 
@@ -107,9 +109,11 @@ def test_a_planner_that_scans_is_drawn_by_its_scans(tmp_path: Path, monkeypatch:
 
 def test_a_comparison_is_drawn_as_a_histogram(tmp_path: Path) -> None:
     entry = PlannerEntry("psca", (("degree_of_parallelism", "3"),))
-    report = compared(CONDITIONS[:1], entry, PlannerEntry("psca"))
+    report = compared(CONDITIONS[2:], entry, PlannerEntry("psca"))
     save_histogram(tmp_path / "histogram.png", report)
-    assert (tmp_path / "histogram.png").read_bytes().startswith(b"\x89PNG")
+    pixels = decoded((tmp_path / "histogram.png").read_bytes(), "RGB")
+    with_3, with_5 = (np.flatnonzero(is_colour(pixels, colour).any(axis=0)) for colour in ("C0", "C1"))
+    assert with_3.max() > with_5.max()  # fewer tweezers need more batches
     save_histogram(tmp_path / "none.png", replace(report, rows=()))
     with pytest.raises(ConfigError, match="the picture cannot be written"):
         save_histogram(tmp_path / "nowhere" / "histogram.png", report)

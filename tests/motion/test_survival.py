@@ -50,10 +50,13 @@ def predict(plan: Plan, wait_s: float = 0.0, **losses: float) -> Survival:
         ({"distance_per_m": 1e4}, LINE, (1 - 0.0449) ** 2, 2 * 0.0449),
         ({"landing": 0.3}, LANDING, 0.7, 0.3),
         ({"image": 0.1}, LINE, 0.9**5, 0.5),
+        ({"move": 0.1, "image": 0.2}, LINE, 0.9**2 * 0.8**5, 3 * 0.2 + 2 * (1 - 0.9 * 0.8)),
         ({"lifetime_s": 50.0, "wait_s": 50 * math.log(2)}, LINE, 0.5**5, 2.5),
     ],
 )
-def test_each_loss_alone(losses: dict[str, float], plan: Plan, survives: float, lost: float) -> None:
+def test_losses_alone_and_together(
+    losses: dict[str, float], plan: Plan, survives: float, lost: float
+) -> None:
     predicted = predict(plan, **losses)
     assert predicted.p_defect_free == pytest.approx(survives, rel=2e-3)
     assert predicted.n_lost == pytest.approx(lost, rel=2e-3)

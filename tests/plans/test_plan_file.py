@@ -94,7 +94,13 @@ def test_a_file_without_a_plan_is_refused(data: bytes, words: str) -> None:
     assert words in str(caught.value)
 
 
-SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+SCALARS = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.sampled_from(["", "a", "1", "\u00b5m", "\x1b[31m", "\ud800"])
+)
 VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=3), max_leaves=5)
 
 

@@ -64,17 +64,13 @@ def test_a_long_program_with_pauses_can_be_drawn(tmp_path: Path) -> None:
     assert count(pixels, INTENDED) > 200
 
 
-def test_one_batch_of_several_can_be_drawn(tmp_path: Path) -> None:
-    what = drawing(there_and_back(5))
+def test_one_of_several_linked_batches_without_pauses_or_ramps_can_be_drawn(tmp_path: Path) -> None:
+    sites = [np.array([site], np.int16) for site in ([0, 0], [0, 3], [2, 3])]
+    plan = Plan.from_batches([Batch(sites[0], sites[1]), Batch(sites[1], sites[2], linked=True)])
+    what = drawing(plan, overhead_per_batch_s=0.0, pick_up_s=0.0, drop_off_s=0.0)
     second = np.flatnonzero(what.program.batch == 1)
     pixels = save(tmp_path, replace(what, segments=range(int(second[0]), int(second[-1]) + 1)))
     assert count(pixels, INTENDED) > 200
-
-
-def test_linked_batches_without_pauses_or_ramps_can_be_drawn(tmp_path: Path) -> None:
-    sites = [np.array([site], np.int16) for site in ([0, 0], [0, 3], [2, 3])]
-    plan = Plan.from_batches([Batch(sites[0], sites[1]), Batch(sites[1], sites[2], linked=True)])
-    save(tmp_path, drawing(plan, overhead_per_batch_s=0.0, pick_up_s=0.0, drop_off_s=0.0))
 
 
 @pytest.mark.parametrize("profile", ["constant", "minimum_jerk", "constant_jerk"])

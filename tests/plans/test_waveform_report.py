@@ -55,7 +55,6 @@ def test_some_batches_are_named_in_report_and_title() -> None:
 
 
 def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     faint = [f"profile.mobile_tweezers.rf.row_amplitudes={[1e-9] * 20}"]
     plan = PlanRequest("random:20x20@0.75", "compact:3x3", seed=1, profile="virtual", overrides=faint)
     request = WaveformRequest(plan, "0", "250 MHz")
@@ -69,7 +68,6 @@ def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
 
 
 def test_everything_can_be_written_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("matplotlib")
     output = WaveformOutput(str(tmp_path / "a.json"), tmp_path / "a.png", tmp_path / "a.npz")
     show_waveform(REQUEST, output)
     out, err = capsys.readouterr()

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 from labseq_andor.camera import AndorCamera
-from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
-from labseq_aravis import load_library
 from labseq_genicam.camera import GenicamCamera
 from labseq_genicam.settings import GenicamSettings
 from labseq_pylon.camera import PylonCamera
-from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 from numpy.typing import NDArray
 
@@ -25,12 +23,21 @@ from labseq.plugin import Clock, Context, SensorMode
 from labseq.roles import WHOLE_SENSOR, Trigger
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
-DRIVERS: dict[str, tuple[Any, Any, Callable[[], object]]] = {
-    "andor": (AndorCamera, AndorSettings, lambda: load_pylablib("camera")),
-    "genicam": (GenicamCamera, GenicamSettings, load_library),
-    "pylon": (PylonCamera, PylonSettings, lambda: load_pypylon("camera")),
+DRIVERS: dict[str, tuple[Any, Any]] = {
+    "andor": (AndorCamera, AndorSettings),
+    "genicam": (GenicamCamera, GenicamSettings),
+    "pylon": (PylonCamera, PylonSettings),
 }
-"""Driver, settings, and what loads the library that it needs."""
+"""Driver and settings."""
+
+NEEDED = {"genicam": "libaravis", "pylon": "pypylon"}
+"""What the simulator of a camera needs beyond the group ``test``."""
+
+
+def driver_param(name: str, *values: Any) -> Any:
+    """A parameter of tests, the name of a driver and further values, with what the driver needs."""
+    marks = [pytest.mark.needs(NEEDED[name])] if name in NEEDED else []
+    return pytest.param(name, *values, marks=marks)
 
 
 class NoisyWorld(RecordingSimulation):
@@ -42,11 +49,6 @@ class NoisyWorld(RecordingSimulation):
         self.shown: list[NDArray[np.uint16]] = []
         self.modes: list[SensorMode] = []
         self.exposures: list[tuple[float, float]] = []
-        self.pulse: Callable[[float, float], object] = lambda _t_s, _width_s: None
-
-    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
-        assert role == "camera"
-        self.pulse = on_pulse
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         frame = super().expose(t_start_s, exposure_s, mode)
@@ -71,7 +73,7 @@ class Rig:
         is_wired: bool = False,
         **settings: Any,
     ) -> None:
-        make, model, _ = DRIVERS[driver]
+        make, model = DRIVERS[driver]
         self.clock: Any = clock or FakeClock()
         self.world = NoisyWorld(self.clock, sensor_shape)
         lines = (LineSpec("shutter", 0, frozenset({"image"}), triggers="camera"),) if is_wired else ()

@@ -6,11 +6,13 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, suppress
 
 import numpy as np
+import pytest
 from labseq_aravis import AravisError, Camera, Stream, StreamOptions
 from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure, Faults
 from numpy.typing import NDArray
 
+needs_aravis = pytest.mark.needs("libaravis")
 REGION = {"OffsetX": 8, "OffsetY": 4, "Width": 256, "Height": 200}
 PACKET_SIZE = 15800
 RETENTION_S = 0.5

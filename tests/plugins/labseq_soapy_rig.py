@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
-from labseq_soapy_sim import Ring, SimulatedRadio, build_module
+from labseq_soapy_sim import Ring
+from labseq_soapy_sim.radio import SimulatedRadio
 from numpy.typing import NDArray
 
 from labseq.plugin import Clock, Context, Simulation, SiteGrid, wait_for
 from labseq.roles import NeverStopped
 from labseq.testing.fakes import FakeClock
-
-from .needs import need_library
 
 GRID = SiteGrid(3, 4)
 COMB = {"centre": 100e6, "step": 60e3}
@@ -35,11 +34,6 @@ SMALL: dict[str, Any] = {
 """Few tones at a low rate, in real time: little work."""
 WAIT_S = 20.0
 """Longer than anything takes that comes at all."""
-
-
-def need_radio() -> None:
-    """Skip without the library, the compiler or the headers."""
-    need_library(build_module)
 
 
 @dataclass
@@ -67,7 +61,6 @@ def made(
     **settings: Any,
 ) -> Rig:
     """The driver, closed."""
-    need_radio()
     clock = clock or FakeClock()
     chosen = {**SMALL, **settings}
     chosen["device"] += f",{arguments}" if arguments else ""
@@ -155,7 +148,6 @@ def another_labseq(
     folder: Path, *, forks: bool = False, **settings: Any
 ) -> Generator[tuple[subprocess.Popen[str], Any]]:
     """A process that has the array on, and its emergency script with arguments; it ends with its input."""
-    need_radio()
     device = f"{SMALL['device']},folder={folder},record=10000000"
     chosen = SoapySettings.model_validate({**SMALL, "device": device, **settings})
     process = subprocess.Popen(

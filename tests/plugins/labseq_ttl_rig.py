@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import select
+import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from labseq_ttl.box import Box
 from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.lines import TtlLines
 from labseq_ttl.protocol import framed, unframed
 from labseq_ttl.settings import TtlSettings
-from labseq_ttl_sim.simavr import SimavrBox, runner
+from labseq_ttl_sim.model import ModelBox
+from labseq_ttl_sim.simavr import SimavrBox
 
 from labseq.plugin import Context, LineProgram, LineSpec
 from labseq.roles.shot import NeverStopped
@@ -21,14 +26,9 @@ from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
-from .needs import need_library
-
 MAX_WAIT_S = 60.0
-
-
-def need_simavr() -> None:
-    """Skip where the firmware cannot be run."""
-    need_library(lambda: runner("lines"))
+FIRMWARE = pytest.param("simavr", marks=pytest.mark.needs("firmware"))
+"""The value of ``simulated_by`` for the firmware itself."""
 
 
 @dataclass
@@ -93,6 +93,59 @@ def works(lab: Rig) -> None:
     lab.lines.wait(60.0)
     if lab.box is not None:
         np.testing.assert_allclose(lab.played[-1][0].t_s, program.t_s, atol=1e-12)
+
+
+class ModelOnACable:
+    """The model of the box at the end of a cable: a pty, which a thread serves."""
+
+    def __init__(self) -> None:
+        import pty
+        import tty
+
+        self._box, self._lock, self._stopped = ModelBox(), threading.Lock(), threading.Event()
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.name = os.ttyname(self._slave)
+        self._wake, self._waker = os.pipe()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def start(self) -> None:
+        """A rising edge at the start input."""
+        with self._lock:
+            self._box.start()
+            self._flush()
+
+    def unplug(self) -> None:
+        """Pull the cable; repeatable."""
+        if not self._stopped.is_set():
+            self._stopped.set()
+            os.write(self._waker, b".")
+            self._thread.join()
+            for fd in (self._master, self._slave, self._wake, self._waker):
+                os.close(fd)
+
+    def _serve(self) -> None:
+        while not self._stopped.is_set():
+            if self._master in select.select([self._master, self._wake], [], [])[0]:
+                with self._lock:
+                    self._box.write(os.read(self._master, 4096))
+                    self._flush()
+
+    def _flush(self) -> None:
+        while self._box.in_waiting:
+            os.write(self._master, self._box.read(4096))
+
+
+class FirmwareOnACable(SimavrBox):
+    """The firmware at the end of a cable."""
+
+    def __init__(self) -> None:
+        super().__init__("lines", NeverStopped())
+
+    def unplug(self) -> None:
+        """End its process, whose pty goes with it; repeatable."""
+        self.close()
 
 
 class Firmware:

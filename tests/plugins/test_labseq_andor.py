@@ -20,7 +20,6 @@ from labseq.plugin import Context
 from labseq.roles import NeverStopped, offers
 
 from .labseq_camera_rig import Rig, assert_shown, opened_rig
-from .needs import need_library
 
 unopened = partial(Rig, "andor")
 rig = partial(opened_rig, "andor")
@@ -28,12 +27,8 @@ rig = partial(opened_rig, "andor")
 COLD: Final[dict[str, Any]] = {"temperature": "-70 degC"}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def pylablib() -> None:
-    need_library(lambda: load_pylablib("camera"))
-
-
 def test_nothing_is_compiled_to_import_pylablib() -> None:
+    load_pylablib("camera")
     from pylablib.devices.Andor.atcore_lib import read_uint12
 
     assert read_uint12.signatures == []

@@ -12,7 +12,6 @@ import pytest
 from labseq_andor.camera import AndorCamera
 from labseq_andor.codes import SHUTTER_CLOSED
 from labseq_andor.heads import IXON_888, IXON_897
-from labseq_andor.library import load_pylablib
 from labseq_andor.settings import AndorSettings
 from labseq_andor_sim import SimulatedCamera
 
@@ -20,15 +19,9 @@ from labseq import ConfigError, DeviceError, DeviceTimeoutError, TransientError
 from labseq.plugin import Context, install_hint
 
 from .labseq_camera_rig import Rig, opened_rig
-from .needs import need_library
 
 unopened = partial(Rig, "andor")
 rig = partial(opened_rig, "andor")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def pylablib() -> None:
-    need_library(lambda: load_pylablib("camera"))
 
 
 def refusal(lab: Rig) -> str:

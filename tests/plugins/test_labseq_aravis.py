@@ -22,21 +22,19 @@ from labseq_aravis import (
     find_cameras,
 )
 from labseq_aravis.camera import camera_id
-from labseq_aravis.library import load_library
 from labseq_aravis.stream import MONO, unpacked
 from labseq_genicam_sim.fake import FakeCamera
 
-from .labseq_genicam_rig import WAIT_S, opened, pattern, plugged_in
-from .needs import need_library
+from .labseq_genicam_rig import WAIT_S, needs_aravis, opened, pattern, plugged_in
 
 
 @pytest.fixture
 def fake() -> Iterator[FakeCamera]:
-    need_library(load_library)
     with plugged_in() as fake:
         yield fake
 
 
+@needs_aravis
 def test_closing_is_legal_in_any_order_and_again(fake: FakeCamera) -> None:
     with opened(fake) as (camera, stream):
         camera.close()
@@ -52,6 +50,7 @@ def test_closing_is_legal_in_any_order_and_again(fake: FakeCamera) -> None:
         camera.stop()
 
 
+@needs_aravis
 @pytest.mark.skipif(sys.platform != "linux", reason="counts the files in /proc")
 def test_opening_and_closing_leaves_nothing_behind(fake: FakeCamera) -> None:
     def counts() -> tuple[int, int, int]:
@@ -72,8 +71,8 @@ def test_opening_and_closing_leaves_nothing_behind(fake: FakeCamera) -> None:
     assert counts() == before
 
 
+@needs_aravis
 def test_cameras_are_found_and_opened_by_their_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    need_library(load_library)
     first, second = f"P{os.getpid()}", f"Q{os.getpid()}"
     found: list[FoundCamera] = []
 

@@ -20,8 +20,7 @@ from labseq.plugin import Context
 from labseq.roles import Trigger
 from labseq.testing import CameraContract
 
-from .labseq_camera_rig import DRIVERS, Rig, assert_shown, opened_rig
-from .needs import need_library
+from .labseq_camera_rig import DRIVERS, Rig, assert_shown, driver_param, opened_rig
 
 ROOT = Path(__file__).parents[2]
 SETTINGS: dict[str, list[dict[str, Any]]] = {
@@ -31,23 +30,21 @@ SETTINGS: dict[str, list[dict[str, Any]]] = {
 }
 
 
-@pytest.fixture(params=DRIVERS)
+@pytest.fixture(params=[*map(driver_param, DRIVERS)])
 def driver(request: pytest.FixtureRequest) -> str:
     name: str = request.param
-    need_library(DRIVERS[name][2])
     return name
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [(name, one) for name, some in SETTINGS.items() for one in some]
+    ("name", "settings"), [driver_param(name, one) for name, some in SETTINGS.items() for one in some]
 )
 class TestCameraDrivers(CameraContract):
     exposure_s = 0.02
 
     @pytest.fixture
     def factory(self, name: str, settings: dict[str, Any]) -> Any:
-        make, model, load = DRIVERS[name]
-        need_library(load)
+        make, model = DRIVERS[name]
         return partial(make, model.model_validate({"camera": "simulated", **settings}))
 
 
@@ -133,13 +130,13 @@ def test_an_edge_of_a_line_that_is_wired_to_it_starts_an_exposure(driver: str) -
         for _ in range(2):
             lab.camera.arm(2, 0.01, "external")
             start_s = lab.clock.now()
-            lab.world.pulse(start_s + 0.002, 1e-3)
-            lab.world.pulse(start_s + 0.1, 1e-3)
+            lab.world.pulse("camera", start_s + 0.002, 1e-3)
+            lab.world.pulse("camera", start_s + 0.1, 1e-3)
             frames = [lab.camera.read(1.0) for _ in range(2)]
             assert [frame.t_start_s - start_s for frame in frames] == pytest.approx([0.002, 0.1])
             assert lab.clock.now() - start_s == pytest.approx(0.11 + lab.camera.facts.readout_s)
             assert_shown(frames, lab)
-            lab.world.pulse(lab.clock.now(), 1e-3)
+            lab.world.pulse("camera", lab.clock.now(), 1e-3)
             assert_shown(frames, lab)
             del lab.world.shown[:]
 
@@ -151,7 +148,7 @@ def test_bulb_exposes_as_long_as_the_line_is_on(driver: str) -> None:
             lab.camera.arm(2, 0.01, "bulb")
             start_s = lab.clock.now()
             for n, width_s in enumerate(widths_s):
-                lab.world.pulse(start_s + 0.1 * n, width_s)
+                lab.world.pulse("camera", start_s + 0.1 * n, width_s)
             frames = [lab.camera.read(1.0) for _ in range(2)]
             assert lab.clock.now() - start_s == pytest.approx(0.1 + widths_s[1] + lab.camera.facts.readout_s)
             made = [(start_s, widths_s[0]), (start_s + 0.1, widths_s[1])]
@@ -170,9 +167,9 @@ def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver
             start_s = lab.clock.now()
             with pytest.raises(DeviceTimeoutError, match="frame 0 waits for its external trigger"):
                 lab.camera.read(0.1)
-            lab.world.pulse(start_s + 0.12, 1e-3)
+            lab.world.pulse("camera", start_s + 0.12, 1e-3)
             frames = [lab.camera.read(1.0)]
-            lab.world.pulse(lab.clock.now(), 1e-3)
+            lab.world.pulse("camera", lab.clock.now(), 1e-3)
             with pytest.raises(DeviceTimeoutError, match="frame 1 is not ready"):
                 lab.camera.read(1e-3)
             frames += [lab.camera.read(1.0) for _ in range(2)]
@@ -184,11 +181,10 @@ def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver
             lab.camera.arm(2, 0.06, "external_start")
 
 
-@pytest.mark.parametrize("name", ["genicam", "pylon"])
+@pytest.mark.parametrize("name", [driver_param("genicam"), driver_param("pylon")])
 def test_a_trigger_that_the_camera_lacks_is_refused_when_it_is_opened(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    need_library(DRIVERS[name][2])
     monkeypatch.setattr(f"labseq_{name}.setup.WIDTH", "NoSuchMode")
     monkeypatch.setattr(f"labseq_{name}.setup.series_trigger", lambda _: None)
     cases: dict[str, dict[str, Any]] = {
@@ -222,7 +218,7 @@ def test_it_describes_itself_also_while_it_acquires(driver: str) -> None:
 
 
 def test_a_simulated_camera_needs_a_simulation_and_a_region_on_its_sensor(driver: str) -> None:
-    make, model, _ = DRIVERS[driver]
+    make, model = DRIVERS[driver]
     with pytest.raises(ConfigError, match=r"add `simulation: \{use: virtual\}`"):
         make(model(camera="simulated"), Context("camera"))
     with pytest.raises(ConfigError, match="beyond the sensor of 96 x 128 pixels"):
@@ -237,10 +233,8 @@ REAL: dict[str, dict[str, Any]] = {
 """Profiles of real cameras."""
 
 
-@pytest.mark.parametrize("name", ["virtual", *DRIVERS])
+@pytest.mark.parametrize("name", ["virtual", *map(driver_param, DRIVERS)])
 def test_every_orientation_shows_the_same_atoms(tmp_path: Path, name: str) -> None:
-    if name in DRIVERS:
-        need_library(DRIVERS[name][2])
     (tmp_path / "look.yaml").write_text(
         "labseq: 1\nname: look\nprofile: bench.yaml\nrecord_frames: all\n"
         "shot: [load: {duration: 500 ms}, image: {exposure: 45 ms}]\n"

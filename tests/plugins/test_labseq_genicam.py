@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_aravis import load_library
 from labseq_genicam.acquisition import LAST_ID, FrameCounter
 from labseq_genicam.settings import FORMATS
+from labseq_genicam.setup import temperature_k
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
@@ -21,17 +22,12 @@ from labseq.plugin import SensorMode
 from labseq.roles import NeverStopped, Trigger
 
 from .labseq_camera_rig import assert_shown, opened_rig, sensors
-from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, plugged_in
-from .needs import need_library
+from .labseq_genicam_rig import PACKET_SIZE, WAIT_S, needs_aravis, plugged_in
 
 rig = partial(opened_rig, "genicam")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def aravis() -> None:
-    need_library(load_library)
-
-
+@needs_aravis
 def test_the_camera_goes_on_waiting_from_one_series_to_the_next() -> None:
     with rig() as lab:
         lab.take(1)
@@ -42,6 +38,7 @@ def test_the_camera_goes_on_waiting_from_one_series_to_the_next() -> None:
         assert lab.camera._opened()._stream is stream
 
 
+@needs_aravis
 def test_a_series_that_is_broken_off_costs_the_next_one_no_packet() -> None:
     """The first frame of a stream must fit into the buffer that a socket has by default."""
     with rig(sensor_shape=(512, 512)) as lab:
@@ -54,6 +51,7 @@ def test_a_series_that_is_broken_off_costs_the_next_one_no_packet() -> None:
             assert_shown(lab.take(1), lab)
 
 
+@needs_aravis
 def test_on_a_real_clock_it_runs_freely_and_shows_no_more_than_was_armed() -> None:
     with rig(clock=NeverStopped(), readout="1 ms", frame_rate="200 Hz") as lab:
         for n_frames in (4, 10):
@@ -67,6 +65,7 @@ def test_on_a_real_clock_it_runs_freely_and_shows_no_more_than_was_armed() -> No
         assert_shown(lab.take(1), lab)
 
 
+@needs_aravis
 @settings(max_examples=4)
 @given(sensor=sensors(tuple(name for name in FORMATS if name != "Mono14")))
 def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]) -> None:
@@ -84,6 +83,7 @@ def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]
     np.testing.assert_array_equal(frame.image, np.minimum(lab.world.shown[0], largest))
 
 
+@needs_aravis
 def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("labseq_genicam.camera.CHECK_PERIOD_S", 1e-3)
     with rig(readout="5 ms") as lab:
@@ -97,6 +97,7 @@ def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: p
         assert_shown(frames, lab)
 
 
+@needs_aravis
 def test_the_camera_answers_while_its_image_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """However long that takes: a busy computer's camera is not gone."""
     with rig() as lab:
@@ -111,6 +112,7 @@ def test_the_camera_answers_while_its_image_is_made(monkeypatch: pytest.MonkeyPa
         assert_shown(lab.take(2), lab)
 
 
+@needs_aravis
 def test_it_says_what_it_is_and_what_it_took() -> None:
     with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2, serial="SIM1") as lab:
         lab.take(1, 0.02)
@@ -134,6 +136,7 @@ def test_it_says_what_it_is_and_what_it_took() -> None:
     assert about["exposure_now_s"] == pytest.approx(0.02)
 
 
+@needs_aravis
 def test_a_camera_with_an_address_is_used_as_a_real_one() -> None:
     """No simulation: region, all triggers, a rate."""
     region = {"y": 8, "x": 16, "height": 24, "width": 32}
@@ -174,6 +177,15 @@ def test_numbers_tell_how_many_frames_never_came(first: int, steps: list[int], i
         assert counter.number(frame_id) == number
 
 
+def test_the_temperature_of_a_camera_that_measures_one_is_in_kelvins() -> None:
+    features = {"DeviceTemperature": 21.5}
+    camera: Any = SimpleNamespace(is_available=features.__contains__, get_float=features.__getitem__)
+    assert temperature_k(camera) == pytest.approx(294.65)
+    features.clear()
+    assert temperature_k(camera) is None
+
+
+@needs_aravis
 def test_a_pulse_or_the_start_of_a_series_is_chosen_by_the_features_of_the_standard() -> None:
     features = ("AcquisitionMode", "ExposureMode", "TriggerMode", "TriggerSource")
     with rig(line_trigger="external_start", cycle_time="50 ms") as lab:

@@ -16,8 +16,7 @@ from labseq import DeviceError, LimitError, TransientError
 from labseq.errors import DeviceTimeoutError
 
 from .labseq_camera_rig import Rig, assert_shown, opened_rig
-from .labseq_genicam_rig import WAIT_S, plugged_in
-from .needs import need_library
+from .labseq_genicam_rig import WAIT_S, needs_aravis, plugged_in
 
 unopened = partial(Rig, "genicam")
 rig = partial(opened_rig, "genicam")
@@ -25,11 +24,6 @@ rig = partial(opened_rig, "genicam")
 LARGE = (512, 512)
 """A sensor whose frames have so many packets that some of a failed one always come."""
 GONE = "camera: the camera is gone: it does not answer; check its cable and power"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def aravis() -> None:
-    need_library(load_library)
 
 
 def opening(**settings: Any) -> DeviceError | LimitError:
@@ -40,6 +34,7 @@ def opening(**settings: Any) -> DeviceError | LimitError:
     return caught.value
 
 
+@needs_aravis
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
@@ -65,6 +60,7 @@ def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(
     assert text in str(opening(**settings))
 
 
+@needs_aravis
 def test_a_region_beyond_the_cameras_sensor_is_refused() -> None:
     region = {"y": 0, "x": 2000, "height": 64, "width": 100}
     with plugged_in() as fake:
@@ -72,6 +68,7 @@ def test_a_region_beyond_the_cameras_sensor_is_refused() -> None:
     assert "end of the region is row 64, column 2100; the limit is the sensor's 2048 x 2048 pixels" in error
 
 
+@needs_aravis
 def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
     faults = {"failed_frames": [1]}
     with rig(sensor_shape=LARGE, faults=faults, frame_timeout="50 ms") as lab:
@@ -91,6 +88,7 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
         assert_shown(frames, lab)
 
 
+@needs_aravis
 def test_frames_of_which_nothing_comes_are_missed_by_their_numbers() -> None:
     """The second and third frame: for the camera, not for the world, the line is cut between them."""
     with rig(sensor_shape=LARGE) as lab:
@@ -111,6 +109,7 @@ def test_frames_of_which_nothing_comes_are_missed_by_their_numbers() -> None:
         assert [call.number for call in lab.take(2)] == [0, 1]
 
 
+@needs_aravis
 def test_a_frame_that_comes_too_late_is_a_timeout_and_does_not_turn_up_in_the_next_series() -> None:
     with rig(faults={"late_by": "100 ms"}) as lab:
         lab.camera.arm(1, 0.01, "software")
@@ -122,6 +121,7 @@ def test_a_frame_that_comes_too_late_is_a_timeout_and_does_not_turn_up_in_the_ne
         assert_shown(lab.take(2), lab)
 
 
+@needs_aravis
 def test_an_unplugged_camera_is_reported_once_and_nothing_waits_for_it_again() -> None:
     made = unopened(faults={"unplugged_at": 1})
     made.camera.open()
@@ -146,6 +146,7 @@ def test_an_unplugged_camera_is_reported_once_and_nothing_waits_for_it_again() -
     made.camera.close()
 
 
+@needs_aravis
 def test_a_loss_that_the_library_notices_ends_a_wait() -> None:
     """It sends its signal 6 s after the last answer of the camera; here the test does."""
     with rig() as lab:
@@ -157,6 +158,7 @@ def test_a_loss_that_the_library_notices_ends_a_wait() -> None:
             lab.camera.read(60.0)
 
 
+@needs_aravis
 def test_a_software_trigger_that_is_not_seen_is_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "MAX_WAIT_S", 0.1)
     with rig(faults={"ignores_triggers": True}) as lab:
@@ -166,6 +168,7 @@ def test_a_software_trigger_that_is_not_seen_is_a_timeout(monkeypatch: pytest.Mo
             lab.camera.read(1.0)
 
 
+@needs_aravis
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
@@ -180,6 +183,7 @@ def test_a_trigger_that_the_camera_does_not_have_is_refused(settings: dict[str, 
         assert len(lab.take(1)) == 1
 
 
+@needs_aravis
 def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
     with rig(max_exposure="60 s", frame_rate="200 Hz") as lab:
         with pytest.raises(LimitError, match="exposure is 20 s; the limit is 10 us to 10 s"):
@@ -193,6 +197,7 @@ def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
         assert len(lab.take(1)) == 1
 
 
+@needs_aravis
 def test_a_camera_that_reads_another_region_is_noticed() -> None:
     with rig(region={"y": 0, "x": 0, "height": 32, "width": 32}) as lab:
         assert lab.camera._link is not None

@@ -6,23 +6,18 @@ import os
 import select
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from labseq_aravis import AravisError, load_library
+from labseq_aravis import AravisError, Camera
 from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
-from .labseq_genicam_rig import WAIT_S, opened, pattern, plugged_in
-from .needs import need_library
+from .labseq_genicam_rig import WAIT_S, needs_aravis, opened, pattern, plugged_in
 
-pytestmark = pytest.mark.usefixtures("aravis")
-
-
-@pytest.fixture
-def aravis() -> None:
-    need_library(load_library)
+pytestmark = needs_aravis
 
 
 def test_an_exposure_that_goes_wrong_fails_its_frame_and_is_reported() -> None:
@@ -41,6 +36,21 @@ def test_an_exposure_that_goes_wrong_fails_its_frame_and_is_reported() -> None:
             with pytest.raises((RuntimeError, ValueError), match=text):
                 fake.raise_pending()
         fake.raise_pending()
+
+
+def test_cameras_that_start_at_the_same_time_get_an_address_each() -> None:
+    """As those of tests that run beside one another: each begins at port 3956 of 127.0.0.1, and leaves it."""
+    fakes = [FakeCamera(pattern, serial=f"T{n}") for n in range(4)]
+    try:
+        with ThreadPoolExecutor(len(fakes)) as pool:
+            list(pool.map(FakeCamera.start, fakes))
+        for fake in fakes:
+            with Camera(fake.address) as camera:
+                assert camera.serial == fake._serial
+        assert len({fake.address for fake in fakes} - {"127.0.0.1"}) == len(fakes)
+    finally:
+        for fake in fakes:
+            fake.stop()
 
 
 def test_a_process_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:

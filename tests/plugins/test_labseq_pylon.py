@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,16 +16,12 @@ from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import BITS, PylonSettings
 
 from .labseq_camera_rig import opened_rig, sensors
-from .needs import need_library
 
+needs_pypylon = pytest.mark.needs("pypylon")
 rig = partial(opened_rig, "pylon")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def pypylon() -> None:
-    need_library(lambda: load_pypylon("camera"))
-
-
+@needs_pypylon
 @settings(max_examples=10)
 @given(sensor=sensors(tuple(BITS)))
 def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(sensor: dict[str, Any]) -> None:
@@ -44,6 +39,7 @@ def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(senso
         np.testing.assert_array_equal(frame.image, np.minimum(shown, 2 ** BITS[sensor["pixel_format"]] - 1))
 
 
+@needs_pypylon
 def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -56,22 +52,26 @@ def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual
             n_waits += 1
             return n_waits > 3 and wait(milliseconds, handling)
 
-        monkeypatch.setattr(lab.camera._opened(), "_camera", Slow(lab.pylon, wait_slowly))
+        monkeypatch.setattr(
+            lab.camera._opened(), "_camera", Changed(lab.pylon, WaitForFrameTriggerReady=wait_slowly)
+        )
         lab.take(1, 0.01)
     assert n_waits == 4
     assert lab.clock.now() == pytest.approx(0.015)
 
 
-class Slow:
-    """pylon's camera, with a wait of its own."""
+class Changed:
+    """An object of pylon's with some attributes replaced."""
 
-    def __init__(self, camera: Any, wait: Callable[[int, Any], bool]) -> None:
-        self._camera, self.WaitForFrameTriggerReady = camera, wait
+    def __init__(self, original: Any, **attributes: Any) -> None:
+        self._original = original
+        vars(self).update(attributes)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
+        return getattr(self._original, name)
 
 
+@needs_pypylon
 def test_it_says_what_it_is_and_what_it_took() -> None:
     with rig(gain=6.0, packet_size=9000, packet_delay="1 us", binning=2) as lab:
         about = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
@@ -83,18 +83,30 @@ def test_it_says_what_it_is_and_what_it_took() -> None:
     assert about["frame_shape"] == [48, 64]
 
 
+@needs_pypylon
+def test_time_stamps_of_the_camera_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The emulated camera makes none; others count nanoseconds unless they say otherwise."""
+    with rig() as lab:
+        retrieve = lab.pylon.RetrieveResult
+        stamped = Changed(lab.pylon, RetrieveResult=lambda *_: Changed(retrieve(*_), TimeStamp=2_500_000_000))
+        monkeypatch.setattr(lab.camera._opened(), "_camera", stamped)
+        assert lab.take(1)[0].device_time_s == pytest.approx(2.5)
+
+
 def serial_numbers() -> list[str]:
     """Serial numbers of the cameras that pylon lists."""
     infos: Any = load_pypylon("test").pylon.TlFactory.GetInstance().EnumerateDevices()
     return [info.GetSerialNumber() for info in infos]
 
 
+@needs_pypylon
 def test_emulated_cameras_never_stand_among_real_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PYLON_CAMEMU", raising=False)
     with rig():
         assert "0815-0000" not in serial_numbers()
 
 
+@needs_pypylon
 def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with rig() as lab:
@@ -104,6 +116,7 @@ def test_no_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert not list(tmp_path.iterdir())
 
 
+@needs_pypylon
 def test_the_camera_reads_its_own_pictures_where_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """As with a real camera: found by its number, whole sensor, all triggers, no simulation."""
     monkeypatch.setenv("PYLON_CAMEMU", "2")

@@ -17,15 +17,10 @@ from labseq import DeviceError, LimitError, TransientError
 from labseq.plugin import install_hint
 
 from .labseq_camera_rig import Rig, opened_rig
-from .needs import need_library
 
+needs_pypylon = pytest.mark.needs("pypylon")
 unopened = partial(Rig, "pylon")
 rig = partial(opened_rig, "pylon")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def pypylon() -> None:
-    need_library(lambda: load_pypylon("camera"))
 
 
 def fail_buffers(lab: Rig, n_buffers: int) -> None:
@@ -41,6 +36,7 @@ def opening(**settings: Any) -> DeviceError | LimitError:
     return caught.value
 
 
+@needs_pypylon
 def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
     with rig() as lab:
         lab.camera.arm(4, 0.01, "software")
@@ -56,6 +52,7 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
             np.testing.assert_array_equal(frame.image, lab.world.shown[number])
 
 
+@needs_pypylon
 def test_an_unplugged_camera_is_an_error_and_can_be_opened_again() -> None:
     made = unopened()
     made.camera.open()
@@ -81,6 +78,7 @@ def test_an_unplugged_camera_is_an_error_and_can_be_opened_again() -> None:
     made.camera.close()
 
 
+@needs_pypylon
 def test_the_trigger_line_is_that_of_the_settings() -> None:
     with rig(trigger_line="Line2", trigger_edge="falling") as lab:
         lab.camera.arm(2, 0.01, "external")
@@ -107,6 +105,7 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
         assert len(lab.take(1)) == 1
 
 
+@needs_pypylon
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
@@ -123,6 +122,7 @@ def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(
     assert text in str(opening(**settings))
 
 
+@needs_pypylon
 def test_an_exposure_beyond_the_cameras_limits_is_refused() -> None:
     with rig(max_exposure="60 s") as lab:
         for exposure_s, came in ((20.0, "20 s"), (1e-7, "100 ns")):
@@ -131,6 +131,7 @@ def test_an_exposure_beyond_the_cameras_limits_is_refused() -> None:
         assert len(lab.take(1)) == 1
 
 
+@needs_pypylon
 def test_a_stream_that_breaks_off_is_an_error() -> None:
     with rig() as lab:
         lab.camera.arm(1, 0.01, "software")
@@ -141,6 +142,7 @@ def test_a_stream_that_breaks_off_is_an_error() -> None:
         assert len(lab.take(1)) == 1
 
 
+@needs_pypylon
 def test_a_region_beyond_the_cameras_sensor_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYLON_CAMEMU", "1")
     region = {"y": 0, "x": 4000, "height": 64, "width": 100}
@@ -148,6 +150,7 @@ def test_a_region_beyond_the_cameras_sensor_is_refused(monkeypatch: pytest.Monke
     assert text in str(opening(camera="0815-0000", region=region))
 
 
+@needs_pypylon
 def test_a_serial_number_that_no_camera_has_is_reported_with_those_there_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -168,11 +171,13 @@ def emulated_only(monkeypatch: pytest.MonkeyPatch) -> Any:
     return sdk
 
 
+@needs_pypylon
 def test_without_a_camera_it_says_so_and_does_not_take_an_emulated_one(emulated_only: Any) -> None:
     with pytest.raises(DeviceError, match=r"no Basler camera was found; .*set `camera: simulated`"):
         connection.find_camera(emulated_only, PylonSettings())
 
 
+@needs_pypylon
 def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "EMULATION", "no class")  # as if these two were real
     text = "2 cameras were found: Emulation '0815-0000', Emulation '0815-0001'; name the serial number"
@@ -180,6 +185,7 @@ def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytes
         connection.find_camera(emulated_only, PylonSettings())
 
 
+@needs_pypylon
 def test_a_camera_that_another_program_has_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """``Open`` is replaced: several programs may open an emulated camera, so it is never busy."""
     sdk = load_pypylon("camera")

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from labseq.plugin import Context, LimitError, MotionSpec, Plan, SiteGrid, TargetPattern, check_plan
 
-from .planning import COMPACT, Bools, loadings, mta1, plan_and_check, tetris
+from .planning import Bools, loadings, mta1, tetris
 
 EBADI = MotionSpec(
     pick_up_s=15e-6, drop_off_s=15e-6, speed_m_s=0.075, overhead_per_batch_s=0.0, overhead_per_cycle_s=0.0
@@ -149,13 +149,6 @@ def test_batches_of_tetris(case: str) -> None:
 def test_a_row_with_more_atoms_than_allowed_takes_several_batches() -> None:
     plan = tetris(Context(), 2).plan(*read(("  ooo", "___  ")))
     assert [len(batch) for batch in plan.batches] == [2, 1, 1, 1, 1]
-
-
-@pytest.mark.parametrize(("dop", "most_batches"), [(15, 31.0), (7, 49.0)])
-def test_mean_number_of_batches_of_the_papers_array(dop: int, most_batches: float) -> None:
-    target = TargetPattern(COMPACT.fill, np.zeros_like(COMPACT.fill))
-    n_batches = [plan_and_check(tetris, atoms, target, dop)[0].n_batches for atoms in loadings(40)]
-    assert np.mean(n_batches) <= most_batches
 
 
 def test_an_interleaved_pattern_is_centred_with_reservoir_around() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,14 +15,15 @@ from hypothesis import given, settings, strategies as st
 from labseq_soapy import tones
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
+from labseq_soapy_stream.messages import Facts
 from labseq_soapy_stream.output import BLOCK, Output, Samples
 from labseq_soapy_stream.streamer import repeated
 
 from labseq.model.grid import centred_comb
-from labseq.plugin import Context, LimitError, SiteGrid
+from labseq.plugin import Context, DeviceError, LimitError, SiteGrid
 from labseq.testing import StaticTweezersContract
 
-from .labseq_soapy_rig import GRID, SMALL, depth, made, need_radio, opened, recorded, until
+from .labseq_soapy_rig import GRID, SMALL, depth, made, opened, recorded, until
 
 
 class TestSoapyStaticTweezers(StaticTweezersContract):
@@ -32,7 +34,6 @@ class TestSoapyStaticTweezers(StaticTweezersContract):
 
     @pytest.fixture
     def factory(self) -> Callable[[Context], SoapyStaticTweezers]:
-        need_radio()
         chosen = SoapySettings.model_validate({**SMALL, "switch": 1e-3})
         return partial(SoapyStaticTweezers, chosen)
 
@@ -127,12 +128,17 @@ def test_phases_make_a_low_crest_factor(n_tones: int, crest: float) -> None:
     assert tones.crest_factor(loop.samples(np.ones(n_tones))) <= crest + 1e-3
 
 
-@pytest.mark.parametrize(("offset_hz", "components"), [(0.0, 2), (200e3, 2), (200e3, 1)])
+@pytest.mark.parametrize(
+    ("offset_hz", "components", "detune_hz"),
+    [(0.0, 2, 0), (200e3, 2, 0), (200e3, 1, 0), (200e3, 1, 11e3), (200e3, 2, -11e3)],
+)
 def test_an_offset_moves_the_leakage_out_of_the_tones_and_leaves_them_where_they_are(
-    offset_hz: float, components: int
+    offset_hz: float, components: int, detune_hz: float
 ) -> None:
+    """Also on a radio that is tuned a little elsewhere: the tones follow what it reports."""
     tones_hz, n = centred_comb(4, 100e6, 60e3), 1200 * 64
-    with opened(arguments=f"leakage=0.01,components={components}", lo_offset=offset_hz) as rig:
+    arguments = f"leakage=0.01,components={components},detune={detune_hz}"
+    with opened(arguments=arguments, lo_offset=offset_hz) as rig:
         rig.tweezers.start()
         n_loop = rig.described("loop_samples")
 
@@ -151,6 +157,22 @@ def test_an_offset_moves_the_leakage_out_of_the_tones_and_leaves_them_where_they
     assert np.count_nonzero(is_tone) == 4
     assert lines_hz[~is_tone] == pytest.approx([leak_hz], abs=20.0)
     assert (tones_hz.min() < leak_hz < tones_hz.max()) == (not offset_hz)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("lo_offset", [0.0, -200e3])
+@pytest.mark.parametrize(("error_hz", "is_refused"), [(-12.1e3, 1), (-11.9e3, 0), (11.9e3, 0), (12.1e3, 1)])
+def test_a_local_oscillator_tuned_further_away_than_a_hundredth_of_the_rate_is_refused(
+    axis: int, lo_offset: float, error_hz: float, is_refused: bool
+) -> None:
+    chosen = SoapySettings.model_validate({**SMALL, "lo_offset": lo_offset})
+    array = tones.ArrayTones("array", chosen, GRID.shape)
+    oscillator_hz = [array.oscillator_hz + lo_offset] * 2
+    oscillator_hz[axis] += error_hz
+    facts = Facts({}, chosen.sample_rate, [array.oscillator_hz] * 2, oscillator_hz, (0.0, 0.0), {})
+    refusal = pytest.raises(DeviceError, match=f"to {oscillator_hz[axis]:.10g} Hz")
+    with refusal if is_refused else nullcontext():
+        array.tune(facts)
 
 
 B210, N210, X310 = "driver=uhd,type=b200", "driver=uhd,type=usrp2", "driver=uhd, product=X310"
@@ -363,15 +385,15 @@ def test_ramps_of_no_duration_switch_from_one_sample_to_the_next(tmp_path: Path)
 def test_a_release_is_silence_for_its_samples_and_the_loop_runs_on(tmp_path: Path) -> None:
     with opened(arguments=f"folder={tmp_path},record=10000000") as rig:
         rig.tweezers.start()
-        assert rig.tweezers.release(50.2e-6) == 60 / 1.2e6
+        assert rig.tweezers.release(50.7e-6) == 61 / 1.2e6
         assert rig.tweezers.describe()["depth"] == 1.0
     samples = recorded(tmp_path)
     full = at_full_depth(samples)
     wave = np.resize(samples[full.start : full.start + SMALL_LOOP], full.stop - full.start)
     kept = samples[full] == wave  # to the last bit: no phase jumps, no other amplitude
     (dark,) = np.flatnonzero(np.diff(np.flatnonzero(np.concatenate([[True], kept, [True]]))) > 1)
-    assert np.count_nonzero(~kept) == 60
-    assert not samples[full][dark : dark + 60].any()
+    assert np.count_nonzero(~kept) == 61
+    assert not samples[full][dark : dark + 61].any()
 
 
 def test_a_ramp_that_comes_during_a_release_starts_from_the_dark_at_once() -> None:

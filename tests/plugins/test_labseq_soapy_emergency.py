@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from labseq_soapy import emergency as script
 from labseq_soapy_sim import Ring, read_trace
+from labseq_soapy_sim.radio import STREAMER
 
 from .emergency import Done, outsider
-from .labseq_soapy_rig import another_labseq, assert_ramped_down, need_radio, recorded, until
+from .labseq_soapy_rig import another_labseq, assert_ramped_down, recorded, until
 
 Labseq = subprocess.Popen[str]
 RAMPED = "streaming process ended, radio ramped down and closed"
@@ -99,13 +100,12 @@ def test_the_streaming_process_ends_with_labseq_although_a_copy_of_labseq_holds_
 
 
 def test_a_radio_that_cannot_be_opened_again_may_transmit_and_the_text_says_so(tmp_path: Path) -> None:
-    need_radio()
     dead = subprocess.Popen(["true"])
     dead.wait()
     opened = tmp_path / "opened"
     opened.write_text(str(dead.pid), "ascii")
     with pytest.raises(script.EmergencyError) as error:
-        script.off(dead.pid, 1, str(opened), 0.01, "driver=none", [0, 1], {})
+        script.off(dead.pid, 1, str(opened), 0.01, "driver=none", [0, 1], STREAMER)
     assert str(error.value) == (
         "the radio 'driver=none' cannot be opened again: makeStrArgs: SoapySDR::Device::make() no match; "
         "it plays nothing any more, but its transmitters stay on with their gain: switch it off by hand"
@@ -120,7 +120,7 @@ def test_wrong_arguments_give_one_clear_line_and_a_process_that_took_the_number_
         "ramp_s": 0.01,
         "device": "driver=none",
         "channels": [0, 1],
-        "environment": {},
+        "program": "none",
     }
     assert script.off(pid=os.getpid(), **arguments) == RAMPED
     with pytest.raises(script.EmergencyError) as error:

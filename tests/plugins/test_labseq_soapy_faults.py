@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import os
-import queue
 import re
 import signal
 import sys
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 from labseq_soapy import link, static_tweezers
 from labseq_soapy.access import marker_of
-from labseq_soapy_sim import Fault, Ring
+from labseq_soapy_sim import Fault, Ring, read_trace
 from labseq_soapy_stream import soapysdr
 from labseq_soapy_stream.soapysdr import SoapyError
-from labseq_soapy_stream.streamer import Streamer, raise_priority, repeated
+from labseq_soapy_stream.streamer import raise_priority
 
 from labseq import DeviceError, TransientError
 from labseq.errors import StopRequested
@@ -66,6 +63,13 @@ def link_of(rig: Rig) -> Any:
             "makes 1000000 samples per second; expected 1200000: choose a sample_rate",
         ),
         ("speed=1", {"column_gain": 70.0}, "a gain of 70 dB; channel 1 has 0 to 60 dB"),
+        ("speed=1", {"antenna": "RX2"}, "setAntenna: there is no antenna RX2"),
+        ("fault=inactive", {}, r"starting the stream: STREAM_ERROR \(-2\)"),
+        (
+            "detune=13000",
+            {},
+            "tuned its local oscillator to 100028000 Hz; expected 100015000 Hz: see its range",
+        ),
     ],
 )
 def test_a_wrong_radio_is_refused_with_what_is_wrong_and_stays_off(
@@ -89,17 +93,6 @@ def test_without_the_library_the_error_says_how_to_install_it(monkeypatch: pytes
     soapysdr.library.cache_clear()
     with pytest.raises(SoapyError, match=r"the library SoapySDR cannot be loaded .*libsoapysdr0.8"):
         soapysdr.library()
-
-
-def test_without_a_compiler_the_error_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    rig = made()
-    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    for use in (rig.tweezers.warm, rig.tweezers.open):
-        with pytest.raises(DeviceError, match=r"no C\+\+ compiler here; .* g\+\+ libsoapysdr-dev"):
-            use()
 
 
 DISTURBANCES = [
@@ -250,6 +243,31 @@ def test_a_radio_that_is_gone_with_its_process_is_not_safe(tmp_path: Path) -> No
         rig.tweezers.close()
 
 
+def test_a_radio_that_was_unplugged_is_not_safe(tmp_path: Path) -> None:
+    with opened(arguments=f"folder={tmp_path}") as rig:
+        rig.tweezers.start()
+        rig.ring.set_fault(Fault.GONE)
+        until(raised(DeviceError, rig.tweezers.check_interlocks))
+        for call in (rig.tweezers.safe_state, rig.tweezers.close):
+            with pytest.raises(DeviceError, match=r"cannot be opened again: .*no such radio; .* by hand"):
+                call()
+
+
+def test_a_call_of_the_radio_that_does_not_return_is_noticed_and_the_transmitters_are_switched_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "END_S", 0.1)
+    with opened(arguments=f"folder={tmp_path},record=1") as rig:
+        rig.tweezers.start()
+        rig.ring.set_fault(Fault.HANG)
+        monkeypatch.setattr(link, "SILENT_S", 1.0)
+        until(raised(DeviceError, rig.tweezers.check_interlocks))
+        with pytest.raises(DeviceError, match="hangs: it sent nothing"):
+            rig.tweezers.safe_state()
+    assert [name for _, name, *_ in read_trace(tmp_path)][-4:] == ["open", "gain", "gain", "close"]
+    assert not Ring(tmp_path).is_transmitting
+
+
 def end_by_a_signal(rig: Rig) -> None:
     os.kill(link_of(rig).pid, signal.SIGTERM)
 
@@ -299,7 +317,9 @@ def test_left_on_after_the_run_the_light_stays_until_the_next_labseq_ends_it(tmp
     with opened(arguments=f"folder={tmp_path},record=10000000", after_run="on") as rig:
         assert not rig.tweezers.leave_on(), "it was not on"
         rig.tweezers.start()
-        assert rig.tweezers.emergency() is not None, "until then the watchdog switches it off"
+        script = rig.tweezers.emergency()
+        assert script is not None, "until then the watchdog switches it off"
+        assert script.arguments["ramp_s"] == pytest.approx(0.01 + 0.02), "also what the radio has buffered"
         assert rig.tweezers.leave_on()
         assert rig.tweezers.emergency() is None
         rig.tweezers.safe_state()
@@ -315,51 +335,6 @@ def test_left_on_after_the_run_the_light_stays_until_the_next_labseq_ends_it(tmp
         assert not rig.ring.latest(100).any()
         rig.tweezers.start()
         assert not rig.tweezers.leave_on(), "after_run is off by default"
-
-
-class Sink:
-    """A stream that keeps the latest samples, or takes none."""
-
-    def __init__(self, is_stalled: bool = False) -> None:
-        self.latest = np.zeros(0, np.float32)
-        self._is_stalled = is_stalled
-
-    def write(self, samples: np.ndarray, start: int, timeout_s: float) -> int:
-        self.latest = samples[:, 2 * start :].copy()
-        return 0 if self._is_stalled else self.latest.shape[1] // 2
-
-    def errors(self) -> Counter[str]:
-        return Counter()
-
-
-def streamer(sink: Sink, *messages: dict[str, Any]) -> tuple[Streamer, list[Any]]:
-    """A streamer that receives these messages, and what it posts."""
-    inbox, posted = queue.SimpleQueue[dict[str, Any]](), list[Any]()
-    for message in messages:
-        inbox.put(message)
-    setup = SimpleNamespace(ramp_s=0.1, hold=False, max_wait_s=5.0)
-    commands = SimpleNamespace(inbox=inbox, closed=False, last_s=float("inf"), setup=setup)
-    return Streamer(cast("Any", sink), 1.2e6, cast("Any", commands), posted.append), posted
-
-
-def test_a_command_that_comes_while_the_light_is_ramped_down_does_not_turn_it_on() -> None:
-    sink = Sink()
-    stream, posted = streamer(
-        sink,
-        {"do": "loop", "id": 1, "loop": repeated(np.ones((2, 160), np.float32)), "fade_s": 0.0},
-        {"do": "ramp", "id": 2, "depth": 1.0, "duration_s": 0.0},
-        {"do": "end"},
-        {"do": "ramp", "id": 3, "depth": 1.0, "duration_s": 0.0},
-    )
-    stream.run()
-    assert not sink.latest[:, -2:].any()
-    assert {"done": 3} not in posted
-
-
-def test_a_radio_that_takes_no_more_samples_is_noticed() -> None:
-    stream, _ = streamer(Sink(is_stalled=True))
-    with pytest.raises(SoapyError, match="the radio took no samples for 2 s"):
-        stream.run()
 
 
 def test_a_loop_that_cannot_be_read_ends_the_stream_by_a_ramp() -> None:

@@ -118,6 +118,14 @@ class TestPlaying:
             with pytest.raises(DeviceError, match="without a prepared program"):
                 lab.tweezers.play()
 
+    @pytest.mark.parametrize(("rate_hz", "clocks"), [(250e6, 238.5), (625e6, 238.5), (640e6, 476.5)])
+    def test_begins_as_long_after_the_trigger_as_the_manual_says(
+        self, driver: Any, rate_hz: float, clocks: float
+    ) -> None:
+        with driver(sample_rate=rate_hz) as lab:
+            delay_s = lab.tweezers.describe()["trigger_delay_s"]
+            assert delay_s == pytest.approx(clocks / rate_hz + 16e-9, abs=1e-9)
+
     @pytest.mark.parametrize("mode", TRIGGERED)
     def test_starts_at_the_external_trigger(self, driver: Any, mode: str) -> None:
         with driver(mode, trigger="external") as lab:

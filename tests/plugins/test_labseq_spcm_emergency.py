@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -25,7 +24,7 @@ from labseq.plugin import Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
 from .emergency import Done, outsider
-from .labseq_soapy_rig import need_radio, until
+from .labseq_soapy_rig import until
 from .small_run import PROFILE, SEQUENCE
 
 LABSEQ = """
@@ -33,11 +32,13 @@ import json, sys, threading
 import numpy as np
 from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
+from labseq_spcm import card, replay_fifo
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
 
-# samples go through a pipe, which may be slow
+# samples go through a pipe to another process: slow, and slower where others are busy
+card.TRANSFER_TIMEOUT_S = replay_fifo.TRANSFER_TIMEOUT_S = 60.0
 Stream._check_bus = lambda self: None
 SpcmSettings.look_ahead_s = lambda self, rate_hz: 0.1
 tones = np.linspace(12e6, 18e6, 5)
@@ -85,7 +86,7 @@ idle["stream"].settle()
 for device in devices.values():
     device.play()
 threading.Thread(target=devices["fifo"].wait, args=(1e3,), daemon=True).start()
-devices["played"].wait(10.0)
+devices["played"].wait(60.0)
 card = devices["locked"]._card
 assert card.spcm.spcm_dwSetParam_i64(card._card.handle(), 30010, 9000) == 0x101  # blocks the driver library
 print("on", flush=True)
@@ -134,7 +135,7 @@ def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
     """The reason for all of this: outputs on, and in the mode dds for ever."""
     assert set(scope.after_death) == STATES
     assert {scope.after_death[state] for state in ENDLESS} == {(True, (True, True))}
-    assert scope.after_death["replay"] == (True, (True, True))
+    assert scope.after_death["replay"][1] == (True, True), "its relays, whether it still plays or not"
     assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
     assert scope.after_death["stream"][1] == (True, True), "its relays, whether it has run dry or not"
     assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"
@@ -220,7 +221,7 @@ u32 spcm_dwGetErrorInfo_i32(void *card, u32 *reg, i32 *value, char *text) { retu
 """
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+@pytest.mark.needs("c-compiler")
 def test_the_functions_of_a_c_library_are_called_as_its_header_declares_them(tmp_path: Path) -> None:
     (tmp_path / "spcm.c").write_text(C_LIBRARY)
     library = tmp_path / "libspcm_linux.so"
@@ -334,7 +335,6 @@ def test_a_card_in_use_elsewhere_is_refused_and_one_that_dies_with_labseq_needs_
 
 def test_a_run_that_is_killed_leaves_card_and_radio_off(tmp_path: Path) -> None:
     """From the command line to the connectors, through the watchdog."""
-    need_radio()
     comb = "{centre: 100 MHz, step: 60 kHz}"
     radio = (
         f"device: 'simulated,speed=1,buffer=0.02,record=100000000,folder={tmp_path}', sample_rate: 1.2 MHz"

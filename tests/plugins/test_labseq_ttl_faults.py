@@ -1,11 +1,12 @@
-"""Faults of the timing box, and the firmware at the end of a real serial port."""
+"""Faults of the timing box, and a box at the end of a real serial port."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from labseq_ttl import box as box_module
@@ -13,23 +14,21 @@ from labseq_ttl.__main__ import main
 from labseq_ttl.lines import Heartbeat
 from labseq_ttl.protocol import STOP, framed
 from labseq_ttl_sim.model import ModelBox
-from labseq_ttl_sim.simavr import SimavrBox, runner
+from labseq_ttl_sim.simavr import runner
 
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
-from labseq.roles.shot import NeverStopped
+from labseq.roles import NeverStopped
 
 from .emergency import outsider
-from .labseq_ttl_rig import Rig, make_rig, need_simavr, rig, works
+from .labseq_ttl_rig import FIRMWARE, MAX_WAIT_S, FirmwareOnACable, ModelOnACable, Rig, make_rig, rig, works
 
 MIDDLE = 10_000
 """Ticks: 5 ms after the first edge."""
 
 
-@pytest.fixture(params=["python", "simavr"])
+@pytest.fixture(params=["python", FIRMWARE])
 def lab(request: pytest.FixtureRequest) -> Generator[Rig]:
     """A driver, open, on a simulated box."""
-    if request.param == "simavr":
-        need_simavr()
     with rig(simulated_by=request.param) as made:
         yield made
 
@@ -143,6 +142,43 @@ def test_the_safe_state_waits_until_the_box_has_stopped(monkeypatch: pytest.Monk
         works(lab)
 
 
+class ReadLate(ModelBox):
+    """What it sends is read only after the stop byte was sent to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_read, self.is_stopped = threading.Event(), threading.Event()
+
+    def read(self, size: int = 1, /) -> bytes:
+        self.is_read.set()
+        assert self.is_stopped.wait(MAX_WAIT_S)
+        return super().read(size)
+
+    def write(self, data: bytes, /) -> int:
+        n_bytes = super().write(data)
+        if data == STOP:
+            self.is_stopped.set()
+        return n_bytes
+
+
+def test_a_wait_in_another_thread_does_not_take_the_message_of_the_stop() -> None:
+    port, ends = ReadLate(), list[object]()
+    box = box_module.Box(port, "lines", NeverStopped(), MAX_WAIT_S)
+
+    def wait() -> None:
+        try:
+            ends.append(box.new_events(MAX_WAIT_S))
+        except DeviceError as error:
+            ends.append(str(error))
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    assert port.is_read.wait(MAX_WAIT_S)
+    box.stop()
+    thread.join(MAX_WAIT_S)
+    assert ends == ["lines: aborted by the safe state"]
+
+
 class KeepsQuiet(ModelBox):
     """The end of its program is not reported."""
 
@@ -162,12 +198,8 @@ def test_an_end_whose_message_is_lost_is_asked_for(monkeypatch: pytest.MonkeyPat
 class Dies(ModelBox):
     """Plays nothing more, and does not say so."""
 
-    def _fire(self) -> None:
-        self._armed = None
-
-    def _boot(self, cause: int) -> None:
-        if not hasattr(self, "_armed"):
-            super()._boot(cause)
+    def _play(self) -> None:
+        self._armed, self._is_due = None, False
 
 
 def test_a_program_that_never_ends_is_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,10 +299,10 @@ def test_what_is_missing_for_simavr_is_named(monkeypatch: pytest.MonkeyPatch, tm
         runner("lines")
 
 
+@pytest.mark.needs("firmware")
 def test_what_takes_long_is_done_before_the_box_is_opened(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    need_simavr()
     monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
     make_rig().lines.warm()
     assert not list(tmp_path.rglob("runner"))  # the model needs nothing
@@ -282,19 +314,39 @@ def test_what_takes_long_is_done_before_the_box_is_opened(
     lines.close()
 
 
-@pytest.fixture
-def plugged() -> Generator[SimavrBox]:
-    """The firmware at the end of a cable: a serial port of this computer."""
-    need_simavr()
-    simavr = SimavrBox("lines", NeverStopped())
-    yield simavr
-    simavr.close()
+class Plugged:
+    """A box at the end of a cable, under a name that no other port gets when it is unplugged."""
+
+    def __init__(self, box: ModelOnACable | FirmwareOnACable, link: Path) -> None:
+        self._box, self._link, self.name = box, link, str(link)
+        self.start = box.start
+        link.symlink_to(box.name)
+
+    def unplug(self) -> None:
+        self._link.unlink(missing_ok=True)
+        self._box.unplug()
 
 
-def test_a_box_that_is_unplugged_and_stays_so_cannot_be_made_safe(plugged: SimavrBox) -> None:
+on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
+
+
+@pytest.fixture(params=[pytest.param("python", marks=on_a_pty), FIRMWARE])
+def plugged(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Generator[Plugged]:
+    """A box at a serial port of this computer: the model, and the firmware. Both answer late under load."""
+    monkeypatch.setattr("labseq_ttl.access.RealBox.max_wait_s", MAX_WAIT_S)
+    monkeypatch.setattr("labseq_ttl.__main__.MAX_WAIT_S", MAX_WAIT_S)
+    kind = FirmwareOnACable if request.param == "simavr" else ModelOnACable
+    plugged = Plugged(kind(), tmp_path / "ttyACM0")
+    yield plugged
+    plugged.unplug()
+
+
+def test_a_box_that_is_unplugged_and_stays_so_cannot_be_made_safe(plugged: Plugged) -> None:
     with rig(port=plugged.name, start="external") as lab:
         lab.fire()
-        plugged._process.kill()
+        plugged.unplug()
         with pytest.raises(DeviceError, match="the line to the box broke"):
             lab.lines.wait(60.0)
         with pytest.raises(DeviceError, match="cannot open"):
@@ -303,7 +355,7 @@ def test_a_box_that_is_unplugged_and_stays_so_cannot_be_made_safe(plugged: Simav
         lab.lines.close()
 
 
-def test_a_real_port_does_the_same_as_a_simulated_box(plugged: SimavrBox) -> None:
+def test_a_real_port_does_the_same_as_a_simulated_box(plugged: Plugged) -> None:
     with rig(port=plugged.name) as lab:
         for _ in range(3):
             works(lab)
@@ -312,7 +364,7 @@ def test_a_real_port_does_the_same_as_a_simulated_box(plugged: SimavrBox) -> Non
             make_rig(port=plugged.name).lines.open()
         works(lab)
         with pytest.raises(DeviceError, match="does its processor run at 16 MHz"):
-            lab.lines.self_test()  # simavr plays without a pause
+            lab.lines.self_test()  # a simulated box plays without a pause
 
 
 def test_a_port_that_is_not_there_is_named() -> None:
@@ -322,12 +374,17 @@ def test_a_port_that_is_not_there_is_named() -> None:
         make_rig(port="socket://here").lines.open()
 
 
-def test_an_external_start_is_waited_for(plugged: SimavrBox) -> None:
+def test_an_external_start_is_waited_for(plugged: Plugged, monkeypatch: pytest.MonkeyPatch) -> None:
     with rig(port=plugged.name, start="external") as lab:
         lab.fire("load", 20e-3)
-        with pytest.raises(DeviceTimeoutError, match="did the edge at the start input come"):
-            lab.lines.wait(0.05)
+        with monkeypatch.context() as patch:  # it answers no question until the edge
+            patch.setattr(lab.driver_box, "_max_wait_s", 0.1)
+            with pytest.raises(DeviceTimeoutError, match="did the edge at the start input come"):
+                lab.lines.wait(0.05)
         lab.lines.safe_state()
+        n_runs = lab.driver_box.state().runs
+        plugged.start()
+        assert lab.driver_box.state().runs == n_runs, "an edge after safe_state() played the program"
         for _ in range(2):
             lab.fire("load", 20e-3)
             plugged.start()
@@ -370,14 +427,31 @@ def test_signs_of_life_go_on_past_a_failure() -> None:
     assert not heartbeat.is_alive()
 
 
-def test_a_box_with_lights_out_hears_signs_of_life_until_it_is_closed(plugged: SimavrBox) -> None:
+def test_signs_of_life_come_several_times_within_the_timeout() -> None:
+    class Waits(threading.Event):
+        seconds: ClassVar[list[float]] = []
+
+        def wait(self, timeout: float | None = None) -> bool:
+            assert timeout is not None
+            self.seconds.append(timeout)
+            return len(self.seconds) > 3
+
+    beats: list[None] = []
+    heartbeat = Heartbeat(lambda: beats.append(None), 2.0)
+    heartbeat._stopped = Waits()
+    heartbeat.run()
+    assert len(beats) == 3
+    assert max(Waits.seconds) <= 1.0, "one that is late would turn the lines off"
+
+
+def test_a_box_with_lights_out_hears_signs_of_life_until_it_is_closed(plugged: Plugged) -> None:
     with rig(port=plugged.name, watchdog_timeout="60 s") as lab:
         works(lab)
         assert any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
     assert not any(isinstance(thread, Heartbeat) for thread in threading.enumerate())
 
 
-def test_another_process_turns_all_lines_off(plugged: SimavrBox) -> None:
+def test_another_process_turns_all_lines_off(plugged: Plugged) -> None:
     with rig(port=plugged.name) as lab:
         emergency = lab.lines.emergency()
         assert emergency is not None
@@ -392,7 +466,7 @@ def test_another_process_turns_all_lines_off(plugged: SimavrBox) -> None:
 
 
 def test_the_command_gives_a_box_its_serial_number(
-    plugged: SimavrBox, capsys: pytest.CaptureFixture[str]
+    plugged: Plugged, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([plugged.name, "--serial", "12"]) == 0
     assert main([plugged.name]) == 0

@@ -16,8 +16,7 @@ from labseq_ttl.protocol import CHANNELS, EDGES, OUTPUTS, SHORTEST, SLOTS, frame
 from labseq_ttl_sim.model import ModelBox
 from labseq_ttl_sim.simavr import APART_CYCLES, CYCLES_PER_TICK, FIRMWARE
 
-from .labseq_ttl_rig import Firmware, need_simavr
-from .needs import need_library
+from .labseq_ttl_rig import FIRMWARE as WITH_FIRMWARE, Firmware
 
 CLOCK_HZ = 16e6
 ERROR_CYCLES = 3
@@ -33,10 +32,9 @@ any_bytes = st.binary(max_size=200)
 few = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[WITH_FIRMWARE])
 def running() -> Generator[Firmware]:
     """One simulated processor for all tests."""
-    need_simavr()
     firmware = Firmware()
     yield firmware
     firmware.close()
@@ -252,6 +250,26 @@ def plain(answer: str) -> str:
     return " ".join(words)
 
 
+@pytest.mark.parametrize("end", ["edge", "stop"])
+def test_the_model_waits_for_its_start_as_the_firmware_does(firmware: Firmware, end: str) -> None:
+    model = ModelBox()
+    for question in ("put 0 0 0 4 64 0", "arm 0 2", "await"):
+        assert plain(firmware.ask(f"a {question}")) == plain(ask(model, f"a {question}"))
+    for box in (firmware, model):
+        box.write(framed("a set 4"))  # it is deaf until the edge
+    if end == "edge":
+        firmware.simavr.start()
+        model.start()
+    else:
+        firmware.write(b"!")
+        model.write(b"!")
+    said = firmware.line() or ""
+    assert said.split()[0] == (unframed(model.read(4096).split(b"\n")[0]) or "").split()[0]
+    assert said.startswith("!done" if end == "edge" else "!off")
+    for question in ("state", "fire"):
+        assert plain(firmware.ask(f"a {question}")) == plain(ask(model, f"a {question}"))
+
+
 PROTOCOL = Path(FIRMWARE).with_name("PROTOCOL.md").read_text()
 
 
@@ -273,12 +291,8 @@ def test_the_protocol_names_every_command() -> None:
     assert set(re.findall(r"^\| `([a-z]+)", PROTOCOL, re.MULTILINE)) == set(ModelBox()._commands)
 
 
+@pytest.mark.needs("avr-gcc")
 def test_the_firmware_is_that_of_its_source(tmp_path: Path) -> None:
-    def compiler() -> None:
-        if shutil.which("avr-gcc") is None or shutil.which("make") is None:
-            raise RuntimeError("`apt-get install --no-install-recommends gcc-avr avr-libc make`")
-
-    need_library(compiler)
     version = subprocess.run(["avr-gcc", "-dumpversion"], capture_output=True, text=True, check=True).stdout
     if not version.startswith("5.4"):
         pytest.skip(f"labseq_ttl.hex was built by avr-gcc 5.4, not {version.strip()}")

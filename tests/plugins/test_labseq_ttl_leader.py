@@ -18,17 +18,16 @@ from labseq.plugin import ConfigError, DeviceError, DeviceTimeoutError, LeaderLi
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.instruments import SPECS
 
-from .labseq_ttl_rig import Firmware, make_rig, need_simavr
+from .labseq_ttl_rig import FIRMWARE, Firmware, make_rig
 
 FREE = [channel for channel in CHANNELS if channel not in {spec.channel for spec in SPECS}]
 BUSY, READY, FAILED = FREE[-3:]
 GO = {"busy": BUSY, "ready": READY, "failed": FAILED, "deadline": 2.0}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[FIRMWARE])
 def running() -> Generator[Firmware]:
     """One simulated processor for all tests."""
-    need_simavr()
     firmware = Firmware()
     yield firmware
     firmware.close()
@@ -200,10 +199,8 @@ def rig() -> Generator[Led]:
     made.lines.close()
 
 
-@pytest.mark.parametrize("simulated_by", ["python", "simavr"])
+@pytest.mark.parametrize("simulated_by", ["python", FIRMWARE])
 def test_go_comes_by_the_pin_and_is_answered(simulated_by: str) -> None:
-    if simulated_by == "simavr":
-        need_simavr()
     made = Led(simulated_by=simulated_by)
     made.lines.open()
     try:

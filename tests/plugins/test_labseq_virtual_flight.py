@@ -280,6 +280,13 @@ def test_the_transport_loss_is_drawn_for_held_atoms() -> None:
     assert flights["fate"].tolist() == [b"hand_over"]
 
 
+def test_the_loss_of_each_tone_beyond_one_per_axis_is_drawn() -> None:
+    settings = SimulationSettings(transport_loss=0.0, transport_loss_per_tone=1.0)
+    assert fly(program_of(batch(((5, 2), (5, 4)))), [(5, 2)], settings)[0] == {(5, 4)}
+    two = program_of(batch(((5, 2), (5, 4)), ((5, 7), (5, 9))))
+    assert fly(two, [(5, 2), (5, 7)], settings)[0] == set()
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_misplaced_tweezer_is_reported_and_far_ones_move_nothing(axis: int) -> None:
     program = program_of(batch(((5, 2), (5, 4))))
@@ -452,6 +459,22 @@ class CachedTransport(RfTransport):
         if id(pulse) not in self.found:
             self.found[id(pulse)] = list(super().find_tones(pulse))
         return self.found[id(pulse)]
+
+
+def test_a_slow_move_leaves_the_atoms_as_warm_as_they_were() -> None:
+    """By equipartition: the mean energy is 3 kT, and a few percent more as the well is no parabola."""
+    flight, rng, heat = CachedTransport(GRID, spec(), SURE), np.random.default_rng(1), list[float]()
+    columns = np.array([0, 5, 10, 15])
+    program = program_of(batch(*(((ROW, c), (ROW, c + 2)) for c in columns.tolist())))
+    pulses = [*PulseReceiver(PlayedRfSource(played(program)), 60e-6).receive_until(START_S + 10.0)]
+    for _ in range(50):
+        atoms = Atoms(np.zeros(GRID.shape, np.bool_), 15e-6)
+        atoms.occupied[ROW, columns] = True
+        for pulse in pulses:
+            flight.carry(atoms, pulse, np.ones(GRID.shape), rng, 1.0)
+        heat.extend(atoms.heat[ROW, columns + 2][atoms.occupied[ROW, columns + 2]])
+    assert len(heat) > 190
+    assert 0.95 < np.mean(heat) / 15e-6 < 1.3
 
 
 def simulated_loss(case: Broken) -> tuple[int, NDArray[Any], NDArray[Any]]:

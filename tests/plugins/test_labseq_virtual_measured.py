@@ -8,35 +8,32 @@ compared figures do not depend on them. ``-s`` prints the figures of ``docs/expl
 
 from __future__ import annotations
 
-import os
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from labseq_virtual.sensors import Register, power_of_two
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtr
 
+from tests.needs import EMCCD_FRAMES
+
 Floats = NDArray[np.float64]
-FOLDER = Path(os.environ.get("LABSEQ_EMCCD_DATA") or Path(__file__).parents[3] / "shared" / "data" / "emccd")
 FILES = {
     1: "ADU__1x-gain_level-03.tif",
     100: "gain-IS__100x-gain_level-03.tif",
     300: "gain-GS__300x-gain.tif",
 }
 N_BINS = 50
-pytestmark = pytest.mark.skipif(
-    not all((FOLDER / name).is_file() for name in FILES.values()),
-    reason="no measured frames: LABSEQ_EMCCD_DATA names no folder that holds them",
-)
+pytestmark = pytest.mark.needs("emccd-frames")
 
 
 @cache
 def frames(gain: int) -> Floats:
     """Measured counts (n_frames, 3, 3)."""
-    return pytest.importorskip("tifffile").imread(FOLDER / FILES[gain]).astype(np.float64)
+    return tifffile.imread(EMCCD_FRAMES / FILES[gain]).astype(np.float64)
 
 
 class Moments:

@@ -506,25 +506,39 @@ def test_preassigned_amplitudes_give_the_full_depth(clock: FakeClock) -> None:
     assert flights["depth_K"][flights["from_row"] == 5] == pytest.approx([2.1e-3], rel=0.02)
 
 
-def test_noise_of_the_intensity_heats_atoms_that_no_light_cools() -> None:
+NOISY = {
+    "loading": 1.0,
+    "intensity_noise": 2e-8,
+    "lights": {"cooling": ["molasses"]},
+    "depth_disorder": 0.0,
+}
+
+
+def without_cooling() -> VirtualSimulation:
+    """Cold atoms at 1.5 s, which the noise of the intensity heats from then on."""
     line = LineSpec("molasses", 3, frozenset({"load"}))
-    noisy = {
-        "loading": 1.0,
-        "intensity_noise": 2e-8,
-        "lights": {"cooling": ["molasses"]},
-        "depth_disorder": 0.0,
-    }
+    context = Context("simulation", ARRAY_GRID, lines=(line,))
+    simulation = VirtualSimulation(SimulationSettings.model_validate(NOISY), context)
+    simulation.open()
+    simulation.begin_shot()
+    simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
+    simulation.load(1.0, 0.5)
+    dark = LineProgram("idle", ("molasses",), np.zeros(1), np.zeros((1, 1), np.bool_), 0.0, 1.0)
+    simulation.play("lines", dark, 1.5)
+    return simulation
+
+
+def test_atoms_that_are_loaded_are_cold_whatever_was_there_before() -> None:
+    simulation = without_cooling()
+    simulation.load(1.55, 0.5)
+    simulation.expose(2.05, 1e-3)
+    assert simulation.losses()["heat"] == 0
+
+
+def test_noise_of_the_intensity_heats_atoms_that_no_light_cools() -> None:
     n_left: list[int] = []
     for hold_s in (0.0, 2e-3, 10e-3):
-        simulation = VirtualSimulation(
-            SimulationSettings.model_validate(noisy), Context("simulation", ARRAY_GRID, lines=(line,))
-        )
-        simulation.open()
-        simulation.begin_shot()
-        simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
-        simulation.load(1.0, 0.5)
-        dark = LineProgram("idle", ("molasses",), np.zeros(1), np.zeros((1, 1), np.bool_), 0.0, 1.0)
-        simulation.play("lines", dark, 1.5)
+        simulation = without_cooling()
         simulation.expose(1.5 + hold_s, 1e-3)
         n_left.append(n_atoms(simulation))
     rate_hz = 2 / 3 * np.pi**2 * 54.7e3**2 * 2e-8  # 55 kHz in a well of 300 uK

@@ -246,6 +246,26 @@ def test_each_further_tone_adds_to_the_loss() -> None:
     assert within_four_sigma(survivors(600, 3, **physics), 3000, 1 - (0.1 + 0.05 * further))
 
 
+def test_the_noise_of_the_intensity_heats_in_a_mobile_tweezer_by_its_trap_frequency() -> None:
+    """At pi^2 nu^2 S along two of three axes: the deeper the tweezer, the faster."""
+    noise_per_hz, n_ramps, heat = 2e-10, 2, dict[int, float]()
+    settings = SimulationSettings(transport_loss=0.0, intensity_noise=noise_per_hz)
+    for n_ms in (1, 3):
+        tape = start([2], [3])
+        for _ in range(n_ms):
+            tape.add([(2, 2, ON, ON)], [(3, 3, ON, ON)])
+        tape.add([(2, 2, ON, ON)], [(3, 3, ON, 0.0)])
+        held = Atoms(atoms((2, 3)), 15e-6)
+        Transport(GRID, MotionSpec(), settings).carry(
+            held, tape.program(), n_ms + n_ramps, FULL, np.random.default_rng(0), 1.0, cooled=0.0
+        )
+        heat[n_ms] = held.heat[2, 3]
+    depth, mass, waist = 2.1e-3 * 1.380649e-23, 86.909 * 1.66054e-27, 0.98e-6
+    trap_hz = np.sqrt(4 * depth / mass) / waist / (2 * np.pi)
+    rate_hz = 2 / 3 * np.pi**2 * trap_hz**2 * noise_per_hz
+    assert np.log(heat[3] / heat[1]) / 2e-3 == pytest.approx(rate_hz, rel=0.15)
+
+
 SURE_LOSS = {"adiabatic_depth": 3e-3, "shallow_loss": 1.0}
 
 

@@ -28,7 +28,7 @@ from labseq_virtual.handover import (
     merging_distance,
     pair_survival,
 )
-from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by, relaxed
+from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by
 from labseq_virtual.responses import move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
@@ -39,6 +39,7 @@ from scipy.special import ndtr
 from labseq import MotionSpec, SiteGrid, ToneProgram
 from tests.docs.scripts import load_script
 
+from .naive_moves import NaiveMoves
 from .rf import ON, ToneProgramBuilder
 
 Floats = NDArray[np.float64]
@@ -75,12 +76,11 @@ class Before:
 
 
 class NaiveTransport:
-    """The rules of ``transport.py``, without any short cut, on a transport's own tables and kernels."""
+    """The rules of ``transport.py``, without any short cut and without a kernel."""
 
     def __init__(self, transport: Transport, settings: SimulationSettings, draws: Floats) -> None:
         self.transport, self.settings, self.draws = transport, settings, draws
-        self.constants, self.reach = transport._constants, transport._merging
-        self.tables = move_tables()
+        self.moves = NaiveMoves(settings, GRID.spacing_m)
         self.thermal = np.stack([np.full(GRID.shape, settings.temperature), np.zeros(GRID.shape)])
         self.hazards = np.zeros(GRID.shape)
         self.now_s, self.n_drawn = 0.0, 0
@@ -127,9 +127,9 @@ class NaiveTransport:
         self.lost["program"] -= count(loaded)
         start, end = crossings(row, col, POWER_START), crossings(row, col, POWER_END)
         power = np.maximum(start, end)
-        depth = np.vectorize(lambda each: kernels.mobile_depth(each, further, self.constants))(power)
+        depth = self.moves.mobile_depth(power, further)
         taken = self._picked_up(fresh, depth, course, row, col)
-        fresh &= ~taken & (start < kernels.RAMP * end)
+        fresh &= ~taken & (start < 0.7 * end)
         loaded |= taken
         mixed = self._mixed(row)[:, None] | self._mixed(col)
         self.lost["collision"] += count(loaded & mixed)
@@ -140,10 +140,8 @@ class NaiveTransport:
         self._pass(lit, loaded, course, depth, row, col, duration_s)
         course[..., kernels.STATE], course[..., kernels.DEPTH] = np.where(loaded, HELD, EMPTY), depth
         for i, j in np.argwhere(lit):
-            kernels.advance(
-                course[i, j], start[i, j], end[i, j], float(down[i, 0]), float(right[0, j]), duration_s, kind,
-                further, self.constants, self.tables,
-            )  # fmt: skip
+            way = float(down[i, 0]), float(right[0, j])
+            self.moves.advance(course[i, j], (start[i, j], end[i, j]), way, duration_s, kind, further)
         self._land(lit & ~loaded & ~lit_end, course, row, col, duration_s)
         self._set_down(loaded & ~lit_end, course, row, col, further, duration_s)
         return Before(row, col, lit_end, loaded & lit_end, fresh, course)
@@ -176,11 +174,11 @@ class NaiveTransport:
         for i, j in np.argwhere(taken):
             site = r[i, j], c[i, j]
             static = float(self.depth[site])
-            taken[i, j] = self.occupied[site] and kernels.takes(depth[i, j], static, away_m[i, j], self.reach)
+            taken[i, j] = self.occupied[site] and self.moves.takes(depth[i, j], static, away_m[i, j])
             self.occupied[site] &= not taken[i, j]
             if taken[i, j]:
                 waited_s = self.now_s - self.thermal[1][site]
-                heat = relaxed(self.thermal[0][site], waited_s, self.constants)
+                heat = self.moves.relaxed(self.thermal[0][site], waited_s)
                 course[i, j, kernels.SITE_DEPTH : kernels.HEAT + 1] = static, away_m[i, j], heat
                 course[i, j, kernels.IS_PICKED] = 0.0
                 course[i, j, kernels.LOST] = 1 - np.exp(-self.hazards[site])
@@ -205,11 +203,10 @@ class NaiveTransport:
                 if not self.settings.site_tolerance * GRID.spacing_m < away_m < 3.1 * WAIST_M:
                     continue
                 waited_s = self.now_s - self.thermal[1, r, c]
-                heat = relaxed(self.thermal[0, r, c], waited_s, self.constants)
+                heat = self.moves.relaxed(self.thermal[0, r, c], waited_s)
                 speed = float(np.linalg.norm(way)) / duration_s
-                loss, warmer = pass_by(
-                    float(self.depth[r, c]), depth[i, j], speed, away_m, heat, self.constants, self.tables
-                )
+                static = float(self.depth[r, c])
+                loss, warmer = self.moves.pass_by(static, depth[i, j], speed, away_m, heat)
                 self.thermal[:, r, c] = heat * warmer, self.now_s
                 self.hazards[r, c] -= np.log1p(-min(loss, 1 - 1e-9))
                 if loaded[i, j]:
@@ -255,9 +252,9 @@ class NaiveTransport:
             if away_m > self.settings.site_tolerance * GRID.spacing_m:
                 continue
             peak, speed, fall_s = course[i, j, [kernels.PEAK, kernels.SPEED, kernels.FALL_S]]
-            heat = relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c], self.constants)
+            heat = self.moves.relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c])
             static = float(self.depth[r, c])
-            loss, warmer = land_on(static, peak, speed, fall_s, heat, self.constants, self.tables)
+            loss, warmer = self.moves.land_on(static, peak, speed, fall_s, heat)
             self.thermal[:, r, c] = heat * warmer, now_s
             self.hazards[r, c] -= np.log1p(-min(loss, 1 - 1e-9))
 
@@ -273,7 +270,7 @@ class NaiveTransport:
         i, j = np.nonzero(dropping)
         r, c, away_m, inside = self._nearest(row[i, END], col[j, END])
         args = zip(self.depth[r, c], course[i, j], away_m, strict=True)
-        found = [kernels.risks(*one, further, self.factor, self.constants, self.tables) for one in args]
+        found = [self.moves.risks(*one, further, self.factor) for one in args]
         risks, heat = np.array(found).reshape(-1, 4)[:, :3], np.array(found).reshape(-1, 4)[:, 3]
         draws = self.draws[self.n_drawn : self.n_drawn + len(i)]
         self.n_drawn += len(i)

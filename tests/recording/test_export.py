@@ -10,7 +10,9 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
+import xarray
 
 from labseq.errors import ConfigError
 from labseq.recording import Run, RunWriter, open_run
@@ -64,10 +66,12 @@ def test_csv_has_nothing_where_nothing_is_known(tmp_path: Path) -> None:
     assert row["reading.a,b"] == 'say "µ"'
 
 
+@pytest.mark.needs("pyarrow")
 def test_parquet_reads_back_with_its_units(run: Run, tmp_path: Path) -> None:
-    pandas, parquet = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
+    from pyarrow import parquet
+
     path = exported(run, "parquet", tmp_path)
-    assert pandas.read_parquet(path).equals(run.to_dataframe())
+    assert pd.read_parquet(path).equals(run.to_dataframe())
     schema = parquet.read_schema(path)
     assert schema.field("shot.2.rearrange.window").metadata[b"units"] == b"s"
     assert all(field.metadata[b"description"] for field in schema)
@@ -75,7 +79,6 @@ def test_parquet_reads_back_with_its_units(run: Run, tmp_path: Path) -> None:
 
 
 def test_netcdf_reads_back_as_it_was(run: Run, tmp_path: Path) -> None:
-    xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(exported(run, "netcdf", tmp_path), engine="h5netcdf") as data:
         expected = run.to_xarray()
         assert dict(data.sizes) == dict(expected.sizes)
@@ -87,14 +90,15 @@ def test_netcdf_reads_back_as_it_was(run: Run, tmp_path: Path) -> None:
 
 
 def test_names_that_netcdf_does_not_take_are_changed(tmp_path: Path) -> None:
-    xarray = pytest.importorskip("xarray")
     with xarray.open_dataset(
         exported(write(tmp_path, make_shot(readings={"laser/780": 1.5})), "netcdf", tmp_path)
     ) as data:
         assert data["reading.laser_780"].values.tolist() == [1.5]
 
 
-@pytest.mark.parametrize("kind", ["netcdf", "parquet", "csv", "archive"])
+@pytest.mark.parametrize(
+    "kind", ["netcdf", pytest.param("parquet", marks=pytest.mark.needs("pyarrow")), "csv", "archive"]
+)
 def test_a_run_without_shots_is_exported(kind: str, tmp_path: Path) -> None:
     run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
     assert exported(run, kind, tmp_path).stat().st_size

@@ -97,7 +97,6 @@ def test_what_is_set_or_scanned_is_a_number_in_si_with_its_unit(run: labseq.Run)
             for address, (value, unit) in {**expected, HOLD: (hold_s, "s")}.items():
                 assert shot["parameters"][address] == parameters[address][()] == value
                 assert parameters[address].attrs["units"].decode() == record["units"].get(address, "") == unit
-    pytest.importorskip("xarray")
     table, data = run.to_dataframe(), run.to_xarray()
     assert table[EXPOSURE].tolist() == [0.08, 0.08]
     assert table.attrs["units"][PICK_UP] == data[PICK_UP].attrs["units"] == data[HOLD].attrs["units"] == "s"

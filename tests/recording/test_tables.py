@@ -21,9 +21,6 @@ from labseq.recording.columns import columns_of
 from .records import make_run, make_shot, write
 from .scanned import ADDRESSES, DEGREES, N_REPEATS, WINDOWS_S, write_scan
 
-pytest.importorskip("pandas")
-pytest.importorskip("xarray")
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:

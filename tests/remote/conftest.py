@@ -9,10 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("zmq")
-pytest.importorskip("msgpack")
-
 from labseq_remote.settings import RemoteSettings
 
 import labseq.remote.server

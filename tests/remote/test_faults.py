@@ -49,7 +49,7 @@ ROLES: dict[str, Any] = {
 }
 
 
-def until(condition: Callable[[], bool], limit_s: float = 10.0) -> float:
+def until(condition: Callable[[], bool], limit_s: float = 60.0) -> float:
     """Wait for something; returns how long that took."""
     begun_s = time.monotonic()
     while not condition():

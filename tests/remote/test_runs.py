@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 import labseq
+import labseq.remote.server
+from labseq import wire
 from tests.remote.conftest import served
 from tests.session.small_runs import table
-
-pytestmark = pytest.mark.skipif(find_spec("spcm") is None, reason="needs the package spcm")
 
 GRID = "{rows: 6, cols: 6, spacing: 4.49 um, row_frequency: TONES, column_frequency: TONES}".replace(
     "TONES", "{centre: 100 MHz, step: 1.6 MHz}"
@@ -82,6 +81,13 @@ def run(folder: Path, profile: str) -> labseq.Run:
     (folder / "small.yaml").write_text(SEQUENCE, encoding="utf-8")
     with labseq.Session.open(folder / "small.yaml", seed=5, output=folder / "runs") as session:
         return session.run()
+
+
+@pytest.fixture(autouse=True)
+def _never_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four servers and a run share this process, which may stand still for long."""
+    for module in (wire, labseq.remote.server):
+        monkeypatch.setattr(module, "LOST_S", 60.0)
 
 
 def test_devices_of_several_servers_share_a_simulation(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def log_of(run: labseq.Run, name: str) -> Path:
 
 
 def test_every_shot_of_a_run_is_analysed_beside_it(tmp_path):
-    done = run(tmp_path, "[{use: survival, atoms: moved, finish_within: 60 s}]")
+    done = run(tmp_path, "[{use: survival, atoms: moved, finish_within: 600 s}]")
     assert warnings(done) == []
     rows = done.analysis("survival")
     assert [row["shot"] for row in rows] == [0, 1, 2]
@@ -110,9 +110,9 @@ def test_every_shot_of_a_run_is_analysed_beside_it(tmp_path):
 
 
 def test_analyses_that_fail_leave_the_run_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(analyses_beside, "GRACE_S", 20.0)  # on a busy computer a process takes long to begin
+    # on a busy computer their processes, which come last, take long to begin
     names = ["fails", "dies", "nomapping"]
-    done = run(tmp_path, f"[{', '.join(f'{{use: {name}, finish_within: 60 s}}' for name in names)}]")
+    done = run(tmp_path, f"[{', '.join(f'{{use: {name}, finish_within: 600 s}}' for name in names)}]")
     assert (done.status, len(done.shots)) == ("complete", 3)
     text = "\n".join(warnings(done))
     assert "analysis 'fails' failed: shot 1: ValueError: too dark; see " in text

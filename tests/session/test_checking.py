@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import labseq
@@ -30,7 +31,8 @@ def test_a_good_sequence_has_no_warnings():
 
 
 def test_durations_span_from_no_cycle_to_all():
-    report = checked("profile.camera.readout=0 s")
+    report = checked("profile.camera.readout=0 s", shots=7)
+    assert report.run_s == pytest.approx((7 * report.shortest_shot_s, 7 * report.longest_shot_s))
     assert report.shortest_shot_s == pytest.approx(0.5 + 2 * 0.045)
     assert report.longest_shot_s == pytest.approx(0.5 + 2 * 0.045 + 10 * (0.06 + 0.045))
     always = checked("profile.camera.readout=0 s", "shot.2.rearrange.stop_when=never")
@@ -151,16 +153,21 @@ def test_a_rearrangement_is_rehearsed_where_the_one_before_it_ends():
     assert "too short for most plans" in warning.what
 
 
+def test_moves_that_do_not_fit_into_a_window_are_left_to_the_next_rearrangement():
+    windows = ", ".join(f"{{rearrange: {{cycles: 1, window: {window}}}}}" for window in ("1 ms", "25 ms"))
+    found = checked(f"shot=[{{load: {{}}}}, {{image: {{}}}}, {windows}, {{image: {{}}}}]").warnings
+    assert ["too short for most plans" in warning.what for warning in found] == [True, True]
+
+
 def test_sequences_without_a_warning(tmp_path: Path):
     assert not checked("shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 3, stop_when: never}}]").warnings
     assert checked("shot=[{image: {}}]").rehearsal is None
 
 
-@pytest.mark.parametrize("frames", ["last", "none"])
-def test_the_disk_space_follows_the_frames_that_are_kept(frames: str):
-    size = checked(f"record_frames={frames}").shot_bytes
-    assert size is not None
-    assert size < (700_000 if frames == "last" else 150_000)
+def test_the_disk_space_follows_the_frames_that_are_kept():
+    sizes = [checked(f"record_frames={frames}").shot_bytes or 0 for frames in ("none", "last", "all")]
+    assert np.diff(sizes).tolist() == [2 * 512**2, 11 * 2 * 512**2]
+    assert 0 < sizes[0] < 150_000
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,19 @@ def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
     stopped = labseq.open_run(folder)
     assert (stopped.status, stopped.error) == ("failed", f"CheckFailedError: {reported}")
     assert len(stopped.shots) == 5
+
+
+def test_a_check_of_a_mean_waits_for_all_of_its_shots_each_time(tmp_path: Path) -> None:
+    """The laser's power is a tenth of the number of the shot."""
+    power: dict[str, Any] = {"value": "reading.laser.power_w", "at_least": 9, "then": "warn"}
+    seen = RecordingObserver()
+    run(sequence(tmp_path, policy={"checks": [{**power, "shots": n} for n in (2, 4, 7)]}), seen)
+    found = [
+        re.match(r"shot (\d): reading.laser.power_w is ([\d.]+) on the mean of the last (\d)", event["text"])
+        for event in seen.of("warning")
+    ]
+    expected = [("1", "0.05", "2"), ("3", "0.25", "2"), ("3", "0.15", "4"), ("5", "0.45", "2")]
+    assert [one and one.groups() for one in found] == expected
 
 
 def test_a_policy_of_a_step_replaces_that_of_the_run(tmp_path: Path) -> None:

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_soapy_sim import build_module
 
 import labseq
 from labseq.analysis.fits import fit_points
 from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
-from tests.plugins.needs import need_library
 
 from .whole_runs import SMALL_FRAMES
 
@@ -138,7 +136,6 @@ def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(tmp_path
 
 
 def test_the_box_and_the_radio_release_as_the_virtual_tweezers_do(tmp_path: Path) -> None:
-    need_library(build_module)
     path, ways = (
         written(tmp_path, BY_HARDWARE.replace("20 us", "20.2 us")),
         {"virtual": [], "box": [f"lines={BOX}"]},

@@ -98,6 +98,20 @@ def fail(self, *_, **__):
 """
 
 
+def test_a_device_that_cannot_be_opened_is_told_to_be_safe_but_is_not_reported_as_safe() -> None:
+    write("{use: mine}", "safe_state(self): pass", "safe_state(self): open('told', 'w').close()")
+    plugin = Path("plugins/mine.py")
+    text = plugin.read_text("utf-8").replace(
+        "def open(self): pass", "def open(self): raise OSError('no answer')"
+    )
+    plugin.write_text(text, "utf-8")
+    outcome, events = secured()
+    assert [name for name, failure in outcome.attempted.items() if failure is not None] == ["shutter"]
+    assert [(t["device"], "no answer" in t["error"]) for t in events if not t["ok"]] == [("shutter", True)]
+    assert len(outcome.failures) == 1
+    assert Path("told").exists()
+
+
 @pytest.mark.parametrize("what", ["broken text", "tricky class", "escapes", "broken error of labseq"])
 def test_no_error_of_a_device_keeps_the_others_from_being_made_safe(
     what: str, capsys: pytest.CaptureFixture[str]
@@ -157,10 +171,10 @@ def test_a_command_that_opens_devices_and_is_killed_leaves_them_off(command: str
     plugin.write_text(text.replace("import labseq\n", STAYS, 1).replace("class Mine:", GUARDED), "utf-8")
     labseq = [sys.executable, "-m", "labseq", command, "./p.yaml"]
     with subprocess.Popen(labseq, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        until(lambda: process.poll() is not None or Path("reached").exists())
+        until(lambda: process.poll() is not None or Path("reached").exists(), 120.0)
         assert process.poll() is None, process.communicate()
         process.kill()
-        _, said = process.communicate(timeout=20.0)  # until the watchdog has ended, too
+        _, said = process.communicate(timeout=120.0)  # until the watchdog has ended, too
     assert not Path("on").exists()
     assert f"labseq-watchdog: labseq {command} died; shutter is off after " in said
 
@@ -216,6 +230,7 @@ def test_a_run_that_died_is_forgotten_once_all_is_safe() -> None:
     ("plugin", "profile", "problem"),
     [
         (("safe_state(self): pass", "safe_state(self): raise OSError('jammed')"), PROFILE, "jammed"),
+        (("open(self): pass", "open(self): raise OSError('no answer')"), PROFILE, "no answer"),
         (
             ("", ""),
             PROFILE.replace("devices:\n  shutter: SHUTTER", "devices: 5"),

@@ -8,8 +8,9 @@ import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import distributed
 import pytest
 
 import labseq
@@ -19,6 +20,7 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.session.options import Options
 from labseq.session.workers import Recipe, ShotWorker, TakenShot
 from labseq.testing.fakes import RecordingObserver
+from labseq.workers import ProcessWorkers
 
 from . import test_policies
 from .small_runs import OWN_DEVICE, PROFILE, interrupted, resumed, table, write
@@ -50,10 +52,30 @@ def alone(sequence: Path) -> labseq.Run:
         return session.run()
 
 
-def test_a_scan_that_is_stopped_and_resumed_while_workers_are_killed(tmp_path: Path) -> None:
+class Counting(ProcessWorkers):
+    """Counts the tasks that have been given to workers and are not done."""
+
+    out: ClassVar[list[int]] = []
+
+    def submit(self, task: int, argument: Any) -> None:
+        super().submit(task, argument)
+        self.out.append(sum(self.out[-1:]) + 1)
+
+    def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+        done = super().finished(timeout_s)
+        self.out.append(sum(self.out[-1:]) - len(done))
+        return done
+
+
+def test_a_scan_that_is_stopped_and_resumed_while_workers_are_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labseq.session.workers.ProcessWorkers", Counting)
+    monkeypatch.setattr(Counting, "out", [])
     sequence, observer = write(tmp_path, "planner"), Killing()
     run_dir = interrupted(sequence, "shot_finished", 2, workers=2)
     assert len(labseq.open_run(run_dir).shots) == 2
+    assert max(Counting.out) >= 4, "a worker that ends a shot has to wait for the next"
     run, expected = resumed(run_dir, observer, workers=2), alone(sequence)
     assert observer.n_kills == 2
     assert table(run) == table(expected)
@@ -116,7 +138,6 @@ def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
 
 
 def test_a_cluster_takes_the_same_shots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    distributed = pytest.importorskip("distributed")
     sequence, keys = write(tmp_path, "planner"), tmp_path / "keys"
     ca, scheduler, worker, _ = map(str, make_keys(keys))
     files = {"tls_ca_file": ca, "tls_scheduler_cert": scheduler, "tls_scheduler_key": scheduler}
@@ -124,7 +145,8 @@ def test_a_cluster_takes_the_same_shots(tmp_path: Path, monkeypatch: pytest.Monk
     files |= {"tls_client_cert": worker, "tls_client_key": worker}
     about: dict[str, Any] = {"dashboard_address": ":0", "protocol": "tls", "processes": False}
     about["security"] = distributed.Security(require_encryption=True, **files)
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, **about) as cluster:
+    make_cluster: Any = distributed.LocalCluster
+    with make_cluster(n_workers=1, threads_per_worker=2, **about) as cluster:
         options: dict[str, Any] = {"scheduler": cluster.scheduler_address, "keys": keys}
         options["output"] = tmp_path / "data"
         runs = list[labseq.Run]()
@@ -173,7 +195,6 @@ def test_a_worker_that_an_error_has_ended_takes_none_of_its_other_shots(tmp_path
 def test_a_cluster_that_cannot_be_used(
     address: str, keys: Path | None, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("distributed")
     monkeypatch.setattr("labseq.cluster._ANSWER_S", 0.5)
     with pytest.raises(ConfigError, match=message):
         ClusterWorkers(address, keys, "shot")

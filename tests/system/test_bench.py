@@ -105,7 +105,7 @@ def check_kept(n_done: int, out: str, err: str) -> None:
 def test_what_is_done_is_kept() -> None:
     with start(*FILES) as child:
         os.killpg(child.pid, signal.SIGINT)  # as a terminal does: every process gets it
-        out, err = child.communicate(timeout=60)
+        out, err = child.communicate(timeout=180)
     assert child.returncode == 130, err
     check_kept(100, out, err)
     for pid in {int(pid) for pid in Path("pids").read_text().split()}:
@@ -129,7 +129,7 @@ def test_others_do_the_work_of_processes_that_die() -> None:
     with start() as child:
         for pid in {int(pid) for pid in Path("pids").read_text().split()} - {child.pid}:
             os.kill(pid, signal.SIGKILL)
-        out, err = child.communicate(timeout=60)
+        out, err = child.communicate(timeout=180)
     assert child.returncode == 0, err
     assert "200" in out
     assert "INCOMPLETE" not in out

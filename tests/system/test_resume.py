@@ -79,7 +79,7 @@ def test_a_run_is_stopped_after_its_shot(scanned):
     process = scanned.start("run", "sequence.yaml", "--realtime", "--set", "shot.0.load.duration=50 ms")
     scanned.await_calls(process, "camera.read", 2)
     stopped = scanned.run("stop", "--wait")
-    out, err = process.communicate(timeout=60.0)
+    out, err = process.communicate(timeout=180.0)
     assert (stopped.returncode, process.returncode) == (0, 143), (stopped.stderr, out, err)
     run_dir = scanned.run_dir()
     assert f"labseq resume {run_dir}" in stopped.stdout

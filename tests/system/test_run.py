@@ -88,7 +88,7 @@ def test_a_run_that_is_stopped(tmp_path: Path) -> None:
         while not child.stderr.readline().startswith("shot 0  "):
             assert child.poll() is None
         child.send_signal(signal.SIGTERM)
-        out, err = child.communicate(timeout=60)
+        out, err = child.communicate(timeout=180)
     answer = json.loads(out)
     assert (child.returncode, answer["status"]) == (143, "stopped")
     assert answer["shots"] >= 1

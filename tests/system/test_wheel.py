@@ -24,7 +24,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
 PLUGINS = {path.parent.name for path in ROOT.glob("plugins/*/__init__.py")}
 UV = shutil.which("uv") or ""
 
-pytestmark = [pytest.mark.system, pytest.mark.skipif(not ASKED, reason="LABSEQ_WHEEL is not set")]
+pytestmark = [pytest.mark.system, pytest.mark.needs("downloads")]
 
 
 def call(*words: str | Path, cwd: Path) -> str:

@@ -180,6 +180,22 @@ class DriverCountsOnFromTheLastSeries(Driver):
         self.series, self.n_fired = series, self.n_taken
 
 
+class ExposesAtEveryEdge(RecordingCamera):
+    """With a line, also after ``safe_state``."""
+
+    @property
+    def facts(self) -> CameraFacts:
+        return CameraFacts(1e-3, max_exposure_s=10.0, triggers=("software", "external"))
+
+    def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
+        super().arm(n_frames, exposure_s, "software" if trigger == "external" else trigger)
+
+    def open(self) -> None:
+        super().open()
+        assert self.simulation is not None
+        self.simulation.wire("camera", self.simulation.expose)
+
+
 class StopsASeriesThatIsNotThere(Driver):
     def _stop(self) -> None:
         self.n_fired = self.series.n_frames
@@ -193,6 +209,7 @@ PLANTED = Planted(
         (GivesAnArray, "test_gives_a_frame"),
         (GivesEmptyImages, "test_gives_a_frame"),
         (TellsAnotherExposure, "test_gives_a_frame"),
+        (ExposesAtEveryEdge, "test_ignores_edges_after_safe_state"),
         (ExposesOnceMore, "test_gives_as_many_frames_as_armed_for"),
         (ChangesItsShape, "test_gives_as_many_frames_as_armed_for"),
         (TellsTheWallClock, "test_tells_when_it_exposed"),

@@ -55,6 +55,13 @@ class LeavesLightOn(RecordingLines):
         self.reset()
 
 
+class KeepsItsProgram(RecordingLines):
+    def safe_state(self) -> None:
+        compiled = self._compiled
+        super().safe_state()
+        self._compiled = compiled
+
+
 PLANTED = Planted(
     LinesContract(),
     RecordingLines,
@@ -64,6 +71,7 @@ PLANTED = Planted(
         (ComesBackAtOnce, "test_waits_for_the_end"),
         (WaitsInFire, "test_waits_for_the_end"),
         (StaysArmed, "test_refuses_fire_without_arm"),
+        (KeepsItsProgram, "test_drops_its_program"),
         (OpensWithLightOn, "test_rests"),
         (LeavesLightOn, "test_rests"),
     ),

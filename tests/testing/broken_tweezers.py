@@ -98,11 +98,60 @@ class PlaysToTheEnd(RecordingMobileTweezers):
         self.clock.sleep(0.6 * self.programs[-1].total_duration_s)
 
 
+class PlaysAtOnce(RecordingMobileTweezers):
+    """After ``open`` it plays silence."""
+
+    is_new = True
+
+    def play(self) -> None:
+        if not self.is_new or not self.is_open:
+            super().play()
+
+    def prepare(self, program: ToneProgram) -> float:
+        self.is_new = False
+        return super().prepare(program)
+
+    def safe_state(self) -> None:
+        self.is_new = False
+        super().safe_state()
+
+
 class StaysPrepared(RecordingMobileTweezers):
     def safe_state(self) -> None:
         prepared = self._prepared
         super().safe_state()
         self._prepared = prepared
+
+
+class WaitsForItsTrigger(RecordingMobileTweezers):
+    """Right: with a line, ``play`` only arms them."""
+
+    waits_for_trigger = True
+    armed: ToneProgram | None = None
+
+    def open(self) -> None:
+        super().open()
+        assert self.simulation is not None
+        self.simulation.wire("mobile_tweezers", lambda t_s, _width_s: self.start(t_s))
+
+    def play(self) -> None:
+        self.armed = self._prepared
+        super().play()
+
+    def start(self, t_s: float) -> None:
+        if self.armed is not None and self.simulation is not None:
+            self.simulation.play(self.name, self.armed, t_s)
+
+    def safe_state(self) -> None:
+        self.armed = None
+        super().safe_state()
+
+
+class StaysArmed(WaitsForItsTrigger):
+    def safe_state(self) -> None:
+        armed = self.armed
+        super().safe_state()
+        self.armed = armed
 
 
 class FailsOnNothing(RecordingMobileTweezers):
@@ -144,7 +193,9 @@ MOBILE = Planted(
         (LeavesOutThePauses, "test_tells_the_playing_time"),
         (RunsOutOfMemory, "test_plays_programs"),
         (PlaysToTheEnd, "test_play_returns_at_once"),
-        (StaysPrepared, "test_refuses_play_without_prepare"),
+        (PlaysAtOnce, "test_refuses_play_without_prepare"),
+        (StaysPrepared, "test_drops_its_program"),
+        (StaysArmed, "test_drops_its_program"),
         (FailsOnNothing, "test_takes_an_empty_program"),
         (LooksWhenItPlays, "test_refuses_what_exceeds_limits"),
         (TellsMilliseconds, "test_tells_its_timings"),

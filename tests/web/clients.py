@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model import Frame, ShotRecord
 from labseq.recording.writer import RunWriter
 from tests.recording.records import make_run, make_shot
 
@@ -96,3 +100,13 @@ def write_run(root: Path, n_taken: int, name: str = "compact", **record: Any) ->
     for index in range(n_taken):
         writer.write_shot(make_shot(index))
     return writer
+
+
+def shot_of_frames(*frames: NDArray[np.uint16]) -> ShotRecord:
+    """A shot with an image of each frame, whose sites are not known."""
+    shot = make_shot(0, n_images=len(frames), batches=((1,),), sites_px=None)
+    images = [
+        replace(image, frame=Frame(frame, 0.045, 1.0, "camera"))
+        for image, frame in zip(shot.images, frames, strict=True)
+    ]
+    return replace(shot, images=images)

@@ -84,6 +84,8 @@ def test_entries_are_moved_and_the_queue_paused(acting: Client, run_dir: Path) -
         assert acting.post("/api/v1/queue/move", wrong).status_code == 409
     assert acting.post("/api/v1/queue/pause", {"paused": True}).status_code == 200
     assert acting.get("/api/v1/queue").json()["is_paused"]
+    assert acting.post("/api/v1/queue/pause", {"paused": False}).status_code == 200
+    assert not acting.get("/api/v1/queue").json()["is_paused"]
     (queue.folder / "0002.json").write_text("{")
     assert "0002.json" in acting.get("/api/v1/queue").json()["error"]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from labseq.analysis.statistics import statistics_of
 from labseq.calibration.store import encode_entry
@@ -20,9 +21,10 @@ from labseq.plain import now
 from labseq.recording import open_run
 from labseq.recording.run_file import is_index_row
 from labseq.web.history import RunHistory
+from tests.pictures.pixels import decoded
 from tests.recording import damages
 
-from .clients import client_of, path_of, write_run
+from .clients import client_of, path_of, shot_of_frames, write_run
 
 
 def answers(client: Any, path: str) -> Any:
@@ -96,18 +98,21 @@ def test_every_address_of_the_description_answers(client: Any, run_dir: Path) ->
         assert methods["get"]["summary"]
 
 
-def test_frame_is_the_recorded_one_in_8_bit(client: Any, run_dir: Path) -> None:
-    import zlib
-
-    answer = client.get(f"{path_of(run_dir)}/shots/1/frames/0.png?width=1024")
-    assert answer.headers["x-reduced"] == "1"
-    frame = open_run(run_dir).shots[1].frames[0]
-    data = answer.content
-    start = data.index(b"IDAT") + 4
-    pixels = np.frombuffer(zlib.decompress(data[start:-16]), np.uint8).reshape(frame.shape[0], -1)[:, 1:]
-    assert pixels.shape == frame.shape
-    order = np.argsort(frame.ravel(), kind="stable")
-    assert (np.diff(pixels.ravel()[order].astype(int)) >= 0).all()
+def test_a_frame_is_shown_from_black_to_white_at_every_size(tmp_path: Path) -> None:
+    """1 % of the pixels are black, 0.2 % white, those between in proportion."""
+    ramp = np.arange(1001, dtype=np.uint16).reshape(7, 143)
+    writer = write_run(tmp_path, 0, n_shots=1)
+    writer.write_shot(shot_of_frames(ramp[::-1], ramp))
+    address = f"{path_of(writer.run_dir)}/shots/0/frames/1.png"
+    client = client_of(tmp_path)
+    whole = client.get(f"{address}?width=143")
+    assert whole.headers["x-reduced"] == "1"
+    assert_allclose(decoded(whole.content), ((ramp - 10.0) * 255 / (998 - 10)).clip(0, 255), atol=1)
+    small = client.get(f"{address}?width=50")
+    means = np.array([[ramp[r : r + 3, c : c + 3].mean() for c in range(0, 141, 3)] for r in (0, 3)])
+    _, low, *_, high = np.sort(means.ravel())
+    assert small.headers["x-reduced"] == "3"
+    assert_allclose(decoded(small.content), ((means - low) * 255 / (high - low)).clip(0, 255), atol=1)
 
 
 def test_list_is_searched_by_name_status_and_comment(run_dir: Path, tmp_path: Path) -> None:

@@ -12,7 +12,15 @@ import numpy as np
 from labseq.errors import DeviceError
 from labseq.model import Frame
 from labseq.roles import Camera, Trigger, offers
-from labseq.testing.contracts.hardware import ALWAYS_SAFE, WORKS, Action, Factory, HardwareContract, Wait
+from labseq.testing.contracts.hardware import (
+    ALWAYS_SAFE,
+    WORKS,
+    Action,
+    Factory,
+    HardwareContract,
+    Wait,
+    n_calls,
+)
 from labseq.testing.contracts.promises import promise, refusal
 
 NUMBERED: Final = "frames are numbered from 0 in each series, and later ones have later time stamps"
@@ -219,6 +227,22 @@ class CameraContract(HardwareContract[Camera]):
                 getattr(camera, name)()
                 getattr(camera, name)()
                 refusal(DeviceError, f"trigger() after {name}()", camera.trigger)
+
+    @promise(
+        "after safe_state() no edge of its trigger line starts an exposure",
+        "let safe_state() end the acquisition",
+    )
+    def test_ignores_edges_after_safe_state(self, factory: Factory[Camera]) -> None:
+        """For a camera with the external trigger."""
+        with self.wired(factory, "image") as (camera, context, pulse):
+            if camera is None or "external" not in triggers_of(camera):
+                return
+            camera.arm(1, self.exposure_s, "external")
+            camera.safe_state()
+            before = n_calls(context)
+            pulse(self.exposure_s)
+            context.clock.sleep(self.exposure_s)
+            assert n_calls(context) == before, "an edge after safe_state() started an exposure"
 
 
 def triggers_of(camera: Camera) -> tuple[str, ...]:

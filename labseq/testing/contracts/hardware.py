@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 
 import pytest
 
-from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
-from labseq.model import SiteGrid
+from labseq.errors import ConfigError, DeviceError, DeviceTimeoutError, LimitError
+from labseq.model import LineSpec, SiteGrid
 from labseq.roles import Context, Hardware
 from labseq.testing.contracts.promises import (
     CallHungError,
@@ -116,9 +116,34 @@ class HardwareContract(Generic[D]):
         return {}
 
     @contextmanager
-    def made(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
-        """A new device, not opened, with its context; closed at the end in any case."""
+    def wired(
+        self, factory: Factory[D], kind: str
+    ) -> Generator[tuple[D | None, Context, Callable[[float], None]]]:
+        """A new device, opened, that a line triggers in steps of a kind.
+
+        Returns:
+            The device, None if it refuses the line; its context; and what makes a pulse of the line,
+            given its width in seconds.
+        """
         context = self.context()
+        simulation = RecordingSimulation(Calls(context.clock))
+        line = LineSpec("trigger", 0, frozenset({kind}), triggers=self.role)
+        context = replace(context, simulation=simulation, lines=(line,))
+
+        def pulse(width_s: float) -> None:
+            simulation.pulse(self.role, context.clock.now(), width_s)
+
+        with ExitStack() as stack:
+            try:
+                device, _ = stack.enter_context(self.opened(factory, context))
+            except ConfigError:
+                device = None
+            yield device, context, pulse
+
+    @contextmanager
+    def made(self, factory: Factory[D], context: Context | None = None) -> Generator[tuple[D, Context]]:
+        """A new device, not opened, with its context; closed at the end in any case."""
+        context = self.context() if context is None else context
         device = factory(context)
         try:
             yield device, context
@@ -126,9 +151,9 @@ class HardwareContract(Generic[D]):
             close_quietly(device)
 
     @contextmanager
-    def opened(self, factory: Factory[D]) -> Generator[tuple[D, Context]]:
+    def opened(self, factory: Factory[D], context: Context | None = None) -> Generator[tuple[D, Context]]:
         """A new device, opened, with its context; closed at the end."""
-        with self.made(factory) as (device, context):
+        with self.made(factory, context) as (device, context):
             if type(device) in _HANGING:
                 pytest.skip(f"cannot continue: promise: {WORKS}")
             if context.simulation is not None:

@@ -203,16 +203,25 @@ class LinesContract(HardwareContract[Lines]):
 
     @promise("each fire() needs its own arm()")
     def test_refuses_fire_without_arm(self, factory: Factory[Lines]) -> None:
-        """So that nothing is fired twice by mistake, or after safe_state()."""
+        """So that nothing is fired twice by mistake."""
         with self.opened(factory) as (lines, _):
             refusal(DeviceError, "arm() before compile()", lines.arm)
             lines.compile(self.program())
             refusal(DeviceError, "fire() before arm()", lines.fire)
             self.work(lines)
             refusal(DeviceError, "a second fire() after one arm()", lines.fire)
-            lines.arm()
-            lines.safe_state()
-            refusal(DeviceError, "fire() after safe_state()", lines.fire)
+
+    @promise(
+        "after safe_state() neither fire() nor arm() takes the program that was compiled",
+        "let safe_state() forget the program, so that only compile() makes the next one possible",
+    )
+    def test_drops_its_program(self, factory: Factory[Lines]) -> None:
+        """In every state."""
+        with self.each_state(factory) as states:
+            for state, lines, _ in states:
+                lines.safe_state()
+                refusal(DeviceError, f"fire() after safe_state() {state}", lines.fire)
+                refusal(DeviceError, f"arm() after safe_state() {state}", lines.arm)
 
     @promise("lines are off after open() and safe_state(), and those of `idle` on after idle()")
     def test_rests(self, factory: Factory[Lines]) -> None:

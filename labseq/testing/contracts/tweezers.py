@@ -279,12 +279,30 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
 
     @promise("play() without prepare() raises DeviceError")
     def test_refuses_play_without_prepare(self, factory: Factory[MobileTweezers]) -> None:
-        """Also after safe_state(), which drops the prepared program."""
+        """So that no program of an earlier shot is played by mistake."""
         with self.opened(factory) as (tweezers, _):
             refusal(DeviceError, "play() after open()", tweezers.play)
-            tweezers.prepare(self.program())
+
+    @promise(
+        "after safe_state() neither play() nor a trigger plays what was prepared",
+        "let safe_state() drop the prepared program, and disarm what waits for its trigger",
+    )
+    def test_drops_its_program(self, factory: Factory[MobileTweezers]) -> None:
+        """In every state; then with a trigger, for tweezers that a line can start."""
+        with self.each_state(factory) as states:
+            for state, tweezers, _ in states:
+                tweezers.safe_state()
+                refusal(DeviceError, f"play() after safe_state() {state}", tweezers.play)
+        with self.wired(factory, "rearrange") as (tweezers, context, pulse):
+            if tweezers is None or not (offers(tweezers, "waits_for_trigger") and tweezers.waits_for_trigger):
+                return
+            duration_s = tweezers.prepare(self.program())
+            tweezers.play()
             tweezers.safe_state()
-            refusal(DeviceError, "play() after safe_state()", tweezers.play)
+            before = n_calls(context)
+            pulse(1e-4)
+            context.clock.sleep(duration_s)
+            assert n_calls(context) == before, "a trigger after safe_state() started the program"
 
     @promise(
         "timings(), if there is one, gives the seconds that parts of the last prepare() took, without I/O"

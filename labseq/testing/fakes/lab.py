@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, TypeVar
 
@@ -127,6 +127,7 @@ class RecordingSimulation(Simulation):
     def __init__(self, calls: Calls | None = None, frame_shape: tuple[int, int] = (512, 512)) -> None:
         self.calls = Calls() if calls is None else calls
         self._frame_shape = frame_shape
+        self._wires: dict[str, Callable[[float, float], object]] = {}
 
     def open(self) -> None:
         """Record the call."""
@@ -147,6 +148,15 @@ class RecordingSimulation(Simulation):
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
         """Record the call."""
         self.calls.note("simulation", "play", role, signal, t_start_s)
+
+    def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
+        """Keep what a device does at a pulse, for :meth:`pulse`."""
+        self._wires[role] = on_pulse
+
+    def pulse(self, role: str, t_s: float, width_s: float) -> None:
+        """Make a pulse of the line that triggers a role; no effect if no device is wired to it."""
+        if role in self._wires:
+            self._wires[role](t_s, width_s)
 
     @property
     def sensor_shape(self) -> tuple[int, int]:

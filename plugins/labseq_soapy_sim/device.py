@@ -1,0 +1,387 @@
+"""A software-defined radio that keeps the samples it is sent: what a module of SoapySDR does for its radio.
+
+It has transmit channels only, plays from a buffer of finite length by a clock, and reports an underflow when
+that ran dry, and packets that were lost or late as the module for UHD does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+from filelock import Timeout
+from numpy.typing import NDArray
+
+from labseq_soapy_sim.ring import CHANNELS, HEADER, SAMPLES, Fault, create, radio_lock
+
+MTU: Final = 16384
+"""Most samples of one packet."""
+APART_S: Final = 5e-6
+"""By how much channel 1 starts after channel 0 without a timed start."""
+GAINS_DB: Final = (0.0, 60.0, 0.25)
+"""Lowest gain, highest, and step."""
+COMPONENTS_HZ: Final[Mapping[str, tuple[float, float]]] = {"RF": (1e6, 6e9), "BB": (-100e6, 100e6)}
+"""Range of the local oscillators, and of the shift of the samples away from them."""
+ANTENNAS: Final = ("TX/RX",)
+CLOCK_SOURCES: Final = ("internal", "external")
+TIMEOUT: Final = -1
+STREAM_ERROR: Final = -2
+CORRUPTION: Final = -3
+NOT_SUPPORTED: Final = -5
+TIME_ERROR: Final = -6
+UNDERFLOW: Final = -7
+HAS_TIME: Final = 1 << 2
+PAUSE_S: Final = 1e-3
+"""Between two looks at a state that another process may change."""
+
+
+class Clock(Protocol):
+    """What a radio needs of a clock; labseq's clocks have it."""
+
+    def now(self) -> float:
+        """Time in seconds."""
+        ...
+
+    def sleep(self, duration_s: float) -> None:
+        """Wait."""
+        ...
+
+
+class ComputerClock:
+    """The clock of this computer, which all its processes share."""
+
+    def now(self) -> float:
+        """Time in seconds."""
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        """Wait."""
+        time.sleep(duration_s)
+
+
+class Radio:
+    """One radio that is open.
+
+    Args:
+        arguments: Those of ``device: simulated,...`` and ``folder``; the package's README describes them.
+        clock: Clock by which it plays.
+
+    Raises:
+        RuntimeError: It is lost, or another process has it open. Methods raise this for what they refuse.
+    """
+
+    def __init__(self, arguments: Mapping[str, str], clock: Clock) -> None:
+        self._clock = clock
+        self._folder = Path(arguments.get("folder", "."))
+        self._unlocked = arguments.get("unlocked", "")
+        self._fault = arguments.get("fault", "")
+        self._number = {key: float(arguments.get(key, default)) for key, default in NUMBERS.items()}
+        self._shift_hz = [0.0] * CHANNELS
+        self._resources = ExitStack()
+        if self._fault == "absent" or _is_gone(self._folder):
+            raise RuntimeError("no such radio")
+        try:
+            self._resources.enter_context(radio_lock(self._folder).acquire(timeout=0.1))
+        except Timeout:
+            raise RuntimeError("the device is busy: another program has opened it") from None
+        self._header, self._ring = create(self._folder)
+        for name in ("speed", "patience", "leakage"):
+            self._header["patience_s" if name == "patience" else name] = self._number[name]
+        self._zero_s = clock.now()
+        self._channels: Sequence[int] = ()
+        self._records: list[Any] = []
+        self._is_dry = False  # an underflow was counted, and no samples came since
+        self._told = dict.fromkeys(REPORTED, 0)
+        self._n_record = int(self._number["record"])
+        self._trace_file: Any = None
+        if self._n_record:
+            self._trace_file = (self._folder / "trace").open("a", encoding="ascii", buffering=1)
+            self._resources.enter_context(self._trace_file)
+        self._trace("open")
+
+    def close(self) -> None:
+        """Switch the transmitters off; another process may open the radio then."""
+        self._header["is_active"] = 0
+        self._trace("close")
+        self._resources.close()
+
+    def check(self) -> None:
+        """Refuse every call once the radio was unplugged."""
+        if self._has(Fault.GONE):
+            raise RuntimeError("the radio does not answer: was it unplugged?")
+
+    @property
+    def n_channels(self) -> int:
+        """Number of channels that transmit."""
+        return int(self._number["channels"])
+
+    def check_channel(self, channel: int) -> None:
+        """Refuse a channel that it does not have."""
+        if not channel < self.n_channels:
+            raise RuntimeError(f"there is no channel {channel}")
+
+    def set_clock_source(self, source: str) -> None:
+        """Choose the reference of its clocks."""
+        if source not in CLOCK_SOURCES:
+            raise RuntimeError(f"there is no clock source {source}")
+
+    def set_antenna(self, _channel: int, name: str) -> None:
+        """Choose a connector."""
+        if name not in ANTENNAS:
+            raise RuntimeError(f"there is no antenna {name}")
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate of all channels."""
+        return float(self._header["rate_hz"])
+
+    @rate_hz.setter
+    def rate_hz(self, value: float) -> None:
+        if not value > 0.0:
+            raise RuntimeError("the sample rate is not above 0")
+        self._header["rate_hz"] = value
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Parts of the frequency, in the order in which SoapySDR sets them."""
+        return ("RF", "BB") if self._number["components"] > 1 else ("RF",)
+
+    def tune(self, channel: int, component: str, frequency_hz: float) -> None:
+        """Set a part of the frequency, as near as the radio can."""
+        lowest, highest = COMPONENTS_HZ[component]
+        if component == "RF":
+            frequency_hz += self._number["detune"]
+            self._header["oscillator_hz"][channel] = min(max(frequency_hz, lowest), highest)
+        else:
+            self._shift_hz[channel] = min(max(frequency_hz, lowest), highest)
+        self._header["frequency_hz"][channel] = (
+            self._header["oscillator_hz"][channel] + self._shift_hz[channel]
+        )
+
+    def tuned_hz(self, channel: int, component: str) -> float:
+        """A part of the frequency."""
+        return float(self._header["oscillator_hz"][channel] if component == "RF" else self._shift_hz[channel])
+
+    def sensors(self, channel: int | None) -> tuple[str, ...]:
+        """Sensors of a channel, or of the whole radio."""
+        return ("ref_locked",) if channel is None else ("lo_locked",)
+
+    def read_sensor(self, channel: int | None, name: str) -> str:
+        """Value of a sensor."""
+        if name not in self.sensors(channel):
+            raise RuntimeError(f"there is no sensor {name}")
+        return "false" if f"{self._unlocked}_locked" == name else "true"
+
+    @property
+    def has_time(self) -> bool:
+        """Whether it has a clock that can be read."""
+        return self._number["time"] > 0.0
+
+    @property
+    def time_ns(self) -> int:
+        """Its clock, which goes at the speed of the computer's."""
+        return int(1e9 * (self._clock.now() - self._zero_s))
+
+    def set_gain(self, channel: int, gain_db: float) -> None:
+        """Set the gain, as near as the radio can."""
+        lowest, highest, step = GAINS_DB
+        self._header["gain_db"][channel] = min(max(round(gain_db / step) * step, lowest), highest)
+        self._trace("gain", channel, self.gain_db(channel))
+
+    def gain_db(self, channel: int) -> float:
+        """Gain of a channel."""
+        return float(self._header["gain_db"][channel])
+
+    def set_up_stream(self, channels: Sequence[int]) -> None:
+        """Prepare for samples to these channels."""
+        for channel in channels:
+            self.check_channel(channel)
+        self._channels = channels
+        if coerced_hz := self._number["coerce_rate"]:  # as its clock is set for this number of channels
+            self._header["rate_hz"] = coerced_hz
+        if self._n_record:
+            self._records = [
+                self._resources.enter_context((self._folder / f"channel{channel}").open("wb", buffering=0))
+                for channel in channels
+            ]
+
+    def activate(self) -> int:
+        """Switch the transmitters on; returns a code of SoapySDR."""
+        if self._fault == "inactive":
+            return STREAM_ERROR
+        self._header["sent"] = 0
+        self._header["t0_s"] = self._clock.now()
+        self._header["is_active"] = 1
+        return 0
+
+    def deactivate(self) -> int:
+        """Switch the transmitters off; returns a code of SoapySDR."""
+        self._header["is_active"] = 0
+        self._trace("stop")
+        return 0
+
+    def write(self, rows: Sequence[NDArray[np.uint64]], start_ns: int | None, timeout_s: float) -> int:
+        """Take samples, after ``timeout_s`` at most; returns how many, or a code of SoapySDR."""
+        while self._has(Fault.HANG):
+            self._clock.sleep(0.1)
+        if not self._header["is_active"] or self._has(Fault.STREAM_ERROR):
+            return STREAM_ERROR
+        if start_ns is not None and self._number["time"] > 1.0:
+            return NOT_SUPPORTED
+        if self._header["sent"] == 0:
+            self._start(start_ns)
+        n = min(len(rows[0]), MTU, max(1, int(self._buffer)))
+        n = self._wait_for_room(n, timeout_s)
+        if n == 0:
+            return TIMEOUT
+        for fault, count in ((Fault.LOST_PACKET, "sequence_errors"), (Fault.LATE_PACKET, "late_packets")):
+            if self._drops(fault, count):
+                return n
+        self._keep([row[:n] for row in rows], n)
+        return n
+
+    def read_status(self, timeout_s: float) -> int:
+        """Report an event of the stream, after ``timeout_s`` at most, as a code of SoapySDR."""
+        deadline_s = self._clock.now() + timeout_s
+        while True:
+            self._notice_underflow()
+            for name, code in REPORTED.items():
+                if self._told[name] != self._header[name]:
+                    self._told[name] += 1
+                    return code
+            if self._clock.now() >= deadline_s:
+                return TIMEOUT
+            self._clock.sleep(PAUSE_S)
+
+    def _has(self, fault: Fault) -> bool:
+        return bool(int(self._header["fault"]) & fault)
+
+    def _trace(self, name: str, first: float = 0.0, second: float = 0.0) -> None:
+        if self._trace_file is not None:
+            self._trace_file.write(f"{self._clock.now():.6f} {name} {first:.6f} {second:.6f}\n")
+
+    @property
+    def _buffer(self) -> float:
+        """Length of its buffer in samples."""
+        return self._number["buffer"] * self.rate_hz
+
+    @property
+    def _speed_hz(self) -> float:
+        return self.rate_hz * self._number["speed"]
+
+    def _start(self, start_ns: int | None) -> None:
+        """The channels start together at a time that is not over; otherwise each with its first packet."""
+        now_s, header = self._clock.now(), self._header
+        start_s = None if start_ns is None else self._zero_s + 1e-9 * start_ns
+        if start_s is not None and start_s <= now_s + self._number["delay"]:
+            header["late_packets"] += 1
+            start_s = None
+        header["t0_s"] = now_s if start_s is None else start_s
+        header["start_s"] = header["t0_s"] + (0.0 if start_s else np.arange(CHANNELS) * APART_S)
+        self._trace("play", header["t0_s"], self._speed_hz)
+
+    def _drops(self, fault: Fault, count: str) -> bool:
+        """Whether a packet is lost: what follows is played earlier, and the phases of all tones jump."""
+        if not self._has(fault):
+            return False
+        self._clear(fault)
+        self._header[count] += 1
+        return True
+
+    def _clear(self, fault: Fault) -> None:
+        self._header["fault"] = int(self._header["fault"]) & ~int(fault)
+
+    def _late_s(self) -> float:
+        """How long its buffer has been empty; negative: how long its samples will last."""
+        return self._clock.now() - float(self._header["t0_s"]) - int(self._header["sent"]) / self._speed_hz
+
+    def _notice_underflow(self) -> None:
+        """Count an underflow, once until more samples come."""
+        is_forced = self._has(Fault.UNDERFLOW)
+        if not self._header["is_active"] or not self._header["sent"] or self._is_dry:
+            return
+        if is_forced or self._late_s() > self._number["patience"]:
+            self._header["underflows"] += 1
+            self._is_dry = True
+            self._clear(Fault.UNDERFLOW)
+
+    def _buffered(self) -> float:
+        """Samples in its buffer; an underflow, or a wait for late samples, sets its clock back."""
+        header, sent = self._header, int(self._header["sent"])
+        self._notice_underflow()
+        late_s = self._late_s()
+        if sent and (self._is_dry or late_s > 0.0):
+            late_s = 0.0
+            header["t0_s"] = self._clock.now() - sent / self._speed_hz
+            self._trace("play", header["t0_s"], self._speed_hz)
+        return min(sent, -late_s * self._speed_hz)
+
+    def _wait_for_room(self, n: int, timeout_s: float) -> int:
+        """How many of n samples the buffer takes; waits for all of them as long as it may."""
+        deadline_s = self._clock.now() + timeout_s
+        while True:
+            is_stalled = self._has(Fault.STALL)
+            free = 0.0 if is_stalled else self._buffer - self._buffered()
+            left_s = deadline_s - self._clock.now()
+            if free >= n:
+                return n
+            if left_s <= 0.0:
+                return int(free)
+            wait_s = PAUSE_S if is_stalled else max(1.0, n - free) / self._speed_hz
+            self._clock.sleep(min(wait_s, left_s, 0.05))
+
+    def _keep(self, rows: Sequence[NDArray[np.uint64]], n: int) -> None:
+        header = self._header
+        sent = int(header["sent"])
+        first = sent % SAMPLES
+        head = min(n, SAMPLES - first)
+        for channel, row in zip(self._channels, rows, strict=True):
+            is_mute = channel < CHANNELS and self._has((Fault.MUTE_0, Fault.MUTE_1)[channel])
+            kept = np.zeros_like(row) if is_mute else row
+            self._ring[channel, first : first + head] = kept[:head]
+            self._ring[channel, : n - head] = kept[head:]
+        for record, row in zip(self._records, rows, strict=False):
+            if sent < self._n_record:
+                record.write(row[: self._n_record - sent].tobytes())
+        silent = int(header["silent"])
+        if any(row.any() for row in rows):
+            header["silence"], silent = silent or header["silence"], 0
+        else:
+            silent += n
+        header["silent"] = silent
+        self._is_dry = False
+        header["sent"] = sent + n
+
+
+REPORTED: Final[Mapping[str, int]] = {
+    "underflows": UNDERFLOW,
+    "sequence_errors": CORRUPTION,
+    "late_packets": TIME_ERROR,
+}
+"""Count in the header -> code with which SoapySDR reports it."""
+NUMBERS: Final[Mapping[str, float]] = {
+    "channels": 2,
+    "buffer": 0.05,
+    "speed": 1.0,
+    "patience": 0.0,
+    "record": 0,
+    "coerce_rate": 0.0,
+    "leakage": 0.0,
+    "time": 1,
+    "delay": 0.0,
+    "components": 2,
+    "detune": 0.0,
+}
+"""Arguments that are numbers, and what they are without one."""
+
+
+def _is_gone(folder: Path) -> bool:
+    """Whether the radio of this folder was unplugged."""
+    path = folder / "ring"
+    if not path.exists() or path.stat().st_size < HEADER.itemsize:
+        return False
+    return bool(int(np.fromfile(path, HEADER, 1)["fault"][0]) & Fault.GONE)

@@ -1,0 +1,140 @@
+"""The simulated library and the real libSoapySDR do the same for the driver, with the same radio."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_soapy_sim import SimulatedLibrary, installed, read_trace
+from labseq_soapy_stream import soapysdr
+from labseq_soapy_stream.messages import Setup
+from labseq_soapy_stream.soapysdr import SoapyError, open_radio, read_back, set_up
+
+from .labseq_soapy_rig import opened, recorded
+
+PACKET = 16384
+"""Most samples that the radio takes at once."""
+
+pytestmark = pytest.mark.needs("soapy-module")
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the SoapySDR module, compiled."""
+    folder = tmp_path_factory.mktemp("module")
+    source = Path(__file__).with_name("labseq_soapy_module.cpp")
+    command = ["g++", "-std=c++14", "-shared", "-fPIC", "-o", str(folder / "libcapture.so"), str(source)]
+    subprocess.run([*command, "-lSoapySDR"], check=True)
+    return folder
+
+
+def attempt(call: Callable[[], object]) -> object:
+    """What a call gives, or the text of its error."""
+    try:
+        return call()
+    except SoapyError as error:
+        return str(error)
+
+
+def use(folder: Path, arguments: str, **settings: Any) -> list[object]:
+    """All that the driver learns of a radio from opening to closing it, with an underflow in between."""
+    values: dict[str, Any] = {
+        "device": f"driver=capture,record=100000000,buffer=0.2,{arguments},folder=.",
+        "stream": "WIRE=sc16, size = 3",
+        "channels": (1, 0),
+        "rate_hz": 1.2e6,
+        "oscillator_hz": 100e6,
+        "lo_offset_hz": 0.0,
+        "bandwidth_hz": 1e6,
+        "gain_db": (12.1, None),
+        "antenna": "TX/RX",
+        "clock_source": "external",
+    }
+    setup = Setup(**(values | settings), ramp_s=0.0, max_wait_s=1.0, hold=False, marker="")
+    results: list[object] = []
+    try:
+        radio = open_radio(setup)
+    except SoapyError as error:
+        return [str(error)]
+    results += [radio.n_channels, radio.gain_range(0), attempt(lambda: radio.gain_range(7))]
+    results.append(attempt(lambda: radio.get("SampleRate", 7)))
+    try:
+        stream = set_up(radio, setup)
+    except SoapyError as error:
+        radio.close()
+        return [*results, str(error)]
+    block = np.arange(2 * 2 * 20_000, dtype=np.float32).reshape(2, -1)
+    results += [
+        read_back(radio, setup),
+        attempt(lambda: stream.write(block, 0, 0.0)),
+        attempt(stream.activate),
+    ]
+    first = attempt(lambda: stream.write(block, 0, 0.0))
+    results.append(first)
+    if isinstance(first, int):
+        stream.check_start()
+        results += [stream.starts_together, stream.write(block, 19_000, 0.0)]
+        while stream.write(block, 0, 0.0) == PACKET:
+            pass
+        results += [{*stream.errors(20.0)}, stream.errors(), stream.write(block, 0, 0.0) > 0]
+    stream.close()
+    radio.close()
+    trace = [(name, *gain) for _, name, *gain in read_trace(folder) if name != "play"]
+    return [*results, trace, recorded(folder, 1)[:17_000].tolist(), attempt(radio.close)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "settings"),
+    [
+        ("", {}),
+        ("detune=30000", {"lo_offset_hz": 200e3}),
+        ("components=1,time=0,unlocked=lo", {"lo_offset_hz": 200e3}),
+        ("time=2", {"oscillator_hz": 7e9}),
+        ("delay=0.6", {}),
+        ("fault=inactive", {}),
+        ("fault=absent", {}),
+        ("channels=1", {}),
+        ("", {"gain_db": (61.0, None)}),
+        ("", {"antenna": "none"}),
+        ("", {"clock_source": "none"}),
+        ("driver=none", {}),
+    ],
+)
+def test_the_driver_learns_the_same_of_a_radio(
+    tmp_path: Path, module: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, settings: dict[str, Any]
+) -> None:
+    monkeypatch.setenv("SOAPY_SDR_PLUGIN_PATH", str(module))
+    monkeypatch.setattr(soapysdr, "START_S", 0.5)  # of notice, also on a busy computer
+    learned: list[list[object]] = []
+    for library in (installed(SimulatedLibrary()), nullcontext()):
+        folder = tmp_path / str(len(learned))
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        soapysdr.library.cache_clear()
+        with library:
+            learned.append(use(folder, arguments, **settings))
+    assert learned[0] == learned[1]
+
+
+def test_a_run_of_the_driver_sends_the_same_samples(
+    tmp_path: Path, module: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOAPY_SDR_PLUGIN_PATH", str(module))
+    seen: list[Any] = []
+    for device in ("simulated,speed=1,patience=0", "driver=capture"):
+        folder = tmp_path / str(len(seen))
+        folder.mkdir()
+        with opened(device=f"{device},buffer=0.2,record=100000000,folder={folder}", row_gain=12.1) as rig:
+            rig.tweezers.start()
+            rig.tweezers.ramp(0.5, 0.01)
+            described = {**rig.tweezers.describe(), "device": "", "notes": "", "no_real_time": ""}
+        names = [name for _, name, *_ in read_trace(folder) if name != "play"]
+        samples = recorded(folder)
+        first = int(np.flatnonzero(samples)[0])
+        seen.append((described, names, samples[first : first + 30_000].tolist()))
+    assert seen[0] == seen[1]
