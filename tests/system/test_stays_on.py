@@ -101,8 +101,5 @@ def test_connections_without_a_key_keep_neither_a_server_nor_its_devices_from_th
             n_before = lab.n_shots
             until(lambda: lab.n_shots > n_before + 5 or run.poll() is not None)
             assert run.poll() is None, lab.output
-            assert lab.interrupt(run) == 130, lab.output
-            assert not lab.is_on
-        with lab.run("--profile", "far.yaml"), lab.strangers(1000):
             assert lab.interrupt(server) == 0, lab.output
             until(lambda: not lab.is_on)
