@@ -96,10 +96,13 @@ def test_connections_without_a_key_keep_neither_a_server_nor_its_devices_from_th
     lab: Lamps, tmp_path: Path
 ) -> None:
     lab.make_keys(tmp_path)
-    with lab.served(keys=True, n_files=300) as server, lab.run("--profile", "far.yaml") as run:
-        with lab.strangers(1000):
-            n_before = lab.n_shots
-            until(lambda: lab.n_shots > n_before + 5 or run.poll() is not None)
-            assert run.poll() is None, lab.output
-            assert lab.interrupt(server) == 0, lab.output
-            until(lambda: not lab.is_on)
+    with (
+        lab.served(keys=True, n_files=300) as server,
+        lab.run("--profile", "far.yaml") as run,
+        lab.strangers(1000),
+    ):
+        n_before = lab.n_shots
+        until(lambda: lab.n_shots > n_before + 5 or run.poll() is not None)
+        assert run.poll() is None, lab.output
+        assert lab.interrupt(server) == 0, lab.output
+        until(lambda: not lab.is_on)
