@@ -31,6 +31,7 @@ from labseq.errors import (
     StopRequested,
 )
 from labseq.messages import error_text, format_error
+from labseq.processes import Pulse
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -50,17 +51,24 @@ class StopFlag:
 
     While it is held (the devices are being made safe) waits do not raise, so that a driver can ramp down
     undisturbed.
+
+    Attributes:
+        signal_number: The signal that the run reports.
+        pulse: Progress of the thread that takes the shots, which beats here whenever it waits.
     """
 
     def __init__(self) -> None:
         self._event = threading.Event()
         self._n_holds = 0
+        self._n_requests = 0
         self.signal_number = 2
+        self.pulse = Pulse()
 
     def request(self, signal_number: int = 2) -> None:
         """Ask the run to stop; safe to call from a signal handler."""
         if not self._event.is_set():
             self.signal_number = signal_number
+        self._n_requests += 1
         self._event.set()
 
     @contextmanager
@@ -77,8 +85,14 @@ class StopFlag:
         """Whether the run was asked to stop, even if held."""
         return self._event.is_set()
 
+    @property
+    def is_urgent(self) -> bool:
+        """Whether it was asked twice: what is not about devices is not waited for."""
+        return self._n_requests > 1
+
     def check(self) -> None:
         """Raise ``StopRequested`` if the run was asked to stop."""
+        self.pulse.beat()
         if self._event.is_set() and not self._n_holds:
             raise StopRequested(self.signal_number)
 
@@ -87,6 +101,7 @@ class StopFlag:
         deadline_s = time.monotonic() + duration_s
         self.check()
         while (left_s := deadline_s - time.monotonic()) > 0:
+            self.pulse.beat()
             if self._n_holds:
                 time.sleep(min(left_s, POLL_S))
             elif self._event.wait(min(left_s, POLL_S)):
@@ -326,6 +341,21 @@ class Guard:
 
         return call.done, result
 
+    def begin_unless_urgent(self, owner: str, timeout_s: float, work: partial[T]) -> Callable[[], T]:
+        """Begin a call that a second request to stop abandons, such as one of the disk.
+
+        Returns:
+            What waits for its end, as :meth:`call_despite_stop` does.
+        """
+        limit, call = _limit(owner, timeout_s, work), GuardedCall(work)
+        is_out = self._submit(owner, call)
+
+        def result() -> T:
+            ended = self._wait(call, limit.deadline_s, math.inf, is_patient=False) if is_out else call
+            return self._result(limit, ended)
+
+        return result
+
     def check(self) -> None:
         """Raise ``StopRequested`` if the run was asked to stop, or if the calling shot was abandoned."""
         if self._stop.is_set or self.is_abandoned:
@@ -349,15 +379,15 @@ class Guard:
         self._named("step", math.inf, SHOT_GRACE_S, work, has_steps=True)
 
     @contextmanager
-    def step(self, what: str, timeout_s: float) -> Generator[None]:
-        """A step, within :meth:`run_shot`; ``what`` names it.
+    def step(self, what: str, timeout_s: float, owner: str = "step") -> Generator[None]:
+        """A step, within :meth:`run_shot`, or another part of a call; ``what`` names it.
 
         Raises:
             StopRequested: The shot was abandoned meanwhile.
         """
         call = current_call()
         assert call is not None
-        call.enter(Limit("step", what, timeout_s, time.monotonic() + timeout_s))
+        call.enter(Limit(owner, what, timeout_s, time.monotonic() + timeout_s))
         try:
             yield
         finally:
@@ -405,10 +435,16 @@ class Guard:
         worker.submit(call)
         return True
 
-    def _wait(self, call: GuardedCall, deadline_s: float, grace_s: float) -> GuardedCall | None:
+    def _wait(
+        self, call: GuardedCall, deadline_s: float, grace_s: float, *, is_patient: bool = True
+    ) -> GuardedCall | None:
         """Wait for the end of a call; see :meth:`run`."""
         try:
+            self._stop.pulse.beat()
             while not call.done.wait(min(POLL_S, max(0.0, deadline_s - time.monotonic()))):
+                self._stop.pulse.beat()
+                if not is_patient and self._stop.is_urgent:
+                    raise StopRequested(self._stop.signal_number)
                 if grace_s < math.inf and self._stop.is_set:
                     call.done.wait(grace_s)
                     if not call.done.is_set():

@@ -8,6 +8,7 @@ import os
 import platform
 import signal
 import sys
+import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -120,7 +121,8 @@ def _start_since_boot(pid: int) -> float | None:
     """The same on Linux, by proc(5), whose times do not follow the clock."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
-        return None if fields[0] in "ZXx" else int(fields[19]) / os.sysconf("SC_CLK_TCK")
+        has_ended = fields[0] in "ZXx" and int(fields[17]) <= 1  # other threads still hold its files
+        return None if has_ended else int(fields[19]) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError):
         try:
             os.kill(pid, 0)
@@ -168,6 +170,38 @@ class Holder:
             return "an unknown process"
         process = f"process {self.process.pid} on {self.process.host}"
         return f"{self.what} ({process}, since {_local(self.since_utc)})"
+
+
+class Pulse:
+    """Progress of one thread, for the heartbeat that another thread sends.
+
+    The thread beats wherever it waits, whatever it waits for; what it does between two waits is short.
+    """
+
+    def __init__(self) -> None:
+        self._n = self._n_before = 0
+        self._silent_s = 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Follow the calling thread from now on."""
+        self._thread = threading.get_ident()
+        self._n += 1
+
+    def beat(self) -> None:
+        """Note progress; calls from other threads are none of this one."""
+        if threading.get_ident() == self._thread:
+            self._n += 1
+
+    def silent_s(self, passed_s: float) -> float:
+        """For how long there was no progress.
+
+        Args:
+            passed_s: Time since the last question, as far as it counts.
+        """
+        self._silent_s = self._silent_s + passed_s if self._n == self._n_before else 0.0
+        self._n_before = self._n
+        return self._silent_s
 
 
 class Lock:

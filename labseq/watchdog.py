@@ -3,7 +3,8 @@
 A run starts it before it opens its devices, passes on how each is switched off (``Emergency``), and sends a
 heartbeat. The watchdog needs the standard library alone: it must start fast, stay small, and work when
 nothing else does. Messages are lines of JSON on its standard input; an empty line is a heartbeat; the end
-of the input without ``end`` is the death of the run.
+of the input without ``end`` is the death of the run. It answers in the same way on its standard output, so
+that the run notices when the watchdog dies or stands still, and starts another one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import json
 import os
 import queue
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -22,7 +22,12 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    import subprocess
+
+    from labseq.processes import Pulse
 
 WATCHDOG_LOG: Final = "watchdog.jsonl"
 """Name of its log in the folder of a run."""
@@ -32,6 +37,8 @@ HUNG_S: Final = 0.6
 """A run without a heartbeat for so long hangs; no call of a run holds the interpreter nearly as long."""
 WAITS_S: Final = 10.0
 """The same while a thread waits for a disk, for memory that was swapped out, or for the processor."""
+STUCK_S: Final = 10.0
+"""A run whose thread that takes the shots has neither waited nor got on for so long counts as dead."""
 TERM_S: Final = 0.1
 """How long a run that hangs may take to end after SIGTERM; then comes SIGKILL."""
 NEXT_S: Final = 0.05
@@ -40,8 +47,12 @@ TRY_AGAIN_S: Final = 5.0
 """How long switching off is tried again if it fails: a dying process may hold the device a little longer."""
 HANGS_S: Final = 1.0
 """How long after that it counts as hanging."""
-ANSWER_S: Final = 5.0
-"""How long a run waits for an answer of the watchdog."""
+ANSWER_S: Final = 10.0
+"""How long a run waits for an answer of the watchdog, which may have to load a vendor's library."""
+SILENT_S: Final = 0.4
+"""A watchdog without a sign of life for so long is replaced."""
+STARTS: Final = 3
+"""Number of watchdogs in a row that do not come to life, after which the run ends."""
 END_S: Final = 1.0
 """How long a run waits for the end of a watchdog that has nothing left to do."""
 MAX_TEXT: Final = 500
@@ -115,7 +126,7 @@ class _Process:
     def watch(self) -> None:
         """Watch until the run ends, dies or hangs."""
         threading.Thread(target=self._read, daemon=True).start()
-        looked_s = time.monotonic()
+        looked_s = told_s = time.monotonic()
         while True:
             try:
                 line = self._lines.get(timeout=BEAT_S)
@@ -123,6 +134,9 @@ class _Process:
                 line = b""
             else:
                 self._beat_s = time.monotonic()
+            if time.monotonic() - told_s > 1.5 * BEAT_S:
+                told_s = time.monotonic()
+                self._tell(b"\n")
             if line is None or self._is_orphan():
                 return self._switch_off("died", time.monotonic())
             if line.strip() and not self._obey(json.loads(line)):
@@ -161,14 +175,21 @@ class _Process:
                 self._answer("")
         elif "forget" in order:
             self._devices.pop(order["forget"], None)
+        elif "stuck" in order:
+            self._end_run()
+            self._switch_off(f"made no progress for {order['stuck']:.0f} s", time.monotonic())
+            return False
         else:  # the end; devices that are left could not be made safe
             self._switch_off("could not make its devices safe", time.monotonic())
             return False
         return True
 
     def _answer(self, failure: str) -> None:
+        self._tell(json.dumps({"failure": failure}).encode() + b"\n")
+
+    def _tell(self, line: bytes) -> None:
         with suppress(OSError):
-            os.write(1, json.dumps({"failure": failure}).encode() + b"\n")
+            os.write(1, line)
 
     def _end_run(self) -> None:
         """End a run that hangs, so that its ports and cards are free."""
@@ -287,23 +308,40 @@ def watchdog_lines(run_dir: Path) -> list[str]:
 class Watchdog:
     """The run's side: starts the watchdog, reports the devices to it, and sends the heartbeat.
 
-    A watchdog that dies is started again. Nothing here raises: a run without a watchdog is a run
-    with a warning.
+    A watchdog that dies, or stands still, is replaced, as often as needed. If that is not possible, ``lost``
+    is called; where it cannot be started at all, there is a warning. Nothing here raises.
 
     Args:
         what: What the watchdog calls the run in its messages.
         log: File to which it adds a line for each device that it switches off; None for none.
+        pulse: Progress of the thread that adds the first device; without any, the run counts as dead to the
+            watchdog. None if there is no such thread.
+        lost: Receives why there is no watchdog any more; it has the run end.
     """
 
-    def __init__(self, what: str = "the run", log: Path | None = None) -> None:
+    def __init__(
+        self,
+        what: str = "the run",
+        log: Path | None = None,
+        pulse: Pulse | None = None,
+        lost: Callable[[str], object] = str,
+    ) -> None:
+        from labseq.processes import Pulse  # not in the watchdog itself
+
         self._about = {"run": what, "log": None if log is None else str(log.absolute()), "path": sys.path}
         self._devices: dict[str, dict[str, Any]] = {}
         self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
+        self._is_silent: Callable[[float], bool] = lambda _: False
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._sending = threading.RLock()
         self._ended = threading.Event()
         self._is_started = False
+        self._pulse = pulse
+        self._lost = lost
+        self._heard = Pulse()
+        self._wake = threading.Event()
+        self._n_awaited = 0
 
     def add(self, name: str, order: int, script: Path, arguments: object) -> None:
         """Have it switch a device off after the death of this process; the first one starts it.
@@ -316,8 +354,10 @@ class Watchdog:
         """
         if not self._is_started:
             self._is_started = True
-            self._launch()
-            threading.Thread(target=self._beat, name="labseq heartbeat", daemon=True).start()
+            if self._pulse is not None:
+                self._pulse.begin()
+            if self._launch():
+                threading.Thread(target=self._beat, name="labseq heartbeat", daemon=True).start()
         device = {"device": name, "order": order, "script": str(script), "arguments": arguments}
         with self._sending:
             self._devices[name] = device
@@ -333,18 +373,23 @@ class Watchdog:
     def end(self) -> None:
         """End it; it then switches off the devices that it was not asked to forget. Legal at any time."""
         self._ended.set()
+        self._wake.set()
         with self._sending:
+            if self._devices and self._process is not None and not self._send({"end": True}):
+                self._launch()  # it died just now, and is needed
+                self._send({"end": True})
             process, self._process = self._process, None
             if process is not None and process.stdin is not None:
-                with suppress(OSError, ValueError):
-                    process.stdin.write(b'{"end": true}\n')
                 with suppress(OSError, ValueError):
                     process.stdin.close()
                 if self._devices:  # it is at work, and needs the ports that this process still holds
                     process.returncode = 0  # nothing waits for it
-                else:
-                    with suppress(subprocess.TimeoutExpired):
-                        process.wait(END_S)
+                    return
+                try:
+                    process.wait(END_S)
+                except Exception:  # noqa: BLE001 - it stands still
+                    process.kill()
+                    process.wait()
 
     def notes(self) -> list[str]:
         """What went wrong since the last call, for the user."""
@@ -354,12 +399,15 @@ class Watchdog:
                 notes.append(self._notes.get_nowait())
         return notes
 
-    def _launch(self) -> None:
-        """Start the process, and send it the devices that are open."""
+    def _launch(self) -> bool:
+        """Start the process, and send it the devices that are open; returns whether it answers."""
+        import subprocess
+
         flags = getattr(subprocess, "CREATE_NO_WINDOW", 0) | getattr(
             subprocess, "CREATE_NEW_PROCESS_GROUP", 0
         )
         self._answers = queue.SimpleQueue()
+        self._wake.clear()
         try:
             self._process = subprocess.Popen(  # noqa: S603 - this file, no shell
                 [sys.executable, "-I", "-S", __file__],
@@ -369,33 +417,60 @@ class Watchdog:
                 start_new_session=True,  # Ctrl-C and a lost terminal are not for it
                 creationflags=flags,
             )
-        except OSError as error:
-            self._note(f"cannot be started: {error.strerror or error}")
-            return
-        threading.Thread(target=self._hear, args=[self._process.stdout, self._answers], daemon=True).start()
-        for message in (self._about, *self._devices.values()):
-            self._tell(message)
+            threading.Thread(target=self._hear, args=[self._process, self._answers], daemon=True).start()
+        except (OSError, RuntimeError, MemoryError) as error:
+            self._note(f"cannot be started: {getattr(error, 'strerror', None) or error}")
+            return False
+        self._is_silent = Hanging(self._process.pid, SILENT_S)
+        answered = [self._tell(message) for message in (self._about, *self._devices.values())]
+        return all(answered)
 
-    def _hear(self, answers: IO[bytes], into: queue.SimpleQueue[bytes]) -> None:
-        with answers, suppress(OSError, ValueError):
-            for line in answers:
-                into.put(line)
+    def _hear(self, process: subprocess.Popen[bytes], into: queue.SimpleQueue[bytes]) -> None:
+        """Receive answers, and signs of life, from one process until it ends."""
+        assert process.stdout is not None
+        self._heard.begin()
+        with process.stdout, suppress(OSError, ValueError):
+            for line in process.stdout:
+                self._heard.beat()
+                if line.strip():
+                    into.put(line)
         into.put(b"")
+        with self._sending:
+            if process is self._process:  # else it was replaced
+                self._wake.set()
 
-    def _tell(self, message: dict[str, Any]) -> None:
-        """Send a message that is answered, and note the failure that the answer names."""
+    def _tell(self, message: dict[str, Any]) -> bool:
+        """Send a message that is answered, and note the failure that it names; False without answer."""
+        self._n_awaited += 1
+        answer = b""
         try:
             if not self._send(message):
-                return
-            answer = self._answers.get(timeout=ANSWER_S)
+                return False
+            answer = self._await_answer()
             failure = json.loads(answer)["failure"] if answer else "it ended"
         except queue.Empty:
             failure = "it does not answer"
         except (TypeError, ValueError) as error:
             failure = _format_error(error)
+        finally:
+            self._n_awaited -= 1
         if failure:
             name = message.get("device")
             self._note(f"cannot switch off '{name}': {failure}" if name else failure)
+        return answer != b""
+
+    def _await_answer(self) -> bytes:
+        """Wait for an answer, unless the process was stopped."""
+        answers, process, deadline_s = self._answers, self._process, time.monotonic() + ANSWER_S
+        while True:
+            if self._pulse is not None:
+                self._pulse.beat()  # it may be the thread that takes the shots that waits here
+            try:
+                return answers.get(timeout=BEAT_S)
+            except queue.Empty:
+                is_stopped = process is not None and "T" in _threads(process.pid)[0]
+                if is_stopped or time.monotonic() > deadline_s:
+                    raise
 
     def _send(self, message: dict[str, Any] | None) -> bool:
         """Send a message, or a heartbeat; returns whether it could be sent."""
@@ -407,19 +482,51 @@ class Watchdog:
         return False
 
     def _beat(self) -> None:
-        """Send heartbeats; start the watchdog again if it is gone."""
-        n_starts = 1
-        while not self._ended.wait(BEAT_S):
-            if self._send(None) or self._ended.is_set():
+        """Send heartbeats; have the run ended if it makes no progress; replace a watchdog that is gone.
+
+        While this thread does not run either, the computer stands still: of that time little counts.
+        """
+        n_failed, looked_s = 0, time.monotonic()
+        while not self._ended.is_set():
+            has_ended = self._wake.wait(BEAT_S)
+            now_s = time.monotonic()
+            passed_s, looked_s = min(now_s - looked_s, 2 * BEAT_S), now_s
+            self._check_progress(passed_s)
+            silent_s = self._heard.silent_s(passed_s)
+            limit_s = ANSWER_S if self._n_awaited else 0.0
+            is_silent = self._is_silent(silent_s) and silent_s > limit_s
+            if self._send(None) and not has_ended and not is_silent:
                 continue
-            if n_starts == 3:
-                self._note("has ended three times and is not started again")
+            if self._replace("does not answer" if is_silent else "has ended"):
+                n_failed = 0
+            elif (n_failed := n_failed + 1) == STARTS:
+                self._note("cannot be started again; the run ends")
+                with self._sending:
+                    self._kill()  # without a heartbeat it would end the run before the devices are safe
+                self._lost("there is no watchdog any more that would switch the outputs off")
                 return
-            n_starts += 1
-            self._note("has ended, and is started again")
-            with self._sending:
-                if not self._ended.is_set():
-                    self._launch()
+
+    def _replace(self, why: str) -> bool:
+        """Start another watchdog in place of one that is gone; returns whether it answers."""
+        with self._sending:
+            if self._ended.is_set():
+                return True
+            self._note(f"{why}, and is started again")
+            self._kill()
+            return self._launch()
+
+    def _kill(self) -> None:
+        """Kill the process, if there is one."""
+        if self._process is not None:
+            with suppress(OSError):
+                self._process.kill()
+            self._process.wait()
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+
+    def _check_progress(self, passed_s: float) -> None:
+        if self._pulse is not None and (silent_s := self._pulse.silent_s(passed_s)) > STUCK_S:
+            self._send({"stuck": silent_s})
 
     def _note(self, text: str) -> None:
         self._notes.put(f"the watchdog that switches the outputs off if labseq dies {text}")

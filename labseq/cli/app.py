@@ -441,8 +441,13 @@ def plugins(
 def safe(
     profile: ProfileArgument,
     end: Annotated[
-        bool, typer.Option("--end", help="First end any process that uses the devices, even if it answers.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--end/--no-end",
+            help="First end a process that uses the devices. Default: ask in a terminal, else end it.",
+            show_default=False,
+        ),
+    ] = None,
     wait: Annotated[
         bool,
         typer.Option(

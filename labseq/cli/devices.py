@@ -117,19 +117,37 @@ def _as_values(report: DevicesReport) -> dict[str, Any]:
     return {"devices": devices, "warnings": report.warnings, "problems": []}
 
 
-def secure_profile(profile: str, overrides: Sequence[str], *, end: bool = False) -> int:
+def secure_profile(profile: str, overrides: Sequence[str], *, end: bool | None = None) -> int:
     """Make a profile's devices safe; print a line for each.
+
+    Args:
+        end: Whether to end a process that uses them first; None to ask in a terminal, and else to end it.
 
     Returns:
         The exit code: 0 if every device is safe and the profile has no error, 3 if a device
         failed, else 2.
     """
-    secured = make_profile_safe(profile, overrides, _Lines(), end=end)
+
+    def may_end(text: str) -> bool:
+        return _asks_to_end(text) if end is None else end
+
+    secured = make_profile_safe(profile, overrides, _Lines(), may_end=may_end)
     if secured.problems is not None:
         report(secured.problems)
     if any(secured.attempted.values()):
         return DeviceError.exit_code
     return ConfigError.exit_code if secured.refused or secured.problems else 0
+
+
+def _asks_to_end(text: str) -> bool:
+    """Whether to end the process that uses a device, as the user says; true where nobody can be asked."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return True
+    try:
+        answer = input(f"{text}. End it first, so that its devices are made safe? [Y/n] ")
+    except EOFError:
+        return True
+    return not answer.strip().lower().startswith("n")
 
 
 def stand_by_for(profile: str, overrides: Sequence[str]) -> None:

@@ -7,16 +7,18 @@ import itertools
 import shutil
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
-from labseq.errors import RecordingError
+from labseq.errors import DeviceError, DeviceHungError, RecordingError, StopRequested
 from labseq.files import LineLog, explained, sync_folder, write_file
+from labseq.guard import Guard, StopFlag
 from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, now_utc
@@ -27,21 +29,34 @@ if TYPE_CHECKING:
     from labseq.recording.shot_file import ShotEncoder
 
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+ANSWER_S: Final = 5.0
+"""How long the disk may take for a file; then nothing more is written, and the run ends."""
+
+
 class RunWriter:
     """The folder of a run in progress; made by :meth:`create` or :meth:`reopen`, used by one process.
 
     A shot is complete on the disk before its line is in the index. So the shots
     in the index are intact even after a kill or a full disk.
 
+    The disk is written to in a thread of its own. If it does not answer within ANSWER_S, or the run is asked
+    to stop twice, that thread is abandoned, so that the devices are made safe. Nothing is written then.
+
     Attributes:
         run_dir: The run's folder.
         run: The run's record, of which each shot has a copy.
         n_written: Shots written that count; failed attempts do not count.
         last_row: The line in the index of the attempt that was written last; empty before the first.
+        is_given_up: Whether the disk did not answer, so that nothing more is written.
     """
 
-    def __init__(self, run_dir: Path, run: RunRecord) -> None:
+    def __init__(self, run_dir: Path, run: RunRecord, stop: StopFlag | None = None) -> None:
         self.run_dir = run_dir
+        self._guard = Guard(stop, reuses_threads=True)
+        self.is_given_up = False
         self.n_written = 0
         self.last_row: Mapping[str, Any] = {}
         self.run = run
@@ -56,7 +71,11 @@ class RunWriter:
 
     @classmethod
     def create(
-        cls, root: Path, run: RunRecord, extra_files: Mapping[str, str | bytes] | None = None
+        cls,
+        root: Path,
+        run: RunRecord,
+        extra_files: Mapping[str, str | bytes] | None = None,
+        stop: StopFlag | None = None,
     ) -> RunWriter:
         """Create ``<root>/<local date>/<counter>_<name>/`` and write the files that a run starts with.
 
@@ -66,6 +85,7 @@ class RunWriter:
             root: Data root; created if it does not exist.
             run: The record of the run before its devices are open.
             extra_files: Further files for the folder: name -> content.
+            stop: The request to stop the run.
 
         Raises:
             RecordingError: The folder cannot be written to, or the disk is full.
@@ -78,8 +98,8 @@ class RunWriter:
             texts = {folders.SEQUENCE_FILE: run.sequence_text, folders.PROFILE_FILE: run.profile_text}
             for name, content in {**texts, **(extra_files or {})}.items():
                 write_file(run_dir / name, encode_text(content) if isinstance(content, str) else content)
-            writer = cls(run_dir, run)
-            writer._write_run_file()
+            writer = cls(run_dir, run, stop)
+            writer._on_disk(writer._write_run_file)()  # also starts the thread, while there is memory for one
             with explained(run_dir):
                 sync_folder(run_dir)
         except BaseException:
@@ -88,12 +108,15 @@ class RunWriter:
         return writer
 
     @classmethod
-    def reopen(cls, run_dir: Path, run: RunRecord, *, n_written: int) -> RunWriter:
+    def reopen(
+        cls, run_dir: Path, run: RunRecord, *, n_written: int, stop: StopFlag | None = None
+    ) -> RunWriter:
         """Resume a run that ended before its last shot; no other process may write to it.
 
         Args:
             run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json.
             n_written: Number of shots written before that count.
+            stop: The request to stop the run.
 
         Raises:
             RecordingError: The folder cannot be written to, the disk is full, or run.json is damaged.
@@ -102,9 +125,9 @@ class RunWriter:
         with explained(run_dir):
             (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
             kept = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
-        writer = cls(run_dir, run)
+        writer = cls(run_dir, run, stop)
         writer.n_written, writer._before, writer._kept = n_written, before, kept
-        writer._write_run_file()
+        writer._on_disk(writer._write_run_file)()
         write_file(run_dir / folders.STATE_FILE, encode_state("running"))
         return writer
 
@@ -120,7 +143,7 @@ class RunWriter:
             if self._before.get("devices"):
                 return
             self._before["devices"] = devices  # the run ended before they were open
-        self._write_run_file()
+        self._on_disk(self._write_run_file)()
 
     def _write_run_file(self) -> None:
         """Write run.json; for a resumed run, as the first process wrote it."""
@@ -159,18 +182,55 @@ class RunWriter:
             RecordingError: As for :meth:`write_shot`.
         """
         file = self._free_name(row["shot"], row["attempt"], counts=row["counts"])
-        path, sha256 = self.run_dir / file, str(row["sha256"])
-        if isinstance(data, Path):
-            with explained(path):
-                data.replace(path)
-                sync_folder(path.parent)
-        else:
-            sha256 = write_hashed(path, data)
-        row = {**row, "file": file, "sha256": sha256}
-        self._index.append(row, sync=True)
-        self.last_row = row
+        sha256 = SimpleQueue[str]()
+        written = self._on_disk(self._add, {**row, "file": file}, data, sha256)
+        # while the disk writes
+        sha256.put(str(row["sha256"]) if isinstance(data, Path) else hashlib.sha256(data).hexdigest())
+        self.last_row = row = written()
         self.n_written += row["counts"]
-        return path
+        return self.run_dir / file
+
+    def _add(
+        self, row: Mapping[str, Any], data: bytes | memoryview | Path, sha256: SimpleQueue[str]
+    ) -> Mapping[str, Any]:
+        """Write the file of an attempt, then its line in the index; returns that."""
+        path = self.run_dir / row["file"]
+        with self._guard.step(f"{path.name} ", ANSWER_S, "disk"):
+            if isinstance(data, Path):
+                with explained(path):
+                    data.replace(path)
+                    sync_folder(path.parent)
+            else:
+                write_file(path, data)
+        row = {**row, "sha256": sha256.get()}
+        with self._guard.step(f"{folders.INDEX_FILE} ", ANSWER_S, "disk"):
+            self._index.append(row, sync=True)
+        return row
+
+    def _on_disk(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
+        """Begin to write something; returns what waits for its end.
+
+        Raises:
+            RecordingError: The disk does not answer; or as ``work`` raises it.
+            StopRequested: The run was asked to stop twice.
+        """
+        refused = RecordingError(self.run_dir, "cannot be written: the disk does not answer")
+        if self.is_given_up:
+            raise refused
+        result = self._guard.begin_unless_urgent("disk", 2 * ANSWER_S, partial(work, *args, **kwargs))
+
+        def written() -> T:
+            try:
+                return result()
+            except (DeviceHungError, StopRequested) as error:
+                self.is_given_up = True
+                if isinstance(error, StopRequested):
+                    raise
+                raise refused from error
+            except DeviceError as error:
+                raise RecordingError(self.run_dir, f"cannot be written: {error}") from error
+
+        return written
 
     def skip(self, shots: Sequence[int], why: str) -> None:
         """Record that shots will not be taken, even if the run is resumed.
@@ -178,9 +238,10 @@ class RunWriter:
         Raises:
             RecordingError: The disk is full.
         """
-        t_utc = now_utc()
-        log = LineLog(self.run_dir / folders.SKIPPED_FILE)
-        log.append({"shots": list(shots), "why": why, "t_utc": t_utc}, sync=True)
+        self._on_disk(self._skip, {"shots": list(shots), "why": why, "t_utc": now_utc()})()
+
+    def _skip(self, row: Mapping[str, Any]) -> None:
+        LineLog(self.run_dir / folders.SKIPPED_FILE).append(row, sync=True)
         with explained(self.run_dir):
             sync_folder(self.run_dir)  # the file may not exist yet
 
@@ -203,6 +264,8 @@ class RunWriter:
             "event": name,
             "values": values,
         }
+        if self.is_given_up:
+            return
         with self._events_lock:
             if self._n_events_lost:
                 line["n_lost_before"] = self._n_events_lost
@@ -219,6 +282,12 @@ class RunWriter:
             RecordingError: The disk is full. The run counts as failed once this
                 process has ended.
         """
+        try:
+            self._on_disk(self._finish, status, error)()
+        finally:
+            self._guard.end()
+
+    def _finish(self, status: RunStatus, error: str) -> None:
         with suppress(OSError):
             (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
         self.event("run_finished", status=status, error=error, n_shots=self.n_written)
@@ -236,11 +305,9 @@ def encoded(encoder: ShotEncoder, run: RunRecord, shot: ShotRecord) -> tuple[dic
 
 
 def write_hashed(path: Path, data: bytes | memoryview) -> str:
-    """Write a file; returns its SHA-256, which is computed while the disk writes."""
-    with ThreadPoolExecutor(1) as beside:
-        checksum = beside.submit(lambda: hashlib.sha256(data).hexdigest())
-        write_file(path, data)
-        return checksum.result()
+    """Write a file; returns its SHA-256."""
+    write_file(path, data)
+    return hashlib.sha256(data).hexdigest()
 
 
 def run_id_of(run_dir: Path) -> str:

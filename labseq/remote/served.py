@@ -10,23 +10,27 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Final
 
 from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
+from labseq.files import devices_root
 from labseq.guard import StopFlag
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import RandomStream
+from labseq.recording import clear_active, mark_active
 from labseq.roles import Clock, Context, offers
 from labseq.roles.simulation import JoinsRun
 from labseq.sequencer.clock import RealClock, VirtualClock
+from labseq.sequencer.lab import method_of
 from labseq.session.chosen import ChosenPlugin
 from labseq.session.lab import construct
 from labseq.watchdog import Watchdog
-from labseq.wire import MessageError, pack, report_error, unpack
+from labseq.wire import MAX_CONNECTIONS, Connections, MessageError, pack, report_error, unpack
 
 LOOK_S: Final = 0.03
 """How often threads that wait look for what else there is to do."""
@@ -170,6 +174,7 @@ class Session:
         aborted_s: When it was aborted, to be made safe beside it; inf if it was not.
         rescue: The outcome of that: "", "under way", "safe", or why it failed.
         is_rescued: Set unless that is under way.
+        is_safe: Whether nothing was called since a safe state that succeeded.
         changing: Held where a call ends, and where it is decided to make the device safe beside it.
         joins: Whether it uses a simulation that another session has begun.
         simulation: The simulation of another server that its device acts on, or None.
@@ -197,6 +202,7 @@ class Session:
     joins: bool = False
     simulation: Any = None
     is_open: bool = False
+    is_safe: bool = False
     watchdog: Watchdog | None = None
 
     def __post_init__(self) -> None:
@@ -216,6 +222,7 @@ class ServedDevice:
         sessions: Token -> session.
         ended: Token -> why that session ended, of the last ones.
         is_busy: Whether its thread does something else than wait for messages.
+        failure: What ended its thread, or None.
 
     Args:
         name: Its role, or its name in the profile.
@@ -224,6 +231,7 @@ class ServedDevice:
         is_known: Whether a client's key is still known.
         report: Receives what happens, for the operator.
         simulation: The plugin of a simulation at another server, or None.
+        identities: What identifies the device, for its marker; none of a simulated one.
     """
 
     def __init__(
@@ -234,6 +242,7 @@ class ServedDevice:
         is_known: Callable[[str], bool],
         report: Callable[[str], object],
         simulation: ChosenPlugin | None = None,
+        identities: Collection[str] = (),
     ) -> None:
         self.name = name
         self.kind = chosen.entry.kind
@@ -241,11 +250,14 @@ class ServedDevice:
         self.sessions: dict[bytes, Session] = {}
         self.ended: dict[bytes, str] = {}
         self.is_busy = False
+        self.failure: BaseException | None = None
         self._chosen = chosen
         self._socket = socket
         self._is_known = is_known
         self._report = report
         self._simulation = simulation
+        self._identities = identities
+        self._key = f"labseq serve-devices {name}"
         self._methods = METHODS.get(self.kind, frozenset())
         self._properties = PROPERTIES.get(self.kind, ())
         self._ended = threading.Event()
@@ -255,13 +267,16 @@ class ServedDevice:
         """Start its thread."""
         self._thread.start()
 
-    def end(self, timeout_s: float) -> bool:
-        """End all sessions, the device safe and closed; whether that was done in time."""
+    def begin_end(self) -> None:
+        """Begin to end all sessions, the device safe and closed, and then its thread."""
         for session in list(self.sessions.values()):
             self.end_session(session, "the server ends")
         self._ended.set()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether its thread runs."""
+        return self._thread.is_alive()
 
     def end_session(self, session: Session, why: str) -> None:
         """Have a session ended by the device's thread, at once or after the call in progress."""
@@ -279,8 +294,12 @@ class ServedDevice:
             session.aborted_s = min(session.aborted_s, time.monotonic())
             session.abort.request()
 
-    def rescue_if_stuck(self, session: Session) -> None:
+    def rescue_stuck(self) -> None:
         """Make the device safe in another thread if a call does not end after it was aborted."""
+        for session in list(self.sessions.values()):
+            self._rescue_if_stuck(session)
+
+    def _rescue_if_stuck(self, session: Session) -> None:
         with session.changing:
             if session.rescue or not session.is_running or time.monotonic() < session.aborted_s + GRACE_S:
                 return
@@ -312,9 +331,22 @@ class ServedDevice:
         import zmq
 
         self._socket.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
-        while not (self._ended.is_set() and not self.sessions):
-            self._step()
-        self._socket.close()
+        connections, looked_s = Connections(self._socket), time.monotonic()
+        try:
+            while not (self._ended.is_set() and not self.sessions):
+                if time.monotonic() - looked_s > LOOK_S:
+                    connections.ended()  # nothing asks which
+                    connections.limit(0 if self._ended.is_set() else MAX_CONNECTIONS)
+                    looked_s = time.monotonic()
+                self._step()
+        except BaseException as error:  # noqa: BLE001 - the main thread ends the server
+            self.failure = error
+        finally:
+            for session in list(self.sessions.values()):
+                self.end_session(session, "the server failed")
+                self._close(session)
+            connections.close()
+            self._socket.close()
 
     def _step(self) -> None:
         """Answer the next message, if one comes within LOOK_S, and close sessions that have ended."""
@@ -433,16 +465,21 @@ class ServedDevice:
         if not session.is_open and call not in _WITHOUT_OPENING:
             raise DeviceError(self.name, "this connection has not opened it")
         if call == "safe_state":
-            if not session.is_open:
-                return None
-            with session.abort.held():
-                return device.safe_state()
+            return self._make_safe(session) if session.is_open else None
         if call in _LOOKS and self.owner is not None:
             device = self.owner.device
+        session.is_safe = session.is_safe and call in _WITHOUT_OPENING
         value = getattr(device, call)(*args, **named)
         if call == "leave_on" and value:
-            self._forget(session)
+            session.is_safe = True  # nobody is to switch it off
+            self._give_up(session)
         return value
+
+    def _make_safe(self, session: Session) -> None:
+        session.is_safe = False
+        with session.abort.held():
+            session.device.safe_state()
+        session.is_safe = True
 
     def _attach(self, session: Session, about: dict[str, Any]) -> dict[str, Any]:
         """Construct the client's object of the driver."""
@@ -500,56 +537,75 @@ class ServedDevice:
             raise DeviceError(self.name, f"in use by {self.owner.who}; one at a time can use it")
         if self.owner is None:
             self._report(f"{self.name}: in use by {session.who}")
-        self.owner, session.is_open = session, True
+        self.owner, session.is_open, session.is_safe = session, True, False
+        self._mark()
         with session.abort.held():
             session.device.open()
         emergency = session.device.emergency() if offers(session.device, "emergency") else None
         if emergency is not None and session.watchdog is None:
-            session.watchdog = Watchdog("labseq serve-devices")
+            session.watchdog = Watchdog("labseq serve-devices", lost=partial(self.end_session, session))
             session.watchdog.add(self.name, 0, emergency.script, dict(emergency.arguments))
             for note in session.watchdog.notes():
                 self._report(f"{self.name}: {note}")
 
     def _close_device(self, session: Session) -> None:
-        """Close it; the owner gives it up."""
-        with session.abort.held():
-            session.device.close()
-        if session.is_open:
-            self._forget(session)
+        """Close it; the owner gives it up, and learns if it is not safe."""
+        if not session.is_open:
+            with session.abort.held():
+                session.device.close()
+        elif failures := self._end_use(session):
+            raise DeviceError(self.name, "; ".join(failures))
 
-    def _forget(self, session: Session) -> None:
+    def _end_use(self, session: Session) -> list[str]:
+        """Make the device of a session safe, unless it is, close it and give it up; returns what failed."""
+        failures: list[str] = []
+
+        def attempt(method: Callable[[], object], what: str) -> None:
+            try:
+                method()
+            except BaseException as error:  # noqa: BLE001 - of the driver's class
+                failures.append(f"{what} failed: {format_error(error)}")
+
+        with session.abort.held():
+            if not session.is_safe:
+                attempt(partial(self._make_safe, session), "safe_state()")
+            attempt(method_of(session.device, "close"), "close()")
+        if not session.is_safe:
+            acts = "its watchdog switches it off" if session.watchdog else "nothing else can switch it off"
+            failures.append(f"it is NOT SAFE: {acts}")
+        self._give_up(session)
+        return failures
+
+    def _give_up(self, session: Session) -> None:
+        """Let others use the device. A watchdog that is not to forget it switches it off."""
         session.is_open = False
         if self.owner is session:
             self.owner = None
         if session.watchdog is not None:
-            session.watchdog.forget([self.name])
+            if session.is_safe:
+                session.watchdog.forget([self.name])
             session.watchdog.end()
             session.watchdog = None
+        if session.is_safe and self._identities:
+            with suppress(LabseqError):
+                clear_active(self._key, self._identities)
+
+    def _mark(self) -> None:
+        """Leave a marker until the device is safe, as a run does: `labseq safe` and `devices` see it."""
+        if self._identities:
+            try:
+                mark_active(self._key, self._identities, devices_root() / f"labseq serve-devices {self.name}")
+            except LabseqError as error:
+                self._report(f"{self.name}: {error}")
 
     def _close(self, session: Session) -> None:
         """End a session: its device is made safe and closed if the client has not done so."""
         self.ended = {**dict([*self.ended.items()][-MAX_REASONS:]), session.token: session.ended}
         del self.sessions[session.token]
         if session.is_open:
-            self._make_safe(session)
+            begun_s = time.monotonic()
+            failures = self._end_use(session)
+            outcome = "; ".join(failures) or f"made safe in {1e3 * (time.monotonic() - begun_s):.0f} ms"
+            self._report(f"{self.name}: the connection of {session.who} ended ({session.ended}); {outcome}")
         if session.simulation is not None:  # whose server may not answer: other sessions must not wait
             threading.Thread(target=session.simulation.close, daemon=True).start()
-
-    def _make_safe(self, session: Session) -> None:
-        """Make the device of a session that has ended safe, and close it."""
-        failures: list[str] = []
-        begun_s = time.monotonic()
-        with session.abort.held():
-            for method in ("safe_state", "close"):
-                try:
-                    getattr(session.device, method)()
-                except Exception as error:  # noqa: BLE001 - of the driver's class
-                    failures.append(f"{method}() failed: {format_error(error)}")
-        after_s = time.monotonic() - begun_s
-        outcome = "; ".join(failures) or f"made safe in {1e3 * after_s:.0f} ms"
-        self._report(f"{self.name}: the connection of {session.who} ended ({session.ended}); {outcome}")
-        if failures and session.watchdog is not None:
-            session.watchdog.end()  # it switches off what it was not asked to forget
-            session.watchdog = None
-        with suppress(LabseqError):
-            self._forget(session)

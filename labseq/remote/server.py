@@ -6,10 +6,10 @@ after and aborted there, by a thread that carries out no calls.
 
 from __future__ import annotations
 
+import os
 import platform
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -17,11 +17,20 @@ from typing import Any, Final
 
 import labseq
 from labseq.config.addresses import profile_overrides
-from labseq.errors import ConfigError, DeviceError, LabseqError, Problem, StopRequested, one_of
+from labseq.errors import (
+    ConfigError,
+    DeviceError,
+    LabseqError,
+    Problem,
+    RecordingError,
+    StopRequested,
+    one_of,
+)
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
 from labseq.messages import clean, format_error
 from labseq.plain import now
+from labseq.recording import clear_active
 from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
 from labseq.remote.simulation import ServedSimulation
 from labseq.roles import offers
@@ -36,6 +45,7 @@ from labseq.wire import (
     LOST_S,
     PATIENT_S,
     PROTOCOL,
+    Connections,
     MessageError,
     find_keys,
     is_loopback,
@@ -55,6 +65,8 @@ MAX_SESSIONS: Final = 64
 """Connections at a time; of a client that makes more, something is wrong."""
 END_S: Final = 10.0
 """How long the devices may take to become safe when the server ends."""
+N_SPARE: Final = 32
+"""Files that may still be opened to make the devices safe when connections have used up all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +131,8 @@ def serving(
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
         report(f"tests {', '.join(hardware.chosen)}")
         _test(hardware, simulation, report)
+        with suppress(RecordingError):  # all are safe now
+            clear_active(hardware.key, hardware.identities)
         if "simulation" in how.devices:
             _warm_simulation(hardware)
         server = Server(hardware, simulation, host, port, keys, report)
@@ -215,13 +229,16 @@ class Server:
         self._runs: dict[bytes, Run] = {}
         self._ended = threading.Event()
         self._failure: BaseException | None = None
+        self._key_failure = ""
+        self._spare = [os.open(os.devnull, os.O_RDONLY) for _ in range(N_SPARE)]
         self.devices: dict[str, ServedDevice] = {}
         try:
             self._control = server_socket(self._zmq, host, port, keys)
             for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
                 socket = server_socket(self._zmq, host, port + number, keys)
                 served = ServedSimulation if chosen.entry.kind == "simulation" else ServedDevice
-                device = served(name, chosen, socket, self.is_known, self._report, simulation)
+                own = [identity for identity, role in hardware.identities.items() if role == name]
+                device = served(name, chosen, socket, self.is_known, self._report, simulation, own)
                 self.devices[name] = device
         except ConfigError:
             self._zmq.destroy(linger=0)
@@ -250,8 +267,17 @@ class Server:
             self._report(f"known keys: {names}")
 
     def end(self) -> None:
-        """Make all devices safe, and end all threads."""
-        late = [device.name for device in self.devices.values() if not device.end(END_S)]
+        """Make all devices safe, all at once, and end all threads."""
+        for device in self.devices.values():
+            device.begin_end()
+        while self._spare:
+            os.close(self._spare.pop())
+        until_s = time.monotonic() + END_S
+        while (left := [one for one in self.devices.values() if one.is_alive]) and time.monotonic() < until_s:
+            for device in left:
+                device.rescue_stuck()
+            time.sleep(LOOK_S)
+        late = [device.name for device in left]
         self._ended.set()
         self._thread.join(1.0)
         if self._auth is not None:
@@ -262,13 +288,14 @@ class Server:
             self._zmq.destroy(linger=0)
 
     def check(self) -> None:
-        """Raise what ended the thread of the control.
+        """Raise what ended the thread of the control, or of a device.
 
         Raises:
             DeviceError: It has ended.
         """
-        if self._failure is not None:
-            raise DeviceError("serve-devices", format_error(self._failure)) from self._failure
+        for failure in (self._failure, *(device.failure for device in self.devices.values())):
+            if failure is not None:
+                raise DeviceError("serve-devices", format_error(failure)) from failure
 
     def is_known(self, peer: str) -> bool:
         """Whether a client's key is known, or none is needed."""
@@ -293,8 +320,10 @@ class Server:
                     with suppress(zmq.ZMQError):  # the client is gone
                         self._control.send_multipart([frames[0], *self._answer(frames)])
                 if (now_s := time.monotonic()) - keys_s > LOOK_AT_KEYS_S and self._keys is not None:
-                    self._known, keys_s = known_keys(keys_root()), now_s
+                    keys_s = now_s
+                    self._look_at_keys()
                 if now_s - looked_s > LOOK_S:
+                    self._connections.limit()
                     self._look(now_s, now_s - looked_s, self._connections.ended())
                     looked_s = time.monotonic()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
@@ -302,6 +331,17 @@ class Server:
         finally:
             self._connections.close()
             self._control.close()
+
+    def _look_at_keys(self) -> None:
+        """Read the known keys; those known before stay if that fails, which is reported once."""
+        failure = ""
+        try:
+            self._known = known_keys(keys_root())
+        except Exception as error:  # noqa: BLE001 - no look at them may end the server
+            failure = f"the known keys cannot be read, and stay as they are: {format_error(error)}"
+        if failure and failure != self._key_failure:
+            self._report(failure)
+        self._key_failure = failure
 
     def _look(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
         """End the sessions of clients that are gone, or no longer known."""
@@ -318,7 +358,7 @@ class Server:
                     device.end_session(session, f"no sign of life for {lost_s:g} s")
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
-                device.rescue_if_stuck(session)
+            device.rescue_stuck()
         self._runs = {key: run for key, run in self._runs.items() if id(run) in live}
 
     def _answer(self, frames: list[Any]) -> list[Any]:
@@ -411,50 +451,6 @@ class Server:
             who = "" if owner is None else owner.who
             rows.append({"device": device.name, "owner": who, "call": call, "for_s": since_s})
         return rows
-
-
-class Connections:
-    """The connections at a socket: the end of one shows that its process has died before heartbeats do.
-
-    The operating system gives the number of one that has ended to a new one. So a connection has two: that
-    one, and how many there were before with the same.
-    """
-
-    def __init__(self, socket: Any) -> None:
-        import zmq
-
-        self._socket = socket
-        self._events = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
-        self._n_before: Counter[int] = Counter()
-        self._ended: set[tuple[int, int]] = set()
-
-    def named(self, number: int) -> tuple[int, int]:
-        """The connection that has a number now."""
-        self._read()
-        return number, self._n_before[number]
-
-    def ended(self) -> set[tuple[int, int]]:
-        """Those that have ended since the last call."""
-        self._read()
-        ended, self._ended = self._ended, set()
-        return ended
-
-    def _read(self) -> None:
-        import zmq
-        from zmq.utils.monitor import recv_monitor_message
-
-        while self._events.poll(0):
-            event = recv_monitor_message(self._events)
-            number = int(event["value"])
-            if event["event"] == zmq.EVENT_DISCONNECTED:
-                self._ended.add((number, self._n_before[number]))
-            else:
-                self._n_before[number] += 1
-
-    def close(self) -> None:
-        """End it, before the socket is closed."""
-        self._socket.disable_monitor()
-        self._events.close()
 
 
 class _Credentials:

@@ -36,7 +36,7 @@ class ServedSimulation(ServedDevice):
         self._asking: Run | None = None
         self._later: deque[list[Any]] = deque()
 
-    def rescue_if_stuck(self, session: Session) -> None:
+    def rescue_stuck(self) -> None:
         """A simulation has no outputs."""
 
     def _construct(self, session: Session, context: Context, about: Mapping[str, Any]) -> Any:

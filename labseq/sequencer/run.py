@@ -316,6 +316,7 @@ class Sequencer:
             self._watchdog.end()
             self._announce(State.CLOSING)
             self._report("closed", outcome)
+            self._warn_of_watchdog()
             self.guard.end()
             self._states.to(State.CLOSED)
         return self._unsafe
@@ -353,8 +354,7 @@ class Sequencer:
     def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
         """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
         self._states.to(State.SHOT)
-        for text in self._watchdog.notes():
-            self._emit("warning", {"text": text})
+        self._warn_of_watchdog()
         record = ShotRecord(index, attempt, self._seed, now_utc(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
         shot = RunningShot(self.lab, self.guard, record, self._events, self._timelines)
@@ -470,6 +470,10 @@ class Sequencer:
         for name, error in outcome.items():
             times = {"after_s": after_s[name]} if after_s and name in after_s else {}
             self._emit(event, {"device": name, "ok": error is None, "error": str(error or ""), **times})
+
+    def _warn_of_watchdog(self) -> None:
+        for text in self._watchdog.notes():
+            self._emit("warning", {"text": text})
 
     def _announce(self, state: State) -> None:
         self._emit("state", {"state": state.value})

@@ -142,7 +142,7 @@ def check_each_device(
     Returns:
         Those that were tried, the simulation first.
     """
-    guard, watchdog = Guard(stop), Watchdog("labseq devices")
+    guard, watchdog = Guard(stop), Watchdog("labseq devices", pulse=stop.pulse)
     tried: list[CheckedDevice] = []
     if simulation is not None and not stop.is_set:
         tried.append(_examined(guard, "simulation", simulation, timeouts, watchdog))

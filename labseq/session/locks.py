@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -100,12 +101,15 @@ def named(role: str, identity: str) -> str:
     return role if identity.startswith(f"{role} ") else f"{role} ({identity})"
 
 
-def end_holders(warn: Callable[[str], object], *, end: bool) -> Callable[[str, Holder], bool]:
-    """For ``blocked`` of :func:`lock_devices`: end each process that uses devices once, if it hangs.
+def end_holders(
+    profile: str, warn: Callable[[str], object], may_end: Callable[[str], bool]
+) -> Callable[[str, Holder], bool]:
+    """For ``blocked`` of :func:`lock_devices`: end each process that uses devices, once.
 
     Args:
+        profile: The profile, as it is named in commands.
         warn: Receives what is done.
-        end: Whether to end processes that do not hang, too.
+        may_end: Asked whether to end a process that does not hang; receives which device it uses.
     """
     seen = set[Process | None]()
 
@@ -114,8 +118,10 @@ def end_holders(warn: Callable[[str], object], *, end: bool) -> Callable[[str, H
         if process in seen:
             return False
         seen.add(process)
-        if process is None or not (holder.hangs or end):
-            warn(f"{text}; it is made safe all the same ('labseq safe --end' ends that process first)")
+        is_other = process is not None and process.is_here and process.pid != os.getpid()
+        if process is None or not is_other or not (holder.hangs or may_end(text)):
+            hint = f"; 'labseq safe {profile} --end' ends that process first" if is_other else ""
+            warn(f"{text}; making it safe anyway, as far as that is possible{hint}")
             return False
         silent = f", which has not answered for {holder.silent_s:.0f} s" if holder.hangs else ""
         warn(f"{text}{silent}; that process is ended first")

@@ -162,12 +162,13 @@ class ResumableRun:
             hint = "'labseq resume --accept-changes' continues anyway, and records the changes"
             raise ConfigError([*problems, Problem(what, str(folder), hint=hint)])
 
-    def reopen(self, record: RunRecord, first_shot: int | None) -> RunWriter:
+    def reopen(self, record: RunRecord, first_shot: int | None, stop: StopFlag) -> RunWriter:
         """Open its folder for writing.
 
         Args:
             record: The current record of the run.
             first_shot: The first shot that is taken; None if none is.
+            stop: The request to stop the run.
 
         Raises:
             RecordingError: The folder cannot be written to, or the disk is full.
@@ -179,7 +180,7 @@ class ResumableRun:
             resumed += ({**entry, "changes": changes, "provenance": record.provenance},)
         then = str(self.run.record["t_start_utc"])
         record = replace(record, t_start_utc=then, resumed=resumed)
-        return RunWriter.reopen(self.run.path, record, n_written=len(self.rows))
+        return RunWriter.reopen(self.run.path, record, n_written=len(self.rows), stop=stop)
 
 
 def _refused(folder: Path, why: str) -> ConfigError:

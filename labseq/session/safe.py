@@ -76,7 +76,8 @@ def make_each_safe(
         Device name -> why it is not safe, or None. A device that is safe but
         cannot be closed is only reported to the observer, as at the end of a run.
     """
-    guard, watchdog = Guard(), Watchdog("labseq safe")
+    stop = StopFlag()
+    guard, watchdog = Guard(stop), Watchdog("labseq safe", pulse=stop.pulse)
     outcome: dict[str, LabseqError | None] = {}
     if simulation is not None and (
         failure := attempt(guard, "simulation", timeouts.call_s, simulation, "open")
@@ -187,16 +188,17 @@ def make_profile_safe(
     overrides: Sequence[str] = (),
     observer: RunObserver | None = None,
     *,
-    end: bool = False,
+    may_end: Callable[[str], bool] = lambda _: True,
 ) -> SafeStateReport:
     """Bring every device of a profile to its safe state.
 
-    It does so even while another process uses them, with a warning that names it: a run in progress fails,
-    or switches its devices on again. A process that hangs is ended first. Ctrl-C is obeyed once every device
-    has been tried. If all devices are safe, the next run need not make them safe, however the last one ended.
+    Another process that uses them is ended first: most devices cannot be opened twice, and a run would switch
+    them on again. Ctrl-C is obeyed once every device has been tried. If all devices are safe, the next run
+    need not make them safe, however the last one ended.
 
     Args:
-        end: Whether to end any other process that uses the devices first.
+        may_end: Asked whether to end a process that does not hang; receives which device it uses. If not, the
+            devices are made safe beside it, as far as that is possible.
 
     Raises:
         ConfigError: The profile cannot be read, or does not exist; no device was touched.
@@ -205,7 +207,7 @@ def make_profile_safe(
     found, stop, to_user = ProblemCollector(), StopFlag(), partial(warn, observer)
     hardware = read_devices(profile, overrides, found)
     with ExitStack() as stack:
-        blocked = end_holders(to_user, end=end)
+        blocked = end_holders(profile, to_user, may_end)
         stack.enter_context(lock_devices(hardware, "labseq safe", to_user, blocked=blocked))
         stack.enter_context(stop_on_signals(stop))
         secured = make_profile_devices_safe(hardware, stop, observer)
@@ -285,7 +287,7 @@ def _secure(
     """Make one device safe, and try again for a while, unless a process that works has begun to use it."""
     hardware = replace(profile, chosen={role: profile.chosen[role]})
     to_user, deadline_s = partial(warn, observer), time.monotonic() + TRY_AGAIN_S
-    ends = end_holders(to_user, end=False)
+    ends = end_holders(str(profile.document.path), to_user, lambda _: False)
 
     def blocked(device: str, holder: Holder) -> bool:
         if not look.is_in_trouble(holder):

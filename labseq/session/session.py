@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import secrets
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext, suppress
 from dataclasses import replace
@@ -78,6 +79,7 @@ class Session:
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
         self._workers: Workers | None = None
+        self._lost = ""
 
     @classmethod
     def open(
@@ -243,9 +245,10 @@ class Session:
             with nullcontext() if lab.clock.virtual else real_time():
                 self._take_shots(lab, writer, record)
         except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
-            error = failure
+            error = DeviceError("watchdog", self._lost) if self._lost else failure
         unsafe = self._shut_down(ended_well=error is None)
-        self._try(self._analyses.finish)
+        if not writer.is_given_up:
+            self._try(self._analyses.finish)
         if error is None and self.scan_run.is_adaptive:
             self._try(self._report_best, writer.run_dir)
         if error is None and unsafe:
@@ -261,7 +264,8 @@ class Session:
 
     def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
-        watchdog = Watchdog(f"the run {writer.run_dir}", writer.run_dir / WATCHDOG_LOG)
+        log, pulse = writer.run_dir / WATCHDOG_LOG, self.stop_flag.pulse
+        watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
         first, policy = self.scan_run.first, self.assembly.policy
         own = OwnShots(lab, first, record, policy, self.stop_flag, writer, self._observers, watchdog)
         sequencer = self._sequencer = own.sequencer
@@ -288,6 +292,11 @@ class Session:
         with closing(shots):
             self.scan_run.run(shots, writer, checks, emit)
 
+    def _end_without_watchdog(self, why: str) -> None:
+        """Have the run end; called by the thread of the heartbeat."""
+        self._lost = why
+        self.stop_flag.request(signal.SIGTERM)
+
     def _analyses_beside(self, run: Run | None) -> AnalysesBeside:
         """The analyses of the sequence, and what the run needs of their results."""
         checks, search = self.assembly.sequence.policy.checks, self.assembly.search
@@ -303,9 +312,10 @@ class Session:
         changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
         record = run_record(self.assembly, self.seed, changes, scan, self._folder)
         if earlier is None:
-            writer = RunWriter.create(root, record, copies(self.assembly.hardware.calibrations))
+            extra_files = copies(self.assembly.hardware.calibrations)
+            writer = RunWriter.create(root, record, extra_files, self.stop_flag)
         else:
-            writer = earlier.reopen(record, next(iter(self.scan_run.shots), None))
+            writer = earlier.reopen(record, next(iter(self.scan_run.shots), None), self.stop_flag)
         self.run_dir = writer.run_dir
         self._observers.log = writer.event
         if earlier is None and (day := later_day(writer.run_dir)):

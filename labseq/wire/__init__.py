@@ -6,8 +6,10 @@ from labseq.wire.messages import MessageError, error_of, pack, report_error, unp
 from labseq.wire.sockets import (
     BEAT_S,
     LOST_S,
+    MAX_CONNECTIONS,
     PATIENT_S,
     PROTOCOL,
+    Connections,
     client_socket,
     endpoint,
     parse_address,
@@ -18,8 +20,10 @@ from labseq.wire.sockets import (
 __all__ = [
     "BEAT_S",
     "LOST_S",
+    "MAX_CONNECTIONS",
     "PATIENT_S",
     "PROTOCOL",
+    "Connections",
     "MessageError",
     "client_socket",
     "endpoint",

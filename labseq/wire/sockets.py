@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,6 +23,10 @@ BEAT_S: Final = 0.15
 """Interval of the heartbeats of a connection."""
 LOST_S: Final = 0.75
 """A connection without a heartbeat for so long is lost."""
+HANDSHAKE_S: Final = 2.0
+"""How long a connection may take to show its key."""
+MAX_CONNECTIONS: Final = 128
+"""Connections at a port, beyond which it does not listen until some have ended."""
 PATIENT_S: Final = 5.0
 """The same for a simulation, which has no outputs that could stay on."""
 
@@ -96,6 +102,7 @@ def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | 
 
     socket = context.socket(zmq.ROUTER)
     _limit(socket)
+    socket.set(zmq.HANDSHAKE_IVL, round(1e3 * HANDSHAKE_S))
     if keys is not None:
         socket.zap_domain = b"labseq"
         socket.curve_server, socket.curve_secretkey = True, keys.secret
@@ -106,6 +113,71 @@ def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | 
         hint = "choose another one with --bind; perhaps the server is already running"
         raise ConfigError(Problem(f"{host}:{port} cannot be used: {error.strerror}", hint=hint)) from error
     return socket
+
+
+class Connections:
+    """The connections at a server's socket: the end of one shows that its process has died, at once.
+
+    The operating system gives the number of one that has ended to a new one. So a connection has two: that
+    one, and how many there were before with the same.
+
+    Args:
+        socket: The socket, which listens; used in the thread of the socket.
+    """
+
+    def __init__(self, socket: zmq.Socket[Any]) -> None:
+        import zmq
+
+        self._socket = socket
+        self._endpoint: Any = socket.get(zmq.LAST_ENDPOINT)
+        self._is_listening = True
+        self._events = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        self._n_before: Counter[int] = Counter()
+        self._open: set[int] = set()
+        self._ended: set[tuple[int, int]] = set()
+
+    def named(self, number: int) -> tuple[int, int]:
+        """The connection that has a number now."""
+        self._read()
+        return number, self._n_before[number]
+
+    def ended(self) -> set[tuple[int, int]]:
+        """Those that have ended since the last call."""
+        self._read()
+        ended, self._ended = self._ended, set()
+        return ended
+
+    def limit(self, limit: int = MAX_CONNECTIONS) -> None:
+        """Listen only while there are fewer connections, or half as many once there were."""
+        import zmq
+
+        self._read()
+        with suppress(zmq.ZMQError):  # the port is not free again yet
+            if self._is_listening and len(self._open) >= limit:
+                self._socket.unbind(self._endpoint)
+                self._is_listening = False
+            elif not self._is_listening and len(self._open) < limit / 2:
+                self._socket.bind(self._endpoint)
+                self._is_listening = True
+
+    def _read(self) -> None:
+        import zmq
+        from zmq.utils.monitor import recv_monitor_message
+
+        while self._events.poll(0):
+            event = recv_monitor_message(self._events)
+            number = int(event["value"])
+            if event["event"] == zmq.EVENT_DISCONNECTED:
+                self._ended.add((number, self._n_before[number]))
+                self._open.discard(number)
+            else:
+                self._n_before[number] += 1
+                self._open.add(number)
+
+    def close(self) -> None:
+        """End it, before the socket is closed."""
+        self._socket.disable_monitor()
+        self._events.close()
 
 
 def _limit(socket: zmq.Socket[Any]) -> None:

@@ -1,9 +1,10 @@
 """Runs, queues and calibrations under random faults, and what must hold after each: `poe chaos --minutes 60`.
 
-A trial takes a job, interrupts it a few times (kill -9, a stopped process, signals, a full or
-read-only disk, a wall clock that is set, a device or planner that fails), gets it to its end as a
-user would, with `labseq resume` or the same command again, and compares it with the same job
-that nothing interrupted. Its random numbers follow from the seed and the trial's number alone.
+A trial takes a job, interrupts it a few times (kill -9, also after its watchdogs were killed or stopped, a
+stopped process, signals, no memory, a full, read-only or stalled disk, a wall clock that is set, a device or
+planner that fails), gets it to its end as a user would, with `labseq resume` or the same command again, and
+compares it with the same job that nothing interrupted. Its random numbers follow from the seed and the
+trial's number alone.
 """
 
 from __future__ import annotations
@@ -129,7 +130,13 @@ def labseq_register(registry):
 
 EMERGENCY: Final = '''
 """Switches a simulated device off."""
+import os
 import pathlib
+
+
+def prepare(file):
+    on = pathlib.Path(file)
+    (on.parent.parent / "watchdogs" / on.name).write_text(str(os.getpid()))
 
 
 def off(file):
@@ -158,11 +165,38 @@ JOBS: Final = {
     "calibration": ["calibrate", "thresholds", "--profile", "chaos", "--seed", "7", "--shots", "40"],
 }
 
-CLOCK: Final = '''
-"""The wall clock of every process is off by the seconds in a file."""
+COMPUTER: Final = '''
+"""The wall clock of every process is off by the seconds in a file; another one ends its memory or disk."""
 import os
 import pathlib
+import resource
+import signal
 import time
+
+FAULT, FSYNC, FULL = pathlib.Path(os.environ["CHAOS_FOLDER"], "fault"), os.fsync, []
+
+
+def fsync(fd):
+    fault = FAULT.read_bytes() if FAULT.exists() else b""
+    if fault:
+        FAULT.unlink(missing_ok=True)
+    if fault == b"disk":  # this thread stands still, and no signal reaches it
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        time.sleep(14.0)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    if fault == b"memory":
+        size = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (size, size))
+        for n_bytes in (1 << 20, 1 << 14, 1 << 9):
+            try:
+                while True:
+                    FULL.append(bytes(n_bytes))
+            except MemoryError:
+                pass
+    return FSYNC(fd)
+
+
+os.fsync = fsync
 
 OFFSET, RIGHT = pathlib.Path(os.environ["CHAOS_FOLDER"], "clock"), time.time
 time.time = lambda: RIGHT() + float(OFFSET.read_bytes() or 0)
@@ -200,11 +234,12 @@ class Bench:
         self.data = self.home / "data"
         (self.home / "plugins").mkdir()
         (self.folder / "on").mkdir()
+        (self.folder / "watchdogs").mkdir()
         files = {
             self.home / f"{job}.yaml": sequence_of(job, profile="chaos", planner="chaos") for job in SHOTS
         }
         files |= {self.home / "plugins" / "chaos.py": PLUGIN, self.home / "chaos.yaml": PROFILE}
-        own = {"emergency.py": EMERGENCY, "sitecustomize.py": CLOCK, "clock": ""}
+        own = {"emergency.py": EMERGENCY, "sitecustomize.py": COMPUTER, "clock": ""}
         for path, text in {**files, **{self.folder / name: text for name, text in own.items()}}.items():
             path.write_text(text, encoding="utf-8")
         self.environment = {
@@ -239,7 +274,7 @@ class Bench:
             process.send_signal(signal.SIGABRT)  # prints where each thread is
             text, _ = process.communicate()
             raise BrokenPromiseError(f"hangs: {process.args}\n{text}") from None
-        if "Traceback" in text or "internal error" in text:
+        if "MemoryError" not in text and ("Traceback" in text or "internal error" in text):
             raise BrokenPromiseError(f"traceback: {process.args}\n{text}")
         return text
 
@@ -266,6 +301,16 @@ class Bench:
     def runs(self) -> list[Path]:
         """The folders of all runs, oldest first."""
         return sorted(file.parent for file in self.data.glob("*/*/run.json"))
+
+    def watchdogs(self, process: subprocess.Popen[str]) -> dict[str, int]:
+        """Device -> the watchdog of a process that knows it, if it lives."""
+        found: dict[str, int] = {}
+        for file in (self.folder / "watchdogs").iterdir():
+            with contextlib.suppress(OSError, ValueError):  # it is being written, or the process has ended
+                status = Path(f"/proc/{int(file.read_text())}/stat").read_text().rpartition(")")[2].split()
+                if int(status[1]) == process.pid:
+                    found[file.name] = int(file.read_text())
+        return found
 
     def is_on(self) -> list[str]:
         """Devices that are on."""
@@ -345,8 +390,53 @@ def lock_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Rando
     return False
 
 
+def stall_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> bool:
+    """Let the disk stand still for 14 s, longer than the time limit after which the outputs must be off."""
+    return _befalls(bench, process, "disk", 8.0)
+
+
+def take_memory(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> bool:
+    """Give the process no more memory while its devices are open."""
+    return bool(bench.watchdogs(process)) and _befalls(bench, process, "memory", 0.0)
+
+
+def _befalls(bench: Bench, process: subprocess.Popen[str], fault: str, limit_s: float) -> bool:
+    """Have a fault come at the next flush to the disk; outputs are off after a time, unless that is 0."""
+    file = bench.folder / "fault"
+    file.write_text(fault, encoding="utf-8")
+    while file.exists() and process.poll() is None:
+        time.sleep(0.005)
+    if file.exists():
+        file.unlink()
+        return False
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.05)
+    if limit_s and process.poll() is None and (on := bench.is_on()):
+        raise BrokenPromiseError(f"still on {limit_s:g} s after the disk stood still: {', '.join(on)}")
+    return True
+
+
+def kill_watchdogs(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> bool:
+    """Kill or stop watchdogs, and the process once another one is ready."""
+    for _ in range(chance.randint(1, 4)):
+        before = bench.watchdogs(process)
+        for pid in set(before.values()):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, chance.choice([signal.SIGKILL, signal.SIGSTOP]))
+        while before.keys() != (now := bench.watchdogs(process)).keys() or before.items() & now.items():
+            if process.poll() is not None:
+                return False
+            time.sleep(0.005)
+    process.kill()
+    return True
+
+
 DISTURBANCES: Final[dict[str, Fault]] = {
     "kill -9": lambda _, process, __: process.kill(),
+    "watchdogs": kill_watchdogs,
+    "disk stalls": stall_disk,
+    "memory": take_memory,
     "pause": pause,
     "freeze": freeze,
     "signal": interrupt,
@@ -388,7 +478,7 @@ def disturbed(bench: Bench, command: list[str], chance: random.Random) -> str:
     """Run a command with one disturbance; returns what it printed."""
     kinds = ["device", "planner", *DISTURBANCES]
     if bench.disk is None:
-        kinds = [kind for kind in kinds if not kind.startswith("disk")]
+        kinds = [kind for kind in kinds if kind not in ("disk full", "disk read-only")]
     kind = chance.choice(kinds)
     fault = fault_of(kind, chance)
     n = bench.n_calls() + chance.randint(1, 150)
