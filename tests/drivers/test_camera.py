@@ -78,21 +78,21 @@ def test_only_exposures_that_the_camera_can_make_reach_it(exposure_s: float) -> 
         bench.camera.arm(1, exposure_s, "software")
         assert bench.camera.series[-1].exposure_s == exposure_s
     else:
-        with pytest.raises(LimitError, match=r"^cam: exposure is .* more than 0 and at most 10 s; choose"):
+        with pytest.raises(LimitError, match=r"^cam: exposure is .* at most 10 s"):
             bench.camera.arm(1, exposure_s, "software")
         assert bench.camera.log == []
 
 
 def test_a_trigger_that_the_camera_does_not_have_is_refused() -> None:
     bench = Bench(triggers=("software", "external"))
-    with pytest.raises(DeviceError, match="no internal trigger; expected one of 'software', 'external'"):
+    with pytest.raises(DeviceError, match=r"no internal trigger.*'software', 'external'"):
         bench.camera.arm(1, 0.01, "internal")
     assert bench.camera.log == []
 
 
 def test_a_refusal_leaves_the_series_as_it_was(bench: Bench) -> None:
     bench.camera.arm(1, 0.01, "software")
-    with pytest.raises(LimitError, match=r"^cam: number of frames is 0; the limit is at least 1"):
+    with pytest.raises(LimitError, match=r"^cam: number of frames is 0"):
         bench.camera.arm(0, 0.01, "software")
     bench.camera.trigger()
     assert bench.read().image.shape == SHAPE
@@ -134,7 +134,7 @@ def test_a_trigger_during_an_exposure_is_refused(bench: Bench) -> None:
 def test_a_software_trigger_belongs_to_a_series_with_one() -> None:
     bench = Bench(triggers=("external",))
     bench.camera.arm(1, 0.01, "external")
-    with pytest.raises(DeviceError, match="triggered, but armed for the external trigger"):
+    with pytest.raises(DeviceError, match="armed for the external trigger"):
         bench.camera.trigger()
     bench.camera.log.clear()
     bench.camera.self_test()
@@ -219,5 +219,5 @@ def test_the_self_test_takes_a_short_frame(facts: Mapping[str, Any], exposure_s:
 
 def test_the_self_test_finds_a_frame_of_another_shape(bench: Bench) -> None:
     bench.camera.shape = (3, 5)
-    with pytest.raises(DeviceError, match=r"a frame has the shape \(3, 5\); expected \(3, 4\)"):
+    with pytest.raises(DeviceError, match=r"\(3, 5\); expected \(3, 4\)"):
         bench.camera.self_test()

@@ -37,8 +37,9 @@ def test_it_is_seen_within_a_look_of_being_steady(cold_s: float) -> None:
 
 
 def test_a_sensor_that_stays_warm_times_out_with_its_temperature() -> None:
-    said = r"^camera: the sensor is at -69.0 degC after 100 s; expected -70.0 degC within 0.5 K; look after"
-    with pytest.raises(DeviceTimeoutError, match=said) as caught:
+    with pytest.raises(
+        DeviceTimeoutError, match=r"^camera: .*-69.0 degC .*-70.0 degC within 0.5 K"
+    ) as caught:
         wait(lambda _t: 204.15, Cooling(203.15, tolerance_k=0.5, timeout_s=100.0))
     assert caught.value.timeout_s == 100.0
 

@@ -120,62 +120,29 @@ def program_of(*batches: Any, grid: SiteGrid = GRID, **rf: Any) -> ToneProgram:
 
 
 @pytest.mark.parametrize(
-    ("batch", "rf", "what", "limit"),
+    ("batch", "rf", "words"),
     [
-        (
-            FOUR,
-            {"column_band_hz": (90e6, 101e6)},
-            "the frequency of column tone 3 in batch 1 is 102.4 MHz",
-            "the band of 90 to 101 MHz",
-        ),
+        (FOUR, {"column_band_hz": (90e6, 101e6)}, "column tone 3 in batch 1 .*102.4 MHz.* 90 to 101 MHz"),
         (
             ([(3, 0)], [(2, 0)]),
             {"row_band_hz": (90e6, 102e6)},
-            "the frequency of row tone 0 in batch 1 is 102.4 MHz",
-            "the band of 90 to 102 MHz",
+            "row tone 0 in batch 1 .*102.4 MHz.* 90 to 102",
         ),
-        (
-            FOUR,
-            {"min_spacing_hz": 1.7e6},
-            "the distance of column tones 0 and 1 in batch 1 is 1.6 MHz",
-            "1.7 MHz at least, in the order of the sites",
-        ),
-        (
-            ([(0, 0), (0, 2)], [(0, 4), (0, 1)]),
-            {},
-            "the distance of column tones 0 and 1 in batch 1 is 0 MHz",
-            "500 kHz at least, in the order of the sites",
-        ),
-        (
-            FOUR,
-            {"column_amplitudes": (0.3, *QUARTERS[1:])},
-            "the sum of the amplitudes of column tones 0 to 3 in batch 1 is 1.05 of full scale",
-            "1: the output would clip",
-        ),
-        (
-            FOUR,
-            {"column_amplitudes": QUARTERS, "full_scale_v": 2.5},
-            "the peak voltage of column tones 0 to 3 in batch 1 is 2.5 V",
-            "2 V: more ruins the amplifier",
-        ),
+        (FOUR, {"min_spacing_hz": 1.7e6}, "column tones 0 and 1 in batch 1 .*1.6 MHz.* 1.7 MHz"),
+        (([(0, 0), (0, 2)], [(0, 4), (0, 1)]), {}, "column tones 0 and 1 in batch 1 .* 0 MHz.* 500 kHz"),
+        (FOUR, {"column_amplitudes": (0.3, *QUARTERS[1:])}, "column tones 0 to 3 in batch 1 .*1.05 of full"),
+        (FOUR, {"column_amplitudes": QUARTERS, "full_scale_v": 2.5}, "tones 0 to 3 in batch 1 .*2.5 V.* 2 V"),
         (
             FOUR,
             {"column_amplitudes": QUARTERS, "amplifier_gain_db": 27.0},
-            "the mean RF power of column tones 0 to 3 in batch 1 is 3.21 W",
-            "3 W at the AOD",
+            "0 to 3 in batch 1 .*3.21 W.* 3 W",
         ),
-        (
-            HARMLESS,
-            {"row_amplitudes": (0.1, 0.2)},
-            "the number of preassigned row amplitudes is 2",
-            "4: one per row",
-        ),
+        (HARMLESS, {"row_amplitudes": (0.1, 0.2)}, "row amplitudes is 2; .* 4"),
     ],
 )
-def test_what_would_be_too_much(batch: Any, rf: dict[str, Any], what: str, limit: str) -> None:
-    with pytest.raises(LimitError) as caught:
+def test_what_would_be_too_much(batch: Any, rf: dict[str, Any], words: str) -> None:
+    with pytest.raises(LimitError, match=words):
         program_of(HARMLESS, batch, **rf)
-    assert str(caught.value) == f"{what}; the limit is {limit}"
 
 
 def test_amplitudes_that_change_on_the_way_may_be_too_loud_in_between() -> None:

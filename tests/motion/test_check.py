@@ -200,9 +200,7 @@ def test_a_later_chunk_of_the_line_stands() -> None:
 def test_the_error_names_the_batch_and_the_atom_move() -> None:
     error = refusal("##..", batch((0, 1, 0, 2)), batch((0, 2, 0, 3), (0, 1, 0, 2)))
     assert (error.batch, error.move, error.rule) == (1, 1, "source")
-    assert str(error) == (
-        "planner 'test': batch 1, atom move 1 breaks the rule 'source': there is no atom on (0, 1)"
-    )
+    assert all(words in str(error) for words in ("'test'", "batch 1", "atom move 1", "'source'", "(0, 1)"))
 
 
 class TestShape:
@@ -210,14 +208,14 @@ class TestShape:
     PLAN = Plan.from_batches([])
 
     def test_what_is_no_plan(self) -> None:
-        with pytest.raises(InvalidPlanError, match=r"'shape': a Plan .* was expected, list came"):
+        with pytest.raises(InvalidPlanError, match=r"'shape': a Plan .* list"):
             check_plan([], grid_of("#."), self.TARGET, 1)  # pyright: ignore[reportArgumentType]
 
     @pytest.mark.parametrize(
         ("given", "message"),
         [
-            ({"target": grid_of("#.")}, "'shape': a TargetPattern as target was expected, ndarray came"),
-            ({"grid": (1, 2)}, "'shape': a SiteGrid as grid was expected, tuple came"),
+            ({"target": grid_of("#.")}, "'shape': a TargetPattern as target .* ndarray"),
+            ({"grid": (1, 2)}, "'shape': a SiteGrid as grid .* tuple"),
         ],
     )
     def test_arguments_that_were_mixed_up(self, given: dict[str, Any], message: str) -> None:
@@ -225,9 +223,9 @@ class TestShape:
         with pytest.raises(InvalidPlanError, match=message):
             check_plan(self.PLAN, grid_of("#."), **arguments)
 
-    @pytest.mark.parametrize("dop", ["7", 1.5])
-    def test_the_degree_of_parallelism_is_a_whole_number(self, dop: Any) -> None:
-        with pytest.raises(LimitError, match=r"degree of parallelism is .*; the limit is a whole"):
+    @pytest.mark.parametrize("dop", ["7", 1.5, 0])
+    def test_the_degree_of_parallelism_is_a_whole_number_above_0(self, dop: Any) -> None:
+        with pytest.raises(LimitError, match=rf"degree of parallelism is .*{dop}"):
             check_plan(self.PLAN, grid_of("#."), self.TARGET, dop)
         assert check_plan(self.PLAN, grid_of("#."), self.TARGET, np.int64(1))  # pyright: ignore[reportArgumentType]
 
@@ -251,13 +249,9 @@ class TestShape:
         for occupancy in ([[1, 0]], np.array([[1.0, 0.0]]), np.array([[1], [0]], np.uint8).T):
             assert check_plan(self.PLAN, occupancy, self.TARGET, 1).meets_target
 
-    def test_the_degree_of_parallelism_is_at_least_one(self) -> None:
-        with pytest.raises(LimitError, match="degree of parallelism is 0; the limit is at least 1"):
-            check_plan(self.PLAN, grid_of("#."), self.TARGET, 0)
-
     def test_an_unknown_speed_profile(self) -> None:
         motion = MotionSpec(speed_profile="jerky")  # pyright: ignore[reportArgumentType]
-        with pytest.raises(LimitError, match="speed profile is 'jerky'; the limit is one of 'constant', "):
+        with pytest.raises(LimitError, match=r"'jerky'.*'constant', "):
             check_plan(self.PLAN, grid_of("#."), self.TARGET, 1, motion=motion)
 
 

@@ -121,11 +121,8 @@ def test_the_time_for_all_sites_is_that_of_the_program(
 @pytest.mark.parametrize(
     ("offset_m", "message"),
     [
-        (
-            (0.0, 50e-6),
-            r"the tone of row 1 at an offset of 50 um is 116.* MHz; the limit is the band of 82 to",
-        ),
-        ((-50e-6, 0.0), r"the tone of column 0 at .* -50 um is 78.* MHz; .*; choose a smaller offset"),
+        ((0.0, 50e-6), r"row 1 at an offset of 50 um is 116.* MHz; .* 82 to"),
+        ((-50e-6, 0.0), r"column 0 at .* -50 um is 78.* MHz"),
     ],
 )
 def test_an_offset_that_leaves_the_band_is_refused(offset_m: tuple[float, float], message: str) -> None:

@@ -214,15 +214,9 @@ def test_only_the_memory_of_waveforms_that_are_gone_is_used_again() -> None:
 @pytest.mark.parametrize(
     ("tone", "message"),
     [
-        (
-            (320e6, 1e8, 0.1, 0.1, 0.0),
-            r"start_hz of a row tone in batch 0 is 320000000.0; the limit is 0 to 312500000",
-        ),
+        ((320e6, 1e8, 0.1, 0.1, 0.0), "start_hz of a row tone in batch 0 .* 320000000.* 312500000"),
         ((1e8, 1e8, float("nan"), 0.1, 0.0), "start_amplitude of a row tone in batch 0 is nan"),
-        (
-            (1e8, 1e8, 0.1, 0.96, 0.0),
-            "sum of the amplitudes of the row tones in batch 0 is 1.01; the limit is 1",
-        ),
+        ((1e8, 1e8, 0.1, 0.96, 0.0), "sum of the amplitudes of the row tones in batch 0 is 1.01"),
     ],
 )
 def test_what_cannot_be_played_is_refused(tone: Any, message: str) -> None:
@@ -239,7 +233,7 @@ def test_wrong_durations_are_refused(duration_s: float) -> None:
 
 @pytest.mark.parametrize("durations_s", [(1e308, 1e308), (1e9,)])
 def test_more_samples_than_can_be_counted_are_refused(durations_s: tuple[float, ...]) -> None:
-    with pytest.raises(LimitError, match=r"the number of samples is .*; the limit is less than 9\.01e\+15"):
+    with pytest.raises(LimitError, match=r"number of samples .*9\.01e\+15"):
         Renderer(program_of(*((duration_s, []) for duration_s in durations_s)), 10e9)
 
 

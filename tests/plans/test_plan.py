@@ -44,14 +44,14 @@ def test_a_plan_without_a_terminal_is_plain_text(moves: PlannedMoves) -> None:
     text = printed(moves)
     assert "\x1b" not in text
     lines = text.splitlines()
-    assert lines[0] == "occupancy  random:6x6@0.7, seed 3: 27 atoms on 6 x 6 sites, triangular, 4.49 um"
-    assert lines[1] == "target     checkerboard 4 x 4: 8 atoms, 8 sites to be empty"
-    assert lines[2] == "planner    psca, degree of parallelism 7"
-    assert "before" in lines[4]
+    for line, facts in enumerate(
+        ("random:6x6@0.7, seed 3: 27 atoms", "8 atoms, 8 sites", "psca", "", "before")
+    ):
+        assert facts in lines[line]
     assert "after" in lines[4]
     assert f"atom moves  {moves.plan.n_atom_moves}" in lines
     assert f"ejected     {moves.n_ejected} atoms" in lines
-    assert lines[-1] == "filled      8 of 8 (100.0 %) target sites"
+    assert "8 of 8 (100.0 %)" in lines[-1]
     assert all(line == line.rstrip() for line in lines)
 
 
@@ -104,10 +104,9 @@ def test_what_falls_short_is_reported() -> None:
     short = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3, degree_of_parallelism=30)
     moves = plan_moves(short)
     n_atoms = int(moves.occupancy.sum())
-    assert warnings(moves, short) == [
-        "--dop 30: planned with 20, the maximum that the planner and the machine allow",
-        f"{n_atoms} atoms for 16 target sites, {16 - n_atoms} short; the plan fills {n_atoms}",
-    ]
+    too_parallel, too_few = warnings(moves, short)
+    assert too_parallel.startswith("--dop 30: planned with 20")
+    assert all(f"{n} " in f"{too_few} " for n in (f"{n_atoms} atoms", 16 - n_atoms, f"fills {n_atoms}"))
     assert warnings(plan_moves(REQUEST), REQUEST) == []
 
 
@@ -136,11 +135,10 @@ def test_a_planner_that_leaves_defects_and_surplus_is_reported(
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
     request = PlanRequest("random:6x6@0.7", "checkerboard:4x4", "lazy", seed=3)
     moves = plan_moves(request)
-    assert warnings(moves, request) == [
-        f"the plan leaves {moves.report.n_defects} target sites empty, although there are enough atoms",
-        f"the plan leaves {moves.report.n_surplus} atoms on sites that must be empty",
-    ]
-    assert ("surplus", f"{moves.report.n_surplus} atoms on sites that must be empty") in totals(moves)
+    defects, surplus = warnings(moves, request)
+    assert f"{moves.report.n_defects} target sites empty" in defects
+    assert f"{moves.report.n_surplus} atoms on sites that must be empty" in surplus
+    assert dict(totals(moves))["surplus"].startswith(f"{moves.report.n_surplus} atoms")
 
 
 BROKEN = """
@@ -221,10 +219,8 @@ def test_a_planner_that_fails_or_hangs_is_named(
     line = BROKEN.splitlines().index(
         "        batches = [([(1, 1)], [(1, 0)]), SECOND[self.kind], ([(1, 0)], [(1, 1)])]"
     )
-    assert (code, err) == (
-        1,
-        f"error: planner 'broken': plan() raised KeyError: 'raises' ({path}:{line + 1})\n",
-    )
+    assert (code, err.count("\n")) == (1, 1)
+    assert all(fact in err for fact in ("'broken'", "KeyError: 'raises'", f"({path}:{line + 1})"))
     path.write_text(
         BROKEN.replace("        batches = ", "        import time; time.sleep(1)\n        batches = "),
         "utf-8",
@@ -232,7 +228,7 @@ def test_a_planner_that_fails_or_hangs_is_named(
     monkeypatch.setattr("labseq.session.planning.MAX_PLAN_S", 0.01)
     code, _, err = call(*command)
     assert code == 1
-    assert "plan() did not return within 0.01 s and was abandoned; a run waits for 'timeouts: {plan: " in err
+    assert all(fact in err for fact in ("'broken'", "0.01 s", "'timeouts: {plan: "))
 
 
 def test_json_in_a_file_is_printed_with_the_report(

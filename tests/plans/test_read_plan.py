@@ -40,10 +40,9 @@ def test_a_plan_that_breaks_a_rule_is_refused_with_the_files_name() -> None:
     document = planned(seed=1)
     row, col = np.argwhere(np.array(document["occupancy"]) == 0)[0].tolist()
     document["batches"] = [{"from": [[row, col]], "to": [[row, col - 1 if col else 1]], "linked": False}]
-    words = (
-        rf"^plan\.json: batch 0, atom move 0 breaks the rule 'source': there is no atom on \({row}, {col}\)"
-    )
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(
+        ConfigError, match=rf"^plan\.json: batch 0, atom move 0 .*'source'.* \({row}, {col}\)"
+    ):
         read(document)
 
 
@@ -63,7 +62,7 @@ def test_a_profile_brings_motion_and_tones() -> None:
 
 
 def test_a_plan_for_another_grid_than_the_profiles_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"has 8 x 9 sites; expected 20 x 20, as in .*virtual"):
+    with pytest.raises(ConfigError, match=r"8 x 9 sites.* 20 x 20.*virtual"):
         read(planned(seed=1), profile="virtual")
 
 
@@ -79,9 +78,9 @@ def test_a_plan_for_another_grid_than_the_profiles_is_refused() -> None:
 def test_options_that_only_planning_takes_are_refused(options: dict[str, Any], option: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read(planned(seed=1), **options)
-    assert str(caught.value).startswith(f"{option}: plan.json is a plan already: there is nothing to plan")
+    assert str(caught.value).startswith(f"{option}: plan.json is a plan already")
 
 
 def test_values_of_a_profile_need_a_profile() -> None:
-    with pytest.raises(ConfigError, match="there is no --profile to change"):
+    with pytest.raises(ConfigError, match="no --profile"):
         read(planned(seed=1), overrides=["profile.mobile_tweezers.speed=65 um/ms"])

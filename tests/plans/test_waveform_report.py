@@ -27,31 +27,20 @@ def made() -> PlannedWaveform:
 def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
     lines = report(made, made.statistics())
     n = made.moves.plan.n_batches
-    assert lines[0] == "occupancy  random:6x6@0.7, seed 3: 27 atoms on 6 x 6 sites, triangular, 4.49 um"
+    assert all(fact in lines[0] for fact in ("random:6x6@0.7", "seed 3", "27 atoms on 6 x 6 sites"))
     assert f"batches    {n}" in lines
     assert any(line.startswith("samples    ") and " per channel at 250 MHz, " in line for line in lines)
-    labels = [line.partition("  ")[0] for line in lines[lines.index("") + 2 :]]
-    assert labels == [
-        "tones at once",
-        "frequencies",
-        "band of the AOD",
-        "shifted onto a comb",
-        "sum of amplitudes",
-        "peak voltage (limit 2 V)",
-        "",
-        "crest factor",
-        "mean power into 50 Ohm",
-        "",
-        "rendered",
-    ]
+    (crest,) = (line for line in lines if line.startswith("crest factor"))
+    assert all(f"{axis.crest_factor:.2f}" in crest for axis in made.statistics())
+    assert any("(limit 2 V)" in line for line in lines)
     assert lines[-1].count("comb 100.0 %") == 2
 
 
 def test_some_batches_are_named_in_report_and_title() -> None:
     made = plan_waveform(WaveformRequest(REQUEST.plan, "1-2", REQUEST.sample_rate))
     n = made.moves.plan.n_batches
-    assert title(made).startswith(f"psca, degree of parallelism 7: batches 1 to 2 (2 of {n}), ")
-    assert f"batches    1 to 2 (2 of {n})" in report(made, made.statistics())
+    text = "\n".join(report(made, made.statistics()))
+    assert all(f"1 to 2 (2 of {n})" in one for one in (title(made), text))
 
 
 def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:

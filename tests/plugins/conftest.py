@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -65,12 +65,14 @@ class Lab:
         card: The card.
         clock: The clock of both.
         motion: How the tweezers move.
+        settings: Those of the driver.
     """
 
     tweezers: SpcmMobileTweezers
     card: SimulatedCard
     clock: FakeClock
     motion: MotionSpec
+    settings: SpcmSettings = field(default_factory=SpcmSettings)
 
     @property
     def rate_hz(self) -> float:
@@ -115,12 +117,13 @@ def open_driver(
     card = SimulatedCard(clock, model=model)
     motion = motion or (DDS_MOTION if mode == "dds" else MotionSpec())
     with installed(card) as name:
-        chosen = {"card": name, "mode": mode, "sample_rate": RATE_HZ, **settings}
+        given = {"card": name, "mode": mode, "sample_rate": RATE_HZ, **settings}
+        chosen = SpcmSettings.model_validate(given)
         context = Context("mobile_tweezers", clock=clock, motion=motion)
-        tweezers = SpcmMobileTweezers(SpcmSettings.model_validate(chosen), context)
+        tweezers = SpcmMobileTweezers(chosen, context)
         tweezers.open()
         try:
-            yield Lab(tweezers, card, clock, motion)
+            yield Lab(tweezers, card, clock, motion, chosen)
         finally:
             tweezers.close()
 

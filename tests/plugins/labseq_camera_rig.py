@@ -87,6 +87,11 @@ class Rig:
         return self.camera.library.camera
 
     @property
+    def genicam(self) -> Any:
+        """The simulated GenICam camera, as libaravis has it."""
+        return self.camera._link.camera
+
+    @property
     def pylon(self) -> Any:
         """pylon's own camera."""
         return self.camera._camera

@@ -158,7 +158,7 @@ def test_closing_leaves_the_cooler_as_the_settings_say(after: str, is_on: bool) 
 def test_a_camera_that_never_calls_itself_stabilized() -> None:
     with rig(cooling={"temperature": "-80 degC", "tolerance": 20, "timeout": "5 min"}) as lab:
         lab.sim.faults.coldest_c = -70.0
-        with pytest.raises(DeviceTimeoutError, match=r"does not report a stabilized temperature after 300 s"):
+        with pytest.raises(DeviceTimeoutError, match="stabilized temperature after 300 s"):
             lab.camera.settle()
 
 
@@ -182,17 +182,16 @@ def test_looking_for_a_serial_number_leaves_other_cameras_cold() -> None:
 
 def test_bulb_with_frame_transfer_is_refused_as_most_heads_do_not_have_it() -> None:
     both: Final[dict[str, Any]] = {"line_trigger": "bulb", "frame_transfer": True}
-    with pytest.raises(ValueError, match="no iXon but the 885 has `line_trigger: bulb` with frame transfer"):
+    with pytest.raises(ValueError, match="`line_trigger: bulb` with frame transfer"):
         unopened(**both)
     made = unopened(**both, model="DU-885")  # a simulated 885 does not have it either
-    with pytest.raises(DeviceError, match="has no bulb trigger with these settings; it has one of"):
+    with pytest.raises(DeviceError, match="no bulb trigger with these settings"):
         made.camera.open()
 
 
 def test_a_cycle_shorter_than_exposure_and_read_out_is_refused() -> None:
     with rig(line_trigger="external_start", cycle_time="12 ms") as lab:
-        least = "cycle_time is 12 ms; the limit is at least 13 ms with this exposure and read-out"
-        with pytest.raises(LimitError, match=least):
+        with pytest.raises(LimitError, match=r"cycle_time is 12 ms; .* 13 ms"):
             lab.camera.arm(2, 0.0119, "external_start")
         lab.camera.arm(2, 5e-3, "external_start")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import re
 import sys
 import threading
 from functools import partial
@@ -34,7 +35,7 @@ def refusal(lab: Rig) -> str:
 def test_no_camera_is_connected() -> None:
     lab = unopened()
     lab.sim.faults.not_connected = True
-    assert "no Andor camera is connected; look at its power and its cable" in refusal(lab)
+    assert "no Andor camera is connected" in refusal(lab)
     lab.sim.faults.not_connected = False
     lab.camera.open()
     assert lab.take(1)
@@ -45,17 +46,17 @@ def test_another_program_has_the_camera() -> None:
     lab = unopened()
     lab.sim.faults.held = True
     text = refusal(lab)
-    assert "close Solis and every other program" in text
+    assert "close Solis" in text
     assert "(Initialize gave 20003, DRV_VXDNOTINSTALLED)" in text
 
 
 def test_another_camera_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "has the serial number 10001; expected 4711" in refusal(unopened(serial=4711))
+    assert "10001; expected 4711" in refusal(unopened(serial=4711))
     lab = unopened(model="DU-888")
     lab.sim.head = IXON_897
-    assert "connected camera is a DU-897; expected a model that begins with DU-888" in refusal(lab)
+    assert re.search("DU-897; expected .*DU-888", refusal(lab))
     monkeypatch.setattr("labseq_andor_sim.camera.READ_MODES", 3)
-    assert "pylablib cannot open this camera: invalid value None for the read_mode" in refusal(unopened())
+    assert "pylablib cannot open this camera: invalid value None" in refusal(unopened())
 
 
 def two_cameras(**settings: Any) -> tuple[Rig, SimulatedCamera]:
@@ -67,7 +68,7 @@ def two_cameras(**settings: Any) -> tuple[Rig, SimulatedCamera]:
 
 def test_with_two_cameras_the_serial_number_decides() -> None:
     lab, _ = two_cameras()
-    assert "2 Andor cameras are connected; choose one by `serial`" in refusal(lab)
+    assert re.search("2 Andor cameras .*`serial`", refusal(lab))
     lab, _ = two_cameras(serial=4711)
     assert "10001 and 10002; expected 4711" in refusal(lab)
     lab, _ = two_cameras(serial=10002)
@@ -81,7 +82,7 @@ def test_unplugged_in_a_series() -> None:
         lab.sim.faults.unplugged_at = 3
         lab.camera.arm(4, 0.01, "internal")
         assert [lab.camera.read(1.0).number for _ in range(2)] == [0, 1]
-        with pytest.raises(DeviceError, match=r"does not answer any more; look at its power.*20013"):
+        with pytest.raises(DeviceError, match=r"does not answer any more.*20013"):
             lab.camera.read(1.0)
         with pytest.raises(DeviceError, match="does not answer any more"):
             lab.camera.safe_state()
@@ -97,7 +98,7 @@ def test_a_frame_later_than_the_timeout() -> None:
         lab.sim.faults.late_s = 0.5
         lab.camera.arm(1, 0.01, "software")
         lab.camera.trigger()
-        with pytest.raises(DeviceTimeoutError, match="no frame within 200 ms: frame 0 is not ready"):
+        with pytest.raises(DeviceTimeoutError, match="200 ms: frame 0 is not ready"):
             lab.camera.read(0.2)
         assert lab.clock.now() == pytest.approx(0.027 + 0.2)
         assert lab.camera.read(0.5).number == 0
@@ -108,7 +109,7 @@ def test_a_software_trigger_during_the_read_out() -> None:
         lab.camera.arm(2, 0.01, "software")
         lab.camera.trigger()
         lab.clock.sleep(0.0101)
-        with pytest.raises(DeviceError, match="still reads the last frame; read that first"):
+        with pytest.raises(DeviceError, match="still reads the last frame"):
             lab.camera.trigger()
 
 
@@ -157,10 +158,7 @@ def test_a_setting_that_the_camera_does_not_have(chosen: dict[str, Any], text: s
         ({"em_gain": 301}, "em_gain is 301: above 300 the EM register ages fast.*allow_high_gain: true"),
         ({"em_gain": 2, "amplifier": "conventional"}, "conventional amplifier has no EM register"),
         ({"isolated_crop": True}, "isolated_crop needs a `region`"),
-        (
-            {"isolated_crop": True, "region": {"height": 8, "width": 8}},
-            "isolated_crop needs `frame_transfer: true`",
-        ),
+        ({"isolated_crop": True, "region": {"height": 8, "width": 8}}, "needs `frame_transfer: true`"),
     ],
 )
 def test_settings_that_do_not_go_together(chosen: dict[str, Any], text: str) -> None:
@@ -173,9 +171,8 @@ def test_a_region_outside_of_the_sensor_is_refused_as_soon_as_the_sensor_is_know
     settings = AndorSettings.model_validate({"model": "DU-897", "region": region})
     with pytest.raises(ConfigError, match="`region` ends at row 564 and column 64, beyond the sensor"):
         AndorCamera(settings, Context("camera"))
-    lab = unopened()
+    lab = unopened(region={"height": 64, "width": 64})
     lab.sim.optics.sensor_shape = (48, 48)
-    lab.camera._settings = AndorSettings.model_validate({"region": {"height": 64, "width": 64}})
     with pytest.raises(ConfigError, match="beyond the sensor of 48 x 48 pixels"):
         lab.camera.open()
 
@@ -206,13 +203,13 @@ def test_the_safe_state_comes_through_while_a_call_hangs() -> None:
 
 def test_without_pylablib_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pylablib.devices.Andor.AndorSDK2", None)
-    assert f"install it with {install_hint('andor')}; to try things without a camera" in refusal(unopened())
+    assert f"install it with {install_hint('andor')}" in refusal(unopened())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there Andor's library may be installed")
 def test_without_andors_library_the_error_says_what_to_install() -> None:
     camera = AndorCamera(AndorSettings(sdk="/nowhere/libandor.so"), Context("camera"))
-    with pytest.raises(DeviceError, match=r"'/nowhere/libandor.so' cannot be loaded.*install Andor SDK2 or"):
+    with pytest.raises(DeviceError, match=r"'/nowhere/libandor.so' .*install Andor SDK2"):
         camera.open()
 
 
@@ -222,6 +219,6 @@ def test_a_real_camera_does_not_take_the_place_of_an_open_simulated_one(
     monkeypatch.setattr("labseq_andor.library.load_file", lambda path: builtins.object())
     with rig() as lab:
         camera = AndorCamera(AndorSettings(sdk="libandor.so"), Context("camera_2"))
-        with pytest.raises(DeviceError, match="camera_2: another Andor camera is open in this process"):
+        with pytest.raises(DeviceError, match="camera_2: another Andor camera is open"):
             camera.open()
         assert lab.take(1)

@@ -115,7 +115,7 @@ def test_a_frame_is_due_when_a_real_camera_would_have_it(driver: str) -> None:
 def test_an_external_trigger_that_never_comes_is_a_timeout(driver: str) -> None:
     with opened_rig(driver) as lab:
         lab.camera.arm(2, 0.01, "external")
-        with pytest.raises(DeviceTimeoutError, match="frame 0 waits for its external trigger; check"):
+        with pytest.raises(DeviceTimeoutError, match="frame 0 waits for its external trigger"):
             lab.camera.read(0.05)
         assert len(lab.take(1)) == 1
         lab.camera.arm(1, 0.01, "external")

@@ -125,14 +125,11 @@ def test_the_token_is_made_for_this_user_alone_and_one_that_others_can_read_is_r
         pass
     token_file().chmod(0o600)
     token_file().write_text("short")
-    with (
-        pytest.raises(DeviceError, match="holds no token; expected 16 to 100 letters"),
-        listening(),
-    ):
+    with pytest.raises(DeviceError, match="no token; expected 16 to 100"), listening():
         pass
     token_file().unlink()
     os.mkfifo(token_file())
-    with pytest.raises(DeviceError, match="cannot be read: it is not an ordinary file"), listening():
+    with pytest.raises(DeviceError, match="not an ordinary file"), listening():
         pass
 
 

@@ -125,9 +125,7 @@ def test_a_shot_that_fails_tells_its_leader_why(tmp_path: Path) -> None:
 def test_a_go_that_never_comes_ends_the_run_in_the_safe_state(tmp_path: Path) -> None:
     overrides = [ANY_PORT, "shot.0.wait.timeout=50 ms"]
     with Session.open(FOLLOW, output=tmp_path, overrides=overrides) as session:
-        with pytest.raises(
-            DeviceTimeoutError, match=r"no 'go' within 50 ms on .*; no leader has connected"
-        ) as caught:
+        with pytest.raises(DeviceTimeoutError, match=r"no 'go' within 50 ms .*no leader") as caught:
             session.run()
         assert caught.value.exit_code == 3
         assert session.run_dir is not None
@@ -178,8 +176,8 @@ def test_who_cannot_lead_is_reported_before_anything_is_opened(
 def test_a_deadline_that_a_shot_may_miss_is_a_warning() -> None:
     with Session.open(FOLLOW, overrides=[SMALL, "profile.devices.leader.deadline=1 s"]) as session:
         (warning,) = check(session).warnings
-    text = "what follows takes up to 1.2 s, but 'leader' must be answered within 1 s; raise 'deadline'"
-    assert f"follow.yaml:12:17: {text}" in str(warning)
+    facts = ("follow.yaml:12:17: ", "1.2 s", "'leader'", "within 1 s", "raise 'deadline'")
+    assert all(fact in str(warning) for fact in facts)
 
 
 def test_the_profile_is_the_virtual_lab_with_a_leader() -> None:

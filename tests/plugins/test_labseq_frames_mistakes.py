@@ -77,9 +77,9 @@ def recorded(
 def test_a_path_that_does_not_exist_is_named_with_one_like_it(tmp_path: Path) -> None:
     (tmp_path / "stack.tif").touch()
     text = refusal(tmp_path / "stak.tif")
-    assert "stak.tif: no such file or folder; expected a run's folder, a TIFF" in text
+    assert "stak.tif: no such file or folder" in text
     assert text.endswith("did you mean 'stack.tif'?")
-    assert refusal(tmp_path / "a" / "b").endswith("check `path`; it is relative to the profile")
+    assert "`path`" in refusal(tmp_path / "a" / "b")
     assert f"no file in {tmp_path} matches" in refusal(tmp_path / "*.png")
     assert "no file in" in refusal(tmp_path / "nowhere" / "*.png")
     assert "is not a pattern" in refusal(tmp_path / "**x" / "*.png") or sys.version_info >= (3, 13)
@@ -87,19 +87,18 @@ def test_a_path_that_does_not_exist_is_named_with_one_like_it(tmp_path: Path) ->
 
 def test_folders_and_files_that_hold_no_frames_are_refused(tmp_path: Path) -> None:
     run = recorded(tmp_path)
-    assert f"holds 1 run and is none itself; give one of them, for example {run}" in refusal(tmp_path)
+    assert refusal(tmp_path).endswith(f"for example {run}")
     (folder := tmp_path / "x").mkdir()
     (folder / "notes.txt").touch()
-    assert "holds no PNG or TIFF files, and is not a run: it has no run.json; give a" in refusal(folder)
+    assert "holds no PNG or TIFF files" in refusal(folder)
     (folder / "x.sif").touch()
     assert "x.sif: is neither a TIFF nor a PNG" in refusal(folder / "x.sif")
     (folder / "x.tif").write_text("version https://git-lfs.github.com/spec/v1")
-    assert "x.tif: cannot be read as a TIFF: not a TIFF file" in refusal(folder / "x.tif")
-    text = "x.tif: is not a run, so that `images: first` has no meaning"
+    assert "x.tif: cannot be read as a TIFF" in refusal(folder / "x.tif")
     tifffile.imwrite(folder / "x.tif", pixels())
-    assert text in refusal(folder / "x.tif", images="first")
+    assert "x.tif: is not a run" in refusal(folder / "x.tif", images="first")
     Image.fromarray(pixels()).save(folder / "x.png")
-    assert "contains 1 PNG and 1 TIFF files; expected files of one kind" in refusal(folder)
+    assert "1 PNG and 1 TIFF files" in refusal(folder)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders")
@@ -110,17 +109,13 @@ def test_what_is_no_ordinary_file_is_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("mode", "message"),
-    [
-        ("RGB", "8 bit colour;"),
-        ("RGBA", "8 bit colour with transparency;"),
-        ("1", "1 bit gray;"),
-    ],
+    [("RGB", "8 bit colour;"), ("RGBA", "8 bit colour with transparency;"), ("1", "1 bit gray;")],
 )
 def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, message: str) -> None:
     Image.new(mode, (6, 4)).save(tmp_path / "x.png")
     text = refusal(tmp_path)
-    assert "x.png: the picture is " in text
-    assert f"{message} expected 16 bit gray; save the camera's own counts" in text
+    assert "x.png: " in text
+    assert f"{message} expected 16 bit gray" in text
 
 
 def test_a_damaged_png_is_named(tmp_path: Path) -> None:
@@ -133,7 +128,7 @@ def test_a_damaged_png_is_named(tmp_path: Path) -> None:
     assert "x1.png: is damaged: " in failure(tmp_path, 1)
     assert "x1.png: is damaged: " in failure(tmp_path, 1, at_end="repeat")
     (tmp_path / "x1.png").write_bytes(b"\x89PNG")
-    assert "x1.png: is not a PNG; restore it from a backup" in refusal(tmp_path)
+    assert "x1.png: is not a PNG" in refusal(tmp_path)
     (tmp_path / "x1.png").write_bytes(whole[:100])
     assert "x1.png: is damaged: " in refusal(tmp_path / "x1.png")
 
@@ -181,20 +176,19 @@ def test_a_stack_that_hides_its_frames_behind_one_page_is_refused(tmp_path: Path
     with tifffile.TiffWriter(tmp_path / "x.tif") as stack:
         stack.write(np.stack([pixels()] * 3), photometric="minisblack", truncate=True)
     text = refusal(tmp_path / "x.tif")
-    assert "holds 3 x 4 x 6 counts behind a single page" in text
-    assert text.endswith("save it as BigTIFF, or in several files")
+    assert all(fact in text for fact in ("3 x 4 x 6", "a single page", "BigTIFF"))
 
 
 def test_a_run_without_its_frames_is_refused(tmp_path: Path) -> None:
     for record_frames, n_shots, n_images, ends, message in (
-        ("all", 2, 2, False, "the run is still being written; wait until it has ended"),
-        ("none", 2, 2, True, "the run holds no frames; expected one that was made with `record_frames: all`"),
-        ("all", 0, 2, True, "the run holds no complete shot"),
-        ("all", 2, 0, True, "holds no frames; expected at least one"),
+        ("all", 2, 2, False, "still being written"),
+        ("none", 2, 2, True, "`record_frames: all`"),
+        ("all", 0, 2, True, "no complete shot"),
+        ("all", 2, 0, True, "holds no frames"),
     ):
         assert message in refusal(recorded(tmp_path, record_frames, n_shots, n_images, ends=ends))
     run = recorded(tmp_path, record_frames="last")
-    assert "the first image of the shot was not kept; record with" in refusal(run, images="first")
+    assert "the first image of the shot was not kept" in refusal(run, images="first")
     camera_of(run).open()
 
 
@@ -205,7 +199,7 @@ def test_a_shot_that_is_damaged_or_gone_is_named(tmp_path: Path) -> None:
     second.write_bytes(whole[: len(whole) // 2])
     assert f"{second}: is damaged: " in failure(run, 2)
     second.unlink()
-    assert f"{second}: is missing; restore it from a backup" in failure(run, 2)
+    assert f"{second}: is missing" in failure(run, 2)
     (run / "run.json").write_text("{}")
     assert f"{run / 'run.json'}: is damaged" in refusal(run)
 

@@ -72,9 +72,8 @@ def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]
     with rig(**sensor) as lab:
         about = lab.camera.facts.frame_shape
         (frame,) = lab.take(1)
-        assert lab.camera._link is not None
         features = ("OffsetY", "OffsetX", "Height", "Width")
-        read = [lab.camera._link.camera.get_integer(feature) for feature in features]
+        read = [lab.genicam.get_integer(feature) for feature in features]
     wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
     binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
     assert read == binned
@@ -118,19 +117,11 @@ def test_it_says_what_it_is_and_what_it_took() -> None:
         lab.take(1, 0.02)
         about = json.loads(json.dumps(dict(lab.camera.describe()), allow_nan=False))
         assert lab.camera.facts.max_exposure_s == 10.0
-        assert lab.camera._link is not None
-        assert lab.camera._link.camera.packet_size == 9000
-        assert lab.camera._link.camera.packet_delay_s == pytest.approx(1e-6)
-    assert (about["vendor"], about["model"], about["serial_number"]) == (
-        "labseq",
-        "Simulated",
-        "SIM1",
-    )
-    assert (about["pixel_format"], about["frame_shape"], about["connection"]) == (
-        "Mono16",
-        [48, 64],
-        "GigE Vision",
-    )
+        assert lab.genicam.packet_size == 9000
+        assert lab.genicam.packet_delay_s == pytest.approx(1e-6)
+    expected = {"vendor": "labseq", "model": "Simulated", "serial_number": "SIM1", "pixel_format": "Mono16"}
+    expected |= {"frame_shape": [48, 64], "connection": "GigE Vision"}
+    assert about.items() >= expected.items()
     assert about["firmware"]
     assert about["gain_now"] == pytest.approx(6.0)
     assert about["exposure_now_s"] == pytest.approx(0.02)
@@ -189,7 +180,7 @@ def test_the_temperature_of_a_camera_that_measures_one_is_in_kelvins() -> None:
 def test_a_pulse_or_the_start_of_a_series_is_chosen_by_the_features_of_the_standard() -> None:
     features = ("AcquisitionMode", "ExposureMode", "TriggerMode", "TriggerSource")
     with rig(line_trigger="external_start", cycle_time="50 ms") as lab:
-        camera = lab.camera._link.camera
+        camera = lab.genicam
 
         def chosen(trigger: Trigger, selector: str) -> list[str]:
             lab.camera.arm(3, 0.01, trigger)

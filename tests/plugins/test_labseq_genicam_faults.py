@@ -39,18 +39,15 @@ def opening(**settings: Any) -> DeviceError | LimitError:
     ("settings", "text"),
     [
         ({"camera": "127.255.0.9"}, "check its cable, power and network address"),
-        ({"faults": {"busy": True}}, "cannot open the camera: another program controls it; close that one"),
-        ({"model": "BFS-1"}, r"SIM1 (Simulated) has the model Simulated; expected BFS-1"),
-        ({"serial": "7"}, r"SIM1 (Simulated) has the serial number SIM1; expected 7"),
-        ({"pixel_format": "Mono14"}, "pixel format cannot be Mono14; the camera offers Mono8, Mono10"),
-        ({"gain": 2000.0}, "gain is 2000; the limit is 0 to 1000, which the camera can do"),
-        (
-            {"binning": 16},
-            "binning is 16; the limit is 1 to 8, in steps of 1, which the camera can do; the n",
-        ),
+        ({"faults": {"busy": True}}, "another program controls it"),
+        ({"model": "BFS-1"}, "the model Simulated; expected BFS-1"),
+        ({"serial": "7"}, "the serial number SIM1; expected 7"),
+        ({"pixel_format": "Mono14"}, "cannot be Mono14; the camera offers Mono8, Mono10"),
+        ({"gain": 2000.0}, "gain is 2000; the limit is 0 to 1000"),
+        ({"binning": 16}, "binning is 16; the limit is 1 to 8, in steps of 1"),
         (
             {"binning": 2, "region": {"y": 3, "x": 0, "height": 32, "width": 32}},
-            "region's y is 3; the limit is 0 to 64, in steps of 2, which the camera can do; the nearest good",
+            "region's y is 3; the limit is 0 to 64, in steps of 2",
         ),
     ],
 )
@@ -65,7 +62,7 @@ def test_a_region_beyond_the_cameras_sensor_is_refused() -> None:
     region = {"y": 0, "x": 2000, "height": 64, "width": 100}
     with plugged_in() as fake:
         error = str(opening(camera=fake.address, region=region))
-    assert "end of the region is row 64, column 2100; the limit is the sensor's 2048 x 2048 pixels" in error
+    assert all(fact in error for fact in ("row 64, column 2100", "2048 x 2048"))
 
 
 @needs_aravis
@@ -76,10 +73,7 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
         lab.camera.trigger()
         frames = [lab.camera.read(1.0)]
         lab.camera.trigger()
-        with pytest.raises(
-            TransientError,
-            match="frame 1 was lost, of a series of 3: some of its network packets are missing",
-        ):
+        with pytest.raises(TransientError, match=r"frame 1 was lost, .* 3: .*network packets are missing"):
             lab.camera.read(1.0)
         del lab.world.shown[1]
         lab.camera.trigger()
@@ -95,11 +89,9 @@ def test_frames_of_which_nothing_comes_are_missed_by_their_numbers() -> None:
         lab.camera.arm(4, 0.01, "software")
         lab.camera.trigger()
         first = lab.camera.read(1.0)
-        assert lab.camera._acquisition is not None
         for _ in range(2):
             lab.camera.trigger()
             lab.clock.sleep(0.01)
-            assert lab.camera._acquisition._stream is not None
             assert lab.camera._acquisition._stream.pop(WAIT_S) is not None
         lab.camera.trigger()
         with pytest.raises(TransientError, match=r"frames 1 to 2 were lost, of a series of 4: .* have a gap"):
@@ -114,7 +106,7 @@ def test_a_frame_that_comes_too_late_is_a_timeout_and_does_not_turn_up_in_the_ne
     with rig(faults={"late_by": "100 ms"}) as lab:
         lab.camera.arm(1, 0.01, "software")
         lab.camera.trigger()
-        with pytest.raises(DeviceTimeoutError, match=r"no frame within 50 ms: frame 0 is not ready"):
+        with pytest.raises(DeviceTimeoutError, match="50 ms: frame 0 is not ready"):
             lab.camera.read(0.05)
         lab.camera.safe_state()
         del lab.world.shown[:]
@@ -152,7 +144,7 @@ def test_a_loss_that_the_library_notices_ends_a_wait() -> None:
     with rig() as lab:
         lab.camera.arm(1, 0.01, "external")
         lib = load_library()
-        device = ctypes.c_void_p(lib.arv_camera_get_device(lab.camera._link.camera._handle))
+        device = ctypes.c_void_p(lib.arv_camera_get_device(lab.genicam._handle))
         lib._libraries[1].g_signal_emit_by_name(device, b"control-lost")
         with pytest.raises(DeviceError, match=GONE):
             lab.camera.read(60.0)
@@ -186,13 +178,11 @@ def test_a_trigger_that_the_camera_does_not_have_is_refused(settings: dict[str, 
 @needs_aravis
 def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
     with rig(max_exposure="60 s", frame_rate="200 Hz") as lab:
-        with pytest.raises(LimitError, match="exposure is 20 s; the limit is 10 us to 10 s"):
+        with pytest.raises(LimitError, match=r"exposure is 20 s; .* 10 us to 10 s"):
             lab.camera.arm(1, 20.0, "software")
-        with pytest.raises(LimitError, match="exposure is 1 us; the limit is 10 us to 10 s"):
+        with pytest.raises(LimitError, match=r"exposure is 1 us; .* 10 us to 10 s"):
             lab.camera.arm(1, 1e-6, "software")
-        with pytest.raises(
-            LimitError, match=r"frame rate is 200; the limit is 0\.1 to 100 per second at this"
-        ):
+        with pytest.raises(LimitError, match=r"frame rate is 200; .* 0\.1 to 100 per second"):
             lab.camera.arm(2, 0.01, "internal")
         assert len(lab.take(1)) == 1
 
@@ -200,8 +190,7 @@ def test_exposures_beyond_the_cameras_limits_are_refused() -> None:
 @needs_aravis
 def test_a_camera_that_reads_another_region_is_noticed() -> None:
     with rig(region={"y": 0, "x": 0, "height": 32, "width": 32}) as lab:
-        assert lab.camera._link is not None
-        lab.camera._link.camera.set_integer("OffsetX", 5)
+        lab.genicam.set_integer("OffsetX", 5)
         lab.camera.arm(1, 0.01, "software")
         with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, .*\); expected"):
             lab.camera.trigger()
@@ -211,6 +200,4 @@ def test_without_the_library_the_error_says_how_to_install_it(monkeypatch: pytes
     monkeypatch.setattr(aravis_library, "_library", None)
     monkeypatch.setattr(aravis_library, "NAMES", {sys.platform: (("libnone.so.1", "none"),)})
     error = str(opening())
-    assert "camera: the library libaravis 0.8 cannot be loaded" in error
-    assert "apt-get install libaravis-0.8-0" in error
-    assert "use: virtual" in error
+    assert all(fact in error for fact in ("camera", "apt-get install libaravis-0.8-0", "use: virtual"))

@@ -196,19 +196,16 @@ def test_a_block_too_small_for_an_atom_is_refused() -> None:
 
 @pytest.mark.parametrize("name", TRIANGULAR)
 def test_a_diluted_triangular_lattice_needs_a_triangular_grid(name: str) -> None:
-    with pytest.raises(
-        ConfigError, match=f"'{name}' dilutes a triangular lattice, and the grid is square"
-    ) as no:
+    with pytest.raises(ConfigError, match=f"'{name}' .*lattice: triangular"):
         make(name, SiteGrid(lattice="square"), rows=9, cols=9)
-    assert "lattice: triangular" in str(no.value)
 
 
 @pytest.mark.parametrize(
     ("model", "values", "message"),
     [
         (BlockSettings, {"rows": 3, "cols": 3, "origin": (-1, 0)}, "greater than or equal to 0"),
-        (SierpinskiSettings, {}, "the size is missing, or half of it; expected either 'order'"),
-        (SierpinskiSettings, {"rows": 3}, "the size is missing, or half of it"),
+        (SierpinskiSettings, {}, "the size is missing, .*'order'"),
+        (SierpinskiSettings, {"rows": 3}, "the size is missing"),
         (SierpinskiSettings, {"order": 3, "rows": 3}, "two sizes are given"),
         (RingSettings, {"width": 2}, "expected either 'radius', or 'rows' and 'cols'"),
         (RingSettings, {"radius": 3, "rows": 5, "cols": 5}, "two sizes are given"),

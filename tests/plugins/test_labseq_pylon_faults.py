@@ -110,10 +110,10 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
     ("settings", "text"),
     [
         ({"region": {"y": 3, "x": 0, "height": 32, "width": 32}, "binning": 2}, "the nearest good one is 4"),
-        ({"binning": 8}, "binning is 8; the limit is 1 to 4, in steps of 1, which the camera can do; the"),
+        ({"binning": 8}, "binning is 8; the limit is 1 to 4, in steps of 1"),
         ({"gain": 60.0}, "gain is 60 dB; the limit is 0 dB to 48 dB"),
         ({"gain_raw": 100}, "gain_raw is 100; the limit is 192 to 1023"),
-        ({"model": "acA1920-40um"}, "the camera 0815-0000 is an Emulation; expected an acA1920-40um"),
+        ({"model": "acA1920-40um"}, "is an Emulation; expected an acA1920-40um"),
     ],
 )
 def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(
@@ -146,8 +146,8 @@ def test_a_stream_that_breaks_off_is_an_error() -> None:
 def test_a_region_beyond_the_cameras_sensor_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYLON_CAMEMU", "1")
     region = {"y": 0, "x": 4000, "height": 64, "width": 100}
-    text = "end of the region is row 64, column 4100; the limit is the sensor's 4096 x 4096 pixels"
-    assert text in str(opening(camera="0815-0000", region=region))
+    error = str(opening(camera="0815-0000", region=region))
+    assert all(fact in error for fact in ("row 64, column 4100", "4096 x 4096"))
 
 
 @needs_pypylon
@@ -155,9 +155,8 @@ def test_a_serial_number_that_no_camera_has_is_reported_with_those_there_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("PYLON_CAMEMU", "2")
-    error = opening(camera="22345678")
-    assert "camera: no camera has the serial number '22345678'; found" in str(error)
-    assert "Emulation '0815-0000', Emulation '0815-0001'" in str(error)
+    error = str(opening(camera="22345678"))
+    assert all(fact in error for fact in ("'22345678'", "'0815-0000'", "'0815-0001'"))
 
 
 @pytest.fixture
@@ -173,15 +172,14 @@ def emulated_only(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @needs_pypylon
 def test_without_a_camera_it_says_so_and_does_not_take_an_emulated_one(emulated_only: Any) -> None:
-    with pytest.raises(DeviceError, match=r"no Basler camera was found; .*set `camera: simulated`"):
+    with pytest.raises(DeviceError, match=r"no Basler camera .*`camera: simulated`"):
         connection.find_camera(emulated_only, PylonSettings())
 
 
 @needs_pypylon
 def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "EMULATION", "no class")  # as if these two were real
-    text = "2 cameras were found: Emulation '0815-0000', Emulation '0815-0001'; name the serial number"
-    with pytest.raises(DeviceError, match=text):
+    with pytest.raises(DeviceError, match=r"2 cameras .*'0815-0000', .*'0815-0001'.* serial number"):
         connection.find_camera(emulated_only, PylonSettings())
 
 
@@ -195,7 +193,7 @@ def test_a_camera_that_another_program_has_is_an_error(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(sdk.pylon.InstantCamera, "Open", refuse)
     error = str(opening())
-    assert "camera: cannot open the camera: The device is controlled by another application" in error
+    assert "controlled by another application" in error
     assert "close the pylon Viewer" in error
 
 

@@ -38,22 +38,10 @@ def synth(simulator: Simulator) -> Iterator[SerialDevice]:
 @pytest.mark.parametrize(
     ("fault", "kind", "text"),
     [
-        (
-            "silent",
-            DeviceTimeoutError,
-            "no reply to 'TEMP\\?' within 250 ms; is it switched on\\? check 'baud_rate'",
-        ),
-        (
-            "garbage",
-            DeviceError,
-            "the reply to 'TEMP\\?', '.*xff.*', is not ascii; check 'baud_rate', 'parity'",
-        ),
-        ("partial", DeviceTimeoutError, "'21', did not end with '.n' within 250 ms; check 'read_ends_with'"),
-        (
-            "other",
-            DeviceError,
-            "temperature: 'TEMP\\?' was answered by 'WHAT': its value is 'WHAT'; expected a number",
-        ),
+        ("silent", DeviceTimeoutError, "'TEMP\\?' within 250 ms; .*'baud_rate'"),
+        ("garbage", DeviceError, "'TEMP\\?', '.*xff.*', is not ascii; .*'baud_rate', 'parity'"),
+        ("partial", DeviceTimeoutError, "'21', .* within 250 ms; check 'read_ends_with'"),
+        ("other", DeviceError, "temperature: 'TEMP\\?' was answered by 'WHAT'"),
         ("echo", DeviceError, "'TEMP\\?' was answered by 'TEMP\\?'"),
         ("endless", DeviceError, "the reply to 'TEMP\\?' does not end: 'xxx"),
     ],
@@ -97,7 +85,7 @@ def test_a_command_is_sent_again_only_if_the_profile_allows_it(
 def test_an_error_of_the_instrument_is_reported_and_not_repeated(
     simulator: Simulator, synth: SerialDevice
 ) -> None:
-    with pytest.raises(DeviceError, match="synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"):
+    with pytest.raises(DeviceError, match=r"synth: 'NONSENSE' .*'ERR -113,undefined header'"):
         synth.command("nonsense")
     assert simulator.log.count("NONSENSE") == 1
 
@@ -114,8 +102,7 @@ def test_a_wrong_baud_rate_is_suspected(simulator: Simulator) -> None:
 def test_another_instrument_is_refused(simulator: Simulator) -> None:
     identify = {"ask": "*IDN?", "reply": "THORLABS SC10.*"}
     device = SerialDevice(settings(port=simulator.port, identify=identify), Context("synth"))
-    text = "reports that it is 'LAB,SIMULATOR,0042,1.7'; expected 'THORLABS SC10.*'; is it the right port"
-    with pytest.raises(DeviceError, match=text):
+    with pytest.raises(DeviceError, match=r"'LAB,SIMULATOR,0042,1.7'; expected 'THORLABS SC10.*'"):
         device.open()
     assert {*simulator.log} == {"*IDN?"}, "it was sent nothing else"
 
@@ -123,20 +110,16 @@ def test_another_instrument_is_refused(simulator: Simulator) -> None:
 def test_a_second_user_is_reported_that_the_port_is_taken(simulator: Simulator, synth: SerialDevice) -> None:
     del synth
     second = SerialDevice(settings(port=simulator.port), Context("laser"))
-    text = f"laser: cannot open {simulator.port}: another program has it open, or another device"
-    with pytest.raises(DeviceError, match=text):
+    with pytest.raises(DeviceError, match=f"laser: .*{simulator.port}: another program has it open"):
         second.open()
 
 
 @pytest.mark.parametrize(
     ("port", "text"),
     [
-        ({"port": "/dev/ttyNOSUCH7"}, "cannot open /dev/ttyNOSUCH7: there is no such port; expected"),
-        ({"port": "/dev/null"}, "cannot open /dev/null: it is not a serial port; expected"),
-        (
-            {"port": None, "usb": {"vid": 0x0403, "serial": "NOSUCH"}},
-            "no USB adapter has vid 0x0403, serial_number",
-        ),
+        ({"port": "/dev/ttyNOSUCH7"}, "cannot open /dev/ttyNOSUCH7: there is no such port"),
+        ({"port": "/dev/null"}, "cannot open /dev/null: it is not a serial port"),
+        ({"port": None, "usb": {"vid": 0x0403, "serial": "NOSUCH"}}, "no USB adapter has vid 0x0403, serial"),
         ({"port": "rfc2217://localhost:1"}, "cannot open rfc2217://localhost:1: "),
     ],
 )
@@ -150,10 +133,10 @@ def test_an_adapter_is_found_by_its_numbers(simulator: Simulator, monkeypatch: p
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: adapters)
     with opened(None, usb={"vid": 0x0403, "serial": "A1"}) as synth:
         assert synth.read("is_open") is False
-    text = "synth: 2 adapters have vid 0x0403: .*/dev/ttyUSB7 .A2.*; add 'serial' to tell them apart"
+    text = "2 adapters have vid 0x0403: .*/dev/ttyUSB7 .A2.*; add 'serial'"
     with pytest.raises(DeviceError, match=text), opened(None, usb={"vid": 0x0403}):
         pass
-    text = "no USB adapter has pid 0x0001; expected one of .*usb 0x0403 0x6001 A1.*; is it plugged in"
+    text = "no USB adapter has pid 0x0001; .*0x0403 0x6001 A1"
     with pytest.raises(DeviceError, match=text), opened(None, usb={"pid": 1}):
         pass
 
@@ -174,7 +157,7 @@ def test_an_unplugged_instrument_fails_the_shot_and_is_opened_again_in_the_next(
         simulator.order("fault", "unplug", 1)
     with pytest.raises(TransientError, match=r"synth: the line broke at 'OPEN' \(.*\); unplugged\?"):
         synth.command("open")
-    with pytest.raises(DeviceError, match="synth: the line broke and could not be opened again: cannot open"):
+    with pytest.raises(DeviceError, match=r"synth: .*could not be opened again"):
         synth.command("open")
     with pytest.raises(DeviceError, match="could not be opened again"):
         synth.safe_state()
@@ -196,9 +179,8 @@ def test_a_broken_line_is_opened_again_for_the_safe_state_but_not_set_up(simulat
 
 def test_the_safe_state_goes_on_after_a_command_that_fails(simulator: Simulator) -> None:
     with opened(simulator.port, safe_state=["nonsense", "once", "close"]) as synth:
-        with pytest.raises(DeviceError) as caught:
+        with pytest.raises(DeviceError, match="'NONSENSE' was refused"):
             synth.safe_state()
-        assert str(caught.value) == "synth: 'NONSENSE' was refused: 'ERR -113,undefined header'"
         assert simulator.log[-3:] == ["NONSENSE", "OPEN", "CLOSE"]
 
 

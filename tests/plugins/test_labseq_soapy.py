@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -58,15 +59,9 @@ def test_it_tests_itself_in_the_dark_and_describes_the_radio_and_the_tones() -> 
 @pytest.mark.parametrize(
     ("chosen", "text"),
     [
-        (
-            {"sample_rate": 200e3},
-            r"column tones: the outermost tone is .* the local oscillator at 100.015 MHz",
-        ),
-        ({"local_oscillator": 99.3e6}, r"the limit is 0.48 MHz, half of 80% of the sample rate of 1.2 MHz"),
-        (
-            {"local_oscillator": 100.1234567e6, "tone_tolerance": 1e-6},
-            "round tones, local_oscillator and sample_rate",
-        ),
+        ({"sample_rate": 200e3}, "column tones: .* local oscillator at 100.015 MHz"),
+        ({"local_oscillator": 99.3e6}, "0.48 MHz, .* sample rate of 1.2 MHz"),
+        ({"local_oscillator": 100.1234567e6, "tone_tolerance": 1e-6}, "round tones, local_oscillator"),
     ],
 )
 def test_tones_that_the_radio_cannot_make_are_refused_before_it_is_opened(
@@ -183,40 +178,19 @@ B210, N210, X310 = "driver=uhd,type=b200", "driver=uhd,type=usrp2", "driver=uhd,
     [
         ({"device": "driver=uhd"}, []),
         ({"device": X310}, []),
-        (
-            {"device": B210},
-            [("a USRP B2x0 takes at most 30.72 MHz on two channels", "a sample_rate up to 30.72 MHz")],
-        ),
-        (
-            {"device": N210},
-            [
-                (
-                    "two channels need 320 MB/s, but Gigabit Ethernet carries 100 MB/s",
-                    "a sample_rate up to 12.5 MHz",
-                )
-            ],
-        ),
+        ({"device": B210}, ["B2x0 .* 30.72 MHz .* up to 30.72 MHz"]),
+        ({"device": N210}, ["320 MB/s, .* Ethernet carries 100 MB/s.* up to 12.5 MHz"]),
         ({"device": N210, "stream": "WIRE=sc8", "sample_rate": 25e6}, []),
-        (
-            {"device": X310, "bus": "1gbe", "stream": "WIRE=sc8"},
-            [
-                (
-                    "two channels need 160 MB/s, but Gigabit Ethernet carries 100 MB/s",
-                    "a sample_rate up to 25 MHz",
-                )
-            ],
-        ),
-        (
-            {"device": B210, "bus": "usb2", "sample_rate": 20e6},
-            [("two channels need 160 MB/s, but USB 2 carries 53.248 MB/s", "a sample_rate up to 6.656 MHz")],
-        ),
+        ({"device": X310, "bus": "1gbe", "stream": "WIRE=sc8"}, ["160 MB/s.* 100 MB/s.* up to 25 MHz"]),
+        ({"device": B210, "bus": "usb2", "sample_rate": 20e6}, ["160 MB/s.* 53.248 MB/s.* up to 6.656 MHz"]),
     ],
 )
 def test_a_sample_rate_that_a_radio_or_its_connection_cannot_keep_up_with_is_warned_of(
-    chosen: dict[str, Any], expected: list[tuple[str, str]]
+    chosen: dict[str, Any], expected: list[str]
 ) -> None:
-    found = [(what, better) for _, what, better in SoapySettings.model_validate(chosen).warnings()]
-    assert found == expected
+    found = [f"{what}; {better}" for _, what, better in SoapySettings.model_validate(chosen).warnings()]
+    assert len(found) == len(expected)
+    assert all(map(re.search, expected, found)), found
 
 
 N_LOOP = 96
@@ -319,7 +293,7 @@ def test_two_times_twenty_tones_are_as_requested_on_their_outputs_and_too_much_c
     with opened(**FULL, row_channel=1, column_channel=0, max_depth=1.5) as rig:
         rig.tweezers.load((rows, columns))
         rig.tweezers.start()
-        with pytest.raises(LimitError, match=r"peak of the row tones is 1.0\d of full scale; the limit is 1"):
+        with pytest.raises(LimitError, match=r"peak of the row tones is 1.0\d of full scale"):
             rig.tweezers.load((np.full(20, 0.18), columns))  # too much at the greatest depth only
         offsets_hz = TONES_HZ - rig.described("local_oscillator")
         n = 75 * 1000  # whole loops, so that a seam would show

@@ -104,12 +104,9 @@ def test_a_radio_that_cannot_be_opened_again_may_transmit_and_the_text_says_so(t
     dead.wait()
     opened = tmp_path / "opened"
     opened.write_text(str(dead.pid), "ascii")
-    with pytest.raises(script.EmergencyError) as error:
+    may_transmit = "'driver=none' .*no match; .*transmitters stay on .*switch it off by hand"
+    with pytest.raises(script.EmergencyError, match=may_transmit):
         script.off(dead.pid, 1, str(opened), 0.01, "driver=none", [0, 1], STREAMER)
-    assert str(error.value) == (
-        "the radio 'driver=none' cannot be opened again: makeStrArgs: SoapySDR::Device::make() no match; "
-        "it plays nothing any more, but its transmitters stay on with their gain: switch it off by hand"
-    )
     assert opened.exists(), "the next attempt tries it again"
 
 
@@ -123,6 +120,5 @@ def test_wrong_arguments_give_one_clear_line_and_a_process_that_took_the_number_
         "program": "none",
     }
     assert script.off(pid=os.getpid(), **arguments) == RAMPED
-    with pytest.raises(script.EmergencyError) as error:
+    with pytest.raises(script.EmergencyError, match="process is 0; expected a number above 1"):
         script.off(pid=0, **arguments)
-    assert str(error.value) == "the number of the streaming process is 0; expected a number above 1"

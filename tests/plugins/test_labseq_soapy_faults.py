@@ -55,21 +55,13 @@ def link_of(rig: Rig) -> Any:
 @pytest.mark.parametrize(
     ("arguments", "chosen", "text"),
     [
-        ("fault=absent", {}, "cannot be opened: .*no such radio; `SoapySDRUtil --find` lists the radios"),
-        ("channels=1", {}, r"it has 1 channel\(s\) that transmit; expected 2, one for each AOD"),
-        (
-            "coerce_rate=1000000",
-            {},
-            "makes 1000000 samples per second; expected 1200000: choose a sample_rate",
-        ),
-        ("speed=1", {"column_gain": 70.0}, "a gain of 70 dB; channel 1 has 0 to 60 dB"),
+        ("fault=absent", {}, "no such radio; `SoapySDRUtil --find`"),
+        ("channels=1", {}, r"1 channel\(s\) that transmit; expected 2"),
+        ("coerce_rate=1000000", {}, "1000000 samples per second; expected 1200000: choose a sample_rate"),
+        ("speed=1", {"column_gain": 70.0}, "70 dB; channel 1 has 0 to 60 dB"),
         ("speed=1", {"antenna": "RX2"}, "setAntenna: there is no antenna RX2"),
         ("fault=inactive", {}, r"starting the stream: STREAM_ERROR \(-2\)"),
-        (
-            "detune=13000",
-            {},
-            "tuned its local oscillator to 100028000 Hz; expected 100015000 Hz: see its range",
-        ),
+        ("detune=13000", {}, "local oscillator to 100028000 Hz; expected 100015000 Hz"),
     ],
 )
 def test_a_wrong_radio_is_refused_with_what_is_wrong_and_stays_off(
@@ -116,7 +108,7 @@ def test_a_disturbance_asks_for_the_shot_again_if_the_array_is_on_and_many_in_a_
         disturb(1)
         rig.tweezers.check_interlocks()  # harmless in the dark
         rig.tweezers.start()
-        once = re.escape(f"the radio {did} 1 time(s) while the array was on: atoms may be lost")
+        once = re.escape(f"{did} 1 time(s) while the array was on")
         for n, pause_s in ((2, 0.0), (3, 61.0)):
             rig.clock.sleep(pause_s)
             disturb(n)
@@ -125,8 +117,7 @@ def test_a_disturbance_asks_for_the_shot_again_if_the_array_is_on_and_many_in_a_
             rig.tweezers.check_interlocks()
             rig.tweezers.ramp(0.5, 0.001)
         disturb(4)
-        twice = f"the radio {did} 2 time(s) within a minute while the array was on; {setting} allows 1"
-        with pytest.raises(DeviceError, match=re.escape(twice)):
+        with pytest.raises(DeviceError, match=rf"{did} 2 time\(s\) within a minute .*{setting} allows 1"):
             rig.tweezers.check_interlocks()
         names = "underflows", "sequence_errors", "late_packets"
         assert rig.tweezers.poll() == {name: 4 if name == count else 0 for name in names}
@@ -202,9 +193,7 @@ def test_a_broken_stream_ends_the_run_with_what_the_radio_reported() -> None:
         rig.tweezers.start()
         rig.ring.set_fault(Fault.STREAM_ERROR)
         until(raised(DeviceError, rig.tweezers.check_interlocks))
-        with pytest.raises(
-            DeviceError, match=r"writing to the stream: STREAM_ERROR \(-2\); the array is dark"
-        ):
+        with pytest.raises(DeviceError, match=r"STREAM_ERROR \(-2\); the array is dark"):
             rig.tweezers.start()
         rig.tweezers.safe_state()
 
@@ -236,9 +225,7 @@ def test_a_radio_that_is_gone_with_its_process_is_not_safe(tmp_path: Path) -> No
         os.kill(link.pid, signal.SIGKILL)
         until(raised(DeviceError, rig.tweezers.check_interlocks))
         for call in (rig.tweezers.safe_state, rig.tweezers.close):
-            with pytest.raises(
-                DeviceError, match=r"'driver=none' cannot be opened again: .*: switch it off by hand"
-            ):
+            with pytest.raises(DeviceError, match=r"'driver=none' cannot be opened again: .* by hand"):
                 call()
         rig.tweezers.close()
 
@@ -350,11 +337,7 @@ def test_a_loop_that_cannot_be_read_ends_the_stream_by_a_ramp() -> None:
     ("loop", "source", "why"),
     [
         ("lo", "", r"not locked \(lo_locked 0, lo_locked 1\): can it tune to `local_oscillator`\?"),
-        (
-            "ref",
-            "external",
-            r"not locked \(ref_locked\): is the reference of `clock_source: external` connected",
-        ),
+        ("ref", "external", r"not locked \(ref_locked\): .*`clock_source: external`"),
         ("ref", "", ""),
     ],
 )

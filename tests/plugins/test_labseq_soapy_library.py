@@ -148,14 +148,14 @@ def test_what_c_would_punish_fails_from_then_on(tmp_path: Path) -> None:
     with installed(bench.library):
         with pytest.raises(SoapyError, match="STREAM_ERROR"):
             bench.write(1)
-        with pytest.raises(SoapyError, match="a stream was used that is not set up"):
+        with pytest.raises(SoapyError, match=r"stream .* not set up"):
             bench.radio.close()
     with installed(SimulatedLibrary(bench.clock)):
         library().SoapySDR_free(0x1234)
-        with pytest.raises(SoapyError, match="memory was freed that the library has not allocated"):
+        with pytest.raises(SoapyError, match="memory was freed"):
             Radio(f"driver=capture,folder={tmp_path}")
     with installed(SimulatedLibrary(bench.clock)):
         radio = Radio(f"driver=capture,folder={tmp_path}")
         radio.stream([0, 1])
-        with pytest.raises(SoapyError, match="the radio was closed, but not its stream"):
+        with pytest.raises(SoapyError, match="but not its stream"):
             radio.close()

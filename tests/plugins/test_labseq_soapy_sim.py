@@ -176,61 +176,30 @@ def test_a_simulated_radio_gives_the_same_atoms_as_the_virtual_tweezers(tmp_path
 @pytest.mark.parametrize(
     ("static", "exit_code", "text"),
     [
-        (
-            "device: simulated, sample_rate: 8 MHz",
-            2,
-            "p.yaml:5:63: static_tweezers: row tones: the outermost tone is 3.6 MHz",
-        ),
-        (
-            "device: simulated, lo_offset: 1 MHz",
-            2,
-            "p.yaml:5:61: static_tweezers: lo_offset is 1 MHz, which leaves it among the tones",
-        ),
-        (
-            "device: driver=hackrf, lo_offset: 18 MHz",
-            2,
-            "p.yaml:5:65: static_tweezers: row tones: the outermost tone is 21.6 MHz from",
-        ),
-        (
-            "device: simulated, lo_offset: 18 MHz, bandwidth: 30 MHz",
-            2,
-            "p.yaml:5:80: static_tweezers: the distance of the outermost tone from the local",
-        ),
-        (
-            "device: 'simulated,coerce_rate=12500000'",
-            3,
-            "the radio makes 12500000 samples per second; expected 40000000: choose a sample_rate",
-        ),
+        ("device: simulated, sample_rate: 8 MHz", 2, "p.yaml:5:63: .*row tones: .* 3.6 MHz"),
+        ("device: simulated, lo_offset: 1 MHz", 2, "p.yaml:5:61: .*lo_offset is 1 MHz"),
+        ("device: driver=hackrf, lo_offset: 18 MHz", 2, "p.yaml:5:65: .*row tones: .* 21.6 MHz"),
+        ("device: simulated, lo_offset: 18 MHz, bandwidth: 30 MHz", 2, "p.yaml:5:80: .*outermost tone"),
+        ("device: 'simulated,coerce_rate=12500000'", 3, "12500000 samples per second; expected 40000000"),
         ("row_channel: 1", 2, "row_channel and column_channel are both 1"),
-        (
-            "device: 'simulated,sped=1'",
-            2,
-            "p.yaml:5:39: the simulated radio has no argument 'sped'; expected one of",
-        ),
-        (
-            "device: 'simulated, speed=0'",
-            2,
-            "p.yaml:5:39: speed of the simulated radio is '0'; expected a number, at least 0.0001",
-        ),
-        ("device: 'simulated,fault=fire'", 2, "fault of the simulated radio is 'fire'; expected"),
-        ("device: 'simulated,fault=absent'", 3, "no such radio; `SoapySDRUtil --find` lists the radios"),
+        ("device: 'simulated,sped=1'", 2, "p.yaml:5:39: .*'sped'"),
+        ("device: 'simulated, speed=0'", 2, "p.yaml:5:39: speed .*'0'; .* 0.0001"),
+        ("device: 'simulated,fault=fire'", 2, "fault .*'fire'"),
     ],
 )
 def test_mistakes_are_reported_with_their_place(
     tmp_path: Path, static: str, exit_code: int, text: str
 ) -> None:
-    with pytest.raises(LabseqError) as caught:
+    with pytest.raises(LabseqError, match=text) as caught:
         run(tmp_path, f"{{use: soapy, {static}}}")
     assert caught.value.exit_code == exit_code
-    assert text in str(caught.value)
 
 
 def test_check_warns_of_a_rate_beyond_the_bus_and_devices_of_a_radio_without_a_clock(tmp_path: Path) -> None:
     static = "{use: soapy, device: 'driver=uhd,type=usrp2', sample_rate: 40 MHz}"
     sequence = write(tmp_path, static)
     warnings = [str(one) for one in check(Session.open(sequence, shots=1)).warnings]
-    text = "p.yaml:5:77: two channels need 320 MB/s, but Gigabit Ethernet carries 100 MB/s; expected"
-    assert [one for one in warnings if text in one]
+    assert [one for one in warnings if "p.yaml:5:77: " in one and "320 MB/s" in one]
     radio = "profile.static_tweezers={use: soapy, device: 'simulated,time=0', sample_rate: 12.5 MHz}"
     report = check_devices(str(tmp_path / "p.yaml"), [radio])
     assert all(found.ok for found in report.devices), report.devices

@@ -363,7 +363,7 @@ class TestTones:
             assert not lab.tweezers.warnings()
         with driver("dds", motion=replace(few, max_row_tones=16)) as lab:
             (text,) = lab.tweezers.warnings()
-        assert "16 row and 5 column tones follow it within 66.1 nm only, not 20 nm" in text
+        assert all(fact in text for fact in ("16 row and 5 column tones", "66.1 nm", "20 nm"))
 
     def test_of_a_program_larger_than_the_queue_are_sent_while_it_plays(self, driver: Any) -> None:
         with driver("dds") as lab:
@@ -570,21 +570,21 @@ def test_a_hot_card_is_reported(driver: Any, above_c: int, well: bool) -> None:
         if well:
             lab.tweezers.self_test()
             return
-        with pytest.raises(DeviceError, match="the base card has 81 degrees Celsius; expected at most 80"):
+        with pytest.raises(DeviceError, match="81 degrees Celsius; expected at most 80"):
             lab.tweezers.self_test()
 
 
 def test_a_card_with_its_recovery_firmware_is_reported(driver: Any) -> None:
     with driver(model=replace(M4I6631, firmware_type=2)) as lab:
         assert lab.tweezers.versions()["driver"] == ("7.9.22000", "")
-        with pytest.raises(DeviceError, match="the card runs its recovery firmware"):
+        with pytest.raises(DeviceError, match="recovery firmware"):
             lab.tweezers.self_test()
 
 
 def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> None:
     with driver() as lab:
         lab.card.write(20000, 100_000_000)
-        with pytest.raises(DeviceError, match="the sample rate is 100 MHz; expected 250 MHz"):
+        with pytest.raises(DeviceError, match="100 MHz; expected 250 MHz"):
             lab.tweezers.self_test()
 
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from labseq_soapy_sim import Ring
@@ -94,6 +95,7 @@ sys.stdin.read()
 """
 STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "stream", "dds", "warm", "warm_dds"}
 ENDLESS = ("dds", "locked", "warm", "warm_dds")
+OFF = "card stopped, outputs 0 and 1 disabled"
 
 
 class Scope:
@@ -145,7 +147,7 @@ def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
 @pytest.mark.parametrize("state", sorted(STATES))
 def test_a_plain_process_brings_its_outputs_to_zero(scope: Scope, state: str) -> None:
     done = scope.off[state]
-    assert done.text == "card stopped, outputs 0 and 1 disabled"
+    assert done.text == OFF
     assert scope.cards[state]("state") == (False, (False, False))
     assert not scope.cards[state]("trigger", 3.3), "an edge at Ext0 starts nothing any more"
     for channel in (0, 1):
@@ -194,16 +196,11 @@ def test_a_missing_library_and_wrong_arguments_give_one_clear_line() -> None:
     }
     with outsider(jobs) as outside:
         done = outside.off()
-    assert outside.prepared == {name: one.text for name, one in done.items() if name != "argument"} | {
-        "argument": "TypeError: prepare() got an unexpected keyword argument 'crad'"
-    }
-    assert done["library"].text == (
-        f"EmergencyError: the driver library {LIBRARY!r} cannot be loaded: {LIBRARY}: cannot open shared "
-        "object file: No such file or directory"
-    )
-    assert done["name"].text == (
-        "EmergencyError: the card's device name is 0; expected a text such as '/dev/spcm0'"
-    )
+    prepared: dict[str, Any] = outside.prepared
+    for name, fact in (("library", repr(LIBRARY)), ("name", "is 0; expected"), ("argument", "'crad'")):
+        assert fact in prepared[name]
+        assert "\n" not in prepared[name]
+        assert name == "argument" or done[name].text == prepared[name]
 
 
 C_LIBRARY = """
@@ -231,7 +228,7 @@ def test_the_functions_of_a_c_library_are_called_as_its_header_declares_them(tmp
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [
         "100=262208 30010=80 30110=80 30091=0 30191=0 100=2 100=1 closed",
-        "card stopped, outputs 0 and 1 disabled",
+        OFF,
     ]
 
 
@@ -281,33 +278,28 @@ def test_a_card_that_a_dying_process_still_holds_is_waited_for(
 
     monkeypatch.setattr(script, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=sleep))
     assert card.acquire()
-    assert script.off("", CARD, "dds") == "card stopped, outputs 0 and 1 disabled"
+    assert script.off("", CARD, "dds") == OFF
     assert 0.5 < now_s < 0.51
     assert card.acquire(), "the script has closed it"
     now_s, gives_back_s = 0.0, 1e9
-    with pytest.raises(script.EmergencyError) as error:
+    with pytest.raises(script.EmergencyError, match=f"'{CARD}' .*2 s: .*in use"):
         script.off("", CARD, "dds")
-    assert str(error.value) == f"the card '{CARD}' cannot be opened for 2 s: '{CARD}' is in use"
 
 
 def test_the_reset_of_the_card_makes_up_for_a_step_that_is_refused(card: Stubborn) -> None:
     card.refused = ((r.SPC_ENABLEOUT0, 0),)
-    reason = "disabling output 0: SPC_ENABLEOUT0 (30091): not now"
-    assert script.off("", CARD, "dds") == (
-        f"card stopped, outputs 0 and 1 disabled by its reset; refused: {reason}"
-    )
+    done, refused = script.off("", CARD, "dds").split("; refused: ")
+    assert done.endswith("disabled by its reset")
+    assert "SPC_ENABLEOUT0 (30091): not now" in refused
     assert (card.running, card.outputs_on) == (False, (False, False))
     card.refused += ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
-    with pytest.raises(script.EmergencyError) as error:
+    with pytest.raises(script.EmergencyError, match=r"SPC_ENABLEOUT0 .*; reset .*SPC_M2CMD \(100\): not now"):
         script.off("", CARD, "dds")
-    assert str(error.value) == f"{reason}; reset of the card: SPC_M2CMD (100): not now"
 
 
 def test_without_the_reset_the_outputs_are_off_all_the_same(card: Stubborn) -> None:
     card.refused = ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
-    assert script.off("", CARD, "replay") == (
-        "card stopped, outputs 0 and 1 disabled; refused: reset of the card: SPC_M2CMD (100): not now"
-    )
+    assert "refused: reset of the card: SPC_M2CMD (100)" in script.off("", CARD, "replay")
     assert (card.running, card.outputs_on) == (False, (False, False))
 
 
@@ -366,7 +358,7 @@ def test_a_run_that_is_killed_leaves_card_and_radio_off(tmp_path: Path) -> None:
         labseq.wait()
     until(lambda: len(log_of(tmp_path)) == 2)
     assert log_of(tmp_path) == {
-        "mobile_tweezers": "card stopped, outputs 0 and 1 disabled",
+        "mobile_tweezers": OFF,
         "static_tweezers": "streaming process ended, radio ramped down and closed",
     }
     assert card("state") == (False, (False, False))

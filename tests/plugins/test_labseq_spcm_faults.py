@@ -61,7 +61,7 @@ class TestCards:
 
     def test_in_use_are_named_and_not_disturbed(self, driver: Any) -> None:
         with driver() as lab:
-            other = SpcmMobileTweezers(lab.tweezers._settings, context())
+            other = SpcmMobileTweezers(lab.settings, context())
             with pytest.raises(DeviceError, match=r"in use; .*close what else uses it"):
                 other.open()
             other.close()
@@ -69,24 +69,23 @@ class TestCards:
 
     def test_of_another_family_are_refused(self, driver: Any) -> None:
         digitizer = replace(M4I6631, name="M4i.4420-x8", card_type=0x74420)
-        text = r"is a M4i\.4420-x8 .* expected a Spectrum M4i\.66xx .*: name another one as `card`"
+        text = r"a M4i\.4420-x8 .* expected a Spectrum M4i\.66xx .*`card`"
         with pytest.raises(DeviceError, match=text), driver(model=digitizer):
             pass
 
     def test_that_are_too_slow_are_refused(self, driver: Any) -> None:
         slow = replace(M4I6631, name="M4i.6622-x8", sample_rate_hz=(50e6, 625e6))
-        text = r"the M4i\.6622-x8 makes at most 625 MS/s; lower sample_rate from 1000 MHz"
+        text = r"M4i\.6622-x8 makes at most 625 MS/s; lower sample_rate"
         with pytest.raises(DeviceError, match=text), driver(model=slow, sample_rate=1e9):
             pass
 
     def test_that_were_refused_are_left_closed_with_their_outputs_off(self, driver: Any) -> None:
         with driver() as lab:
-            name, card = lab.tweezers._settings.card, lab.card
             lab.tweezers.close()
-            wrong = SpcmMobileTweezers(SpcmSettings(card=name, serial=99), context())
+            wrong = SpcmMobileTweezers(SpcmSettings(card=lab.settings.card, serial=99), context())
             with pytest.raises(DeviceError):
                 wrong.open()
-            assert card.outputs_on == (False, False)
+            assert lab.card.outputs_on == (False, False)
             lab.tweezers.open()
             lab.play(lab.program())
 
@@ -244,8 +243,7 @@ for card in ("/dev/spcm0", "simulated", "/dev/spcm0"):
     before, after = done.stdout.splitlines()
     for line in (before, after):
         assert line.startswith("3 mobile_tweezers: ")
-        for text in ("no driver library", "install Spectrum's driver", "`card: simulated`"):
-            assert text in line
+        assert "`card: simulated`" in line
 
 
 def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -308,8 +306,8 @@ def test_a_line_starts_a_card_that_outlives_the_process(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("n_edges", "text"),
     [
-        (0, r"no trigger came within .* s; check the cable at Ext0 and trigger_level"),
-        (2, r"ended \d+ us too early, so a pulse before that of the line started it; look for a second edge"),
+        (0, "no trigger came .* cable at Ext0 and trigger_level"),
+        (2, r"ended \d+ us too early, .* second edge"),
     ],
 )
 def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
@@ -338,39 +336,26 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
 @pytest.mark.parametrize(
     ("mobile", "exit_code", "text"),
     [
-        ("card: simulated, serial: 99", 3, "has the serial number 12345; expected 99: name another one"),
-        ("card: simulated, sample_rate: 755 MHz", 2, "p.yaml:6:60: sample_rate: the card's clock has a gap"),
-        ("card: simulated, sample_rate: 150 MHz", 2, "sample_rate is 150 MHz; the limit is above 236 MHz"),
-        ("card: simulated, sample_rate: .nan", 2, "p.yaml:6:60: sample_rate is .nan; expected a finite"),
-        ("card: simulated, mode: fifo, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
-        ("card: simulated, mode: stream, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
-        (
-            "card: simulated, mode: stream, trigger: external",
-            2,
-            "takes no external trigger, because the card",
-        ),
-        (
-            "card: simulated, mode: stream, look_ahead: 0.1 ms",
-            2,
-            "look_ahead is 100 us; expected at least 157",
-        ),
-        (
-            "card: simulated, mode: stream, notify_size: 5000",
-            2,
-            "notify_size is 5000; expected a power of two",
-        ),
-        ("card: simulated, mode: stream, card_buffer: 8192", 2, "expected at least notify_size, 65536"),
-        (f"card: simulated, mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream takes no"),
-        ("card: simulated, mode: dds", 2, "set max_row_tones and max_column_tones to at most 16 and 5"),
-        ("card: simulated, rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; the limit is the card's 80 mV"),
+        ("serial: 99", 3, "12345; expected 99"),
+        ("sample_rate: 755 MHz", 2, "p.yaml:6:60: sample_rate: .* gap"),
+        ("sample_rate: 150 MHz", 2, "sample_rate is 150 MHz; .* 236 MHz"),
+        ("sample_rate: .nan", 2, "p.yaml:6:60: sample_rate is .nan; expected a finite"),
+        ("mode: fifo, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
+        ("mode: stream, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
+        ("mode: stream, trigger: external", 2, "no external trigger"),
+        ("mode: stream, look_ahead: 0.1 ms", 2, "look_ahead is 100 us; expected at least 157"),
+        ("mode: stream, notify_size: 5000", 2, "notify_size is 5000; expected a power of two"),
+        ("mode: stream, card_buffer: 8192", 2, "at least notify_size, 65536"),
+        (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream"),
+        ("mode: dds", 2, "max_row_tones and max_column_tones .* 16 and 5"),
+        ("rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; .* 80 mV"),
     ],
 )
 def test_mistakes_are_reported_with_what_is_expected(
     tmp_path: Path, mobile: str, exit_code: int, text: str
 ) -> None:
-    with pytest.raises(LabseqError) as raised:
-        run(tmp_path, mobile=f"{{use: spcm, {mobile}}}")
-    assert text in str(raised.value)
+    with pytest.raises(LabseqError, match=text) as raised:
+        run(tmp_path, mobile=f"{{use: spcm, card: simulated, {mobile}}}")
     assert raised.value.exit_code == exit_code
 
 

@@ -206,9 +206,7 @@ def test_a_computer_that_is_held_up_in_motion(driver: Any, held_s: float, is_sur
             lab.tweezers.wait(duration_s + 1e-3)
             start_s(lab, program)
             return
-        with pytest.raises(
-            TransientError, match=r"underrun: .* \(\d\d% of a part of .*s was played\); raise `fill`"
-        ):
+        with pytest.raises(TransientError, match=r"underrun: .* \(\d\d% .*; raise `fill`"):
             lab.tweezers.wait(duration_s + 1e-3)
         assert lab.card.outputs_on == (False, False)
         assert not lab.card.running
@@ -272,9 +270,7 @@ def test_nothing_is_appended_where_nothing_plays_or_a_program_must_be_whole(driv
 
 def test_a_bus_that_cannot_stream_is_reported_when_the_card_is_opened(driver: Any) -> None:
     slow = replace(M4I6631, bus_bytes_per_s=1.4e9)  # four lanes
-    text = (
-        r"the bus carries 1\.4 GB/s, but mode: stream at 624 MHz needs 2\.5 GB/s; .* below 350 MHz, or mode"
-    )
+    text = r"1\.4 GB/s, .* 624 MHz needs 2\.5 GB/s; .* below 350 MHz"
     with pytest.raises(DeviceError, match=text), driver("stream", model=slow, sample_rate=624e6):
         pass
     with driver("stream", model=slow, sample_rate=300e6) as lab:
@@ -289,7 +285,7 @@ def test_a_computer_that_renders_too_slowly_is_reported(
     for step_s in (1e-6, 1.0):
         clock = SimpleNamespace(perf_counter=count(0.0, step_s).__next__)
         monkeypatch.setattr("labseq_spcm.stream.time", clock)
-        slow = pytest.raises(DeviceError, match=r"renders \d+ moving tones at .*; use a lower sample_rate")
+        slow = pytest.raises(DeviceError, match=r"\d+ moving tones .* lower sample_rate")
         with slow if step_s == 1.0 else nullcontext():
             check_rendering("awg", context, 250e6, 0)
 

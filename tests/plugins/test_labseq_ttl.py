@@ -72,11 +72,9 @@ TWO = (LineSpec("a", 2, frozenset()), LineSpec("b", 9, frozenset()))
 
 
 def test_edges_too_near_and_pauses_too_long_are_refused() -> None:
-    with pytest.raises(LimitError) as raised:
+    too_near = "lines: `image`: .*'a' at 1 ms and of 'b' at 1.003 ms is 3 us; .* at least 5 us"
+    with pytest.raises(LimitError, match=too_near):
         edges_of(two_edges_apart(3e-6), TWO, "lines")
-    text = "lines: `image`: time between the edges of 'a' at 1 ms and of 'b' at 1.003 ms is 3 us; the limit"
-    assert text in str(raised.value)
-    assert "at least 5 us" in str(raised.value)
     edges_of(two_edges_apart(SHORTEST * TICK_S), TWO, "lines")
     with pytest.raises(LimitError, match="at most"):
         edges_of(two_edges_apart(3000.0), TWO, "lines")
@@ -116,14 +114,12 @@ def test_a_step_with_every_line_of_the_box_fits_its_edges() -> None:
 
 
 def test_a_line_on_a_channel_that_the_box_does_not_have_is_refused() -> None:
-    with pytest.raises(
-        ConfigError, match=r"the box has no channel 13 for 'mot'; expected one of '2', .*'12'"
-    ):
+    with pytest.raises(ConfigError, match=r"no channel 13 for 'mot'; .*'2', .*'12'"):
         make_rig((LineSpec("mot", 13, frozenset()),)).lines.open()
 
 
 def test_a_simulated_box_has_no_external_start() -> None:
-    with pytest.raises(ValidationError, match="a simulated box has no external start"):
+    with pytest.raises(ValidationError, match="no external start"):
         TtlSettings(start="external")
     assert TtlSettings(port="/dev/ttyACM0", start="external").start == "external"
 

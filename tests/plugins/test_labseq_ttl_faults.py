@@ -295,7 +295,7 @@ def test_a_bad_memory_is_found_by_the_self_test(monkeypatch: pytest.MonkeyPatch)
 def test_what_is_missing_for_simavr_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(DeviceError, match=r"there is no C compiler; `apt-get install .* libsimavr-dev"):
+    with pytest.raises(DeviceError, match=r"no C compiler; `apt-get install .* libsimavr-dev"):
         runner("lines")
 
 
@@ -368,9 +368,9 @@ def test_a_real_port_does_the_same_as_a_simulated_box(plugged: Plugged) -> None:
 
 
 def test_a_port_that_is_not_there_is_named() -> None:
-    with pytest.raises(DeviceError, match="cannot open /dev/ttyNONE: there is no such port"):
+    with pytest.raises(DeviceError, match="/dev/ttyNONE: there is no such port"):
         make_rig(port="/dev/ttyNONE").lines.open()
-    with pytest.raises(DeviceError, match="cannot open socket://here: it is not a network port; expected"):
+    with pytest.raises(DeviceError, match="socket://here: it is not a network port"):
         make_rig(port="socket://here").lines.open()
 
 
@@ -470,9 +470,9 @@ def test_the_command_gives_a_box_its_serial_number(
 ) -> None:
     assert main([plugged.name, "--serial", "12"]) == 0
     assert main([plugged.name]) == 0
-    said = "serial number 12, started 0 times, last by power-up; active low: none"
-    assert capsys.readouterr().out.startswith(said)
-    with pytest.raises(DeviceError, match="has the serial number 12; expected 7"):
+    said = capsys.readouterr().out
+    assert all(fact in said for fact in ("serial number 12", "started 0 times", "active low: none"))
+    with pytest.raises(DeviceError, match="serial number 12; expected 7"):
         make_rig(port=plugged.name, serial_number=7).lines.open()
     with rig(port=plugged.name, serial_number=12) as lab:
         works(lab)

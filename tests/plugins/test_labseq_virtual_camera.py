@@ -80,12 +80,12 @@ def test_with_the_internal_trigger_exposures_follow_one_another_and_begin_when_r
     assert [frame.t_start_s for frame in frames] == pytest.approx([2.0, 2.05, 2.1])
     assert dark.exposed_s() == [frame.t_start_s for frame in frames]
     assert dark.clock.now() == pytest.approx(2.15)
-    with pytest.raises(DeviceTimeoutError, match="all 3 frames of the series were read"):
+    with pytest.raises(DeviceTimeoutError, match="all 3 frames"):
         dark.camera.read(0.1)
 
 
 def test_no_wire_brings_an_external_trigger(dark: DarkLab) -> None:
-    with pytest.raises(DeviceError, match="no external trigger; expected one of 'software', 'internal'"):
+    with pytest.raises(DeviceError, match=r"no external trigger; .*'software', 'internal'"):
         dark.camera.arm(1, 0.1, "external")
 
 
@@ -97,7 +97,7 @@ def test_simulated_failures_come_with_their_probability() -> None:
         try:
             flaky.camera.read(1.0)
         except TransientError as error:
-            assert str(error).startswith("camera: frame 0 was lost, of a series of 1: the frame arrived")
+            assert str(error).startswith("camera: frame 0 was lost, of a series of 1")
             n_lost += 1
     assert 12 < n_lost < 48
 
@@ -252,13 +252,10 @@ def test_behind_a_closed_shutter_it_is_dark_and_the_light_still_takes_atoms(sens
 @pytest.mark.parametrize(
     ("camera", "text"),
     [
-        (
-            "region: {y: 100, height: 60, width: 60}",
-            "ends at row 160 and column 60, beyond the sensor of 128",
-        ),
-        ("binning: 3", "128 x 128 pixels cannot be binned by 3; choose a `region`"),
-        ("em_gain: 300", "the EM gain is 300; the limit is 1: a qCMOS sensor has no EM register; leave the"),
-        ("cooling: {temperature: -70 K}", "temperature is -70 K (-343 degC); expected -123 to 50 degC"),
+        ("region: {y: 100, height: 60, width: 60}", "row 160 and column 60, beyond the sensor of 128"),
+        ("binning: 3", "128 x 128 pixels cannot be binned by 3"),
+        ("em_gain: 300", "the EM gain is 300; the limit is 1"),
+        ("cooling: {temperature: -70 K}", "(-343 degC); expected -123 to 50 degC"),
     ],
 )
 def test_settings_that_the_sensor_lacks_are_reported_with_their_line(

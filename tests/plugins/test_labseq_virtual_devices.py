@@ -256,9 +256,7 @@ def test_the_static_tweezers_refuse_calibrated_amplitudes_beyond_a_limit(lab: La
     settings = StaticTweezersSettings(max_amplitude_sum=0.5)
     static = VirtualStaticTweezers(settings, lab.context("static_tweezers"))
     static.open()
-    with pytest.raises(
-        DeviceError, match=r"the calibrated amplitudes exceed a limit: .*.* is 1; the limit is 0\.5"
-    ):
+    with pytest.raises(DeviceError, match=r"calibrated amplitudes .* is 1; .* 0\.5"):
         static.self_test()
 
 
@@ -266,9 +264,7 @@ def test_the_self_test_names_a_site_out_of_reach(lab: Lab) -> None:
     settings = MobileTweezersSettings(band_half_width=1e6)
     mobile = VirtualMobileTweezers(settings, lab.context("mobile_tweezers"))
     mobile.open()
-    with pytest.raises(
-        DeviceError, match=r"column 0 is out of reach: its tone of .* is not in the band of 99 to"
-    ):
+    with pytest.raises(DeviceError, match=r"column 0 is out of reach: .* 99 to"):
         mobile.self_test()
 
 
@@ -346,7 +342,7 @@ def test_idle_lines_stay_on_between_steps() -> None:
 
 
 def test_an_undeclared_line_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"`lights.loading` names a line 'mott'; the profile has 'cooling'"):
+    with pytest.raises(ConfigError, match=r"`lights.loading` .*'mott'; .*'cooling'"):
         Lights(LightSettings(loading=("mott",)), SPECS)
 
 
@@ -440,22 +436,14 @@ def test_the_trigger_lines_start_the_exposures_and_the_moves(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "on: [load], lag",
-            "on: [laod], lag",
-            r"lined.yaml:\d+:\d+: there is no kind of step 'laod'.*'load'",
-        ),
+        ("on: [load], lag", "on: [laod], lag", r"lined.yaml:\d+:\d+: .*'laod'.*'load'"),
         ("channel: 3", "channel: 77", "the box has no channel 77"),
         ("on: [image], pulse", "on: [load], pulse", "a line that triggers the camera is on at other times"),
-        (
-            "on: [rearrange], pulse",
-            "on: [image], pulse",
-            "a line that triggers the mobile tweezers is on at other times; expected `on: \\[rearrange\\]`",
-        ),
+        ("on: [rearrange], pulse", "on: [image], pulse", "mobile tweezers .* `on: \\[rearrange\\]`"),
         (
             "  channels:",
             "  mutually_exclusive: [[mot, cooling]]\n  channels:",
-            "'mot' and 'cooling' must never be on together, but both are during 'load'",
+            "'mot' and 'cooling' must never be on together, .*'load'",
         ),
     ],
 )
@@ -471,10 +459,9 @@ def test_a_trigger_line_for_a_driver_that_cannot_wait_for_it_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(VirtualMobileTweezers, "waits_for_trigger", False)
-    message = (
-        r"lined.yaml:\d+:\d+: the mobile tweezers take no external trigger; expected mobile tweezers that do"
-    )
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(
+        ConfigError, match=r"lined.yaml:\d+:\d+: the mobile tweezers take no external trigger"
+    ):
         run(tmp_path, LINES)
 
 
@@ -505,30 +492,22 @@ def test_with_an_external_start_the_images_wait_for_the_camera(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("lines", "overrides", "message"),
     [
-        (
-            LINES,
-            [BULB],
-            r"lined.yaml:\d+:\d+: the camera exposes as long as 'camera_tr.*no `pulse`",
-        ),
-        (
-            UNWIRED,
-            [BULB],
-            "'bulb', but no line triggers the camera; expected a line with `triggers: camera`",
-        ),
+        (LINES, [BULB], r"lined.yaml:\d+:\d+: .*'camera_tr.*no `pulse`"),
+        (UNWIRED, [BULB], "no line triggers the camera; .*`triggers: camera`"),
         (
             WIDE.replace("  use: virtual", "  use: virtual\n  resolution: 1 ms"),
             [BULB, "shot.1.image.exposure=45.3 ms"],
-            r"shot.*45.3 ms, and the edges of the line make it .*; expected a multiple of 1 ms",
+            "45.3 ms, .* a multiple of 1 ms",
         ),
         (
             LINES,
             [START, "profile.camera.cycle_time=90 ms"],
-            "'cycle 0: move' takes 0 s to 60 ms, but .*images at a fixed interval; .*line_trigger: external",
+            "'cycle 0: move' takes 0 s to 60 ms, .*line_trigger: external",
         ),
         (
             LINES,
             [START, "profile.camera.cycle_time=50 ms", TWO_IMAGES],
-            "cycle_time=50 ms: images follow after 70.2 ms, .* every 50 ms by itself; expected more than",
+            "cycle_time=50 ms: .* 70.2 ms, .* every 50 ms",
         ),
         (LINES, [START], "`external_start` needs a `cycle_time`"),
         (LINES, ["profile.camera.cycle_time=50 ms"], "`cycle_time` needs `line_trigger: external_start`"),
@@ -550,7 +529,7 @@ def test_a_trigger_that_cannot_work_is_refused_by_the_check(
 
 def test_a_blinding_line_in_an_exposure_with_em_gain_is_refused_before_the_run(tmp_path: Path) -> None:
     lines = LINES.replace("on: [load], lag", "on: [load, image], lag")
-    with pytest.raises(ConfigError, match="'mot' is blinding and on during `image`, with an EM gain of 300"):
+    with pytest.raises(ConfigError, match=r"'mot' is blinding .*EM gain of 300"):
         run(tmp_path, lines, "profile.camera.em_gain=300")
 
 

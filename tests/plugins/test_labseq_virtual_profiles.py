@@ -82,12 +82,3 @@ def test_the_grid_and_its_ejection_slots_fit_into_the_aods_band() -> None:
     for hz in (grid.row_frequency_hz, grid.column_frequency_hz):
         reach = max(abs(hz - limits.band_centre)) + slots * (hz[1] - hz[0])
         assert reach <= limits.band_half_width
-
-
-def fields(model: type[Settings]) -> dict[str, str | None]:
-    found: dict[str, str | None] = {}
-    for name, info in model.model_fields.items():
-        found[name] = info.description
-        if isinstance(info.annotation, type) and issubclass(info.annotation, Settings):
-            found |= {f"{name}.{key}": text for key, text in fields(info.annotation).items()}
-    return found

@@ -40,4 +40,4 @@ def test_a_deeper_static_tweezer_bears_more_speed() -> None:
 def test_the_sound_of_the_tables_takes_ten_microseconds() -> None:
     light = PAPER.mobile_light.model_copy(update={"transit_time": 6e-6})
     (text,) = beyond(MotionSpec(), PAPER.model_copy(update={"mobile_light": light}))
-    assert "mobile_light.transit_time is 6 us; the virtual lab knows heat and loss from 8 us to 12" in text
+    assert all(fact in text for fact in ("mobile_light.transit_time is 6 us", "8 us to 12"))

@@ -456,11 +456,7 @@ def test_the_light_of_the_last_shot_moves_nothing_in_the_next(clock: FakeClock) 
     [
         ({"speed_m_s": 0.3}, 10e-6, r"in a transit_time of 10 us is 0\.67 sites; the limit is 0\.6"),
         ({}, 50e-6, r"1\.4 sites"),
-        (
-            {},
-            1e-6,
-            r"step of the sites' tones at a transit_time of 1 us is 1\.6 MHz; the limit is at least 2 MHz",
-        ),
+        ({}, 1e-6, r"transit_time of 1 us is 1\.6 MHz; .* 2 MHz"),
     ],
 )
 def test_unresolvable_tones_are_refused(
@@ -473,10 +469,7 @@ def test_unresolvable_tones_are_refused(
 
 @pytest.mark.parametrize(
     ("changes", "transit_s"),
-    [
-        ({"speed_m_s": 0.26}, 10e-6),
-        ({}, 1.5e-6),
-    ],
+    [({"speed_m_s": 0.26}, 10e-6), ({}, 1.5e-6)],
 )
 def test_barely_resolvable_tones_carry_neighbours(
     clock: FakeClock, changes: dict[str, float | str], transit_s: float

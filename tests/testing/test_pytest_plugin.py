@@ -8,33 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import labseq.testing
 from labseq.model import SiteGrid
 from labseq.roles import Context
 from labseq.testing.fakes import FakeClock, RecordingSimulation
-
-
-def test_every_public_name_resolves() -> None:
-    for name in (
-        "SUITES",
-        "AnalysisContract",
-        "ContractViolation",
-        "CameraContract",
-        "DetectorContract",
-        "DeviceContract",
-        "MobileTweezersContract",
-        "PatternContract",
-        "PlannerContract",
-        "ScannerContract",
-        "SimulationContract",
-        "StaticTweezersContract",
-        "StepContract",
-        "fakes",
-        "strategies",
-    ):
-        assert getattr(labseq.testing, name) is not None
-        assert name in dir(labseq.testing)
-
 
 MODULE = """
 import pytest
@@ -70,34 +46,21 @@ def test_the_fixtures_fit_together(
 @pytest.mark.system
 def test_a_plugin_author_sees_the_broken_promise(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(MODULE)
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--tb=short",
-        "-k",
-        "frame",
-        "test_mine.py",
-    ]
+    options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", "frame", "test_mine.py"]
+    command = [sys.executable, "-m", "pytest", *options]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "test_mine.py::TestForgetfulCamera::test_gives_a_frame" in done.stdout
     assert "promise: arm, trigger, read gives a Frame" in done.stdout
     assert "the frame's exposure is 0.02 s; expected 0.01 s" in done.stdout
     assert "1 failed" in done.stdout
-    text = "TestWithoutFactory needs a fixture 'factory' that returns a callable: context -> device"
-    assert text in done.stdout
+    assert "TestWithoutFactory needs a fixture 'factory'" in done.stdout
 
 
 @pytest.mark.system
 def test_the_plugin_itself_imports_next_to_nothing() -> None:
     code = "import sys, labseq.testing.pytest_plugin as p; print(*sorted(m for m in sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = done.stdout.split()
     assert "labseq.testing.pytest_plugin" in modules
     heavy = {"numpy", "hypothesis", "pydantic", "numba", "labseq.model", "labseq.testing.contracts"}
