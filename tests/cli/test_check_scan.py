@@ -29,10 +29,8 @@ def test_check_says_that_an_option_replaces_the_scan(capfd: pytest.CaptureFixtur
     check_sequence(SCAN, PROFILE, overrides, "off", as_json=True)
     answer = json.loads(capfd.readouterr().out)
     assert (answer["points"], answer["shots"]) == (1, 10)
-    (note,) = (warning["what"] for warning in answer["warnings"])
-    assert note == (
-        "--set planner.degree_of_parallelism=7 replaces the scan of 'planner.degree_of_parallelism'"
-    )
+    (warning,) = answer["warnings"]
+    assert "replaces the scan of 'planner.degree_of_parallelism'" in warning["what"]
 
 
 def test_a_run_of_the_first_shots_and_the_table_of_its_points(
