@@ -51,13 +51,14 @@ class FakeSession:
         observer.event("run_starting", {"record": self.record, "run_dir": str(self.run_dir)})
         for shot in self.shots:
             writer.write_shot(shot)
-            line = {"t_s": 1.0 + shot.shot_index, "event": "shot_finished"}
-            writer._events.append(line, sync=False)
             observer.event("shot_finished", {"shot": shot})
         stopped = isinstance(self.error, StopRequested)
         writer.finish(
             "complete" if self.error is None else "stopped" if stopped else "failed", str(self.error or "")
         )
+        lines = [{"t_s": 1.0 + shot.shot_index, "event": "shot_finished"} for shot in self.shots]
+        with (self.run_dir / "events.jsonl").open("a", encoding="utf-8") as events:
+            events.writelines(f"{json.dumps(line)}\n" for line in lines)
         if self.error is not None:
             raise self.error
 

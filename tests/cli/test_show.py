@@ -165,7 +165,7 @@ def test_a_scan_whose_points_were_all_skipped_is_no_error(
     skipped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     show_run(skipped, as_json=False, tables=Tables(scan=ScanRequest()))
-    assert capsys.readouterr().out == "no point of the scan has a shot: 8 of 8 were skipped\n"
+    assert "8 of 8 were skipped" in capsys.readouterr().out
     show_run(skipped, as_json=True, tables=Tables(scan=ScanRequest()))
     assert json.loads(capsys.readouterr().out)["points"] == []
 
