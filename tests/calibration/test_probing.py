@@ -35,7 +35,7 @@ def test_a_hidden_offset_is_found_and_corrected(tmp_path: Path, make_lab: Any) -
     lab.store.use_none("overlay")  # the correction that was in use during the run counts
     assert lab.calibrate("overlay", source=again.run.path).stored.entry.id == again.stored.entry.id
 
-    outcome = lab.calibrate("frequencies", seed=3, shots=2 * N_POINTS, overrides=NO_FRAMES)
+    outcome = lab.calibrate("frequencies", seed=3, shots=N_POINTS, overrides=NO_FRAMES)
     entry = outcome.stored.entry
     assert entry.origin["calibrations"] == {"overlay": again.stored.entry.id}
     (warning,) = outcome.warnings
