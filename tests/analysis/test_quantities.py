@@ -17,7 +17,6 @@ from labseq.analysis.fits import MODELS, RB87_U, Fit, fit_points
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
 from labseq.errors import ConfigError
-from labseq.model import CycleRecord, Plan, PlanReport, follow_atoms
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.recording.points import scan_points
 from labseq.recording.quantities import OF_IMAGES, select_shots
@@ -43,15 +42,6 @@ def test_atoms_are_followed_up_to_the_image_of_a_cycle_through_its_moves(write: 
     run = write([make_shot(0, n_cycles=2)])
     assert run.quantity("survival:0,1").over(run.shots) == Rate(6, 6)
     assert run.quantity("survival:1,2").over(run.shots) == Rate(6, 6)
-
-
-def test_atoms_are_followed_through_the_batches_that_were_played() -> None:
-    before = np.array([[True, True, False, True]])
-    batches = [([(0, 1)], [(0, 2)]), ([(0, 3)], [(0, 9)]), ([(0, 2)], [(0, 1)])]
-    report = PlanReport(before, np.zeros(3), np.ones(3, np.int32), 0, 0)
-    cycle = CycleRecord(0, 0, Plan.from_batches(batches), report, 2, 0.1, 0.0, 0.0)
-    moved, held = follow_atoms(before, [cycle])
-    assert (moved.tolist(), held.tolist()) == ([[False, False, True, False]], [[True, False, False, False]])
 
 
 def test_every_recorded_or_analysed_number_is_a_quantity(lifetime: labseq.Run) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -111,7 +112,7 @@ def test_a_worse_one_is_kept_but_not_used(lab: Any, measured: Any) -> None:
     lab.store.use(lab.store.add(good), GRID)
     source = measured.sites.run.path
     outcome = lab.calibrate("sites", source=source)
-    assert outcome.refused == "it found 36 sites, the one in use 37"
+    assert re.search("36 sites.* 37", outcome.refused)
     assert lab.store.active()["sites"].id == good.id
     assert lab.store.find(outcome.stored.entry.id).path == outcome.stored.path
     assert lab.calibrate("sites", source=source, force=True).refused == ""
@@ -153,9 +154,7 @@ def test_an_analysis_that_fails_says_why_and_keeps_what_is_in_use(
     assert copied.store.active() == before
     assert len(copied.store.entries()) == 2
     (warning,) = (values["text"] for name, values in copied.observer.events if name == "warning")
-    assert warning.startswith(
-        "the calibration failed, and the one in use is unchanged; analyse the run again"
-    )
+    assert "analyse the run again" in warning
 
 
 def test_sites_of_an_irregular_array_come_from_a_file(lab: Any) -> None:
@@ -234,7 +233,7 @@ def test_a_run_without_frames_is_refused(lab: Any) -> None:
 def test_a_choice_in_the_profile_is_reported(lab: Any, measured: Any) -> None:
     lab.write_profile(PROFILE + "calibrations: {use: {sites: off}}\n")
     warnings = lab.calibrate("sites", source=measured.sites.run.path).warnings
-    assert "the profile says 'calibrations.use.sites: off', which takes precedence" in warnings
+    assert any("'calibrations.use.sites: off'" in warning for warning in warnings)
 
 
 def test_the_time_to_the_light_is_measured_and_used_instead_of_the_profiles(

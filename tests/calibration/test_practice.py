@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,8 @@ Floats = NDArray[np.float64]
 ROOT = Path(__file__).parents[2]
 SHOTS = {"tweezers": 1, "sites": 8, "thresholds": 60, "frequencies": 29, "overlay": 29}
 """Kinds in the order of the morning, and fewer shots than usual."""
+SMALLER = {"frame: [512, 512]": "frame: [340, 480]", "[243.2, 268.9]": "[157.2, 252.9]"}
+"""Changes of the profile: frames without what lies far from the sites, which stay as far from the middle."""
 N_FRESH = 15
 COSTS = np.array([3.0, 1.0])
 """Of an atom that is missed and of one that is imagined, as thresholds are fitted."""
@@ -40,7 +41,11 @@ class Practice:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.profile = folder / "practice.yaml"
-        shutil.copy(ROOT / "hardware_profiles" / "practice.yaml", self.profile)
+        text = (ROOT / "hardware_profiles" / "practice.yaml").read_text("utf-8")
+        for old, new in SMALLER.items():
+            assert old in text
+            text = text.replace(old, new)
+        self.profile.write_text(text, "utf-8")
         document, spec = load_profile(str(self.profile), beside=folder)
         physics = document.validate(SimulationSettings, ("simulation",), drop={"use"})
         self.detector = document.validate(ThresholdSettings, ("detector",), drop={"use"})

@@ -18,28 +18,28 @@ simulation:
   image: {frame: [150, 200], centre_px: [74.5, 99.5]}
 """
 N_POINTS = 29
+NO_FRAMES = ["record_frames=none"]  # the occupancies are enough
 HIDDEN_M = np.array([200e-9, -150e-9])
 
 
 def test_a_hidden_offset_is_found_and_corrected(tmp_path: Path, make_lab: Any) -> None:
     lab = make_lab(tmp_path, PROFILE)
-    first = lab.calibrate("overlay", shots=N_POINTS)
+    first = lab.calibrate("overlay", shots=N_POINTS, overrides=NO_FRAMES)
     overlay = first.stored.entry
     assert overlay.values["offset_m"] == pytest.approx(HIDDEN_M, abs=100e-9)
     assert overlay.quality["error_m"] < 50e-9
     assert first.stored.picture is not None
-    again = lab.calibrate("overlay", seed=2, shots=N_POINTS)
+    again = lab.calibrate("overlay", seed=2, shots=N_POINTS, overrides=NO_FRAMES)
     assert again.stored.entry.values["offset_m"] == pytest.approx(HIDDEN_M, abs=100e-9)
     assert "in addition to the correction in use" in again.summary_lines[0]
     lab.store.use_none("overlay")  # the correction that was in use during the run counts
     assert lab.calibrate("overlay", source=again.run.path).stored.entry.id == again.stored.entry.id
 
-    outcome = lab.calibrate("frequencies", seed=3, shots=2 * N_POINTS)
+    outcome = lab.calibrate("frequencies", seed=3, shots=N_POINTS, overrides=NO_FRAMES)
     entry = outcome.stored.entry
     assert entry.origin["calibrations"] == {"overlay": again.stored.entry.id}
-    assert outcome.warnings == (
-        f"overlay {again.stored.entry.id} is no longer used: these frequencies include its correction",
-    )
+    (warning,) = outcome.warnings
+    assert warning.startswith(f"overlay {again.stored.entry.id} is no longer used")
     assert {*lab.store.active()} == {"frequencies"}
     grid = labseq.SiteGrid(8, 8)
     for hz, nominal_hz, hidden_m in (
@@ -50,5 +50,5 @@ def test_a_hidden_offset_is_found_and_corrected(tmp_path: Path, make_lab: Any) -
         assert moved_m.mean() == pytest.approx(hidden_m, abs=100e-9)
         assert moved_m == pytest.approx(np.full(8, hidden_m), abs=150e-9)
     old = lab.calibrate("overlay", source=first.run.path)
-    assert old.refused == "it was measured with other frequencies of the mobile tweezers"
+    assert "other frequencies" in old.refused
     assert {*lab.store.active()} == {"frequencies"}

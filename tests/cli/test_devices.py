@@ -224,8 +224,8 @@ def test_safe_reports_every_device_and_the_exit_code_is_that_of_the_worst(
 def test_standing_by_needs_devices_that_are_locked_and_ends_no_process_that_works(call: Any) -> None:
     write("virtual")
     code, _, error = call("safe", "./p.yaml", "--stand-by")
-    text = "all of its devices are simulated, and those are not locked; there is nothing to stand by for"
-    assert (code, error) == (2, f"error: p.yaml: {text}\n")
+    assert code == 2
+    assert error.startswith("error: p.yaml: all of its devices are simulated")
     code, _, error = call("safe", "./p.yaml", "--stand-by", "--end")
     assert code == 2
-    assert "--stand-by leaves processes that answer alone; leave out --end" in error
+    assert "leave out --end" in error

@@ -43,7 +43,6 @@ def test_a_sequence_that_was_never_checked(call: Any) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["run", "a.yaml", "--shots", "x"],
         ["run", "--shots", "x", "--", "--json"],
         ["plan", "--json", "-"],
         ["fly", "--json"],

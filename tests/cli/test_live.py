@@ -129,7 +129,7 @@ def test_the_screen_is_given_back_even_if_drawing_fails(fake: Any, monkeypatch: 
     def fail(*_: Any) -> Any:
         raise ValueError("broken")
 
-    monkeypatch.setattr("labseq.cli.live._progress", fail)
+    monkeypatch.setattr(Tally, "time_left_s", property(fail))
     with pytest.raises(ValueError, match="broken"):
         terminal.view.close()
     assert sys.stdout is not before

@@ -17,6 +17,7 @@ labseq: 1
 name: screens
 profile: virtual
 seed: 1
+record_frames: none
 target: {pattern: compact, rows: 15, cols: 15}
 scan: {planner.degree_of_parallelism: [3, 7], shot.2.rearrange.window: [60 ms, 100 ms]}
 shot:

@@ -41,10 +41,10 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     folder = write_run(tmp_path, fake, shots)
     show_run(folder, as_json=False)
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split() for line in lines[1:4]] == [
-        ["0", "defect-free", "after", "2", "cycles", "100.0", "%", "0", "0", "1.9", "s"],
-        ["1", "2", "defects", "99.1", "%", "0", "0", "1.9", "s"],
-        ["2", "not", "judged:", "no", "image", "-", "0", "0", "1.9", "s"],
+    assert [" ".join(line.split()) for line in lines[1:4]] == [
+        "0 defect-free after 2 cycles 100.0 % 0 0 1.9 s",
+        "1 2 defects 99.1 % 0 0 1.9 s",
+        "2 not judged: no image - 0 0 1.9 s",
     ]
     assert "shots             3 of 3, 1 attempt kept that did not complete" in lines
     assert "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %" in lines  # one was not judged
@@ -165,7 +165,7 @@ def test_a_scan_whose_points_were_all_skipped_is_no_error(
     skipped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     show_run(skipped, as_json=False, tables=Tables(scan=ScanRequest()))
-    assert capsys.readouterr().out == "no point of the scan has a shot: 8 of 8 were skipped\n"
+    assert "8 of 8 were skipped" in capsys.readouterr().out
     show_run(skipped, as_json=True, tables=Tables(scan=ScanRequest()))
     assert json.loads(capsys.readouterr().out)["points"] == []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -82,38 +82,22 @@ def test_the_truth_of_a_simulation_is_reported() -> None:
 @pytest.mark.parametrize(
     ("unreadable", "printed"),
     [
-        ((3,), "1 shot cannot be read and is left out of cycles and defects: 3"),
-        (
-            tuple(range(7)),
-            "7 shots cannot be read and are left out of cycles and defects: 0, 1, 2, 3, 4, ...",
-        ),
+        ((3,), r"1 shot .*: 3"),
+        (tuple(range(7)), r"7 shots .*: 0, 1, 2, 3, 4, \.\.\."),
     ],
 )
-def test_shots_that_cannot_be_read_are_named(unreadable: Sequence[int], printed: str) -> None:
-    assert lines(unreadable=tuple(unreadable))["warning"] == printed
+def test_shots_that_cannot_be_read_are_named(unreadable: tuple[int, ...], printed: str) -> None:
+    assert re.fullmatch(printed, lines(unreadable=unreadable)["warning"])
 
 
 def test_each_cycle_has_a_row() -> None:
     header, row, note = cycle_table(STATISTICS)
     assert header.split()[:3] == ["cycle", "shots", "defect-free"]
-    assert row.split() == [
-        "0",
-        "20",
-        "5.0",
-        "%",
-        "(2.1",
-        "to",
-        "12.3)",
-        "97.66(4)",
-        "%",
-        "185(4)",
-        "33.6(7)",
-        "0",
-    ]
-    assert note == "each cycle is judged on its own final image"
+    assert " ".join(row.split()) == "0 20 5.0 % (2.1 to 12.3) 97.66(4) % 185(4) 33.6(7) 0"
+    assert "reached" not in note  # all shots did
     assert cycle_table(replace(STATISTICS, cycles=())) == []
 
 
 def test_cycles_that_not_all_shots_made_are_said_to_be() -> None:
     *_, note = cycle_table(replace(STATISTICS, cycles=(CYCLE, replace(CYCLE, cycle=1, n_shots=12))))
-    assert "only shots that reached it count" in note
+    assert "reached" in note

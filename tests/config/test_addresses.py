@@ -105,10 +105,7 @@ def test_split_names_every_wrong_option() -> None:
         "--set a..b=5",
         "--set profile.=3",
     ]
-    assert str(caught.value.problems[0]) == (
-        "--set shots: this is not of the form address=value; "
-        "expected for example --set planner.degree_of_parallelism=5"
-    )
+    assert "address=value" in caught.value.problems[0].what
 
 
 def test_where_only_a_profile_can_be_changed() -> None:
@@ -118,7 +115,4 @@ def test_where_only_a_profile_can_be_changed() -> None:
     with pytest.raises(ConfigError) as caught:
         profile_overrides(["camera.x=1", "profile.camera.x=1", "shots=3"])
     assert [problem.source for problem in caught.value.problems] == ["--set camera.x=1", "--set shots=3"]
-    assert str(caught.value.problems[0]) == (
-        "--set camera.x=1: there is no sequence here whose values could be changed; "
-        "expected an address that begins with 'profile.'; write --set profile.camera.x=..."
-    )
+    assert str(caught.value.problems[0]).endswith("write --set profile.camera.x=...")

@@ -50,18 +50,17 @@ def test_unknown_name(shelves: Path) -> None:
     (shelves / "packaged" / "notes.txt").touch()
     Path("sequences/other.yaml").touch()  # a sequence, most likely
     places = f"sequences, hardware_profiles, {shelves / 'packaged'}"
-    expected = "expected one of lab, virtual; did you mean 'virtual'?"
-    assert refusal("virtul") == f"there is no hardware profile 'virtul' in {places}; {expected}"
+    assert f"'virtul' in {places}; expected one of lab, virtual; did you mean 'virtual'?" in refusal("virtul")
 
 
 def test_the_place_of_the_name_is_named() -> None:
     document = Document.parse("labseq: 1\nprofile: virtul\n", "s.yaml")
-    assert refusal("virtul", document).startswith("s.yaml:2:10: there is no hardware profile 'virtul' in ")
+    assert refusal("virtul", document).startswith("s.yaml:2:10: ")
     document = document.override("profile", "lab_onn.yaml", "--set profile=lab_onn.yaml")
     Path("sequences/lab_one.yaml").touch()
-    what = f"there is no hardware profile at {Path('sequences') / 'lab_onn.yaml'}"
-    expected = f"--set profile=lab_onn.yaml: {what}; did you mean 'lab_one.yaml'?"
-    assert refusal("lab_onn.yaml", document) == expected
+    reported = refusal("lab_onn.yaml", document)
+    assert reported.startswith("--set profile=lab_onn.yaml: ")
+    assert reported.endswith(f" at {Path('sequences') / 'lab_onn.yaml'}; did you mean 'lab_one.yaml'?")
 
 
 def test_a_file_that_only_ends_alike_is_not_meant() -> None:
@@ -113,10 +112,8 @@ def test_a_path_of_a_sequence_is_taken_as_it_is(path: str) -> None:
 def test_a_packaged_sequence_is_not_far(shelves: Path) -> None:
     (shelves / "packaged" / "kagome.yaml").touch()
     reported = refused_sequence("sequences/kagome.yaml")
-    assert reported == (
-        f"{Path('sequences/kagome.yaml')}: there is no such file; say 'kagome' for the one that comes with "
-        "labseq, or copy it by 'labseq demo --copy .'"
-    )
+    assert reported.startswith(f"{Path('sequences/kagome.yaml')}: ")
+    assert all(remedy in reported for remedy in ("'kagome'", "'labseq demo --copy .'"))
     Path("sequences/kagome.yaml").mkdir()  # then it is said that this is a folder
     assert find_sequence(Path("sequences/kagome.yaml")) == Path("sequences/kagome.yaml")
 
@@ -124,8 +121,6 @@ def test_a_packaged_sequence_is_not_far(shelves: Path) -> None:
 def test_unknown_name_of_a_sequence(shelves: Path) -> None:
     (shelves / "packaged" / "kagome.yaml").touch()
     places = f"., sequences, {shelves / 'packaged'}"
-    assert refused_sequence("kagme") == (
-        f"there is no sequence 'kagme' in {places}; expected kagome; did you mean 'kagome'?"
-    )
+    assert f"'kagme' in {places}; expected kagome; did you mean 'kagome'?" in refused_sequence("kagme")
     Path("my_scan.yaml").touch()
     assert refused_sequence("my_scann").endswith("; did you mean 'my_scan.yaml'?")

@@ -32,7 +32,7 @@ FEW: Final = {
     "calibrate sites": "--shots 8 --seed 1",
     "calibrate timing": "--shots 5 --seed 1",
     "calibrate thresholds": "--shots 30 --seed 1",
-    "calibrate": "--shots 29 --seed 1",
+    "calibrate": "--shots 29 --seed 1 --set record_frames=none",
 }
 """Commands that take long -> what makes them short where the page says nothing else."""
 RUN: Final = re.compile(r"data/(\d{4}-\d\d-\d\d/\d{4})_([a-z0-9-]+)")

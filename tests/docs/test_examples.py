@@ -1,4 +1,4 @@
-"""What the documentation shows can be used as it stands; what is not run is known."""
+"""What the documentation shows can be used as it stands."""
 
 from __future__ import annotations
 
@@ -43,105 +43,6 @@ PROFILE = {
     "simulation": "{use: virtual}",
 }
 """What an example leaves out."""
-MEASURED = "a measurement that takes long; the tests run the same file with few frames"
-TUTORIALS = "tests/docs/test_tutorials.py"
-NOT_RUN = {
-    "CONTRIBUTING.md": ["installs labseq", "these are the checks"],
-    "README.md": ["installs labseq; runs all tests"],
-    "docs/explanation/checked-plans.md": ["takes minutes"],
-    "docs/explanation/detection.md": [MEASURED],
-    "docs/explanation/finding-sites.md": [MEASURED],
-    "docs/explanation/grid-planner.md": [
-        "takes a minute",
-        "measured",
-        "takes minutes",
-        "takes minutes",
-    ],
-    "docs/explanation/planners.md": ["tests/docs/test_planner_tables.py runs the script"] * 4,
-    "docs/explanation/run-statistics.md": ["a formula"],
-    "docs/explanation/scale.md": ["takes minutes"],
-    "docs/explanation/survival.md": ["takes minutes"],
-    "docs/explanation/timing-budget.md": ["plays programs for minutes"],
-    "docs/explanation/virtual-lab.md": [
-        "takes ten minutes of a core for each series of 10,000 shots",
-        "takes minutes",
-    ],
-    "docs/how-to/remote-devices.md": [
-        "makes the keys of two computers",
-        "a server does not end by itself",
-        "needs a server of devices",
-        "a server does not end by itself",
-        "needs a server of devices",
-    ],
-    "plugins/labseq_remote/README.md": ["needs a server of devices"],
-    "docs/how-to/web.md": ["a server does not end by itself"] * 5,
-    "docs/explanation/virtual-images.md": ["needs the published frames of a real camera"],
-    "docs/how-to/cameras-andor.md": ["installs packages", MEASURED],
-    "docs/how-to/cameras-genicam.md": ["changes the computer's settings", MEASURED],
-    "docs/how-to/cameras-pylon.md": ["installs packages", MEASURED],
-    "docs/how-to/cluster.md": [
-        "needs three computers",
-        "needs three computers",
-        "tests/test_campaign.py runs one",
-        "tests/test_campaign.py does it",
-    ],
-    "docs/how-to/compare-planners.md": ["tests/docs/test_planner_tables.py runs the script"],
-    "docs/how-to/editor.md": [
-        "tests/scaffold/test_made.py looks for this line",
-        "changes the settings of the shell",
-    ],
-    "docs/how-to/export.md": ["installs packages"],
-    "docs/how-to/fit.md": ["needs a run with releases"],
-    "docs/how-to/first-day.md": ["needs your own profile"],
-    "docs/how-to/first-week.md": [
-        *["tests/session/test_first_week.py takes these measurements"] * 3,
-        "the picture of the page",
-        *["tests/session/test_first_week.py takes these measurements"] * 4,
-        "they take minutes; tests/docs/test_paper_figures.py takes some of their shots",
-    ],
-    "docs/how-to/follow.md": [
-        "a drawing",
-        "waits for the leader below; tests/plugins/test_labseq_follow_session.py runs both",
-        "tests/plugins/test_labseq_follow_session.py runs it beside labseq",
-    ],
-    "docs/how-to/install.md": [
-        "tests/system/test_wheel.py builds one",
-        "tests/system/test_wheel.py installs it",
-        "tests/cli/test_run_demo.py copies them",
-    ],
-    "docs/how-to/new-plugin.md": ["a list of files"],
-    "docs/how-to/plot.md": ["tests/docs/test_paper_figures.py runs the script"] * 3,
-    "docs/how-to/plugin-trouble.md": ["an example; tests/test_plugin_troubles.py has them all"],
-    "docs/how-to/resume-a-run.md": ["tests/session/test_changes.py makes such changes"],
-    "docs/how-to/static-tweezers-soapy.md": ["installs packages, and looks for a radio"],
-    "docs/how-to/stop-and-safe.md": [
-        "no run is in progress; tests/session/test_stopping.py stops one",
-        "takes two processes; tests/session/test_holding.py has them",
-        "waits until Ctrl-C; tests/session/test_holding.py stands by",
-    ],
-    "docs/how-to/timing-box.md": ["writes to a real board", "needs a real board"],
-    "docs/how-to/update.md": ["fetches another version"],
-    "docs/reference/errors.md": ["tests/docs/test_examples.py makes this mistake"],
-    "docs/reference/patterns.md": ["a drawing"],
-    "docs/reference/testing.md": ["an example"],
-    "docs/tutorials/camera-driver.md": [
-        f"{TUTORIALS} runs them",
-        f"{TUTORIALS} runs it",
-        f"{TUTORIALS} writes it into the profile",
-        f"{TUTORIALS} does, with this driver",
-    ],
-    "docs/tutorials/planner.md": [
-        f"{TUTORIALS} runs them",
-        f"{TUTORIALS} deletes these lines",
-        f"{TUTORIALS} looks for these lines",
-        f"{TUTORIALS} installs it",
-    ],
-    "plugins/labseq_ttl/firmware/PROTOCOL.md": [
-        "tests/plugins/test_labseq_ttl_firmware.py says these lines to the firmware"
-    ]
-    * 3,
-}
-"""Page -> why blocks on it, or parts of them, are not run: add new ones here, too."""
 
 
 def of(*languages: str) -> list[Block]:
@@ -171,21 +72,9 @@ SHOWN = [*of("console"), *(block for page in PAGES for block in inline_of(page))
 LINES = [(block, line) for block in SHOWN for line in lines_of(block)]
 
 
-def test_what_is_not_run_is_listed_with_its_reason() -> None:
-    found: dict[str, list[str]] = {}
-    for block in BLOCKS:
-        if block.reason:
-            found.setdefault(block.page, []).append(block.reason)
-    assert found == NOT_RUN
-
-
 def test_tests_that_run_a_block_elsewhere_are_there() -> None:
-    named = {
-        path
-        for reasons in NOT_RUN.values()
-        for text in reasons
-        for path in re.findall(r"tests/\S+\.py", text)
-    }
+    named = {path for block in BLOCKS for path in re.findall(r"tests/\S+\.py", block.reason)}
+    assert named
     assert [path for path in sorted(named) if not (ROOT / path).is_file()] == []
 
 

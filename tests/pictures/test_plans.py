@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.strategies import DataObject
-from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -36,6 +35,7 @@ from labseq.pictures.plans import (
     save_plan,
 )
 from labseq.testing import strategies
+from tests.pictures.pixels import decoded, is_colour
 
 
 @settings(max_examples=30)
@@ -171,19 +171,16 @@ def drawing(occupancy: Occupancy, plan: Plan, fill: Any = None, **grid: Any) -> 
 @pytest.fixture
 def save(tmp_path: Path) -> Save:
     def save(what: PlanDrawing) -> np.ndarray[Any, Any]:
-        path = tmp_path / "plan.png"
-        save_plan(path, what)
-        with Image.open(path) as image:
+        save_plan(tmp_path / "plan.png", what)
+        with Image.open(tmp_path / "plan.png") as image:
             assert image.info["dpi"] == pytest.approx((DPI, DPI), rel=1e-3)
-            return np.asarray(image.convert("RGB")).astype(int)
+        return decoded((tmp_path / "plan.png").read_bytes(), "RGB")
 
     return save
 
 
 def count(pixels: np.ndarray[Any, Any], colour: Any) -> int:
-    """Pixels of about this colour."""
-    wanted = np.round(255 * np.array(to_rgb(colour)))
-    return int(np.count_nonzero(np.abs(pixels - wanted).max(axis=2) < 12))
+    return int(np.count_nonzero(is_colour(pixels, colour)))
 
 
 def row_plan(n_rows: int, n_cols: int) -> tuple[Occupancy, Plan]:

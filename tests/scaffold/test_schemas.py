@@ -175,12 +175,11 @@ def test_a_bare_name_is_reported_once(registry: Registry) -> None:
 
 def test_keys_are_explained(registry: Registry) -> None:
     schema = file_schema("sequence", registry)
-    assert schema["properties"]["shots"]["description"] == "how many shots a run takes"
+    assert "shots" in schema["properties"]["shots"]["description"]
     exposure = schema["definitions"]["step.image"]["properties"]["exposure"]
-    assert (exposure["description"], exposure["default"]) == ("exposure time of the camera", "45 ms")
-    assert exposure["patternErrorMessage"].startswith(
-        "expected a time such as '45 ms' (s, ms, us, ns, min, h)"
-    )
+    assert exposure["default"] == "45 ms"
+    assert "exposure" in exposure["description"]
+    assert "(s, ms, us, ns, min, h)" in exposure["patternErrorMessage"]
     planner = schema["properties"]["planner"]["anyOf"][0]["properties"]["use"]
     assert len(planner["enum"]) == len(planner["enumDescriptions"])
     assert {"psca", "lsap", "tetris"} <= {*planner["enum"]}

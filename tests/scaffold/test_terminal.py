@@ -53,7 +53,6 @@ def test_a_planner_from_an_empty_folder(capsys: pytest.CaptureFixture[str]) -> N
             ["planer", "x"],
             "there is no kind 'planer'; expected one of planner, camera, .*did you mean 'planner'",
         ),
-        (["planner", "my-planner"], "a planner cannot be called 'my-planner'.*for example 'my_planner'"),
         (["sequence", "a", "--package"], "--package does not apply to a sequence; leave it out"),
         (["static_tweezers", "a", "--profile", "lab"], "--profile does not apply to a static tweezers"),
     ],

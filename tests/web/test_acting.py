@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -16,7 +18,7 @@ from labseq.queue.running import QueueRun
 from labseq.scaffold.schemas import file_schema
 from labseq.session.chosen import load_plugins
 from labseq.session.options import Options
-from labseq.web.acting import Actions, form_fields
+from labseq.web.acting import form_fields
 from tests.recording.damages import rewrite_state
 
 from .clients import Client, client_of, path_of, write_run
@@ -129,11 +131,12 @@ def test_a_known_sequence_is_queued_with_values_of_its_form(
     """The commands run in processes of their own: here what they are called with."""
     called = list[list[str]]()
 
-    def labseq(_: Any, arguments: list[str], variables: dict[str, str]) -> str:
-        called.append([*arguments, *variables.values()])
-        return "{}" if arguments[0] == "schema" else "1: queued\n"
+    def labseq(command: list[str], *, env: dict[str, str], **_: Any) -> subprocess.CompletedProcess[bytes]:
+        assert command[:3] == [sys.executable, "-m", "labseq"]
+        called.append([*command[3:], env.get("LABSEQ_DATA", "")])
+        return subprocess.CompletedProcess(command, 0, b"{}" if "schema" in command else b"1: queued\n", b"")
 
-    monkeypatch.setattr(Actions, "_labseq", labseq)
+    monkeypatch.setattr("labseq.web.acting.subprocess.run", labseq)
     monkeypatch.chdir(ROOT)
     assert "compact_225" in acting.get("/api/v1/sequences").json()["sequences"]
     values = {"sequence": "compact_225", "profile": "virtual", "changes": {"shots": "5; rm -rf"}}
