@@ -260,29 +260,23 @@ def test_files_that_this_version_cannot_read_are_replaced(package: Package, cach
     assert compiled_modules(package.load) == []
 
 
-def test_kernels_unused_for_long_are_deleted(package: Package, cache: Path) -> None:
-    root = cache / "kernels"
-    (root / "notes").mkdir(parents=True)
-    for name in ("old", "new"):
-        (root / name).write_text("")
-    long_ago = time.time() - 31 * 86400
-    for name in ("old", "notes"):
-        os.utime(root / name, (long_ago, long_ago))
-    package.load()
-    assert {"new", "notes"} < {path.name for path in root.iterdir()}
-    assert not (root / "old").exists()
-
-
-def test_a_clock_that_is_ahead_deletes_no_kernels(
-    package: Package, cache: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("ahead_days", [0, 365])
+def test_kernels_unused_for_long_are_deleted_and_no_others_whatever_the_clock(
+    package: Package, cache: Path, monkeypatch: pytest.MonkeyPatch, ahead_days: int
 ) -> None:
+    root, now_s = cache / "kernels", time.time()
+    (root / "notes").mkdir(parents=True)
+    for name, days in (("old", 31), ("recent", 29), ("notes", 31)):
+        if name != "notes":
+            (root / name).write_text("")
+        used_s = now_s - days * 86400
+        os.utime(root / name, (used_s, used_s))
+    (root / "new").write_text("")
+    monkeypatch.setattr(time, "time", lambda: now_s + ahead_days * 86400)
     package.load()
-    before = {*(cache / "kernels").iterdir()}
-    now_s = time.time()
-    monkeypatch.setattr(time, "time", lambda: now_s + 365 * 86400)
-    monkeypatch.setattr(labseq.kernel, "_CLEANED", set())
-    labseq.kernel._delete_unused(cache / "kernels")
-    assert {*(cache / "kernels").iterdir()} == before
+    left = {path.name for path in root.iterdir()}
+    assert {"recent", "new", "notes"} < left
+    assert "old" not in left
 
 
 def test_a_function_of_a_notebook_is_cached_by_its_code(cache: Path) -> None:

@@ -169,10 +169,8 @@ class TestHanging:
         code = GOOD.replace("# at the top", "print(1)\nimport gate; gate.wait()")
         stdout = sys.stdout
         _, info = loaded(tmp_path, code, SHORT_S)
-        assert info.reason == (
-            "it did not finish loading within 0.5 s and was abandoned; if it is only slow, raise "
-            "'timeouts: {load: ...}' in the profile"
-        )
+        assert "did not finish loading within 0.5 s" in info.reason
+        assert "'timeouts: {load: ...}'" in info.reason
         assert sys.stdout is stdout
         assert "it printed ('1')" in info.notes[0]
         assert f"{LOCAL_PACKAGE}.mine" not in sys.modules
@@ -292,10 +290,7 @@ def test_two_distributions_with_a_plugin_of_one_name(monkeypatch: pytest.MonkeyP
     first, second = host.infos
     assert (first.state, first.source) == ("loaded", "the distribution labseq-ixon 1.2")
     assert (second.name, second.state) == ("ixon (the distribution lab-of-bob 1.2)", "failed")
-    assert second.reason == (
-        "an installed plugin (of the distribution labseq-ixon 1.2) is called 'ixon' already; rename one of "
-        "them"
-    )
+    assert "labseq-ixon 1.2) is called 'ixon' already" in second.reason
     assert host.get("planner", "mine").origin == "ixon"
 
 

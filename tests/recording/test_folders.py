@@ -84,7 +84,7 @@ def test_any_path_in_a_run_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_folder_of_runs_names_its_latest(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"is not a run: it has no run\.json; give a run's folder"):
+    with pytest.raises(RecordingError, match=r"no run\.json"):
         find_run(tmp_path)
     make_finished(tmp_path, "a")
     with pytest.raises(RecordingError, match=r"holds 1 run and is none itself; .*0001_a"):
@@ -107,7 +107,5 @@ def test_a_run_that_lost_its_run_file_is_not_to_be_deleted(tmp_path: Path) -> No
     (run / "STATE").write_text("{}")
     (run / "run.json").unlink()
     for path in (run, run / "shots" / "shot_000000.h5"):
-        with pytest.raises(
-            RecordingError, match=r"holds shots, but its run\.json is gone; restore that from a backup"
-        ):
+        with pytest.raises(RecordingError, match=r"run\.json is gone; restore"):
             find_run(path)

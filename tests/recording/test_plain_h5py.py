@@ -119,9 +119,7 @@ def test_a_sequence_without_a_target_is_run_shown_and_drawn(tmp_path: Path) -> N
     save_shot(tmp_path / "shot.png", shot_picture(run, 0))
 
     path.write_text(path.read_text("utf-8").replace("{wait:", "{rearrange: {}}, {wait:"), "utf-8")
-    with pytest.raises(
-        labseq.ConfigError, match=r"5:.*'rearrange' needs a target; expected 'target' in the sequence"
-    ):
+    with pytest.raises(labseq.ConfigError, match=r"5:.*'rearrange' needs a target"):
         labseq.Session.open(path)
 
 
@@ -140,11 +138,8 @@ def test_average_image_loading_map_and_counts_of_any_run(
         picture_of(run, what).save(tmp_path / f"{what}.png")
     with pytest.raises(labseq.ConfigError) as caught:
         picture_of(run, "image")
-    assert str(caught.value) == (
-        f"{run.path}: the picture cannot be drawn from this run: there is nothing to show of the average "
-        "image; expected shots whose frames were kept: 'record_frames: all' in the sequence, or "
-        "--set record_frames=all"
-    )
+    assert str(caught.value).startswith(f"{run.path}: ")
+    assert "--set record_frames=all" in str(caught.value)
 
     kept = write(tmp_path, make_shot(0), make_shot(1))
     mean, n = average_frame(kept.shots, image=1)

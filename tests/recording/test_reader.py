@@ -69,7 +69,7 @@ def test_the_index_is_enough_to_open_a_run(run_dir: Path) -> None:
     run = open_run(run_dir)
     assert [shot.index for shot in run.shots] == list(range(1_000))
     assert run.defect_free == 1.0
-    with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing; restore it from a backup"):
+    with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing; restore"):
         _ = run.shots[17].plans
     with pytest.raises(RecordingError, match=r"shot_000017.h5: is missing"):
         _ = run.shots[17].frames
@@ -150,9 +150,7 @@ def test_a_run_without_a_state_has_failed(run_dir: Path, content: bytes | None) 
 @pytest.mark.parametrize("content", [b"[]", b"\xff", b'{"format": "other"}'])
 def test_a_damaged_run_file_is_explained(run_dir: Path, content: bytes) -> None:
     (run_dir / "run.json").write_bytes(content)
-    with pytest.raises(
-        RecordingError, match=r"run.json: is damaged, or not labseq's; restore it from a backup"
-    ):
+    with pytest.raises(RecordingError, match=r"run.json: is damaged.*restore"):
         open_run(run_dir)
 
 
@@ -175,9 +173,7 @@ def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
     rewrite_json(run_dir / "run.json", format_version="4.9")  # a newer minor version only adds things
     open_run(run_dir)
     rewrite_json(run_dir / "run.json", format_version="5.0")
-    with pytest.raises(
-        RecordingError, match=r"has format version 5\.0, this labseq reads 4\.0; update labseq"
-    ):
+    with pytest.raises(RecordingError, match=r"version 5\.0, .* 4\.0; update labseq"):
         open_run(run_dir)
     rewrite_json(run_dir / "run.json", format_version="1.3")
     with pytest.raises(RecordingError, match=r"format version 1\.3, .* 4\.0; use labseq 0\.1\.0 to read it"):
@@ -207,7 +203,7 @@ def test_a_damaged_shot_file_is_explained(run_dir: Path, part: float) -> None:
     shot = open_run(run_dir).shots[0]
     data = shot.file.read_bytes()
     shot.file.write_bytes(data[: int(part * len(data))])
-    with pytest.raises(RecordingError, match=r"shot_000000.h5: is damaged: .*; restore it from a backup"):
+    with pytest.raises(RecordingError, match=r"shot_000000.h5: is damaged: .*; restore"):
         _ = shot.occupancies
     with pytest.raises(RecordingError, match="is damaged"):
         _ = shot.frames
@@ -218,11 +214,6 @@ def test_several_values_of_a_shot_read_its_file_once(run_dir: Path) -> None:
     assert len(shot.plans) == 3
     shot.file.unlink()
     assert len(shot.timing) == 4
-
-
-def test_importing_the_package_is_light() -> None:
-    code = "import sys, labseq.recording; assert 'h5py' not in sys.modules and 'pydantic' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("path", [None, b"data"])

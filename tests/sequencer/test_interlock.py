@@ -43,9 +43,7 @@ def n_exposures(made: Rig) -> int:
 
 def test_a_blinding_light_refuses_the_exposure_and_ends_the_run_safely() -> None:
     made = rig(LOAD, command("on"), IMAGE, blinding=MARKED)
-    with pytest.raises(
-        DeviceError, match=r"no exposure with an EM gain of 300 while 'shutter' is on"
-    ) as caught:
+    with pytest.raises(DeviceError, match=r"EM gain of 300 while 'shutter' is on") as caught:
         made.run()
     assert caught.value.device == "camera"
     assert n_exposures(made) == 0

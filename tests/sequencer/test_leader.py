@@ -237,9 +237,9 @@ def test_lines_stay_idle_while_it_waits() -> None:
 def test_a_missing_or_wrong_leader_is_refused() -> None:
     devices = {"shutter": RecordingDevice(), "a": RecordingLeader(), "b": RecordingLeader()}
     assert find_leader(devices, "b") == ("b", devices["b"])
-    with pytest.raises(ConfigError, match="no device through which another control system leads"):
+    with pytest.raises(ConfigError, match="no device"):
         find_leader({"shutter": devices["shutter"]})
-    with pytest.raises(ConfigError, match="no other control system leads through 'shutter'"):
+    with pytest.raises(ConfigError, match="'shutter'"):
         find_leader(devices, "shutter")
-    with pytest.raises(ConfigError, match="set `device` to one of 'a', 'b'"):
+    with pytest.raises(ConfigError, match=r"`device` .*'a', 'b'"):
         find_leader(devices)

@@ -113,7 +113,7 @@ def test_a_frame_of_an_extra_trigger_is_not_taken_for_the_next_image() -> None:
     camera = EdgeCamera()
     camera.n_extra = 1
     made = rig(camera, IMAGE, IMAGE, line_specs=[TRIGGERED])
-    with pytest.raises(DeviceError, match=r"a frame came 45 ms before its exposure was over, .*second edge"):
+    with pytest.raises(DeviceError, match=r"45 ms before .*second edge"):
         made.run()
     assert "camera" in made.made_safe()
 
@@ -124,6 +124,6 @@ def test_a_step_that_comes_after_the_exposure_that_the_camera_began_by_itself_fa
         triggers=("external_start",), line_trigger="external_start", cycle_s=0.05
     )
     made = rig(camera, IMAGE, WAIT, IMAGE, line_specs=[TRIGGERED])
-    late = r"the step came 5 ms too late for it; set a longer `cycle_time`"
+    late = r"5 ms too late .*`cycle_time`"
     with pytest.raises(TransientError, match=late):
         made.run()

@@ -138,9 +138,9 @@ def test_an_analysis_that_does_not_finish_is_ended(tmp_path, monkeypatch):
     done = run(tmp_path, "[{use: hangs, finish_within: 0 s}]")
     assert done.status == "complete"
     ended, left = warnings(done)
-    assert ended == "analysis 'hangs' did not finish within 0 s after the run, and was ended"
-    missing = "analysis 'hangs' has no result of 3 of 3 shots"
-    assert left == f"{missing}; 'labseq analyse {done.path}' computes the missing results"
+    assert "'hangs' did not finish within 0 s" in ended
+    assert "'hangs' has no result of 3 of 3 shots" in left
+    assert f"'labseq analyse {done.path}'" in left
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_two_processes_never_write_the_same_results(taken):
     path = results_file(taken.path, "fails")
     lock = Lock(path.with_name(".fails.lock"), "the analysis 'fails'")
     assert lock.take() is None
-    with pytest.raises(ConfigError, match="results of 'fails' are being written by the analysis 'fails'"):
+    with pytest.raises(ConfigError, match="'fails' are being written"):
         analyse_missing(taken, {"use": "fails"})
     lock.release()
 

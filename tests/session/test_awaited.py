@@ -133,15 +133,14 @@ def test_a_result_that_does_not_come_is_no_value_and_an_analysis_that_dies_ends_
             session.run()
         run_dir = session.run_dir
     assert run_dir is not None
-    assert str(caught.value) == (
-        "analysis 'trouble': it has ended, and the run needs 'analysis.trouble.filling' to choose the next "
-        "point; see analysis/trouble.log in the run's folder"
-    )
+    for words in ("analysis 'trouble'", "'analysis.trouble.filling'", "analysis/trouble.log"):
+        assert words in str(caught.value)
     assert caught.value.exit_code == 3
     assert [one["value"] is None for one in seen.of("scan_point")] == [False, True, True, False]
     texts = [one["text"] for one in seen.of("warning")]
-    assert "shot 1 has no 'analysis.trouble.filling': the analysis failed: ValueError: too dark" in texts
-    assert any("shot 2 has no 'analysis.trouble.filling': the analysis gave no result" in t for t in texts)
+    missing = [text for text in texts if "has no 'analysis.trouble.filling'" in text]
+    assert [text[:6] for text in missing] == ["shot 1", "shot 2"]
+    assert "ValueError: too dark" in missing[0]
 
     Path("repaired").touch()
     again = resumed(run_dir)
@@ -169,10 +168,10 @@ def test_a_check_waits_for_the_analysis_of_each_shot(tmp_path: Path) -> None:
         assert session.run_dir is not None
         run = labseq.open_run(session.run_dir)
     loading = run.quantity("loading")
-    assert [one["text"] for one in seen.of("warning")] == [
-        f"shot {i}: loading:last is {loading.of_shot(run.shots[i]):.6g}; it should be at most 0"
-        for i in (0, 1)
-    ]
+    for i, warning in enumerate(seen.of("warning")):
+        value = f"{loading.of_shot(run.shots[i]):.6g}"
+        assert warning["text"].startswith(f"shot {i}: loading:last is {value}; ")
+    assert len(seen.of("warning")) == 2
     assert len(run.shots) == 2
 
 
@@ -196,6 +195,7 @@ def test_a_result_that_no_analysis_gives_is_refused(
         labseq.Session.open(write(tmp_path, rest))
     (problem,) = caught.value.problems
     assert problem.line == N_LINES + 4
-    assert problem.what == f"there is no quantity '{figure}' {purpose}"
+    assert figure in problem.what
+    assert purpose in problem.what
     assert expected in problem.expected.split(", ")
     assert hint in problem.hint

@@ -220,12 +220,14 @@ def test_a_card_that_would_play_a_pause_between_batches_is_refused_one() -> None
 
 def test_wrong_options_are_reported_with_the_files() -> None:
     write({"rows: 15": "rows: 0"})
-    assert messages(shots=0, overrides=["planr.x=1", "profile.camera.gain=5"]) == [
-        "--set planr.x=1: there is no 'planr' in s.yaml; expected one of labseq, name, profile, shots, target, planner, shot; did you mean 'planner'?",
-        "--shots 0: shots is 0; expected at least 1",
-        "--set profile.camera.gain=5: 'gain' is not a setting of camera 'virtual'; expected one of transpose, flip, region, binning, max_exposure, line_trigger, cycle_time, arming_time, readout, em_gain, cooling, faults; did you mean 'em_gain'?",
-        "s.yaml:7:34: rows is 0; expected at least 1",
+    expected = [
+        "--set planr.x=1: .* did you mean 'planner'",
+        "--shots 0: shots is 0",
+        "--set profile.camera.gain=5: 'gain' .* did you mean 'em_gain'",
+        "s.yaml:7:34: rows is 0",
     ]
+    found = messages(shots=0, overrides=["planr.x=1", "profile.camera.gain=5"])
+    assert all(re.match(*pair) for pair in zip(expected, found, strict=True)), found
 
 
 @pytest.mark.parametrize(

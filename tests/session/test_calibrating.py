@@ -68,8 +68,14 @@ def test_frequencies_reach_every_role_but_the_simulation(bench: Bench) -> None:
     lab = bench.session().build_lab()
     assert {*lab.calibrations} == {"frequencies"}
     assert np.array_equal(lab.grid.column_frequency_hz, shifted_hz(GRID))
-    simulation: Any = lab.simulation
-    assert np.array_equal(simulation._grid.column_frequency_hz, GRID.column_frequency_hz)
+    bench.use("frequencies", values={"column_hz": GRID.column_frequency_hz + 8e5})  # half a site beside
+    moves = ["shots=1", "target.rows=3", "target.cols=3"]
+    moves.append("shot=[{load: {}}, {image: {}}, {rearrange: {cycles: 1, window: 60 ms}}]")
+    n_defects = [
+        bench.session(*moves, *overrides).run().shots[0].readings["simulation.n_defects_true"]
+        for overrides in ((), ("profile.calibrations.use.frequencies=off",))
+    ]
+    assert n_defects[0] > n_defects[1] == 0, "the atoms are where they were without the calibration"
 
 
 def test_an_overlay_counts_on_top_of_the_frequencies_that_it_was_measured_with(bench: Bench) -> None:

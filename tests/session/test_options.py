@@ -21,18 +21,17 @@ def test_the_sequence_is_a_path(sequence: Any) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"output": 5}, "output is 5; expected a path"),
-        ({"profile": 5}, "profile is 5; expected the name or the path of a hardware profile"),
-        ({"shots": "many"}, "--shots many: shots is 'many'; expected a whole number"),
-        ({"dry_run": "slow"}, "dry_run is 'slow'; expected one of 'off', 'full', 'fast'"),
-        ({"overrides": "shots=5"}, "overrides is 'shots=5'; expected a list of texts such as ['shots=5']"),
-        ({"seed": -1}, "--seed -1: seed is -1; expected at least 0"),
+        ({"output": 5}, "output is 5; .* path"),
+        ({"profile": 5}, "profile is 5; .* hardware profile"),
+        ({"shots": "many"}, "--shots many: .* a whole number"),
+        ({"dry_run": "slow"}, "dry_run is 'slow'; .*'off', 'full', 'fast'"),
+        ({"overrides": "shots=5"}, r"overrides is 'shots=5'; .*\['shots=5'\]"),
+        ({"seed": -1}, "--seed -1: .* at least 0"),
     ],
 )
 def test_options_say_what_was_expected(given: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=f"^{message}"):
         Session.open(SEQUENCE, **given)
-    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize(

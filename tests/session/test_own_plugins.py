@@ -109,28 +109,16 @@ def test_a_wrong_plan_is_stopped_before_anything_plays(tmp_path, batches, rule):
     ("old", "new", "kind", "message"),
     [
         (
-            "now, batches =",
-            "raise KeyError('typo')\n        now, batches =",
-            ConfigError,
-            "raised KeyError: 'typo'",
-        ),
-        (
             "return labseq.Plan.from_batches(batches)",
             "return batches",
             ConfigError,
-            r"'shape': a Plan \(labseq.plugin.Plan.from_batches makes one\) was expected, list came",
+            r"'shape': .*labseq.plugin.Plan.from_batches.* list",
         ),
         (
             "    def plan(",
             "    def warm(self):\n        raise SystemExit(0)\n\n    def plan(",
             PlanError,
             r"warm\(\) raised SystemExit: 0",
-        ),
-        (
-            "def __init__(self, settings, context):",
-            "def __init__(self, settings, context):\n        raise OSError('no')",
-            labseq.PluginLoadError,
-            "constructor of planner 'mine' raised OSError: no",
         ),
         (
             "        self.degree_of_parallelism = 1\n",

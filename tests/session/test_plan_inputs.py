@@ -50,7 +50,7 @@ def test_targets_as_text(text: str, expected: Any) -> None:
 
 @pytest.mark.parametrize("text", ["", ":3x3", "compact:15", "compact:3x3,4x4", "a b"])
 def test_what_is_no_target_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="this is not a target; expected a pattern such as kagome:15x15"):
+    with pytest.raises(ConfigError, match=r"not a target; .*kagome:15x15"):
         parse_target(text)
 
 

@@ -80,9 +80,8 @@ def test_a_shot_that_fails_again_and_again_is_skipped_and_the_run_complete(tmp_p
     assert [shot.index for shot in done.shots] == [0, 1, 3, 4, 5]
     assert [(shot.index, shot.attempt) for shot in done.attempts] == [(2, 0), (2, 1)]
     assert done.skipped == {2: "DeviceError: laser: went out of lock"}
-    assert [event["text"] for event in seen.of("warning")] == [
-        "shot 2 is skipped: DeviceError: laser: went out of lock"
-    ]
+    (warning,) = seen.of("warning")
+    assert re.match(r"shot 2 .*laser: went out of lock", warning["text"])
     assert done.summary()["skipped"] == 1
     with pytest.raises(ConfigError, match="it is complete"):
         labseq.Session.resume(done.path)
@@ -133,18 +132,17 @@ def test_a_check_between_shots_warns_or_stops(tmp_path: Path) -> None:
     ]
     seen = RecordingObserver()
     path = sequence(tmp_path, policy={"checks": checks})
-    reported = "reading.laser.power_w is 0.35 on the mean of the last 2 shots; it should be at most 0.25"
-    with pytest.raises(CheckFailedError) as caught:
+    with pytest.raises(
+        CheckFailedError, match=r"power_w is 0\.35 .* last 2 shots; .*at most 0\.25"
+    ) as caught:
         run(path, seen)
-    assert (str(caught.value), caught.value.value, caught.value.exit_code) == (
-        reported, "reading.laser.power_w", 3
-    )  # fmt: skip
+    assert (caught.value.value, caught.value.exit_code) == ("reading.laser.power_w", 3)
     warnings = [event["text"] for event in seen.of("warning")]
     assert len(warnings) == 4  # one a shot, before the run ends
     assert "it should be at least 2" in warnings[0]
     (folder,) = [path.parent for path in (tmp_path / "data").rglob("run.json")]
     stopped = labseq.open_run(folder)
-    assert (stopped.status, stopped.error) == ("failed", f"CheckFailedError: {reported}")
+    assert (stopped.status, stopped.error) == ("failed", f"CheckFailedError: {caught.value}")
     assert len(stopped.shots) == 5
 
 
@@ -181,8 +179,9 @@ def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     with labseq.Session.open(path) as session:
         reported = [str(problem) for problem in check(session).warnings]
-    what = "the step takes up to 500 ms, longer than its timeout of 400 ms; expected more than 500 ms"
-    assert f"{path}:10:23: {what}" in reported
+    (warning,) = [text for text in reported if text.startswith(f"{path}:10:23: ")]
+    assert "timeout of 400 ms" in warning
+    assert "more than 500 ms" in warning
 
 
 @pytest.mark.parametrize(
@@ -261,10 +260,9 @@ def test_a_value_that_no_shot_has_is_one_warning(tmp_path: Path) -> None:
         observer.session = session
         with pytest.raises(labseq.StopRequested):
             session.run()
-    assert [event["text"] for event in observer.of("warning")] == [
-        "shot 0 has no 'reading.laser.pwer_w' to check (did you mean 'reading.laser.power_w'?)",
-        "shot 0 has no 'stage.plan' to check (did you mean 'stage.plan_s'?)",
-    ]
+    first, second = (event["text"] for event in observer.of("warning"))
+    assert re.match(r"shot 0 .*'reading.laser.pwer_w'.*'reading.laser.power_w'", first)
+    assert re.match(r"shot 0 .*'stage.plan'.*'stage.plan_s'", second)
     assert session.run_dir is not None
     resumed(session.run_dir, seen)
     assert seen.of("warning") == []

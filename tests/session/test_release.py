@@ -55,9 +55,10 @@ def test_a_wait_that_the_computer_cannot_keep_is_refused(profile: str, tmp_path:
                 refused()
             (problem,) = caught.value.problems
             assert (problem.line, problem.column) == (10, 22)
-            assert "the computer cannot keep 10 us" in problem.what
+            assert "10 us" in problem.what
             assert problem.expected == "at least 1 ms"
-            assert "use the step `release`, which 'static_tweezers' times" in problem.hint
+            assert "`release`" in problem.hint
+            assert "'static_tweezers'" in problem.hint
     assert not (tmp_path / "data").exists()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from labseq.model import SiteGrid
 from labseq.recording import open_run
 from labseq.recording.folders import INDEX_FILE, STATE_FILE
 from labseq.testing.fakes.records import fake_calibration
+
+from .whole_runs import SMALL_FRAMES
 
 PLUGIN = """
 import labseq
@@ -74,11 +77,12 @@ def write_plugin(folder: Path, batches: str = "[]") -> None:
     (folder / "mine" / "lazy.py").write_text(PLUGIN.replace("BATCHES", batches))
 
 
-def take(folder: Path, text: str, **options: object) -> labseq.Run:
+def take(folder: Path, text: str, *overrides: str, **options: Any) -> labseq.Run:
     write_plugin(folder)
+    options["overrides"] = [*SMALL_FRAMES, *overrides]
     path = folder / "replayed.yaml"
     path.write_text(text)
-    with labseq.Session.open(path, output=folder / "data", **options) as session:  # pyright: ignore[reportArgumentType]
+    with labseq.Session.open(path, output=folder / "data", **options) as session:
         return session.run()
 
 
@@ -172,7 +176,7 @@ def test_another_detector_is_compared_site_by_site(taken):
 
 
 def test_frames_that_were_not_kept_are_no_failure(tmp_path):
-    run = take(tmp_path, SEQUENCE, overrides=["record_frames=last"], shots=1)
+    run = take(tmp_path, SEQUENCE, "record_frames=last", shots=1)
     found = replay(run, ReplayRequest())
     assert found.is_reproduced
     assert (len(found.images.images), len(found.plans) > 0) == (1, True)

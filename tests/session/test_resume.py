@@ -82,7 +82,7 @@ def test_what_was_resumed_is_on_record(stopped: Path) -> None:
     assert (len(run.shots), run.n_damaged_lines, len(lines(stopped))) == (6, 0, 6)
     assert run.record["devices"]
     assert not (stopped / "STOP").exists()
-    with pytest.raises(ConfigError, match="it is complete: no shot is missing"):
+    with pytest.raises(ConfigError, match="it is complete"):
         labseq.Session.resume(stopped)
 
 
@@ -218,18 +218,14 @@ def test_a_run_that_cannot_be_resumed_is_left_alone(stopped: Path, name: str) ->
 
 def test_a_run_that_may_be_in_progress_elsewhere_is_a_change(stopped: Path) -> None:
     state_of_another(stopped, host="another")
-    with pytest.raises(
-        ConfigError, match="the computer was another, is this one; the run may still be in progress there"
-    ):
+    with pytest.raises(ConfigError, match=r"computer was another, .*in progress there"):
         labseq.Session.resume(stopped)
     assert resumed(stopped, accept_changes=True).status == "complete"
 
 
 def test_one_resumes_at_a_time(stopped: Path) -> None:
     with labseq.Session.resume(stopped) as session:
-        with pytest.raises(
-            ConfigError, match=r"another process resumes it already: labseq resume \(process \d+ on "
-        ):
+        with pytest.raises(ConfigError, match=r"labseq resume \(process \d+ on "):
             labseq.Session.resume(stopped)
         session.run()
     assert labseq.open_run(stopped).status == "complete"

@@ -165,8 +165,8 @@ def test_a_run_on_an_earlier_day_than_others_says_so(tmp_path: Path, monkeypatch
         with labseq.Session.open(sequence, **options) as session:
             session.run()
     texts = [values["text"] for values in seen.of("warning")]
-    text = f"{tmp_path / 'data'} has runs of 2099-01-02: this run is listed before them; is the clock right?"
-    assert texts == [text] * 2
+    assert len(texts) == 2
+    assert all(str(tmp_path / "data") in text and "2099-01-02" in text for text in texts)
     assert [path.name[:4] for path in sorted((tmp_path / "data").glob("2023-11-1*/*"))] == ["0001", "0002"]
 
 

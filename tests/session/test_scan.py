@@ -14,7 +14,7 @@ import labseq
 from labseq.errors import ConfigError
 from labseq.recording.points import scan_points
 from labseq.session.check import check
-from labseq.session.lab import _reopened, rebuild_lab
+from labseq.session.lab import rebuild_lab
 from labseq.session.scan import MAX_PROBLEMS
 from labseq.testing.fakes import RecordingObserver
 
@@ -98,14 +98,15 @@ def test_a_shot_of_a_scan_is_the_same_as_in_a_run_with_its_values_set(tmp_path: 
     scanned = run(tmp_path, text)
     for shot, point in zip(scanned.shots, scanned.record["scan"]["point_of_shot"], strict=True):
         overrides = [f"{address}={value}" for address, value in scan_points(scanned)[point].written.items()]
-        alone = run(tmp_path, "shots: 4\n", overrides=overrides).shots[shot.index]
+        alone = run(tmp_path, f"shots: {shot.index + 1}\n", overrides=overrides).shots[shot.index]
         assert np.array_equal(shot.occupancies, alone.occupancies)
         assert [p.moves.tobytes() for p in shot.plans] == [p.moves.tobytes() for p in alone.plans]
 
 
 def test_a_shuffled_order_follows_from_the_seed_and_is_recorded(tmp_path: Path) -> None:
     text = "scan: {shot.0.load.duration: {range: [50 ms, 100 ms, 10 ms]}}\nrepeats: 2\norder: shuffled\n"
-    done = run(tmp_path, text)
+    options: dict[str, Any] = {"overrides": ["shot=[{load: {}}, {image: {}}]"]}
+    done = run(tmp_path, text, **options)
     scan = json.loads((done.path / "run.json").read_text())["scan"]
     assert scan["order"] == "shuffled"
     order = scan["point_of_shot"]
@@ -113,7 +114,7 @@ def test_a_shuffled_order_follows_from_the_seed_and_is_recorded(tmp_path: Path) 
     assert order != sorted(order)
     taken = [shot.parameters["shot.0.load.duration"] for shot in done.shots]
     assert taken == [scan["points"][p][0] for p in order]
-    first = run(tmp_path, text, shots=3)
+    first = run(tmp_path, text, shots=3, **options)
     assert [shot.parameters["shot.0.load.duration"] for shot in first.shots] == taken[:3]
 
 
@@ -172,7 +173,8 @@ def test_without_a_simulation_only_what_changes_is_reopened(tmp_path: Path) -> N
   - profile.mobile_tweezers.speed: [50 um/ms, 60 um/ms, 60 um/ms]
     profile.mobile_tweezers.eject_slots: [1, 1, 2]
 """
-    session = open_scan(tmp_path, text)
+    (tmp_path / "s.yaml").write_text(REST + text)
+    session = labseq.Session.open(tmp_path / "s.yaml", profile="bench_awg")
     lab = replace(session.build_lab(), simulation=None)
     points = [session.assembly.at(point) for point in range(3)]
     after, reopened = rebuild_lab(lab, points[0], points[1], 5)
@@ -180,7 +182,7 @@ def test_without_a_simulation_only_what_changes_is_reopened(tmp_path: Path) -> N
     assert after.mobile_tweezers is lab.mobile_tweezers
     assert after.planner is not lab.planner
     assert len(after.random_streams) == len(lab.random_streams)
-    assert _reopened(lab, points[1].hardware, points[2].hardware) == {"mobile_tweezers"}
+    assert rebuild_lab(lab, points[1], points[2], 5)[1] == {"mobile_tweezers"}
 
 
 def test_the_check_shows_points_and_the_time_of_all_of_them(tmp_path: Path) -> None:

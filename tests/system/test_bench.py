@@ -122,14 +122,3 @@ def test_what_is_done_is_kept_without_other_processes(
         main([*COMMAND, "--workers", "1", *FILES])
     out, err = capfd.readouterr()
     check_kept(50, out, err)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
-def test_others_do_the_work_of_processes_that_die() -> None:
-    with start() as child:
-        for pid in {int(pid) for pid in Path("pids").read_text().split()} - {child.pid}:
-            os.kill(pid, signal.SIGKILL)
-        out, err = child.communicate(timeout=180)
-    assert child.returncode == 0, err
-    assert "200" in out
-    assert "INCOMPLETE" not in out

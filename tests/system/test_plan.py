@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labseq.messages import install_hint
 from labseq.session.planning import PlanRequest, plan_moves
 
 pytestmark = pytest.mark.system
@@ -49,20 +48,3 @@ def test_a_poor_terminal_gets_poor_characters(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert "@ atom on a target site" in done.stdout
     assert "->" in done.stdout
-
-
-def test_without_matplotlib_everything_else_works(tmp_path: Path) -> None:
-    code = """
-import sys
-sys.modules["matplotlib"] = None
-from labseq.cli import main
-for option in ("--json=-", "--png=a.png"):
-    try:
-        main(["plan", "random:5x5@0.7", "--target", "compact:3x3", option])
-    except SystemExit as leaving:
-        sys.stderr.write(f"code {leaving.code}\\n")
-"""
-    done = call("-c", code, cwd=tmp_path)
-    assert json.loads(done.stdout)["degree_of_parallelism"] == 7
-    assert [line for line in done.stderr.splitlines() if line.startswith("code")] == ["code 0", "code 2"]
-    assert f"needs matplotlib, which is not installed; {install_hint('plot')}" in done.stderr

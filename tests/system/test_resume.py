@@ -90,7 +90,8 @@ def test_a_run_is_stopped_after_its_shot(scanned):
     assert not run.attempts  # the shot in progress was taken to its end
     assert scanned.calls()[-8:].count("mobile_tweezers.close") == 1
     again = scanned.run("stop")
-    assert (again.returncode, again.stderr) == (2, "error: no run is in progress\n")
+    assert again.returncode == 2
+    assert "no run is in progress" in again.stderr
 
 
 def test_a_queue_that_is_killed_resumes_its_run(scanned):
@@ -108,7 +109,7 @@ def test_a_queue_that_is_killed_resumes_its_run(scanned):
     assert [(run.status, len(run.shots)) for run in runs] == [("complete", 6), ("complete", 1)]
     assert str(runs[0].path) == listed[0]["run_dir"]
     assert len(runs[0].record["resumed"]) == 1
-    assert scanned.run("queue", "list").stdout == "the queue is empty\n"
+    assert json.loads(scanned.run("queue", "list", "--json").stdout)["entries"] == []
 
 
 @pytest.fixture
