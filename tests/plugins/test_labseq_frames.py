@@ -75,8 +75,9 @@ def write_tiff(file: Path, frames: Stack, **options: Any) -> Path:
 
 
 class FilesContract(CameraContract):
-    @pytest.fixture
-    def path(self, tmp_path: Path) -> Path:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def path(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
         raise NotImplementedError
 
     @pytest.fixture
@@ -85,21 +86,24 @@ class FilesContract(CameraContract):
 
 
 class TestFramesOfARun(FilesContract):
-    @pytest.fixture
-    def path(self, tmp_path: Path) -> Path:
-        return write_run(tmp_path, [stack_of(3)] * 5)
+    @pytest.fixture(scope="class")
+    @classmethod
+    def path(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_run(tmp_path_factory.mktemp("run"), [stack_of(3)] * 5)
 
 
 class TestFramesOfAStack(FilesContract):
-    @pytest.fixture
-    def path(self, tmp_path: Path) -> Path:
-        return write_tiff(tmp_path / "stack.tif", stack_of(12))
+    @pytest.fixture(scope="class")
+    @classmethod
+    def path(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_tiff(tmp_path_factory.mktemp("stack") / "stack.tif", stack_of(12))
 
 
 class TestFramesOfPngFiles(FilesContract):
-    @pytest.fixture
-    def path(self, tmp_path: Path) -> Path:
-        return write_pngs(tmp_path / "png", stack_of(12))
+    @pytest.fixture(scope="class")
+    @classmethod
+    def path(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return write_pngs(tmp_path_factory.mktemp("png"), stack_of(12))
 
 
 del FilesContract  # it has no frames of its own
