@@ -105,8 +105,7 @@ def test_a_shot_of_a_scan_is_the_same_as_in_a_run_with_its_values_set(tmp_path: 
 
 def test_a_shuffled_order_follows_from_the_seed_and_is_recorded(tmp_path: Path) -> None:
     text = "scan: {shot.0.load.duration: {range: [50 ms, 100 ms, 10 ms]}}\nrepeats: 2\norder: shuffled\n"
-    options: dict[str, Any] = {"overrides": ["shot=[{load: {}}, {image: {}}]"]}
-    done = run(tmp_path, text, **options)
+    done = run(tmp_path, text)
     scan = json.loads((done.path / "run.json").read_text())["scan"]
     assert scan["order"] == "shuffled"
     order = scan["point_of_shot"]
@@ -114,7 +113,7 @@ def test_a_shuffled_order_follows_from_the_seed_and_is_recorded(tmp_path: Path) 
     assert order != sorted(order)
     taken = [shot.parameters["shot.0.load.duration"] for shot in done.shots]
     assert taken == [scan["points"][p][0] for p in order]
-    first = run(tmp_path, text, shots=3, **options)
+    first = run(tmp_path, text, shots=3)
     assert [shot.parameters["shot.0.load.duration"] for shot in first.shots] == taken[:3]
 
 
