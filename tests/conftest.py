@@ -37,7 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure() -> None:
     """Keep the user's folders, options and terminal from the tests and their processes."""
     terminal = ("NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES", "TTY_COMPATIBLE", "TTY_INTERACTIVE")
-    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", *terminal):
+    for name in ("LABSEQ_DATA", "LABSEQ_PLUGIN_PATH", "PYTHONUNBUFFERED", *terminal):
         os.environ.pop(name, None)
     os.environ["TERM"] = "xterm-256color"
     for name in ("LABSEQ_LOCKS", "LABSEQ_STATE"):  # for fixtures that outlive a test: leads nowhere

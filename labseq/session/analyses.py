@@ -9,6 +9,7 @@ where it was. The end of standard input signals the end of the run.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 import threading
@@ -275,6 +276,8 @@ def _report(shot: int, error: BaseException) -> None:
 
 
 if __name__ == "__main__":
+    # in the log, what an analysis prints and its errors keep their order
+    cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
     try:
         main(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))
     except LabseqError as failure:

@@ -21,6 +21,8 @@ from labseq.recording.export import ENDINGS, check_export, export_run
 from .records import make_run, make_shot, write
 from .scanned import ADDRESSES, POINTS, write_scan
 
+KINDS = ["netcdf", pytest.param("parquet", marks=pytest.mark.needs("pyarrow")), "csv", "archive"]
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
@@ -96,9 +98,7 @@ def test_names_that_netcdf_does_not_take_are_changed(tmp_path: Path) -> None:
         assert data["reading.laser_780"].values.tolist() == [1.5]
 
 
-@pytest.mark.parametrize(
-    "kind", ["netcdf", pytest.param("parquet", marks=pytest.mark.needs("pyarrow")), "csv", "archive"]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_run_without_shots_is_exported(kind: str, tmp_path: Path) -> None:
     run = open_run(RunWriter.create(tmp_path, make_run()).run_dir)
     assert exported(run, kind, tmp_path).stat().st_size
@@ -234,7 +234,7 @@ def test_what_cannot_be_exported_is_told_before(
         check_export(kind, tmp_path / name, **options)
 
 
-@pytest.mark.parametrize("kind", [*ENDINGS])
+@pytest.mark.parametrize("kind", KINDS)
 def test_an_older_file_is_replaced_whole_or_not_at_all(
     kind: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
