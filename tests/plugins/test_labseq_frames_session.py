@@ -26,7 +26,7 @@ class Lab:
         self.folder = folder
         self.look = folder / "look.yaml"
         self.look.write_text(LOOK)
-        self.looked = self.run(self.look, seed=1, shots=2)
+        self.looked = self.run(self.look, seed=1, shots=3)
         self.rearranged = self.run(COMPACT, seed=3, shots=2)
 
     def run(self, sequence: Path, **options: Any) -> labseq.Run:
@@ -54,12 +54,12 @@ def occupancies(done: labseq.Run) -> list[Any]:
 def test_an_equal_detector_sees_on_recorded_frames_what_it_saw_then(lab: Lab) -> None:
     """Also in a dry run."""
     earlier, profile = lab.looked, lab.playing(lab.looked.path)
-    again = lab.run(lab.look, seed=2, shots=2, profile=profile, dry_run="full")
+    again = lab.run(lab.look, seed=2, shots=3, profile=profile, dry_run="full")
     assert [shot.frames.tobytes() for shot in again.shots] == [s.frames.tobytes() for s in earlier.shots]
     assert occupancies(again) == occupancies(earlier)
     assert again.record["devices"]["camera"]["run_id"] == earlier.record["run_id"]
     higher = [f"profile.detector.threshold={2 * THRESHOLD}"]
-    stricter = lab.run(lab.look, shots=2, profile=profile, overrides=higher)
+    stricter = lab.run(lab.look, shots=3, profile=profile, overrides=higher)
     before, after = np.array(occupancies(earlier)), np.array(occupancies(stricter))
     assert not np.any(after & ~before)  # a higher threshold only loses atoms
     assert 0 < after.sum() < before.sum()
@@ -79,14 +79,14 @@ def test_a_whole_experiment_is_planned_again_as_it_was(lab: Lab) -> None:
 def test_a_run_ends_safely_when_the_frames_are_over(lab: Lab, tmp_path: Path) -> None:
     profile = lab.playing(lab.looked.path)
     with (
-        labseq.Session.open(lab.look, output=tmp_path, profile=profile, shots=4) as session,
-        pytest.raises(labseq.DeviceError, match="camera: all 2 frames") as caught,
+        labseq.Session.open(lab.look, output=tmp_path, profile=profile, shots=5) as session,
+        pytest.raises(labseq.DeviceError, match="camera: all 3 frames") as caught,
     ):
         session.run()
     assert caught.value.exit_code == 3
     assert session.run_dir is not None
     kept = labseq.open_run(session.run_dir)
-    assert (kept.status, len(kept.shots)) == ("failed", 2)
+    assert (kept.status, len(kept.shots)) == ("failed", 3)
     profile = lab.playing(lab.looked.path, at_end="repeat")
-    repeated = lab.run(lab.look, profile=profile, shots=3)
-    assert occupancies(repeated) == [occupancies(lab.looked)[i % 2] for i in range(3)]
+    repeated = lab.run(lab.look, profile=profile, shots=5)
+    assert occupancies(repeated) == [occupancies(lab.looked)[i % 3] for i in range(5)]

@@ -206,8 +206,7 @@ def test_a_reply_is_made_up_for_a_pattern(pattern: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:Possible")  # a set that Python will once read differently
 @given(
-    st.text(string.ascii_letters + string.digits + r" .,=+*?[](){}|\-", max_size=12),
-    st.text(string.digits, max_size=3),
+    st.from_regex(r"[A-Za-z0-9 .,=+*?\[\](){}|\\-]{0,12}", fullmatch=True), st.text(string.digits, max_size=3)
 )
 def test_whatever_the_pattern_what_is_made_up_matches_it(pattern: str, value: str) -> None:
     try:
