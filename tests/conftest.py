@@ -30,7 +30,7 @@ LONGEST = ("tests/web/test_browser.py", "tests/docs/test_blocks.py")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--quick``, for whoever runs tests while editing."""
+    """Add ``--quick``, for running tests while editing."""
     parser.addoption("--quick", action="store_true", help="nothing outlives a power cut; less is looked up")
 
 

@@ -140,7 +140,7 @@ def secure_profile(profile: str, overrides: Sequence[str], *, end: bool | None =
 
 
 def _asks_to_end(text: str) -> bool:
-    """Whether to end the process that uses a device, as the user says; true where nobody can be asked."""
+    """Whether to end the process that uses a device, as the user says; true without a terminal to ask in."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return True
     try:
