@@ -228,6 +228,8 @@ def test_a_run_that_is_killed_is_said_to_have_died(server: Server, watched: Watc
     run = subprocess.Popen(
         [sys.executable, "-c", RUN, str(server.data)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
+    assert run.stdout is not None
+    assert run.stdout.readline() == "ready\n"  # both shots are written
     expect(page.locator("h1 + .pill")).to_have_text(re.compile("running"))
     run.send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))
     run.communicate()
