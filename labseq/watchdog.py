@@ -119,6 +119,7 @@ class _Process:
         self._devices: dict[str, _Device] = {}
         self._log: Path | None = None
         self._what = "the run"
+        self._may_end = False
         self._parent = os.getppid()
         self._hangs = Hanging(self._parent)
         self._beat_s = time.monotonic()
@@ -163,6 +164,7 @@ class _Process:
         """Carry out a message; returns whether to go on."""
         if "run" in order:
             self._what, self._log = order["run"], Path(order["log"]) if order["log"] else None
+            self._may_end = order["may_end"]
             sys.path += [path for path in order["path"] if path not in sys.path]
             self._answer("")
         elif "device" in order:
@@ -203,12 +205,24 @@ class _Process:
                 time.sleep(0.002)
 
     def _switch_off(self, cause: str, since_s: float) -> None:
-        """Switch every device off, in the order of the safe state; none waits long for another."""
-        threads: dict[str, threading.Thread] = {}
-        for name, device in sorted(self._devices.items(), key=lambda item: item[1].order):
+        """Switch every device off; for those that it cannot, end the process that may hold their ports."""
+        failed = self._try_all(self._devices, cause, since_s)
+        if failed and self._may_end and not self._is_orphan():
+            self._end_run()
+            self._try_all(failed, cause, since_s)
+
+    def _try_all(self, devices: dict[str, _Device], cause: str, since_s: float) -> dict[str, _Device]:
+        """Switch devices off in the order of the safe state, none waiting long for another.
+
+        Returns those that are not off.
+        """
+        failed, threads = dict(devices), dict[str, threading.Thread]()
+        for name, device in sorted(devices.items(), key=lambda item: item[1].order):
 
             def report(done: str, failure: str, name: str = name) -> None:
                 self._report(cause, name, done, failure, time.monotonic() - since_s)
+                if not failure:
+                    failed.pop(name)
 
             threads[name] = threading.Thread(target=device.off, args=[report], daemon=True)
             threads[name].start()
@@ -218,6 +232,7 @@ class _Process:
             thread.join(max(0.0, deadline - time.monotonic()))
             if thread.is_alive():
                 self._report(cause, name, "", "switching it off hangs", time.monotonic() - since_s)
+        return failed
 
     def _report(self, cause: str, name: str, done: str, failure: str, after_s: float) -> None:
         """Write down what was done, first to the log, then to the terminal."""
@@ -317,6 +332,7 @@ class Watchdog:
         pulse: Progress of the thread that adds the first device; without any, the run counts as dead to the
             watchdog. None if there is no such thread.
         lost: Receives why there is no watchdog any more; it has the run end.
+        may_end: Whether it may end this process to switch off a device that it cannot switch off otherwise.
     """
 
     def __init__(
@@ -325,10 +341,12 @@ class Watchdog:
         log: Path | None = None,
         pulse: Pulse | None = None,
         lost: Callable[[str], object] = str,
+        may_end: bool = False,
     ) -> None:
         from labseq.processes import Pulse  # not in the watchdog itself
 
-        self._about = {"run": what, "log": None if log is None else str(log.absolute()), "path": sys.path}
+        log_path = None if log is None else str(log.absolute())
+        self._about = {"run": what, "log": log_path, "path": sys.path, "may_end": may_end}
         self._devices: dict[str, dict[str, Any]] = {}
         self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None

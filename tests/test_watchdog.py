@@ -126,7 +126,7 @@ def test_a_device_that_cannot_be_switched_off_does_not_delay_the_others(tmp_path
     script = tmp_path / "emergency.py"
     script.write_text(EMERGENCY, encoding="utf-8")
     process = watchdog._Process()
-    process._obey({"run": "the run", "log": str(tmp_path / "watchdog.jsonl"), "path": []})
+    process._obey({"run": "the run", "log": str(tmp_path / "watchdog.jsonl"), "path": [], "may_end": False})
     for order, (name, then) in enumerate(
         {"fails": "fails", "hangs": "hangs", "third": "", "lost": "missing"}.items()
     ):

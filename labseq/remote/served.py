@@ -543,7 +543,9 @@ class ServedDevice:
             session.device.open()
         emergency = session.device.emergency() if offers(session.device, "emergency") else None
         if emergency is not None and session.watchdog is None:
-            session.watchdog = Watchdog("labseq serve-devices", lost=partial(self.end_session, session))
+            session.watchdog = Watchdog(
+                "labseq serve-devices", lost=partial(self.end_session, session), may_end=True
+            )
             session.watchdog.add(self.name, 0, emergency.script, dict(emergency.arguments))
             for note in session.watchdog.notes():
                 self._report(f"{self.name}: {note}")

@@ -29,6 +29,8 @@ from labseq.plugin import Emergency
 
 LABSEQ_API = 1
 FOLDER = pathlib.Path(os.environ["LAMPS_FOLDER"])
+PORT = str(FOLDER / "port") if "LAMPS_HOLDS_PORT" in os.environ else ""
+OPENED = []
 SCRIPT = FOLDER / "emergency.py"
 OFF = runpy.run_path(str(SCRIPT))["off"]
 
@@ -41,21 +43,20 @@ class Settings(labseq.plugin.Settings):
 class Lamp:
     def __init__(self, settings, context): pass
     def open(self):
-        if os.environ.get("LAMPS_HOLDS_PORT"):  # as a serial line, which only one process can open
+        if PORT and not OPENED:  # as a serial line, which only one process can open
             import fcntl
-            self._port = (FOLDER / "port").open("w")
-            fcntl.flock(self._port, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self.is_open = True
-    def close(self): pass
+            line = open(PORT, "w")
+            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            OPENED.append(line)
+    def close(self): pass  # the line stays open until the process ends
     def safe_state(self):
-        if (FOLDER / "refuses").exists() or (os.environ.get("LAMPS_HOLDS_PORT") and not self.is_open):
+        if (FOLDER / "refuses").exists() or (PORT and not OPENED):
             raise OSError("the lamp does not answer")
         OFF(str(FOLDER))
     def describe(self): return {}
     def command(self, name, **arguments): (FOLDER / "on").touch()
     def read(self, name): pass
-    is_open = False
-    def emergency(self): return Emergency(SCRIPT, {"folder": str(FOLDER)})
+    def emergency(self): return Emergency(SCRIPT, {"folder": str(FOLDER), "port": PORT})
 
 
 @labseq.plugin.hookimpl
@@ -65,12 +66,16 @@ def labseq_register(registry):
 EMERGENCY: Final = """
 import os, pathlib, time
 
-def prepare(folder):
+def prepare(folder, port):
     if pathlib.Path(folder, "no watchdog").exists():
         os._exit(1)
     pathlib.Path(folder, "watchdog").write_text(str(os.getpid()))
 
-def off(folder):
+def off(folder, port=""):
+    if port:
+        import fcntl
+        with open(port, "w") as line:
+            fcntl.flock(line, fcntl.LOCK_EX | fcntl.LOCK_NB)
     on = pathlib.Path(folder, "on")
     if on.exists():
         pathlib.Path(folder, "off").write_text(str(time.monotonic()))

@@ -80,6 +80,16 @@ def test_a_served_device_whose_safe_state_fails_is_switched_off_and_stays_known(
     assert "died" not in lab.output[begin:]
 
 
+def test_a_server_that_holds_the_port_of_a_device_that_is_not_safe_is_ended(lab: Lamps) -> None:
+    lab.environment["LAMPS_HOLDS_PORT"] = "yes"
+    with lab.served() as server:
+        with lab.run("--profile", "far.yaml") as run:
+            (lab.folder / "refuses").touch()
+            lab.interrupt(run)
+            until(lambda: not lab.is_on)
+        assert server.wait(60.0) < 0, lab.output  # ended by a signal
+
+
 def test_safe_ends_the_run_that_holds_the_port_of_a_device(lab: Lamps) -> None:
     lab.environment["LAMPS_HOLDS_PORT"] = "yes"
     with lab.run() as run:
