@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -269,8 +269,12 @@ class Point:
 
     def __init__(self, name: str, distribution: str, load: Callable[[], object]) -> None:
         self.name = self.value = name
-        self.dist = SimpleNamespace(read_text=lambda _: f"Name: {distribution}\nVersion: 1.2\n\nVersion: 2")
+        self.dist, self.distribution = self, distribution
         self.load = load
+
+    def read_text(self, _file: str) -> str:
+        """Of its distribution, which is this object too."""
+        return f"Name: {self.distribution}\nVersion: 1.2\n\nVersion: 2"
 
 
 def module(name: str, code: str = GOOD) -> ModuleType:
