@@ -36,7 +36,7 @@ from labseq.recording.hdf5 import (
 )
 from labseq.recording.reader import Run
 from labseq.recording.shot import Shot
-from labseq.recording.shot_file import open_finished, opened, read_content
+from labseq.recording.shot_file import content_of, open_finished, opened
 from labseq.recording.tables import facts_of
 
 FORMAT: Final = "labseq-archive"
@@ -130,8 +130,8 @@ class _Shots:
         Raises:
             RecordingError: Its frames are compressed and the package for it is missing.
         """
-        read_content(shot.file)  # refuses what would lead out of the file
-        with opened(shot.file) as entry:
+        with opened(shot.file) as entry:  # refuses what would lead out of the file
+            content_of(entry)
             check_attributes(entry.file)
         with open_finished(shot.file) as source:
             entry: Any = source["entry"]

@@ -212,9 +212,14 @@ def read_content(path: Path) -> ShotContent:
         RecordingError: It is missing, damaged, or of another format.
     """
     with opened(path) as entry:
-        run = read_fields(entry["run"], schema.RUN) | read_texts(entry["run"], schema.RUN_TEXTS)
-        fill, clear = (entry[f"target/{name}"][()].astype(np.bool_) for name in ("fill", "clear"))
-        return ShotContent(_record(entry), run, TargetPattern(fill, clear, run["target.name"]))
+        return content_of(entry)
+
+
+def content_of(entry: Any) -> ShotContent:
+    """Read a shot's file, :func:`opened`, without its frames."""
+    run = read_fields(entry["run"], schema.RUN) | read_texts(entry["run"], schema.RUN_TEXTS)
+    fill, clear = (entry[f"target/{name}"][()].astype(np.bool_) for name in ("fill", "clear"))
+    return ShotContent(_record(entry), run, TargetPattern(fill, clear, run["target.name"]))
 
 
 def read_occupancies(path: Path) -> tuple[list[tuple[int, int, str]], NDArray[np.uint8]]:

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import distributed
 import pytest
 
 import labseq
@@ -146,6 +145,8 @@ def test_a_worker_with_other_code_takes_no_shot(tmp_path: Path) -> None:
 def test_a_cluster_takes_the_same_shots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scanned: labseq.Run
 ) -> None:
+    import distributed  # takes 0.7 s, which the processes that run other tests need not spend
+
     sequence, keys = write(tmp_path, "planner"), tmp_path / "keys"
     ca, scheduler, worker, _ = map(str, make_keys(keys))
     files = {"tls_ca_file": ca, "tls_scheduler_cert": scheduler, "tls_scheduler_key": scheduler}

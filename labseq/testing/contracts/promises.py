@@ -13,13 +13,16 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from functools import wraps
+from contextvars import Context
+from functools import partial, wraps
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
 import pytest
+
+from labseq.guard import Guard
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -75,7 +78,7 @@ def failure_text(error: ContractViolation) -> str:
     first = next((i for i, one in enumerate(frames) if here not in Path(one.filename).parents), len(frames))
     while first < len(frames) and any(here in Path(one.filename).parents for one in frames[first:]):
         first += 1
-    own = [one for one in frames[first:] if Path(one.filename).name not in ("contextlib.py", "threading.py")]
+    own = [one for one in frames[first:] if Path(one.filename).name not in ("contextlib.py", "guard.py")]
     return str(error) + "".join(["\n\n", *traceback.format_list(own)] if own else []).rstrip()
 
 
@@ -174,23 +177,16 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
         CallHungError: It has not returned after ``limit_s`` of real time.
     """
     __tracebackhide__ = True
-    results: list[T] = []
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            results.append(call(*args, **kwargs))
-        except BaseException as error:  # noqa: BLE001 - raised again in the test's own thread
-            errors.append(error)
-
-    thread = threading.Thread(target=run, name=f"labseq test: {what}", daemon=True)
-    thread.start()
-    thread.join(limit_s)
-    if errors:
-        raise errors[0]
-    if not results:
+    guard = Guard(reuses_threads=True)  # to start a thread takes longer than most of these calls
+    try:
+        done = guard.run("test of a contract", limit_s, partial(Context().run, call, *args, **kwargs))
+    finally:
+        guard.end()
+    if done is None:
         raise CallHungError(f"{what} has not returned after {limit_s:g} s")
-    return results[0]
+    if done.error is not None:
+        raise done.error
+    return done.result
 
 
 @contextmanager
