@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,7 +24,6 @@ from labseq.cli.devices import plugins_table as table
 from labseq.config.document import Document
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo, call_plugin
-from labseq.plugins.host import installed_points
 from labseq.registry import Entry, Owner
 from labseq.roles import Context
 from labseq.session.chosen import ChosenPlugin, construct_one, construct_target, validate
@@ -270,12 +269,8 @@ class Point:
 
     def __init__(self, name: str, distribution: str, load: Callable[[], object]) -> None:
         self.name = self.value = name
-        self.dist, self.distribution = self, distribution
+        self.dist = SimpleNamespace(read_text=lambda _: f"Name: {distribution}\nVersion: 1.2\n\nVersion: 2")
         self.load = load
-
-    def read_text(self, _file: str) -> str:
-        """Of its distribution, which is this object too."""
-        return f"Name: {self.distribution}\nVersion: 1.2\n\nVersion: 2"
 
 
 def module(name: str, code: str = GOOD) -> ModuleType:
@@ -284,38 +279,12 @@ def module(name: str, code: str = GOOD) -> ModuleType:
     return made
 
 
-def test_of_two_versions_of_a_package_the_first_on_the_path_counts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    versions: dict[str, dict[str, str | None]] = {  # package -> folder, in the order of the path -> plugin
-        "labseq-both": {"new": "a", "old": "b"},
-        "labseq-same": {"new": "f", "old": "f"},
-        "labseq-gone": {"new": None, "old": "c"},
-        "labseq.dot": {"old": "d"},
-    }
-    for package, folders in versions.items():
-        for folder, plugin in folders.items():
-            info = tmp_path / folder / f"{package.replace('-', '_')}-1.dist-info"
-            info.mkdir(parents=True)
-            (info / "METADATA").write_text(f"Name: {package}\nVersion: 1\n", "utf-8")
-            points = f"[x]\ny = z\n[labseq]\n{plugin} = m{plugin}" if plugin else "[x]\ny = z"
-            (info / "entry_points.txt").write_text(points, "utf-8")
-    for plugin in ("e", "g"):
-        nameless = tmp_path / "old" / f"odd_{plugin}-1.dist-info"
-        nameless.mkdir()
-        (nameless / "entry_points.txt").write_text(f"[labseq]\n{plugin} = m{plugin}", "utf-8")
-    monkeypatch.setattr(sys, "path", [str(tmp_path / "new"), str(tmp_path / "old")])
-    found = [point.value for point in installed_points()]
-    assert found == [point.value for point in importlib.metadata.entry_points(group="labseq")]
-    assert sorted(found) == ["ma", "md", "me", "mf", "mg"]
-
-
 def test_two_distributions_with_a_plugin_of_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
     points = [
         Point("ixon", "labseq-ixon", lambda: module("a")),
         Point("ixon", "lab-of-bob", lambda: module("b")),
     ]
-    monkeypatch.setattr("labseq.plugins.host.installed_points", lambda: points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
     host = PluginHost()
     host.load_entry_points()
     first, second = host.infos
@@ -332,7 +301,7 @@ def test_an_installed_plugin_is_named_by_its_distribution(monkeypatch: pytest.Mo
         Point("odd", "labseq-odd", lambda: 5),
         Point("old", "labseq-old", lambda: module("old", "LABSEQ_API = 0")),
     ]
-    monkeypatch.setattr("labseq.plugins.host.installed_points", lambda: points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
     host = PluginHost()
     host.load_entry_points()
     assert [info.state for info in host.infos] == ["loaded", "failed", "failed"]

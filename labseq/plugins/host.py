@@ -223,7 +223,7 @@ class PluginHost:
     def load_entry_points(self) -> None:
         """Load every installed plugin; each failure is kept for the report."""
         described = cache(name_and_version)  # one distribution may offer many plugins, as labseq does
-        for point in installed_points():
+        for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
             name, version = ("", "") if point.dist is None else described(point.dist)
             source = f"the distribution {name or 'unknown'} {version}".rstrip()
             info = PluginInfo(point.name, "installed", version, source=source)
@@ -359,31 +359,6 @@ def _prepare(importing: Callable[[], ModuleType], owner: Owner, registry: Regist
 
 def _states_api(path: Path) -> bool:
     return b"LABSEQ_API" in path.read_bytes()
-
-
-def installed_points() -> list[importlib.metadata.EntryPoint]:
-    """The entry points of installed plugins, as ``importlib.metadata.entry_points`` finds them.
-
-    That function parses the entry points of every installed package, which takes twice the time.
-    """
-    points: list[importlib.metadata.EntryPoint] = []
-    names: set[str] = set()
-    for distribution in importlib.metadata.distributions():
-        text = distribution.read_text("entry_points.txt") or ""
-        if f"[{ENTRY_POINT_GROUP}]" in text:
-            name, _ = name_and_version(distribution)
-            if name not in names and _is_first(name, text):
-                points += distribution.entry_points.select(group=ENTRY_POINT_GROUP)
-                names |= {name} - {""}
-    return points
-
-
-def _is_first(name: str, entry_points: str) -> bool:
-    """False if a package of this name, with other entry points, comes earlier on Python's path."""
-    try:
-        return importlib.metadata.distribution(name).read_text("entry_points.txt") == entry_points
-    except (importlib.metadata.PackageNotFoundError, ValueError):  # its folder has another name
-        return True
 
 
 def name_and_version(distribution: importlib.metadata.Distribution) -> tuple[str, str]:
