@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from types import ModuleType
@@ -222,9 +222,8 @@ class PluginHost:
 
     def load_entry_points(self) -> None:
         """Load every installed plugin; each failure is kept for the report."""
-        described = cache(name_and_version)  # one distribution may offer many plugins, as labseq does
         for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
-            name, version = ("", "") if point.dist is None else described(point.dist)
+            name, version = ("", "") if point.dist is None else name_and_version(point.dist)
             source = f"the distribution {name or 'unknown'} {version}".rstrip()
             info = PluginInfo(point.name, "installed", version, source=source)
             self._load(info, partial(module_location, point.value.partition(":")[0]), point.load)
