@@ -201,12 +201,14 @@ class DeviceError(LabseqError):
 
     Attributes:
         device: Role or device name in the profile, for example "camera".
+        message: What failed, without the device.
     """
 
     exit_code: ClassVar[int] = 3
 
     def __init__(self, device: str, message: str) -> None:
         self.device = device
+        self.message = message
         super().__init__(f"{device}: {message}")
 
 
@@ -303,13 +305,22 @@ class RecordingError(LabseqError):
 
     Attributes:
         path: The file or folder.
+        what: What is wrong with it.
+        advice: What to do, or "".
     """
 
     exit_code: ClassVar[int] = 1
 
-    def __init__(self, path: object, message: str) -> None:
+    def __init__(self, path: object, what: str, advice: str = "") -> None:
         self.path = str(path)
-        super().__init__(f"{path}: {message}")
+        self.what = what
+        self.advice = advice
+        super().__init__(f"{path}: {self.text}")
+
+    @property
+    def text(self) -> str:
+        """What is wrong and what to do, without the path."""
+        return f"{self.what}; {self.advice}" if self.advice else self.what
 
 
 class TransientError(LabseqError):
@@ -317,12 +328,14 @@ class TransientError(LabseqError):
 
     Attributes:
         device: Role or device name, or "".
+        message: What failed, without the device.
     """
 
     exit_code: ClassVar[int] = 3
 
     def __init__(self, message: str, device: str = "") -> None:
         self.device = device
+        self.message = message
         super().__init__(f"{device}: {message}" if device else message)
 
 

@@ -109,7 +109,7 @@ def explained(path: Path) -> Generator[None]:
     except OSError as error:
         reason = error.strerror or str(error)
         advice = _ADVICE.get(error.errno or 0, f"check the disk, or {_ELSEWHERE}")
-        raise RecordingError(path, f"cannot be written: {reason}; {advice}") from error
+        raise RecordingError(path, f"cannot be written: {reason}", advice) from error
 
 
 MAX_DOCUMENT: Final = 16 << 20
@@ -148,11 +148,13 @@ def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:
         with open_ordinary(path) as file:
             n_bytes = os.fstat(file.fileno()).st_size
             if n_bytes > max_bytes:
-                raise RecordingError(path, f"is larger than {max_bytes >> 20} MiB; restore it from a backup")
+                raise RecordingError(
+                    path, f"is larger than {max_bytes >> 20} MiB", "restore it from a backup"
+                )
             return file.read(n_bytes)
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
         reason = getattr(error, "strerror", None) or error
-        raise RecordingError(path, f"cannot be read: {reason}; check the disk") from error
+        raise RecordingError(path, f"cannot be read: {reason}", "check the disk") from error
 
 
 def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
@@ -166,11 +168,11 @@ def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
             file.seek(start)
             while line := file.readline(MAX_LINE + 1):
                 if len(line) > MAX_LINE:
-                    what = f"has a line longer than {MAX_LINE >> 20} MiB; restore it from a backup"
-                    raise RecordingError(path, what)
+                    what = f"has a line longer than {MAX_LINE >> 20} MiB"
+                    raise RecordingError(path, what, "restore it from a backup")
                 yield line
     except OSError as error:
-        raise RecordingError(path, f"cannot be read: {error.strerror}; check the disk") from error
+        raise RecordingError(path, f"cannot be read: {error.strerror}", "check the disk") from error
 
 
 class LineLog:

@@ -99,8 +99,7 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
     try:
         content = parse_object(read_file(path))
     except RecordingError as error:
-        what = f"it {str(error).removeprefix(f'{error.path}: ').partition(';')[0]}"
-        raise ConfigError(Problem(what, str(path))) from error
+        raise ConfigError(Problem(f"it {error.what}", str(path))) from error
     if content is None:
         raise damaged(path, "it is not JSON, or no object")
     if content.get("format") != file_format:

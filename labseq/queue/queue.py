@@ -260,7 +260,7 @@ def _read(file: Path) -> Entry | None:
             return None
         raise
     if values.get("format") != FORMAT:
-        raise RecordingError(file, f"is not a queue entry of format {FORMAT}; move it away")
+        raise RecordingError(file, f"is not a queue entry of format {FORMAT}", "move it away")
     try:
         if not _POSITION.fullmatch(str(values.get("position"))):
             raise ValueError("position: expected a number such as 3 or 5/2")
@@ -271,7 +271,7 @@ def _read(file: Path) -> Entry | None:
         if isinstance(error, ValidationError):
             first = error.errors()[0]
             what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise RecordingError(file, f"is a damaged queue entry: {what}; move it away") from error
+        raise RecordingError(file, f"is a damaged queue entry: {what}", "move it away") from error
     return replace(entry, options=replace(entry.options, overrides=tuple(entry.options.overrides)))
 
 

@@ -271,8 +271,7 @@ class _Check:
 
     def report_unreadable(self, error: RecordingError) -> None:
         """Report unreadable files and folders, which only the user can repair."""
-        what, _, advice = str(error).removeprefix(f"{error.path}: ").partition("; ")
-        self._add(what, Path(error.path), f"left: {advice or what}")
+        self._add(error.what, Path(error.path), f"left: {error.advice or error.what}")
 
     def _report_missing_run_file(self, shots: Path) -> None:
         if any(name.endswith(".h5") for name in names_in(shots)):
@@ -384,10 +383,10 @@ class _Check:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return None
         except OtherFormatError as error:
-            self._add("no line in the index", path, f"left: {_reason(error)}")
+            self._add("no line in the index", path, f"left: {error.text}")
             return None
         except RecordingError as error:
-            self._quarantine(f"no line in the index, and {_reason(error).partition('; ')[0]}", path)
+            self._quarantine(f"no line in the index, and {error.what}", path)
             return None
         if content.run_id != run_id:
             self._quarantine(f"a shot of another run, {content.run_id}", path)
@@ -440,10 +439,6 @@ def _is_name(row: dict[str, Any]) -> bool:
     return row["file"] == name
 
 
-def _reason(error: RecordingError) -> str:
-    return str(error).removeprefix(f"{error.path}: ")
-
-
 def _move_away(what: str, path: Path, folder: Path) -> None:
     place = _quarantine_of(folder)
     goal, n = place / path.name, 1
@@ -481,7 +476,7 @@ def names_in(folder: Path) -> list[str]:
     except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:
-        raise RecordingError(folder, f"cannot be read: {error.strerror}; check its permissions") from error
+        raise RecordingError(folder, f"cannot be read: {error.strerror}", "check its permissions") from error
 
 
 def _runs(root: Path, report: Report) -> Iterator[Path]:

@@ -136,7 +136,7 @@ def find_run(path: Path) -> Path:
     path = Path(path).expanduser().resolve()
     if not path.exists():
         raise RecordingError(
-            path, "no such file or folder; give a run's folder, <data>/<date>/<counter>_<name>"
+            path, "no such file or folder", "give a run's folder, <data>/<date>/<counter>_<name>"
         )
     for folder in (path, path.parent, path.parent.parent):
         if (folder / RUN_FILE).is_file():
@@ -148,9 +148,9 @@ def find_run(path: Path) -> Path:
     if runs:
         holds = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
         raise RecordingError(
-            path, f"holds {holds} and is none itself; give one of them, for example {runs[-1]}"
+            path, f"holds {holds} and is none itself", f"give one of them, for example {runs[-1]}"
         )
-    raise RecordingError(path, f"is not a run: it has no {RUN_FILE}; give a run's folder")
+    raise RecordingError(path, f"is not a run: it has no {RUN_FILE}", "give a run's folder")
 
 
 def _without_run_file(folder: Path) -> str:

@@ -339,5 +339,5 @@ def load_filter(path: Path, dataset: Any) -> None:
     try:
         import hdf5plugin  # noqa: F401  # pyright: ignore[reportUnusedImport] - importing it registers the filter
     except ImportError as error:
-        text = f"holds compressed frames, and to read them hdf5plugin is needed; {install_hint('compress')}"
-        raise RecordingError(path, text) from error
+        what = "holds compressed frames, and to read them hdf5plugin is needed"
+        raise RecordingError(path, what, install_hint("compress")) from error

@@ -31,8 +31,8 @@ def reporting_damage(run_dir: Path) -> Generator[None]:
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        reason = f"has a damaged scan: {error!r}; restore it from a backup"
-        raise RecordingError(run_dir / RUN_FILE, reason) from error
+        what = f"has a damaged scan: {error!r}"
+        raise RecordingError(run_dir / RUN_FILE, what, "restore it from a backup") from error
 
 
 class ChosenPoints:

@@ -41,7 +41,7 @@ def open_run(path: str | Path) -> Run:
     try:
         path = Path(path)
     except TypeError:
-        raise RecordingError(repr(path), "is not a path; give a run's folder or a file in it") from None
+        raise RecordingError(repr(path), "is not a path", "give a run's folder or a file in it") from None
     folder = folders.find_run(path)
     record = read_run(folder)
     status, error = read_state(folder)

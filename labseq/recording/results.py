@@ -129,7 +129,7 @@ def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
         names = sorted(file.stem for file in path.parent.glob(f"*{_SUFFIX}"))
         there = f"there are those of {', '.join(names)}" if names else "there are none at all"
         hint = f"'labseq analyse {run_dir} --use {name}' makes them"
-        raise RecordingError(path, f"there are no results of the analysis '{name}', {there}; {hint}")
+        raise RecordingError(path, f"there are no results of the analysis '{name}', {there}", hint)
     return read_results(path)[0]
 
 

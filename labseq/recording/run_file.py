@@ -54,7 +54,7 @@ def check_version(path: Path, found: str, known: str) -> None:
     major = found.partition(".")[0]
     if not major.isdecimal():
         raise RecordingError(
-            path, f"has the format version '{found}'; expected one like {known}; it is damaged"
+            path, f"has the format version '{found}'; expected one like {known}", "it is damaged"
         )
     if major != known.partition(".")[0]:
         reader = _READ_BY.get(int(major), "")
@@ -103,7 +103,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     path = folder / RUN_FILE
     record = parse_object(read_file(path))
     if record is None or record.get("format") != schema.RUN_FORMAT:
-        raise RecordingError(path, "is damaged, or not labseq's; restore it from a backup")
+        raise RecordingError(path, "is damaged, or not labseq's", "restore it from a backup")
     check_version(path, str(record.get("format_version")), schema.RUN_FORMAT_VERSION)
     wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
     wrong += [name for name in _DICTS_IN_RUN if not isinstance(record.get(name) or {}, dict)]
@@ -113,7 +113,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not wrong and not all(isinstance(one, dict) and "written" in one for one in changes.values()):
         wrong = ["overrides"]
     if wrong:
-        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'; restore it from a backup")
+        raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'", "restore it from a backup")
     return record
 
 
@@ -127,7 +127,7 @@ def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
         target = record["target"]
         return TargetPattern(_grid(target["fill"]), _grid(target["clear"]), str(target["name"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(path, f"has a damaged target: {error!r}; restore it from a backup") from error
+        raise RecordingError(path, f"has a damaged target: {error!r}", "restore it from a backup") from error
 
 
 def _rows(sites: NDArray[np.bool_]) -> list[str]:
@@ -270,8 +270,8 @@ def summary_of(row: Mapping[str, Any]) -> ShotSummary:
         simulation = {str(name): _number(value) for name, value in row["simulation"].items()}
         return ShotSummary(_columns(Images, row["images"]), _columns(Cycles, row["cycles"]), simulation)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        reason = f"has a damaged line for shot {row.get('shot')}; 'labseq doctor' moves it away"
-        raise RecordingError("index.jsonl", reason) from error
+        what = f"has a damaged line for shot {row.get('shot')}"
+        raise RecordingError("index.jsonl", what, "'labseq doctor' moves it away") from error
 
 
 _T = TypeVar("_T", Images, Cycles)

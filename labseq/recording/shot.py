@@ -192,7 +192,7 @@ class Shot:
 
         images = [frame.image for frame in read_frames(self.file).values()]
         if len({image.shape for image in images}) > 1:
-            raise RecordingError(self.file, "holds frames of several sizes; use shot.record().images")
+            raise RecordingError(self.file, "holds frames of several sizes", "use shot.record().images")
         return np.stack(images) if images else np.empty((0, 0, 0), np.uint16)
 
     def record(self) -> ShotRecord:
@@ -211,10 +211,9 @@ class Shot:
             with open_ordinary(self.file) as file:
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            what = f"cannot be read: {error.strerror}; check the disk"
-            raise RecordingError(self.file, what) from error
+            raise RecordingError(self.file, f"cannot be read: {error.strerror}", "check the disk") from error
         if sha256 != self.row.get("sha256"):
-            raise RecordingError(self.file, "has changed since it was written; restore it from a backup")
+            raise RecordingError(self.file, "has changed since it was written", "restore it from a backup")
 
     @property
     def _content(self) -> ShotContent:

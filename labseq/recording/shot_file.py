@@ -70,7 +70,7 @@ class ShotEncoder:
         except Exception as error:  # a plugin's camera or step may put anything into the record
             where = f"shot {shot.shot_index} (attempt {shot.attempt})"
             what = f"cannot be laid out as a file: {format_error(error)}"
-            raise RecordingError(where, f"{what}; see the plugin that made it") from error
+            raise RecordingError(where, what, "see the plugin that made it") from error
         # of the bytes, which are not copied: the buffer's own view would keep it from being closed
         return memoryview(buffer.getvalue())
 
@@ -279,9 +279,11 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
         RecordingError: It is missing, damaged, or of another format.
     """
     if what := something_else(path):
-        raise RecordingError(path, f"cannot be read: {what}; restore it from a backup")
+        raise RecordingError(path, f"cannot be read: {what}", "restore it from a backup")
     if not path.is_file():
-        raise RecordingError(path, "is missing; restore it from a backup, or delete its line from the index")
+        raise RecordingError(
+            path, "is missing", "restore it from a backup, or delete its line from the index"
+        )
     with damage_reported(path), open_finished(path) as file:
         if read_attribute(file, "format") != schema.FORMAT:
             raise RecordingError(path, "is not a shot's file of labseq")
@@ -312,7 +314,7 @@ def damage_reported(path: Path) -> Generator[None]:
     except RecordingError:
         raise
     except Exception as error:  # of h5py, numpy, and whatever a damaged file has instead of the values
-        raise RecordingError(path, f"is damaged: {error_text(error)}; restore it from a backup") from error
+        raise RecordingError(path, f"is damaged: {error_text(error)}", "restore it from a backup") from error
 
 
 def _record(entry: Any) -> ShotRecord:

@@ -344,8 +344,7 @@ class RunningShot:
                 try:
                     self.call(name, self.call_timeout_s, device.check_interlocks)
                 except DeviceError as error:
-                    text = str(error).removeprefix(f"{error.device}: ")
-                    raise InterlockError(error.device, text) from error
+                    raise InterlockError(error.device, error.message) from error
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
         """Wait for the start signal of another control system; see ``labseq.plugin.Shot``."""

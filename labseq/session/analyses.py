@@ -192,7 +192,7 @@ def _alone(path: Path, name: str) -> Generator[None]:
     except OSError as error:
         if not knows_no_locks(error):
             raise RecordingError(
-                path.parent, f"cannot be written: {error.strerror}; check the disk"
+                path.parent, f"cannot be written: {error.strerror}", "check the disk"
             ) from error
         holder = None
     if holder is not None:

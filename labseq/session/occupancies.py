@@ -188,8 +188,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
     try:
         content = read_content(path)
     except RecordingError as error:
-        text = str(error).removeprefix(f"{error.path}: ")
-        raise ConfigError(Problem(text, name, expected="a shot's file")) from error
+        raise ConfigError(Problem(error.text, name, expected="a shot's file")) from error
     cycles, images = content.record.cycles, content.record.images
     if not cycles:
         raise ConfigError(Problem("this shot has no cycles", name, expected="a shot that was rearranged"))

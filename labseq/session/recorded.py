@@ -46,7 +46,7 @@ def stored_text(path: Path, sha256: str) -> StoredText:
     """
     text = read_file(path).decode("utf-8", "surrogateescape")
     if sha256_of_text(text) != sha256:
-        raise RecordingError(path, f"is not what {RUN_FILE} says it was; restore it from a backup")
+        raise RecordingError(path, f"is not what {RUN_FILE} says it was", "restore it from a backup")
     return StoredText(text, str(path))
 
 
@@ -112,7 +112,7 @@ def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
         entries[kind] = read_entry(path)
         if entries[kind].id != own:
             text = f"is calibration {entries[kind].id}, but the run was taken with {own}"
-            raise RecordingError(path, f"{text}; restore that from a backup")
+            raise RecordingError(path, text, "restore that from a backup")
     return entries
 
 

@@ -196,8 +196,8 @@ def _check(folder: Path) -> None:
     record = read_run(folder)
     wrong = [name for name, kind in _NEEDED.items() if not isinstance(record.get(name), kind)]
     if wrong:
-        what = f"is damaged: it has no valid '{wrong[0]}'; restore it from a backup"
-        raise RecordingError(folder / RUN_FILE, what)
+        what = f"is damaged: it has no valid '{wrong[0]}'"
+        raise RecordingError(folder / RUN_FILE, what, "restore it from a backup")
 
 
 def _has_changed(path: Path, text: str) -> bool:

@@ -172,9 +172,9 @@ class RunHistory:
                 file.seek(start)
                 row = parse_object(file.readline(1 << 24))
         except OSError as error:
-            raise RecordingError(self._path, f"cannot be read: {error.strerror}; check the disk") from error
+            raise RecordingError(self._path, f"cannot be read: {error.strerror}", "check the disk") from error
         if row is None or not is_index_row(row):
-            raise RecordingError(self._path, "has a damaged line; `labseq doctor` reports them")
+            raise RecordingError(self._path, "has a damaged line", "`labseq doctor` reports them")
         return row
 
     def line_of(self, shot: int, attempt: int | None = None) -> int | None:

@@ -188,7 +188,7 @@ class Catalogue:
                 except OSError as error:
                     self._folders = []
                     reason = f"the data folder cannot be read: {error.strerror}"
-                    raise RecordingError(self.root, f"{reason}; it is tried again") from error
+                    raise RecordingError(self.root, reason, "it is tried again") from error
                 self._listed_s = time.monotonic()
             return self._folders
 

@@ -132,7 +132,7 @@ def _cached_png(path: Path, _sha256: str, image: int, width: int) -> tuple[bytes
     for _, frame in iter_frames(path, image):
         factor = max(1, math.ceil(max(frame.image.shape) / max(1, width)))
         return encode_png(reduced(frame.image, factor)), factor
-    raise RecordingError(path, f"has no frame of image {image}; see 'record_frames' of the sequence")
+    raise RecordingError(path, f"has no frame of image {image}", "see 'record_frames' of the sequence")
 
 
 def reduced(frame: NDArray[np.uint16], factor: int) -> NDArray[np.uint8]:

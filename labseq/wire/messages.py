@@ -293,7 +293,7 @@ def error_of(report: Any, name: str, where: str) -> LabseqError:
     if cls is None:
         return DeviceError(name, f"{text} (at {where})")
     if issubclass(cls, DeviceError | errors.TransientError) and "device" in values:
-        text = f"{name}: {text.removeprefix(str(values['device']) + ': ')}"
+        text = f"{name}: {values.get('message', text)}"
         values["device"] = name
     made = cls.__new__(cls)
     made.args = (f"{text} (at {where})",)
