@@ -157,6 +157,20 @@ def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:
         raise RecordingError(path, f"cannot be read: {reason}", "check the disk") from error
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is anything at a path.
+
+    Raises:
+        OSError: There cannot be, as the name is too long, or it cannot be told; ``Path.exists`` hides that
+            from Python 3.14 on.
+    """
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
     r"""The lines of a file from a byte on, with their ends; the last one may lack its "\n".
 

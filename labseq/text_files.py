@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.errors import ConfigError, Problem
+from labseq.files import is_there
 from labseq.messages import clean, closest, visible
 
 MAX_BYTES: Final = 1 << 18
@@ -156,7 +157,7 @@ def check_output(path: Path, kind: str, ending: str) -> None:
     if what := something_else(path):
         raise ConfigError(Problem(what, name, expected=expected))
     try:
-        path.exists()
+        is_there(path)
     except OSError as error:  # for a name that is too long
         raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", name)) from error
 

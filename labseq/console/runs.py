@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.files import is_there
 from labseq.messages import clean, visible
 from labseq.recording import Run, data_root, open_run
 from labseq.recording.folders import RUN_FILE, counter_of, find_run, runs_in
@@ -27,7 +28,7 @@ def existing_run(path: Path) -> Path:
         ConfigError: There is no such run: the command line is wrong, not the data.
     """
     try:
-        if not path.expanduser().exists():
+        if not is_there(path.expanduser()):
             return named_run(path.as_posix(), data_root())
         return find_run(path)
     except RecordingError as error:

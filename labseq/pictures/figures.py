@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import ConfigError, Problem
-from labseq.files import whole_file
+from labseq.files import is_there, whole_file
 from labseq.messages import install_hint
 from labseq.model import SiteGrid
 
@@ -45,7 +45,7 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
         raise ConfigError(Problem(what, name, expected=wanted))
     try:
         has_folder, is_folder = path.parent.is_dir(), path.is_dir()
-        is_odd = path.exists() and not path.is_file()
+        is_odd = is_there(path) and not path.is_file()
     except OSError as error:  # a name that is too long
         raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", name)) from error
     if not has_folder:

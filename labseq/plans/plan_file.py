@@ -169,8 +169,9 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
     except json.JSONDecodeError as error:
         what = f"this is not JSON: {error.msg[:1].lower()}{error.msg[1:]}"
         raise ConfigError(Problem(what, name, error.lineno, error.colno, _EXPECTED)) from error
-    except (RecursionError, ValueError) as error:  # nested too deeply, or a number of thousands of digits
-        raise ConfigError(Problem(f"this is not a plan: {error}", name, expected=_EXPECTED)) from error
+    except (RecursionError, ValueError) as error:  # or a number of thousands of digits
+        reason = "it is nested too deep" if isinstance(error, RecursionError) else error
+        raise ConfigError(Problem(f"this is not a plan: {reason}", name, expected=_EXPECTED)) from error
     if not isinstance(values, dict) or not {"planner", "batches"} & values.keys():
         raise ConfigError(Problem("this is not a plan", name, expected=_EXPECTED))
     file = validate_values(_File, cast("Mapping[str, Any]", values), name)

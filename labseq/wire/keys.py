@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -111,13 +112,19 @@ def read_public(path: Path) -> bytes:
 
 
 def known_keys(folder: Path) -> dict[bytes, str]:
-    """The public keys of other computers -> their names; files that are damaged are left out."""
+    """The public keys of other computers -> their names; files that are damaged are left out.
+
+    Raises:
+        OSError: The folder cannot be read, which is not the same as an empty one.
+        RecordingError: A file cannot be read.
+    """
     known: dict[bytes, str] = {}
-    for path in sorted((folder / KNOWN).glob(f"*{PUBLIC}")):
-        try:
-            known[read_public(path)] = path.stem
-        except ConfigError:
-            continue
+    with suppress(FileNotFoundError):
+        for name in sorted(os.listdir(folder / KNOWN)):  # noqa: PTH208 - glob() hides what fails
+            if name.endswith(PUBLIC):
+                key = dict(_LINE.findall(read_file(folder / KNOWN / name, 4096))).get(b"public")
+                if key is not None:
+                    known[key] = name.removesuffix(PUBLIC)
     return known
 
 

@@ -82,7 +82,7 @@ def test_a_wrong_plan_is_refused_with_its_batch(
         (b'{\n"batches": [1,\n', "plan.json:3:1: this is not JSON: expecting value"),
         (b"[]", "plan.json: this is not a plan; expected what 'labseq plan --json' writes"),
         (b'{"batches": ' + b"9" * 5000 + b"}", "this is not a plan: Exceeds the limit"),
-        (b"[" * 100_000, "this is not a plan: maximum recursion depth exceeded"),
+        (b"[" * 100_000, "this is not a plan: it is nested too deep"),
         (b"\xff", "byte 0xFF at offset 0 is not UTF-8"),
         (b" " * (MAX_BYTES + 1), "it is larger than 4 MiB"),
         (json.dumps(document()).replace("4.49e-06", "1e999").encode(), "expected a finite number"),

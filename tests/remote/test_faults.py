@@ -380,6 +380,24 @@ def test_keys(tmp_path: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> No
             device.close()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="processes have no limit of open files")
+def test_keys_that_cannot_be_read_are_not_taken_for_withdrawn_ones(tmp_path: Path) -> None:
+    import resource
+
+    _, public = wire.new_keys("here", tmp_path)
+    (tmp_path / "known" / "here.key").write_bytes(public.read_bytes())
+    assert [*wire.known_keys(tmp_path).values()] == ["here"]
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+    try:
+        with pytest.raises(OSError, match="Too many open files"):
+            wire.known_keys(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    (tmp_path / "known" / "damaged.key").write_bytes(b"\0")
+    assert [*wire.known_keys(tmp_path).values()] == ["here"]
+
+
 def test_a_server_without_keys_cannot_be_reached_by_others(tmp_path: Path, keys: Path) -> None:
     path = tmp_path / "served.yaml"
     path.write_text(PROFILE, encoding="utf-8")
