@@ -409,10 +409,10 @@ def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
 
 def _n_not_by_chance(fitted: FittedThresholds, n_frames: int) -> int:
     """Number of sites with one peak whose loading differs from the others' by more than chance explains."""
-    from scipy.stats import binom
+    from scipy.special import bdtr, bdtrc  # importing scipy.stats would take a second
 
     n_full, usual = np.rint(fitted.loading * n_frames), float(np.median(fitted.loading))
-    chance = np.minimum(binom.cdf(n_full, n_frames, usual), binom.sf(n_full - 1, n_frames, usual))
+    chance = np.minimum(bdtr(n_full, n_frames, usual), bdtrc(n_full - 1, n_frames, usual))
     one_peak = fitted.never_loaded | fitted.always_loaded
     return int(np.count_nonzero(one_peak & (chance < CHANCE / one_peak.size)))
 

@@ -247,7 +247,7 @@ def iter_frames(path: Path, only: int | None = None) -> Generator[tuple[int, Fra
         path: The file.
         only: Index of the one image whose frame is read; None for all.
     """
-    with opened(path) as entry:
+    with opened(path, "/entry/camera") as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
             stack = group["frames"]
             load_filter(path, stack)
