@@ -18,6 +18,9 @@ from hypothesis import settings
 
 from tests.needs import NEEDS, is_here
 
+# Read when numpy is imported, which is later; on small arrays, threads of linear algebra mostly wait.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
 # A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
 settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=30)
 settings.register_profile("search", deadline=None)

@@ -181,6 +181,7 @@ for line in sys.stdin.read().splitlines():
     except SystemExit as leaving:
         print(f"exit {leaving.code or 0}: {line}", file=sys.stderr)
 '''
+# `plan` comes after `waveform`: it chooses plain Python for all kernels that follow
 WORKS = """\
 check compact_225
 run compact_225 --shots 2 --seed 1
@@ -192,8 +193,8 @@ show 2 --scan survival:before,after --fit exponential
 export 1 --output shots.csv
 replay 1
 doctor
-plan random:20x20@0.75 --target compact:15x15
 waveform random:10x10@0.75 --target compact:7x7
+plan random:20x20@0.75 --target compact:15x15
 bench planners --loadings 2
 devices virtual
 safe virtual
