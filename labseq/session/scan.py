@@ -105,7 +105,7 @@ class ScanPoints:
         Raises:
             ConfigError: All that plugins refuse of the values.
         """
-        return self.with_values([*self.scan.values(point)])
+        return self._once(point, lambda: self.with_values([*self.scan.values(point)]))
 
     def with_values(self, values: Sequence[tuple[Axis, Node]]) -> Point:
         """The settings with a value for each axis.
