@@ -167,14 +167,15 @@ def _check_band(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: Array
 
 def _batches(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLike) -> Iterator[_Batch]:
     offsets = np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
+    kinds, of_kind = np.unique(offsets.reshape(-1, 2), axis=0, return_inverse=True)
+    of_kind = of_kind.reshape(grid.shape)
     most = min(motion.max_tweezers, motion.max_column_tones)
     for row in range(grid.n_rows):
         columns = np.flatnonzero(sites[row])
-        kinds, of_kind = np.unique(offsets[row, columns], axis=0, return_inverse=True)
-        for i, offset in enumerate(kinds):
-            together = columns[of_kind.ravel() == i]
+        for i in sorted({*of_kind[row, columns].tolist()}):
+            together = columns[of_kind[row, columns] == i]
             for first in range(0, len(together), most):
-                yield _Batch(np.array([row]), together[first : first + most], offset)
+                yield _Batch(np.array([row]), together[first : first + most], kinds[i])
 
 
 def _segments(motion: MotionSpec, hold_s: float, drop_off_s: float | None = None) -> list[_Segment]:
