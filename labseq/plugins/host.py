@@ -293,7 +293,8 @@ class PluginHost:
         """Whether a file is neither a plugin that was found already nor an installed library."""
         files = {getattr(plugin, "__file__", None) for plugin in self._pluggy.get_plugins()}
         files |= {info.source for info in self._infos.values()}
-        if any(file and Path(file).resolve() == path.resolve() for file in files):
+        own = path.resolve()
+        if any(file and Path(file).resolve() == own for file in files):
             return False
         return module_location(plugin_name(path)) != plugin_location(path) or _states_api(path)
 
