@@ -57,9 +57,11 @@ def _set_scheduler(policy: str, priority: int) -> bool:
 @contextmanager
 def real_time() -> Generator[None]:
     """Lock the memory, let waiting threads have Python soon, and keep the processors awake meanwhile."""
-    sys.setswitchinterval(SWITCH_S)
-    lock_memory()
     with ExitStack() as stack:
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(SWITCH_S)
+        if lock_memory():
+            stack.callback(ctypes.CDLL(None).munlockall)
         with suppress(OSError):
             stack.enter_context(LATENCY.open("wb", buffering=0)).write(bytes(4))  # 0 us
         yield

@@ -58,6 +58,23 @@ def test_processors_stay_awake_for_a_run_in_real_time(monkeypatch, tmp_path, is_
     assert "awake" not in realtime.refused()
 
 
+def test_what_a_run_in_real_time_changes_is_given_back():
+    before = sys.getswitchinterval()
+    with realtime.real_time():
+        assert sys.getswitchinterval() == pytest.approx(realtime.SWITCH_S)
+        is_locked = _locked_kb() > 0
+    assert is_locked == realtime.lock_memory()  # root alone may
+    with realtime.real_time():
+        pass
+    assert sys.getswitchinterval() == before
+    assert _locked_kb() == 0
+
+
+def _locked_kb() -> int:
+    lines = Path("/proc/self/status").read_text("ascii").splitlines()
+    return int(next(line for line in lines if line.startswith("VmLck")).split()[1])
+
+
 def test_memory_is_not_locked_under_a_limit(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     import resource
