@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from labseq.recording.columns import columns_of
 from labseq.recording.doctor import examine
 from labseq.recording.export import export_run
 from labseq.recording.reader import Follower
-from labseq.recording.shot_file import read_content, read_occupancies
+from labseq.recording.shot_file import read_content, read_frames, read_occupancies
 from labseq.watchdog import WATCHDOG_LOG, watchdog_lines
 
 from .damages import N_SHOTS, edit_index
@@ -54,6 +55,13 @@ def external_storage(file: Any, secret: Path) -> None:
     del file["entry/target/fill"]
     storage: Any = [(str(secret), 0, 10)]
     file["entry/target"].create_dataset("fill", (10,), np.uint8, external=storage)
+
+
+def frames_elsewhere(file: Any, secret: Path) -> None:
+    shape = file["entry/camera/camera/frames"].shape
+    del file["entry/camera/camera/frames"]
+    storage: Any = [(str(secret), 0, 2 * math.prod(shape))]
+    file["entry/camera/camera"].create_dataset("frames", shape, np.uint16, external=storage)
 
 
 def virtual_dataset(file: Any, secret: Path) -> None:
@@ -114,6 +122,7 @@ def many_parts(file: Any, secret: Path) -> None:
         (external_link, "/entry/target is a link that leads elsewhere"),
         (soft_link, "/entry/target is a link that leads elsewhere"),
         (external_storage, "/entry/target/fill keeps its data in another file"),
+        (frames_elsewhere, "/entry/camera/camera/frames keeps its data in another file"),
         (virtual_dataset, "/entry/target/fill keeps its data in another file"),
         (filtered, "/entry/target/fill has the filter 512, which labseq does not use"),
         (cycle, "is in the file twice"),
@@ -131,7 +140,7 @@ def test_a_shot_file_that_leads_elsewhere_is_refused_by_reader_doctor_and_export
 ) -> None:
     secret, path = tmp_path / "secret", run_dir / "shots" / "shot_000001.h5"
     secret.write_bytes(SECRET)
-    seen = read_occupancies(path)[1]
+    seen, frames = read_occupancies(path)[1], images(path)
     with h5py.File(path, "r+", libver=("earliest", "v110")) as file:
         plant(file, secret)
     with pytest.raises(RecordingError) as caught:
@@ -141,6 +150,8 @@ def test_a_shot_file_that_leads_elsewhere_is_refused_by_reader_doctor_and_export
     assert what in str(caught.value)
     with suppress(RecordingError):  # unless what it reads is as it was
         np.testing.assert_array_equal(read_occupancies(path)[1], seen)
+    with suppress(RecordingError):
+        np.testing.assert_equal(images(path), frames)
     believe(run_dir, path)  # as if labseq had written it
     left_out = export_run(open_run(run_dir), "archive", tmp_path / "run.h5", frames=True)
     assert [what in reason for reason in left_out] == [True]
@@ -158,6 +169,10 @@ def test_the_export_reads_no_attribute_that_labseq_does_not_write(run_dir: Path,
     believe(run_dir, path)
     (left_out,) = export_run(open_run(run_dir), "archive", tmp_path / "run.h5", frames=True)
     assert left_out.startswith(f"{path}: is damaged: the attribute 'mine' ")
+
+
+def images(path: Path) -> dict[int, Any]:
+    return {index: frame.image for index, frame in read_frames(path).items()}
 
 
 def believe(run_dir: Path, path: Path) -> None:
