@@ -269,7 +269,7 @@ class Survival:
         loaded_s = [timing.t_start_s for timing in shot.timing if timing.step in loads]
         if len(images) != len(occupancies):
             raise RecordingError(
-                shot.file, "has other images than its index says", "restore it from a backup"
+                shot.file, "has other images than the index says", "restore it from a backup"
             )
         last = -1
         for i, ended in enumerate(images.cycle):
