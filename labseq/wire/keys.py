@@ -6,6 +6,7 @@ which others need, and a folder ``known`` with the public keys of others.
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from contextlib import suppress
@@ -112,19 +113,25 @@ def read_public(path: Path) -> bytes:
 
 
 def known_keys(folder: Path) -> dict[bytes, str]:
-    """The public keys of other computers -> their names; files that are damaged are left out.
+    """The public keys of other computers -> their names; files that are unreadable or damaged are left out.
 
     Raises:
         OSError: The folder cannot be read, which is not the same as an empty one.
-        RecordingError: A file cannot be read.
+        RecordingError: This process, or the computer, can open no more files.
     """
-    known: dict[bytes, str] = {}
+    names: list[str] = []
     with suppress(FileNotFoundError):
-        for name in sorted(os.listdir(folder / KNOWN)):  # noqa: PTH208 - glob() hides what fails
-            if name.endswith(PUBLIC):
-                key = dict(_LINE.findall(read_file(folder / KNOWN / name, 4096))).get(b"public")
-                if key is not None:
-                    known[key] = name.removesuffix(PUBLIC)
+        names = sorted(os.listdir(folder / KNOWN))  # noqa: PTH208 - glob() hides what fails
+    known: dict[bytes, str] = {}
+    for path in [folder / KNOWN / name for name in names if name.endswith(PUBLIC)]:
+        try:
+            public = _values(path).get(b"public")
+        except RecordingError as error:
+            if getattr(error.__cause__, "errno", 0) in (errno.EMFILE, errno.ENFILE):
+                raise
+            continue
+        if public is not None:
+            known[public] = path.stem
     return known
 
 
@@ -133,6 +140,10 @@ def _read(path: Path) -> dict[bytes, bytes]:
         what, hint = f"there is no key of {path.stem}", "copy the public key of that computer there"
         raise ConfigError(Problem(what, str(path), hint=hint))
     try:
-        return dict(_LINE.findall(read_file(path, 4096)))
+        return _values(path)
     except RecordingError as error:
         raise ConfigError(str(error)) from error
+
+
+def _values(path: Path) -> dict[bytes, bytes]:
+    return dict(_LINE.findall(read_file(path, 4096)))
