@@ -30,7 +30,7 @@ from labseq.errors import (
     PlanError,
     StopRequested,
 )
-from labseq.messages import error_text, format_error
+from labseq.messages import error_text, format_error, one_line
 from labseq.processes import Pulse
 
 P = ParamSpec("P")
@@ -163,7 +163,8 @@ def readable(error: LabseqError) -> LabseqError:
     kind = next(one for one in kinds if one.__module__ == LabseqError.__module__)
     made = kind.__new__(kind, text)
     with suppress(BaseException):
-        made.__dict__.update(vars(error))
+        for name, value in vars(error).items():
+            made.__dict__[name] = one_line(value) if isinstance(value, str) else value
     made.args = (text,)
     return made
 

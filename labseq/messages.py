@@ -60,7 +60,7 @@ def error_text(error: BaseException) -> str:
         text = str.__str__(str(error))  # of a subclass of str, too
     except BaseException as another:  # noqa: BLE001 - its __str__ may raise anything
         return f"(its text cannot be read: {_kind_name(another)})"
-    return _one_line(text)
+    return one_line(text)
 
 
 def format_error(error: BaseException) -> str:
@@ -75,7 +75,7 @@ def format_error(error: BaseException) -> str:
     try:
         if issubclass(type(error), BaseExceptionGroup):
             first: BaseException = vars(BaseExceptionGroup)["exceptions"].__get__(error)[0]
-            return _one_line(f"{text}; the first: {format_error(first)}")
+            return one_line(f"{text}; the first: {format_error(first)}")
     except BaseException:  # noqa: BLE001, S110 - too deep
         pass
     return text
@@ -88,7 +88,8 @@ def _kind_name(error: BaseException) -> str:
         return "an error"
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
+    """A text on one line of limited length, with unprintable characters as escapes."""
     line = visible(" ".join(text[: MAX_ERROR + 1].split()))
     return line if max(len(text), len(line)) <= MAX_ERROR else f"{line[:MAX_ERROR]} ..."
 

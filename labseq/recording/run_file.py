@@ -53,13 +53,12 @@ def check_version(path: Path, found: str, known: str) -> None:
     found = clean(found)
     major = found.partition(".")[0]
     if not major.isdecimal():
-        raise RecordingError(
-            path, f"has the format version '{found}'; expected one like {known}", "it is damaged"
-        )
+        advice = f"expected one like {known}; it is damaged"
+        raise RecordingError(path, f"has the format version '{found}'", advice)
     if major != known.partition(".")[0]:
         reader = _READ_BY.get(int(major), "")
         advice = f"use {reader} to read it" if reader else "update labseq"
-        raise OtherFormatError(path, f"has format version {found}, this labseq reads {known}; {advice}")
+        raise OtherFormatError(path, f"has format version {found}, this labseq reads {known}", advice)
 
 
 _MAX_INT: Final = 2**63

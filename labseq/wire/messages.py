@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from labseq import errors, model
 from labseq.errors import DeviceError, LabseqError
-from labseq.messages import error_text, format_error, visible
+from labseq.messages import error_text, format_error, one_line, visible
 
 Part: TypeAlias = bytes | memoryview
 
@@ -292,10 +292,11 @@ def error_of(report: Any, name: str, where: str) -> LabseqError:
     cls = _ERRORS.get(kind)
     if cls is None:
         return DeviceError(name, f"{text} (at {where})")
-    if issubclass(cls, DeviceError | errors.TransientError) and "device" in values:
-        text = f"{name}: {values.get('message', text)}"
-        values["device"] = name
+    text = f"{text} (at {where})"
+    if issubclass(cls, DeviceError | errors.TransientError) and {"device", "message"} <= values.keys():
+        values["device"], values["message"] = name, f"{one_line(str(values['message']))} (at {where})"
+        text = f"{name}: {values['message']}"
     made = cls.__new__(cls)
-    made.args = (f"{text} (at {where})",)
+    made.args = (text,)
     made.__dict__.update(values)
     return made

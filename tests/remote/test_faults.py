@@ -395,7 +395,16 @@ def test_keys_that_cannot_be_read_are_not_taken_for_withdrawn_ones(tmp_path: Pat
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     (tmp_path / "known" / "damaged.key").write_bytes(b"\0")
+    (tmp_path / "known" / "folder.key").mkdir()
     assert [*wire.known_keys(tmp_path).values()] == ["here"]
+
+
+def test_the_message_of_a_distant_error_is_one_printable_line_that_says_where() -> None:
+    report = messages.report_error(DeviceError("lamp", "no\nlight\x1b[2J"))
+    error = messages.error_of(report, "far lamp", "tcp://there")
+    assert isinstance(error, DeviceError)
+    assert error.message == r"no light\x1b[2J (at tcp://there)"
+    assert str(error) == f"far lamp: {error.message}"
 
 
 def test_a_server_without_keys_cannot_be_reached_by_others(tmp_path: Path, keys: Path) -> None:
