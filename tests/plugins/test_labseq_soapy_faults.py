@@ -306,7 +306,8 @@ def test_left_on_after_the_run_the_light_stays_until_the_next_labseq_ends_it(tmp
         rig.tweezers.start()
         script = rig.tweezers.emergency()
         assert script is not None, "until then the watchdog switches it off"
-        assert script.arguments["ramp_s"] > 0.01 + 0.0199, "also what the radio has buffered"
+        # it has buffered 20 ms, and has played a little while that was written
+        assert 0.03 * (1 - 1e-6) < script.arguments["ramp_s"] < 0.06, "also what the radio has buffered"
         assert rig.tweezers.leave_on()
         assert rig.tweezers.emergency() is None
         rig.tweezers.safe_state()

@@ -189,9 +189,11 @@ tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated", mode="dds"), contex
 assert "spcm" not in sys.modules
 tweezers.warm()
 assert "spcm" in sys.modules
+tweezers.open()
+tweezers.close()
 print("warm")
 for card in sys.argv[1:]:
-    tweezers = SpcmMobileTweezers(SpcmSettings(card=card, mode="dds"), context)
+    tweezers = SpcmMobileTweezers(SpcmSettings(card=card), Context("mobile_tweezers"))
     try:
         tweezers.open()
     except LabseqError as error:
