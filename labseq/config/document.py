@@ -53,12 +53,14 @@ class Document:
         text: The file's text, without a byte order mark.
         root: The top mapping, with the results of the expressions once they are computed.
         expressions: The expressions; None before :meth:`evaluated`.
+        replaced: Locations of wrong values that fallbacks replaced, so that the rest could be checked.
     """
 
     path: Path
     text: str
     root: Node
     expressions: Expressions | None = None
+    replaced: frozenset[Loc] = frozenset()
 
     @classmethod
     def read(cls, path: Path, kept: StoredText | None = None) -> Document:
@@ -299,7 +301,7 @@ def load_checked(
 
 def _without_wrong_values(document: Document, model: type[BaseModel], fallbacks: FallbackValues) -> Document:
     """A copy whose invalid values are replaced by fallbacks, or removed if there is no fallback."""
-    root, seen = document.root, set[Loc]()
+    root, seen, replaced = document.root, set[Loc](), set[Loc]()
     for _ in range(_MAX_PASSES):  # validators of a whole list run once all its items are right
         found = check(model, root, ValidationContext("", needs_units=True))
         if not isinstance(found, list):
@@ -310,10 +312,12 @@ def _without_wrong_values(document: Document, model: type[BaseModel], fallbacks:
             if len(loc) > 1 and key in fallbacks.items and around and around.at(loc[1:]) and loc not in seen:
                 item = node_of(fallbacks.items[key], around.mark)
                 values[key] = around.replaced(loc[1:], item, same_key=True)
+                replaced.add(loc)
             elif key in fallbacks.values:
                 values[key] = node_of(fallbacks.values[key], root.mark)
+                replaced.add((key,))
             else:
                 values.pop(key, None)
             seen.add(loc)
         root = Node(values, root.mark, {key: root.keys.get(key, root.mark) for key in values})
-    return replace(document, root=root, expressions=None)
+    return replace(document, root=root, expressions=None, replaced=frozenset(replaced))

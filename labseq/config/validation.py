@@ -397,13 +397,11 @@ def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Proble
 
 
 def _of_validator(text: str, name: str, plain: str) -> Problem:
-    """The message of a validator's ValueError, on one line and split at "; expected"."""
+    """The message of a validator's ValueError, on one line; one that begins with "expected" has no value."""
     text = " ".join(text.split())
     if text.startswith("expected "):
         return Problem(plain, expected=text.removeprefix("expected "))
-    what, _, rest = text.partition("; expected ")
-    expected, _, hint = rest.partition("; ")
-    return Problem(f"{name}: {what}" if name else what, expected=expected, hint=hint)
+    return Problem(f"{name}: {text}" if name else text)
 
 
 def _type_hint(kind: str, value: Any) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import Field
 
+from labseq.config.addresses import split_overrides
 from labseq.config.document import Document
 from labseq.errors import ConfigError, Problem
 from labseq.files import explained, write_file
@@ -117,8 +118,10 @@ class Campaign:
                 line, column = self.document.locate((name,))
                 what = f"{name} is '{clean(problem.source)}': {problem.what}"
                 return replace(problem, what=what, source=self.document.name, line=line, column=column)
-        for address, i in zip(self.axes, point, strict=True):
-            if problem.source.startswith(f"--set {address}="):
+        for option, address, i in zip(self.options(point).overrides, self.axes, point, strict=True):
+            if any(
+                problem.source == override.source for override in itertools.chain(*split_overrides([option]))
+            ):
                 line, column = self.document.locate(("axes", address, i))
                 return replace(problem, source=self.document.name, line=line, column=column)
         return problem

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from labseq import builtin as builtins
+from labseq.config.addresses import NAMED, PROFILE, ROLES
 from labseq.config.document import Document
 from labseq.errors import (
     ConfigError,
@@ -118,19 +119,18 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
 
 
 def _with_advice(error: ConfigError, document: Document, choice: Choice) -> ConfigError:
-    """The error about settings of another plugin that are left in the file, if an option chose this one."""
-    option = document.root.mark_at((*choice.loc, choice.key)).source
-    address, dot, key = option.removeprefix("--set ").partition("=")[0].rpartition(".")
-    if not (option.startswith("--set ") and dot and key == choice.key):
+    """Add how to drop settings that the file has for another plugin, if an option chose this one."""
+    if document.root.mark_at((*choice.loc, choice.key)).line:
         return error
-    hint = f'to drop the settings of another plugin, use --set "{address}={{{key}: {choice.use}}}"'
-    problems = [
-        replace(one, hint="; ".join(filter(None, [one.hint, hint])))
-        if one.line and "setting" in one.what
-        else one
-        for one in error.problems
-    ]
-    return ConfigError(problems)
+    prefix = PROFILE if choice.loc[0] in (*ROLES, *NAMED) else ""
+    address = prefix + ".".join(map(str, choice.loc))
+    hint = f'to drop the settings of another plugin, use --set "{address}={{{choice.key}: {choice.use}}}"'
+    return ConfigError(
+        [
+            replace(problem, hint="; ".join(filter(None, [problem.hint, hint]))) if problem.line else problem
+            for problem in error.problems
+        ]
+    )
 
 
 def named(

@@ -226,7 +226,7 @@ def choose_plugins(
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
-        if repaired and _is_fallback(document, choice):
+        if choice.loc in document.replaced:
             refused[role] = ConfigError("what the profile says of it is wrong")
             continue
         try:
@@ -262,9 +262,3 @@ def choose_role(
     chosen, warning = choose(host, document, kind, choice, dry_run)
     by_line = kind == role and trigger_line(spec.line_specs, role) is not None
     return replace(chosen, by_line=by_line), warning
-
-
-def _is_fallback(document: Document, choice: Choice) -> bool:
-    """Whether a choice replaces an invalid value; it then has the place of its parent in the file."""
-    here, around = document.locate(choice.loc), document.locate(choice.loc[:-1])
-    return choice.use == VIRTUAL_TWIN and here == around
