@@ -49,6 +49,7 @@ print("on", *dog.notes(), flush=True)
 
 def lose_terminal():
     import fcntl, termios
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored if the tests run under nohup
     terminal, mine = os.openpty()
     os.setsid()
     fcntl.ioctl(mine, termios.TIOCSCTTY, 0)
