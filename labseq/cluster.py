@@ -22,7 +22,7 @@ from labseq import __version__
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, error_text, format_error, install_hint
 from labseq.processes import is_loopback
-from labseq.workers import Do, Make, Unfinished, finished
+from labseq.workers import Do, Make
 
 CA_FILE: Final = "ca.pem"
 CLIENT_FILE: Final = "client.pem"
@@ -234,8 +234,7 @@ _prepared: Final[dict[str, Do]] = {}
 def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any:
     """Carry out a task on a worker.
 
-    Whatever the worker's number of threads, one task is in work at a time, and others only wait for the disk:
-    they secede, so that the worker begins the next one.
+    Whatever the worker's number of threads, one task is in work at a time.
 
     Returns:
         The result; None if the worker is not prepared and was not given the recipe.
@@ -253,9 +252,4 @@ def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any
             while len(_prepared) >= _MAX_PREPARED:
                 del _prepared[next(iter(_prepared))]
             _prepared[run] = make(recipe)
-        result = _prepared[run](argument)
-    if isinstance(result, Unfinished):
-        from distributed import secede
-
-        secede()
-    return finished(result)
+        return _prepared[run](argument)

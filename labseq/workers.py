@@ -13,7 +13,6 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,7 +25,7 @@ from labseq.errors import LabseqError
 from labseq.messages import error_text
 
 Do = Callable[[Any], Any]
-"""Carries out the task with this argument; returns its result, or an :class:`Unfinished` one."""
+"""Carries out the task with this argument; returns its result."""
 Make = Callable[[Any], Do]
 """Prepares a worker from the recipe that all workers get; a function of a module, for it is sent by name."""
 
@@ -78,24 +77,6 @@ class Workers(Protocol):
     def close(self) -> None:
         """End all workers at once, whatever they are doing; legal at any time."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Unfinished:
-    """A task of which a last part is left, which waits for the disk.
-
-    A worker does that part beside its next task.
-
-    Attributes:
-        finish: Does the last part; returns the result of the task.
-    """
-
-    finish: Callable[[], Any]
-
-
-def finished(result: Any) -> Any:
-    """The result of a task, or of an unfinished one, which is finished now."""
-    return result.finish() if isinstance(result, Unfinished) else result
 
 
 def portable(error: Exception) -> LabseqError:
@@ -233,32 +214,23 @@ _Answer = tuple[Literal["ready", "begins", "done", "failed"], int, Any]
 def _serve(connection: Connection, make: Make, recipe: Any) -> None:
     """Carry out tasks in a worker process until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
-    sending = threading.Lock()
 
     def send(*answer: *_Answer) -> None:
-        with sending:
-            connection.send(answer)
+        connection.send(answer)
 
-    def finish(task: int, result: Any) -> None:
-        try:
-            send("done", task, finished(result))
-        except Exception as error:  # noqa: BLE001 - the first process raises it
-            send("failed", task, portable(error))
-
-    with suppress(EOFError, OSError), ThreadPoolExecutor(1) as beside:  # the first process has ended
+    task = _START
+    with suppress(EOFError, OSError):  # the first process has ended
         try:
             do = make(recipe)
             send("ready", _START, None)
-            last = None
             while True:
                 task, argument = connection.recv()
                 send("begins", task, None)
-                result = do(argument)
-                if last is not None:
-                    last.result()  # one at a time is finished, so that memory does not grow
-                last = beside.submit(finish, task, result)
+                send("done", task, do(argument))
+        except (EOFError, OSError):
+            raise
         except Exception as error:  # noqa: BLE001 - the first process raises it
-            send("failed", _START, portable(error))
+            send("failed", task, portable(error))
 
 
 @contextmanager

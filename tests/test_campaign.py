@@ -1,8 +1,9 @@
-"""Campaigns: a run for each point, continued after a stop; mistakes of the file with their place."""
+"""Campaigns: runs at each point, continued after a stop, taken at once; mistakes with their place."""
 
 from __future__ import annotations
 
 import math
+import multiprocessing
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,13 +13,17 @@ import numpy as np
 import pytest
 
 from labseq.analysis.campaigns import campaign_picture, combined
-from labseq.campaign import run_file
+from labseq.campaigns.campaign import Campaign, PlannedRun, recorded_runs
+from labseq.campaigns.certificates import make_certificates
+from labseq.campaigns.commands import run_file
+from labseq.campaigns.running import run_at_once, run_in_turn
 from labseq.cli import main
+from labseq.cluster import ClusterWorkers
 from labseq.errors import ConfigError, StopRequested
-from labseq.session.campaign import Campaign, recorded_runs, run_campaign
-from labseq.session.options import Options
+from labseq.recording import Run
 from labseq.session.session import Session
-from tests.session.small_runs import write
+from labseq.workers import ProcessWorkers
+from tests.session.small_runs import OWN_DEVICE, PROFILE, table, write
 
 FILE = """labseq: 1
 sequence: no_scan.yaml
@@ -55,13 +60,14 @@ def running(n_runs: int) -> Callable[[Any], None]:
 def test_a_campaign_that_is_stopped_goes_on_and_its_results_are_combined(file: Path) -> None:
     campaign, folder = Campaign.read(file), file.parent / "out"
     with pytest.raises(StopRequested):
-        run_campaign(running(2), campaign, folder, Options())
+        run_in_turn(running(2), campaign, folder)
     half = combined(*recorded_runs(folder))
     assert half["n_shots"].values.tolist() == [[2, 0], [0, 0]]
     assert np.isfinite(half["filling"].values).tolist() == [[True, False], [False, False]]
     assert "0.8" in str(half["profile.simulation.loading"].values)  # of points without a run, too
     assert "1 of 4 points are complete" in campaign_picture(folder).note
-    runs = run_campaign(running(9), campaign, folder, Options())
+    run_in_turn(running(9), campaign, folder)
+    runs = all_runs(folder)
     assert [run.status for run in runs] == ["complete"] * 4
     assert len([*folder.glob("*/*/run.json")]) == 4
     file.unlink()  # the folder has a copy
@@ -84,7 +90,108 @@ def test_a_campaign_that_is_stopped_goes_on_and_its_results_are_combined(file: P
     assert len(campaign_picture(folder).rows) == 2
     file.write_text(FILE.replace("seed: 3", "seed: 4"), encoding="utf-8")
     with pytest.raises(ConfigError, match="this run belongs to no point of the campaign"):
-        run_campaign(running(9), Campaign.read(file), folder, Options())
+        run_in_turn(running(9), Campaign.read(file), folder)
+
+
+def all_runs(folder: Path) -> list[Run]:
+    """The runs of a campaign, in the order of its points."""
+    return [run for runs in recorded_runs(folder)[1].values() for run in runs]
+
+
+class Killing(ProcessWorkers):
+    """Kills a worker as soon as a run has begun."""
+
+    folder = Path()
+    n_kills = 0
+
+    def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+        found = super().finished(timeout_s)
+        if self.n_kills < 2 and [*self.folder.glob(f"*/000{self.n_kills + 1}*/index.jsonl")]:
+            multiprocessing.active_children()[0].kill()
+            self.n_kills += 1
+        return found
+
+
+SPLIT = FILE.replace("repeats: 2", "repeats: 5\nruns: 2").replace("[60 %, 80 %]", "[60 %]")
+
+
+def test_runs_at_once_of_which_some_die_are_those_in_turn(file: Path) -> None:
+    file.write_text(SPLIT, encoding="utf-8")
+    campaign, folder, reported = Campaign.read(file), file.parent / "at once", list[tuple[PlannedRun, Run]]()
+    workers = Killing(2, "run")
+    workers.folder = folder
+    run_at_once(campaign, folder, workers, lambda planned, run: reported.append((planned, run)))
+    assert workers.n_kills == 2
+    assert not multiprocessing.active_children()
+    run_in_turn(running(9), campaign, file.parent / "in turn")
+    runs, expected = all_runs(folder), all_runs(file.parent / "in turn")
+    assert [table(run) for run in runs] == [table(run) for run in expected]
+    assert [len(run.shots) for run in runs] == [3, 2, 3, 2]
+    assert len({run.seed for run in runs}) == 2, (
+        "the runs of a point are independent, and compared with those"
+    )
+    assert [run.seed for run in runs[:2]] == [run.seed for run in runs[2:]]
+    assert sorted(run.path for _, run in reported) == sorted(run.path for run in runs)
+    results = combined(*recorded_runs(folder))
+    assert results["n_shots"].values.tolist() == [[5], [5]]
+    assert results["filling_fraction"].values[0, 0].tolist() == [
+        shot.filling_fraction for run in expected[:2] for shot in run.shots
+    ]
+    run_at_once(
+        campaign, folder, workers := ProcessWorkers(1, "run"), lambda *_: pytest.fail("all are there")
+    )
+    assert not [*folder.glob("*/0005*")]
+
+
+def test_a_stop_ends_the_runs_at_once_and_they_are_resumed(file: Path) -> None:
+    campaign, folder = Campaign.read(file), file.parent / "out"
+
+    class Stopping(ProcessWorkers):
+        def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
+            if [*folder.glob("*/*/index.jsonl")]:
+                raise StopRequested
+            return super().finished(timeout_s)
+
+    with pytest.raises(StopRequested):
+        run_at_once(campaign, folder, Stopping(2, "run"), lambda *_: None)
+    assert not multiprocessing.active_children()
+    run_at_once(campaign, folder, ProcessWorkers(2, "run"), lambda *_: None)
+    assert [run.status for run in all_runs(folder)] == ["complete"] * 4
+    assert len([*folder.glob("*/*/run.json")]) == 4
+
+
+def test_real_hardware_is_not_used_by_several_runs_at_once(file: Path) -> None:
+    (file.parent / "mine.py").write_text(OWN_DEVICE, encoding="utf-8")
+    profile = f"{PROFILE}devices: {{laser: {{use: mine}}}}\nplugin_folders: [.]\n"
+    (file.parent / "p.yaml").write_text(profile, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"real hardware .laser.; .*leave out --workers and --scheduler"):
+        run_at_once(Campaign.read(file), file.parent / "out", ProcessWorkers(2, "run"), lambda *_: None)
+    assert not (file.parent / "out").exists()
+
+
+def test_a_cluster_takes_the_runs_where_it_sees_the_folder(file: Path) -> None:
+    import distributed  # takes 0.7 s, which the processes that run other tests need not spend
+
+    ca, scheduler, worker, _ = map(str, make_certificates(file.parent / "keys"))
+    files = {"tls_ca_file": ca, "tls_scheduler_cert": scheduler, "tls_scheduler_key": scheduler}
+    files |= {"tls_worker_cert": worker, "tls_worker_key": worker}
+    files |= {"tls_client_cert": worker, "tls_client_key": worker}
+    about: dict[str, Any] = {"dashboard_address": ":0", "protocol": "tls", "processes": False}
+    about["security"] = distributed.Security(require_encryption=True, **files)
+    make_cluster: Any = distributed.LocalCluster
+    folder, campaign = file.parent / "out", Campaign.read(file)
+    with make_cluster(n_workers=1, threads_per_worker=2, **about) as cluster:
+
+        def workers() -> ClusterWorkers:
+            return ClusterWorkers(cluster.scheduler_address, file.parent / "keys", "run")
+
+        run_at_once(campaign, folder, workers(), lambda *_: None)
+        elsewhere = file.parent / "elsewhere"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("labseq.campaigns.running._keep", lambda *_, **__: None)
+            with pytest.raises(ConfigError, match=r"the worker on .* does not see this folder"):
+                run_at_once(campaign, elsewhere, workers(), lambda *_: None)
+    assert [run.status for run in all_runs(folder)] == ["complete"] * 4
 
 
 def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
@@ -92,11 +199,12 @@ def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
 ) -> None:
     fillings = [[0.5, math.nan, 1.0], [0.9], [math.nan], []]
     runs = [
-        SimpleNamespace(path=Path(f"day/{n}"), shots=[SimpleNamespace(filling_fraction=one) for one in own])
+        [SimpleNamespace(path=Path(f"day/{n}"), shots=[SimpleNamespace(filling_fraction=one) for one in own])]
         for n, own in enumerate(fillings)
     ]
-    monkeypatch.setattr("labseq.session.campaign.run_campaign", lambda *_: runs)
-    run_file(lambda *_, **__: None, file, file.parent, None, Options())
+    recorded = dict(zip(Campaign.read(file).points(), runs, strict=True))
+    monkeypatch.setattr("labseq.campaigns.campaign.recorded_runs", lambda _: (None, recorded))
+    run_file(lambda *_, **__: None, file, file.parent / "out", 1, None, None)
     rows = [line for line in capsys.readouterr().out.splitlines() if "day/" in line]
     assert [row.split("%")[1].split()[-2:] for row in rows[:2]] == [["3", "75.00"], ["1", "90.00"]]
     assert all(" - " in row for row in rows[2:])
@@ -105,7 +213,8 @@ def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("labseq: 1\nsequence: x\naxes: {}\n", r"campaign.yaml:3:7: .*axes"),
+        (f"{FILE}runs: 3\n", r"campaign.yaml:8:7: 3 runs cannot share 2 shots"),
+        (FILE.replace("seed: 3", "runs: 2"), r"campaign.yaml:7:7: 'seed' is missing"),
         ("labseq: 1\nsequence: x\nrepeat: 2\naxes: {a: [1]}\n", r"campaign.yaml:3:1: .*'repeat'.*'repeats'"),
         ("labseq: 1\nsequence: x\naxes: {a: [1, 1]}\n", r"campaign.yaml:3:11: a value occurs twice"),
         (FILE.replace("[1, 4]", "[1, 0]"), r"campaign.yaml:4:38: degree_of_parallelism is 0"),
@@ -114,7 +223,7 @@ def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
 def test_mistakes_have_their_place(file: Path, text: str, message: str) -> None:
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
-        run_campaign(running(9), Campaign.read(file), file.parent / "out", Options())
+        run_in_turn(running(9), Campaign.read(file), file.parent / "out")
 
 
 def test_a_folder_without_a_campaign_and_what_a_campaign_cannot_be(

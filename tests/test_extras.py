@@ -24,7 +24,7 @@ from labseq_pylon.library import load_pypylon
 import labseq.testing
 from labseq import messages
 from labseq.builtin.patterns import read_drawing
-from labseq.campaign import make_keys
+from labseq.campaigns.certificates import make_certificates
 from labseq.cluster import connect
 from labseq.errors import LabseqError
 from labseq.model import ScanSpace
@@ -52,7 +52,7 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("analysis", "h5netcdf", "h5netcdf"): lambda: check_export("netcdf", Path("a.nc")),
     ("andor", "pylablib", "pylablib.devices.Andor.AndorSDK2"): lambda: load_pylablib("camera"),
     ("campaign", "distributed", "distributed"): lambda: connect("tcp://127.0.0.1:9", None),
-    ("campaign", "cryptography", "cryptography"): lambda: make_keys(Path("keys")),
+    ("campaign", "cryptography", "cryptography"): lambda: make_certificates(Path("keys")),
     ("compress", "hdf5plugin", "hdf5plugin"): lambda: load_filter(Path("shot.h5"), compressed()),
     ("frames", "tifffile", "tifffile"): lambda: load("tifffile", "tifffile", Path("a.tif")),
     ("frames", "pillow", "PIL.Image"): lambda: load("PIL.Image", "Pillow", Path("a.png")),

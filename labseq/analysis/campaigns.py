@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from labseq.analysis.overview import RunPicture, scan_panels
 from labseq.analysis.scanned import DEFAULT, WITHOUT_TARGET, Scanned, make_axis
+from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_runs
 from labseq.console.output import say
 from labseq.console.text import plural
 from labseq.errors import ConfigError, Problem, RecordingError
@@ -21,17 +22,17 @@ from labseq.recording.folders import RUN_FILE, find_run
 from labseq.recording.points import ScanPoint
 from labseq.recording.quantities import Quantity, description_of
 from labseq.recording.tables import check_installed
-from labseq.session.campaign import CAMPAIGN_FILE, Campaign, recorded_runs
 from labseq.units import parse_any, si_unit_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Runs = Mapping[tuple[int, ...], Run]
+Runs = Mapping[Point, Sequence[Run]]
 
 OF_SHOTS: Final = ("filling_fraction", "success", "n_defects", "n_batches", "n_atom_moves")
 """Columns of the shots that the combined file has for each shot."""
 REPEAT: Final = "repeat"
+_NO_AXES: Final = "'labseq plot' draws each of its runs, 'labseq export' writes their shots to one file"
 
 
 def campaign_in(path: Path | None) -> Path | None:
@@ -68,11 +69,13 @@ def export_campaign(folder: Path, path: Path) -> None:
 
 def _missing(campaign: Campaign, runs: Runs) -> list[str]:
     """A line about the points whose runs are not complete; none if all are."""
-    n_points = math.prod(map(len, campaign.axes.values()))
-    n_complete = sum(run.status == "complete" for run in runs.values())
-    if n_complete == n_points:
+    n_complete = sum(
+        len(of) == campaign.settings.runs and all(run.status == "complete" for run in of)
+        for of in runs.values()
+    )
+    if n_complete == (n_points := len(runs)):
         return []
-    n_without = n_points - sum(bool(run.shots) for run in runs.values())
+    n_without = n_points - sum(any(run.shots for run in of) for of in runs.values())
     return [f"{n_complete} of {plural(n_points, 'point')} are complete; {n_without} without shots are nan"]
 
 
@@ -89,18 +92,21 @@ def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
     import xarray as xr
 
     shape, names = tuple(map(len, campaign.axes.values())), tuple(campaign.axes)
-    n_repeats = max(campaign.settings.repeats, *(len(run.shots) for run in runs.values()))
+    shots = {point: _shots(of) for point, of in runs.items()}
+    n_repeats = max(campaign.settings.repeats, *map(len, shots.values()))
     means = {f"{name}{end}": np.full(shape, np.nan) for name in DEFAULT for end in ("", "_low", "_high")}
     of_shots = {name: np.full((*shape, n_repeats), np.nan) for name in OF_SHOTS}
     n_shots = np.zeros(shape, np.int64)
-    for point, run in runs.items():
-        n_shots[point] = len(run.shots)
+    for point, of in runs.items():
+        if not of:
+            continue
+        n_shots[point] = len(shots[point])
         for name in DEFAULT:
-            one = run.quantity(name).over(run.shots)
+            one = of[0].quantity(name).over(shots[point])
             for end, value in zip(("", "_low", "_high"), (one.value, *one.interval), strict=True):
                 means[name + end][point] = value
         for name, values in of_shots.items():
-            known = [shot.row.get(name) for shot in run.shots]
+            known = [shot.row.get(name) for shot in shots[point]]
             values[point][: len(known)] = [math.nan if value is None else value for value in known]
     dims, of_shot = (*names, REPEAT), slice(None)
     if n_repeats == 1:
@@ -129,8 +135,9 @@ def _values(campaign: Campaign, address: str, runs: Runs) -> list[Any]:
     for i, word in enumerate(words):
         with suppress(ValueError):
             values[i] = parse_any(word)[0]
-    for point, run in runs.items():  # as the run read it, which knows the setting's type
-        values[point[axis]] = run.record["overrides"][address]["value"]
+    for point, of in runs.items():  # as the run read it, which knows the setting's type
+        for run in of:
+            values[point[axis]] = run.record["overrides"][address]["value"]
     return values if all(type(value) in (int, float) for value in values) else [*words]
 
 
@@ -142,6 +149,8 @@ def campaign_picture(folder: Path) -> RunPicture:
         RecordingError: A run is damaged.
     """
     campaign, runs = recorded_runs(folder)
+    if not campaign.axes:
+        raise ConfigError(Problem("the campaign has no axes to draw", visible(str(folder)), hint=_NO_AXES))
     varied = [i for i, words in enumerate(campaign.axes.values()) if len(words) > 1] or [0]
     addresses = [[*campaign.axes][i] for i in varied]
     axes = tuple(
@@ -149,10 +158,10 @@ def campaign_picture(folder: Path) -> RunPicture:
         for one in addresses
     )
     points = [*campaign.points()]
-    shots = [tuple(runs[point].shots) if point in runs else () for point in points]
+    shots = [_shots(runs[point]) for point in points]
     places = tuple(tuple(point[i] for i in varied) for point in points)
     found = Scanned(axes, places, tuple(ScanPoint({}, {}, of) for of in shots))
-    some = next(iter(runs.values()))
+    some = _first(runs)
     names = WITHOUT_TARGET if some.target.is_none else DEFAULT
     rows = tuple(row for name in names if (row := scan_panels(found, _over_runs(runs, name))))
     if not rows:
@@ -163,9 +172,18 @@ def campaign_picture(folder: Path) -> RunPicture:
 
 def _over_runs(runs: Runs, name: str) -> Quantity:
     """A quantity of the shots of several runs, each with the target of its own run."""
-    of_run = {run.shots[0].file.parent: run.quantity(name) for run in runs.values() if run.shots}
+    of_run = {run.shots[0].file.parent: run.quantity(name) for of in runs.values() for run in of if run.shots}
 
     def events_of(shot: Shot) -> tuple[float, float]:
         return of_run[shot.file.parent].events_of(shot)
 
-    return replace(next(iter(runs.values())).quantity(name), events_of=events_of)
+    return replace(_first(runs).quantity(name), events_of=events_of)
+
+
+def _first(runs: Runs) -> Run:
+    return next(run for of in runs.values() for run in of)
+
+
+def _shots(runs: Sequence[Run]) -> tuple[Shot, ...]:
+    """The shots of the runs of a point."""
+    return tuple(shot for run in runs for shot in run.shots)

@@ -322,7 +322,6 @@ class EqualiseStep(Step):
     takes_time = False
     device_setting = "device"
     device_may_be_camera = True
-    shots_in_order = True
 
     def __init__(self, settings: EqualiseSettings) -> None:
         self.settings = settings

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
@@ -17,7 +17,7 @@ from labseq.analysis.commands import (
 )
 from labseq.bench.commands import bench
 from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibration
-from labseq.campaign import campaign
+from labseq.campaigns.commands import campaign
 from labseq.console.options import (
     DryRun,
     FitName,
@@ -157,9 +157,6 @@ def run(
     output: Output = None,
     as_json: Json = False,
     realtime: Realtime = False,
-    workers: Workers = 1,
-    scheduler: Scheduler = None,
-    keys: Keys = None,
     web: Annotated[
         bool, typer.Option("--web", help="Also show the run in a browser, as `labseq web` does.")
     ] = False,
@@ -169,18 +166,8 @@ def run(
     from labseq.cli.run import run_sequence
     from labseq.session.options import Options
 
-    options = Options(
-        profile,
-        shots,
-        seed,
-        tuple(overrides or ()),
-        output,
-        dry_run_mode(dry_run),
-        realtime,
-        workers,
-        scheduler,
-        keys,
-    )
+    changes = tuple(overrides or ())
+    options = Options(profile, shots, seed, changes, output, dry_run_mode(dry_run), realtime)
     run_sequence(sequence, options, as_json=as_json, web=web)
 
 
@@ -196,16 +183,12 @@ def resume(
     ] = False,
     as_json: Json = False,
     realtime: Realtime = False,
-    workers: Workers = 1,
-    scheduler: Scheduler = None,
-    keys: Keys = None,
     _plugins: Plugins = None,
 ) -> None:
     """Take the missing shots of a run that was stopped, failed or crashed."""
     from labseq.cli.run import resume_run
 
-    who: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "keys": keys}
-    resume_run(run, {"accept_changes": accept_changes, "realtime": realtime, **who}, as_json=as_json)
+    resume_run(run, {"accept_changes": accept_changes, "realtime": realtime}, as_json=as_json)
 
 
 @app.command(short_help="End a run in progress after its current shot.")
@@ -243,7 +226,7 @@ def run_queue(
     raise typer.Exit(run_entries(run, keep_going=keep_going, watch=watch))
 
 
-@campaign.command("run", short_help="Run a sequence at each point of a grid of values.")
+@campaign.command("run", short_help="Take the runs of a campaign file.")
 def run_campaign(
     file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="The file.", show_default=False)],
     output: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the campaign.", show_default=False)],
@@ -256,16 +239,23 @@ def run_campaign(
     keys: Keys = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Run a sequence at each point of a grid of values; continue a campaign that was stopped."""
-    from labseq.analysis.campaigns import export_campaign
-    from labseq.campaign import run_file
-    from labseq.cli.run import run_session
-    from labseq.session.options import Options
+    """Run a sequence at each point of a grid of values, in one or several runs each.
 
-    who = Options(workers=workers, scheduler=scheduler, keys=keys)
-    run_file(run_session, file, output, netcdf, who)
+    The same command continues a campaign that was stopped.
+    """
+    from labseq.analysis.campaigns import export_campaign
+    from labseq.campaigns.commands import run_file
+    from labseq.cli.run import run_session
+    from labseq.console.output import check_writable
+    from labseq.recording.tables import check_installed
+
+    folder = output.expanduser()
+    if netcdf is not None:  # before the first run
+        check_installed("xarray", "h5netcdf")
+        check_writable(netcdf)
+    run_file(partial(run_session, as_json=False), file, folder, workers, scheduler, keys)
     if netcdf is not None:
-        export_campaign(output.expanduser(), netcdf)
+        export_campaign(folder, netcdf)
 
 
 @app.command(short_help="Check a sequence; print its timeline and limits.")

@@ -173,7 +173,7 @@ Workers = Annotated[
     typer.Option(
         metavar="N",
         min=1,
-        help="Number of processes that take the shots of a simulated run; the data do not depend on it.",
+        help="Number of simulated runs at a time, each in a process of its own.",
     ),
 ]
 Scheduler = Annotated[

@@ -168,40 +168,23 @@ class RunWriter:
             RecordingError: The disk is full, or the record contradicts itself.
                 The shots written before are intact, and this one may be written again.
         """
-        return self.add_shot(*encoded(self._encoder, self.run, shot))
-
-    def add_shot(self, row: Mapping[str, Any], data: bytes | memoryview | Path) -> Path:
-        """Write an attempt at a shot that was made into a file elsewhere.
-
-        Args:
-            row: Its line in the index, as :func:`encoded` gives it; with the SHA-256 of a file on the disk.
-            data: The bytes of its file; or that file, on the disk and in the folder of the shots, which is
-                renamed.
-
-        Raises:
-            RecordingError: As for :meth:`write_shot`.
-        """
+        data = self._encoder.encode(shot)
+        row = index_row(shot, self.run.target, file="", sha256="", n_bytes=data.nbytes)
         file = self._free_name(row["shot"], row["attempt"], counts=row["counts"])
         sha256 = SimpleQueue[str]()
-        written = self._on_disk(self._add, {**row, "file": file}, data, sha256)
-        # while the disk writes
-        sha256.put(str(row["sha256"]) if isinstance(data, Path) else hashlib.sha256(data).hexdigest())
-        self.last_row = row = written()
+        written = self._on_disk(self._write_shot, {**row, "file": file}, data, sha256)
+        sha256.put(hashlib.sha256(data).hexdigest())  # while the disk writes
+        self.last_row = written()
         self.n_written += row["counts"]
         return self.run_dir / file
 
-    def _add(
-        self, row: Mapping[str, Any], data: bytes | memoryview | Path, sha256: SimpleQueue[str]
+    def _write_shot(
+        self, row: Mapping[str, Any], data: memoryview, sha256: SimpleQueue[str]
     ) -> Mapping[str, Any]:
         """Write the file of an attempt, then its line in the index; returns that."""
         path = self.run_dir / row["file"]
         with self._guard.step(f"{path.name} ", ANSWER_S, "disk"):
-            if isinstance(data, Path):
-                with explained(path):
-                    data.replace(path)
-                    sync_folder(path.parent)
-            else:
-                write_file(path, data)
+            write_file(path, data)
         row = {**row, "sha256": sha256.get()}
         with self._guard.step(f"{folders.INDEX_FILE} ", ANSWER_S, "disk"):
             self._index.append(row, sync=True)
@@ -292,22 +275,6 @@ class RunWriter:
             (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
         self.event("run_finished", status=status, error=error, n_shots=self.n_written)
         write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error))
-
-
-def encoded(encoder: ShotEncoder, run: RunRecord, shot: ShotRecord) -> tuple[dict[str, Any], memoryview]:
-    """An attempt at a shot for :meth:`RunWriter.add_shot`: its line in the index, and the bytes of its file.
-
-    Raises:
-        RecordingError: The record contradicts itself.
-    """
-    data = encoder.encode(shot)
-    return index_row(shot, run.target, file="", sha256="", n_bytes=data.nbytes), data
-
-
-def write_hashed(path: Path, data: bytes | memoryview) -> str:
-    """Write a file; returns its SHA-256."""
-    write_file(path, data)
-    return hashlib.sha256(data).hexdigest()
 
 
 def run_id_of(run_dir: Path) -> str:

@@ -52,12 +52,9 @@ class Hardware(ABC):
         any_thread: Whether the vendor's library allows calls from different threads. By default each device
             has a thread of its own for all calls; waking it takes 0.1 ms. ``safe_state`` of a device
             that says True may be called while another call hangs.
-        shots_in_order: Whether a shot depends on what the device did in earlier ones, as with frames from a
-            file; such shots cannot be divided among workers.
     """
 
     any_thread: ClassVar[bool] = False
-    shots_in_order: ClassVar[bool] = False
 
     @abstractmethod
     def open(self) -> None:

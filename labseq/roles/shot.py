@@ -402,8 +402,6 @@ class Step(ABC):
         windows_s: Longest time for the moves of each of its rearrangement cycles, in seconds; `labseq check`
             compares the planner's moves with them.
         judges_shot: Whether a shot whose last rearrangement it is needs no further image.
-        shots_in_order: Whether a shot depends on what the step did in earlier ones; such shots cannot be
-            divided among workers.
     """
 
     needs_image: bool = False
@@ -417,7 +415,6 @@ class Step(ABC):
     device = ""
     windows_s = tuple[float, ...]()
     judges_shot = False
-    shots_in_order = False
 
     @abstractmethod
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:

@@ -47,11 +47,6 @@ class Observers:
         if name == "shot_finished":
             self.after_shot()
 
-    @property
-    def need_frames(self) -> bool:
-        """Whether a plugin receives the shots, with their frames."""
-        return any(True for _ in self._host.listeners("labseq_shot_finished", shot=None))
-
     def end(self) -> None:
         """End the plugins' threads."""
         self._guard.end()

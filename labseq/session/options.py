@@ -41,9 +41,6 @@ class Options:
         dry_run: "full": every device by its simulator if its plugin has one, else by its virtual twin;
             "fast": virtual twins only; or "off".
         realtime: Let virtual time pass at the speed of real time.
-        workers: Number of processes that take the shots of a simulated run.
-        scheduler: Address of the scheduler of a dask cluster that takes them instead.
-        keys: Folder of the cluster's certificates.
     """
 
     profile: str | Path | None = None
@@ -53,14 +50,6 @@ class Options:
     output: Path | None = None
     dry_run: DryRun = "off"
     realtime: bool = False
-    workers: int = 1
-    scheduler: str | None = None
-    keys: Path | None = None
-
-    @property
-    def has_workers(self) -> bool:
-        """Whether other processes take the shots."""
-        return self.workers != 1 or self.scheduler is not None
 
     def __post_init__(self) -> None:
         if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]

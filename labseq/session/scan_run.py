@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from labseq.config.scan import Scan
 from labseq.errors import DeviceError
@@ -35,24 +35,6 @@ from labseq.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from labseq.session.assembly import Assembly
-
-
-class ShotTaker(Protocol):
-    """Takes the shots of a run one after the other."""
-
-    def take(self, shot: int, point: Point, skipped: Collection[int]) -> str:
-        """Take and record a shot.
-
-        Args:
-            skipped: Shots that will not be taken.
-
-        Returns:
-            Why it failed for good, or "".
-
-        Raises:
-            LabseqError: The error that ends the run.
-        """
-        ...
 
 
 class OwnShots:
@@ -98,8 +80,15 @@ class OwnShots:
             watchdog=watchdog,
         )
 
-    def take(self, shot: int, point: Point, skipped: Collection[int] = ()) -> str:  # noqa: ARG002
-        """See :class:`ShotTaker`."""
+    def take(self, shot: int, point: Point) -> str:
+        """Take and record a shot.
+
+        Returns:
+            Why it failed for good, or "".
+
+        Raises:
+            LabseqError: The error that ends the run.
+        """
         if point is not self._point:
             lab, reopened = rebuild_lab(self.sequencer.lab, self._point, point, self._seed)
             self.sequencer.change(lab, point.steps, {**self._changes, **point.parameters}, reopened)
@@ -172,7 +161,7 @@ class ScanRun:
             found.setdefault((id(point.planner), id(point.hardware)), point)
         return [*found.values()]
 
-    def run(self, taker: ShotTaker, writer: RunWriter, checks: Checks, emit: Emit) -> None:
+    def run(self, taker: OwnShots, writer: RunWriter, checks: Checks, emit: Emit) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
 
         Args:
@@ -205,7 +194,7 @@ class ScanRun:
             if point is None:
                 emit("scan_ended", {"scanner": self.scanner_name, "n_shots": shot})
                 return
-            given_up = taker.take(shot, point, skipped)
+            given_up = taker.take(shot, point)
             if warning := self._add_result(writer):
                 emit("warning", {"text": warning})
             if why := given_up or checks.after(writer.last_row):

@@ -6,8 +6,7 @@ import gc
 import secrets
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext, suppress
-from dataclasses import replace
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, Self
@@ -40,7 +39,6 @@ from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
     from labseq.session.resume import ResumableRun
-    from labseq.workers import Workers
 
 
 P = ParamSpec("P")
@@ -78,7 +76,6 @@ class Session:
         self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._analyses)
         self._hold: Callable[[str], None] = lambda _: None
         self._sequencer: Sequencer | None = None
-        self._workers: Workers | None = None
         self._lost = ""
 
     @classmethod
@@ -93,9 +90,6 @@ class Session:
         output: str | Path | None = None,
         dry_run: DryRun = "off",
         realtime: bool = False,
-        workers: int = 1,
-        scheduler: str | None = None,
-        keys: Path | None = None,
         observer: RunObserver | None = None,
     ) -> Session:
         """Read and check sequence and profile; nothing is opened yet.
@@ -109,9 +103,6 @@ class Session:
             output: Folder for the data.
             dry_run: "off", "full" or "fast".
             realtime: Let virtual time pass at the speed of real time.
-            workers: Number of processes that take the shots of a simulated run; the data do not depend on it.
-            scheduler: Address of a dask cluster that takes them instead.
-            keys: Folder of its certificates.
             observer: Receives every event.
 
         Raises:
@@ -120,9 +111,7 @@ class Session:
             PluginLoadError: A plugin that is named failed to load.
         """
         folder = None if output is None else path_of(output, "output")
-        options = Options(
-            profile, shots, seed, overrides, folder, dry_run, realtime, workers, scheduler, keys
-        )
+        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime)
         return cls(assemble(path_of(sequence, "sequence"), options), options, observer)
 
     @classmethod
@@ -132,9 +121,6 @@ class Session:
         *,
         accept_changes: bool = False,
         realtime: bool = False,
-        workers: int = 1,
-        scheduler: str | None = None,
-        keys: Path | None = None,
         observer: RunObserver | None = None,
     ) -> Session:
         """Read back a run that ended before its last shot, in order to take the missing shots.
@@ -147,9 +133,6 @@ class Session:
             accept_changes: Whether to continue although code, plugins or settings have changed; run.json
                 records the changes.
             realtime: Let virtual time pass at the speed of real time.
-            workers: Number of processes, as for :meth:`open`.
-            scheduler: See there.
-            keys: See there.
             observer: Receives every event.
 
         Raises:
@@ -161,9 +144,7 @@ class Session:
         assembly, options, earlier = reopened(
             path_of(run, "run"), accept_changes=accept_changes, realtime=realtime
         )
-        return cls(
-            assembly, replace(options, workers=workers, scheduler=scheduler, keys=keys), observer, earlier
-        )
+        return cls(assembly, options, observer, earlier)
 
     def __enter__(self) -> Self:
         return self
@@ -206,15 +187,7 @@ class Session:
                 _, writer = self._begin(root)
                 writer.finish("complete")
                 return open_run(writer.run_dir)
-            if self.options.has_workers:
-                from labseq.session.workers import refuse_workers  # most runs have none
-
-                refuse_workers(self.assembly, self.options, self.build_lab())
             warnings = [str(problem) for problem in check(self, runs=True).warnings]
-            if self.options.has_workers:
-                from labseq.session.workers import open_workers
-
-                self._workers = stack.enter_context(closing(open_workers(self.options)))
             first, *others = self.scan_run.known_labs()
             self.warm(lab := self.build_lab(first))
             for point in others:
@@ -280,17 +253,7 @@ class Session:
         before = () if self.earlier is None else self.earlier.rows
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
         checks = Checks(settings, writer.run_dir, before, target, self._analyses, self._warn)
-        emit = self._observers.event
-        if self._workers is None:
-            self.scan_run.run(own, writer, checks, emit)
-            return
-        from labseq.session.workers import WorkersShots
-
-        shots = WorkersShots(
-            self._workers, self.scan_run, self.options, writer, self._observers, self.stop_flag
-        )
-        with closing(shots):
-            self.scan_run.run(shots, writer, checks, emit)
+        self.scan_run.run(own, writer, checks, self._observers.event)
 
     def _end_without_watchdog(self, why: str) -> None:
         """Have the run end; called by the thread of the heartbeat."""

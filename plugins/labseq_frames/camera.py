@@ -63,8 +63,6 @@ class FramesCamera(CameraDriver):
     recorded with if the file contains it, else the requested one.
     """
 
-    shots_in_order = True
-
     def __init__(self, settings: FramesSettings, context: Context) -> None:
         super().__init__(context, settings.orientation)
         self._settings = settings

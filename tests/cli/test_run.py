@@ -167,9 +167,7 @@ def test_for_people(perform: Any) -> None:
 
 
 def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
-    options = Options(
-        "lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", realtime=True, workers=2, scheduler="tls://a:1"
-    )
+    options = Options("lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", realtime=True)
     session, *_ = perform(options=options)
     given = {name: value for name, value in session.given.items() if name != "observer"}
     assert given == {
@@ -180,9 +178,6 @@ def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
         "output": tmp_path,
         "dry_run": "fast",
         "realtime": True,
-        "workers": 2,
-        "scheduler": "tls://a:1",
-        "keys": None,
     }
 
 

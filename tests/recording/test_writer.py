@@ -21,8 +21,6 @@ from labseq.errors import RecordingError
 from labseq.model import RunRecord
 from labseq.recording import RunWriter, open_run
 from labseq.recording.run_file import summarise
-from labseq.recording.shot_file import ShotEncoder
-from labseq.recording.writer import encoded, run_id_of, write_hashed
 
 from .records import make_run, make_shot
 
@@ -208,20 +206,6 @@ def test_a_full_disk_at_any_moment_of_a_shot_leaves_the_others_whole(
     assert writer.n_written == 1 + n_calls
     for found in open_run(writer.run_dir).shots:
         assert len(found.record().images) == 3
-
-
-def test_a_file_that_was_made_elsewhere_is_on_the_disk_before_its_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = RunWriter.create(tmp_path, make_run())
-    row, data = encoded(ShotEncoder(writer.run, run_id_of(writer.run_dir)), writer.run, make_shot())
-    made = writer.run_dir / "shots" / ".made.part"
-    row |= {"sha256": write_hashed(made, data)}
-    n_calls = n_disk_calls(lambda: writer.add_shot(row, made), monkeypatch)
-    assert n_calls == 4  # replace, fsync of the folder; write, fsync of the index
-    (shot,) = open_run(writer.run_dir).shots
-    shot.verify()
-    assert not made.exists()
 
 
 def test_shots_that_are_skipped_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

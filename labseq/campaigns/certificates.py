@@ -1,85 +1,23 @@
-"""Parameter campaigns: one run for each point of a grid of values; and the certificates of clusters."""
+"""The certificates with which the computers of a dask cluster know one another."""
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Any, Final
 
-import typer
-
+from labseq.cluster import CA_FILE, CLIENT_FILE
 from labseq.errors import ConfigError, Problem
 from labseq.files import explained, write_file
 from labseq.messages import install_hint, visible
 from labseq.plain import now
 
-if TYPE_CHECKING:
-    from labseq.session.options import Options
-
-
 DAYS: Final = 730
 """How long the certificates are valid."""
 
-campaign = typer.Typer(
-    name="campaign",
-    help="Clusters, and runs over many values.",
-    short_help="Runs over many values; certificates of a cluster.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
 
-
-@campaign.command("keys", short_help="Make the certificates of a cluster.")
-def make_certificates(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A folder without certificates.", show_default=False)
-    ],
-) -> None:
-    """Make the certificates with which scheduler, workers and clients of a dask cluster know one another.
-
-    Anyone who has one of the files can have the cluster run any code: copy them only to its machines.
-    """
-    from labseq.console.output import say
-    from labseq.console.text import quoted
-
-    ca, scheduler, worker, _ = map(quoted, make_keys(folder))
-    say(
-        f"The certificates are in {quoted(folder)}, valid for {DAYS} days. Copy the folder to each machine.",
-        f"  dask scheduler --protocol tls --tls-ca-file {ca} --tls-cert {scheduler} --tls-key {scheduler}",
-        "  dask worker tls://SCHEDULER:8786 --nthreads 1 --nworkers 4 "
-        f"--tls-ca-file {ca} --tls-cert {worker} --tls-key {worker}",
-        f"  labseq run SEQUENCE --scheduler tls://SCHEDULER:8786 --keys {quoted(folder)}",
-    )
-
-
-def run_file(
-    run_session: Callable[..., None], file: Path, folder: Path, netcdf: Path | None, workers: Options
-) -> None:
-    """Run a campaign file; print a table; check first that the combined file can be written."""
-    from labseq.console.output import check_writable, say
-    from labseq.console.text import columns, plural
-    from labseq.recording.tables import check_installed
-    from labseq.session.campaign import Campaign, run_campaign
-
-    if netcdf is not None:
-        check_installed("xarray", "h5netcdf")
-        check_writable(netcdf)
-    wanted = Campaign.read(file)
-    runs = run_campaign(partial(run_session, as_json=False), wanted, folder.expanduser(), workers)
-    rows: list[tuple[Any, ...]] = [(*wanted.axes, "shots", "filling", "run")]
-    for point, run in zip(wanted.points(), runs, strict=True):
-        values = [wanted.axes[address][i] for address, i in zip(wanted.axes, point, strict=True)]
-        known = [one for shot in run.shots if not math.isnan(one := shot.filling_fraction)]
-        filling = f"{100 * sum(known) / len(known):.2f} %" if known else "-"
-        rows.append((*values, str(len(run.shots)), filling, f"{run.path.parent.name}/{run.path.name}"))
-    say("", *columns(rows), f"{plural(len(runs), 'run')} in {folder}")
-
-
-def make_keys(folder: Path) -> list[Path]:
+def make_certificates(folder: Path) -> list[Path]:
     """Make an authority, and a certificate with its key for scheduler, workers and clients.
 
     The key of the authority is kept nowhere: for another certificate, all are made again. Existing files are
@@ -95,8 +33,6 @@ def make_keys(folder: Path) -> list[Path]:
         ConfigError: One of the files exists, or the extra is not installed.
         RecordingError: The folder cannot be written to.
     """
-    from labseq.cluster import CA_FILE, CLIENT_FILE
-
     try:
         import cryptography  # noqa: F401  # pyright: ignore[reportUnusedImport]
         from cryptography.hazmat.primitives import serialization
