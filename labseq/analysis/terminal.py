@@ -37,7 +37,7 @@ from labseq.pictures.figures import check_place
 from labseq.plain import to_plain
 from labseq.recording import Run
 from labseq.session.analyses import AnalysisOutcome, analyse_missing, analyses_of
-from labseq.session.analyses_beside import USE
+from labseq.session.analysis_processes import USE
 from labseq.units import format_quantity
 
 MAX_REPORTED: Final = 5

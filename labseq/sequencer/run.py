@@ -199,6 +199,10 @@ class Sequencer:
         parameters: Settings that differ from the files, recorded with each shot: address -> value.
         watchdog: Switches the outputs off if this process dies or hangs; by default one without a log.
 
+    Attributes:
+        lab: The devices.
+        unsafe: Devices that could not be made safe, and why; complete once the run is shut down.
+
     Raises:
         LabseqError: A step fails to lay out its timeline.
     """
@@ -228,7 +232,7 @@ class Sequencer:
         self._policy = policy
         self._parameters = dict(parameters or {})
         self._states = StateTable(self._announce)
-        self._unsafe: dict[str, LabseqError] = {}
+        self.unsafe: dict[str, LabseqError] = {}
         self._timelines = plan_timelines(self.lab, self.guard, self._steps)
 
     @property
@@ -312,14 +316,14 @@ class Sequencer:
             self._states.to(State.CLOSING, announce=False)
             with self._stop.held():
                 outcome = close_all(self.lab, self.guard)
-            self._watchdog.forget(name for name in outcome if name not in self._unsafe)
+            self._watchdog.forget(name for name in outcome if name not in self.unsafe)
             self._watchdog.end()
             self._announce(State.CLOSING)
             self._report("closed", outcome)
             self._warn_of_watchdog()
             self.guard.end()
             self._states.to(State.CLOSED)
-        return self._unsafe
+        return self.unsafe
 
     def _secure(self, *, ended_well: bool = False) -> None:
         self._states.to(State.MAKING_SAFE, announce=False)
@@ -332,7 +336,7 @@ class Sequencer:
                 outcome |= make_safe(self.lab, self.guard, {"static_tweezers"})
             else:
                 outcome, after_s = end_safely(self.lab, self.guard)
-        self._unsafe = {name: error for name, error in outcome.items() if error is not None}
+        self.unsafe = {name: error for name, error in outcome.items() if error is not None}
         self._states.to(State.SAFE, announce=False)
         self._announce(State.MAKING_SAFE)  # only now: neither a screen nor a disk may delay the devices
         self._report("safe_state", outcome, after_s)

@@ -30,7 +30,7 @@ from labseq.recording import Run, open_run
 from labseq.recording.reader import Follower
 from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
-from labseq.session.analyses_beside import FAILED, FINISH_WITHIN, USE
+from labseq.session.analysis_processes import FAILED, FINISH_WITHIN, USE
 from labseq.session.chosen import ChosenPlugin, construct_one
 from labseq.session.recorded import context_of, plugins_of, resolved_of
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from typing import Any, Final
 
 from labseq.errors import DeviceTimeoutError, LabseqError
@@ -24,30 +25,31 @@ MAX_WAIT_S: Final = 5.0
 
 
 class Observers:
-    """Implements ``RunObserver`` for the sequencer; no failure of a receiver stops the run.
-
-    Attributes:
-        log: Writes a line into the run's event log; set once the run has a folder.
-        after_shot: Called after each shot.
-    """
+    """Implements ``RunObserver`` for the sequencer; no failure of a receiver stops the run."""
 
     def __init__(self, host: PluginHost, observer: RunObserver | None) -> None:
         self._host = host
         self._observer = observer
         self._guard = Guard()
         self._hung: set[str] = set()
-        self.log: Callable[..., None] | None = None
-        self.after_shot: Callable[[], None] = lambda: None
+        self._log: Callable[..., None] | None = None
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Pass an event on to every receiver."""
         self._write(name, values)
         self._notify(name, values)
         self._show(name, values)
-        if name == "shot_finished":
-            self.after_shot()
 
-    def end(self) -> None:
+    @contextmanager
+    def logged_by(self, log: Callable[..., None]) -> Generator[None]:
+        """Write the events of the block to the log of the run: ``log(name, **values)``."""
+        self._log = log
+        try:
+            yield
+        finally:
+            self._log = None
+
+    def close(self) -> None:
         """End the plugins' threads."""
         self._guard.end()
 
@@ -78,14 +80,14 @@ class Observers:
             self._write("warning", {"text": f"the live view failed and is off: {format_error(error)}"})
 
     def _write(self, name: str, values: Mapping[str, Any]) -> None:
-        if self.log is None or name in _QUIET:
+        if self._log is None or name in _QUIET:
             return
         timing = values.get("timing")
         if isinstance(timing, StageTiming):
             if timing.over_budget:
-                self.log("over_budget", **_timing(timing))
+                self._log("over_budget", **_timing(timing))
             return
-        self.log(name, **{key: _plain(value) for key, value in values.items() if key != "record"})
+        self._log(name, **{key: _plain(value) for key, value in values.items() if key != "record"})
 
 
 def _timing(timing: StageTiming) -> dict[str, Any]:

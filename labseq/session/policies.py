@@ -24,7 +24,7 @@ from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy
 
 if TYPE_CHECKING:
-    from labseq.session.analyses_beside import AnalysesBeside
+    from labseq.session.analysis_processes import AnalysisProcesses
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
@@ -163,7 +163,7 @@ class Checks:
         run_dir: Path,
         rows: Iterable[Mapping[str, Any]],
         target: TargetPattern,
-        analyses: AnalysesBeside,
+        analyses: AnalysisProcesses,
         warn: Callable[[str], None],
     ) -> None:
         self._checks = [

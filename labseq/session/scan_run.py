@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,7 +25,7 @@ from labseq.sequencer.lab import Lab
 from labseq.sequencer.leader import Emit
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer, ShotSink
-from labseq.session.analyses_beside import AnalysesBeside
+from labseq.session.analysis_processes import AnalysisProcesses
 from labseq.session.lab import rebuild_lab
 from labseq.session.policies import Checks, missing_quantity
 from labseq.session.scan import Point
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from labseq.session.assembly import Assembly
 
 
-class OwnShots:
-    """Takes the shots in this process.
+class ShotTaker:
+    """Takes the shots, each at its point.
 
     Args:
         lab: The devices, not open, at the point of the first shot.
@@ -161,12 +161,16 @@ class ScanRun:
             found.setdefault((id(point.planner), id(point.hardware)), point)
         return [*found.values()]
 
-    def run(self, taker: OwnShots, writer: RunWriter, checks: Checks, emit: Emit) -> None:
+    def run(
+        self, taker: ShotTaker, writer: RunWriter, checks: Checks, emit: Emit, after_shot: Callable[[], None]
+    ) -> None:
         """Take all shots; an adaptive scan ends earlier if the scanner has finished.
 
         Args:
             taker: Takes each of them.
             checks: Checks each result; may end the run, or skip the other shots of a point.
+            emit: Receives the events.
+            after_shot: Called after each shot.
 
         Raises:
             StopRequested: Another process asked the run to end.
@@ -195,6 +199,7 @@ class ScanRun:
                 emit("scan_ended", {"scanner": self.scanner_name, "n_shots": shot})
                 return
             given_up = taker.take(shot, point)
+            after_shot()
             if warning := self._add_result(writer):
                 emit("warning", {"text": warning})
             if why := given_up or checks.after(writer.last_row):
@@ -272,7 +277,7 @@ class AdaptiveScanRun(ScanRun):
         stop: StopFlag,
         run: Run | None = None,
         done: Collection[int] = (),
-        analyses: AnalysesBeside | None = None,
+        analyses: AnalysisProcesses | None = None,
     ) -> None:
         super().__init__(assembly, seed, done)
         self.scanner_name = search.name
@@ -397,7 +402,7 @@ def scan_run_of(
     stop: StopFlag,
     run: Run | None = None,
     done: Collection[int] = (),
-    analyses: AnalysesBeside | None = None,
+    analyses: AnalysisProcesses | None = None,
 ) -> ScanRun:
     """The shots of a run and their points."""
     if assembly.search is None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import gc
 import secrets
 import signal
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, Self
 
-from labseq.errors import ConfigError, DeviceError, LabseqError, RecordingError
+from labseq.errors import ConfigError, DeviceError, RecordingError
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord
@@ -22,7 +22,7 @@ from labseq.recording.folders import later_day
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer
-from labseq.session.analyses_beside import AnalysesBeside
+from labseq.session.analysis_processes import AnalysisProcesses
 from labseq.session.assembly import Assembly, assemble
 from labseq.session.check import check
 from labseq.session.chosen import DryRun
@@ -34,7 +34,7 @@ from labseq.session.policies import Checks
 from labseq.session.provenance import copies, ending, run_record
 from labseq.session.safe import make_safe_after_crash
 from labseq.session.scan import Point
-from labseq.session.scan_run import OwnShots, scan_run_of
+from labseq.session.scan_run import ShotTaker, scan_run_of
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
@@ -42,6 +42,16 @@ if TYPE_CHECKING:
 
 
 P = ParamSpec("P")
+
+
+@contextmanager
+def only_new_garbage() -> Generator[None]:
+    """Keep the garbage collector from searching what exists now: it would take 0.1 s of a shot."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 class Session:
@@ -66,16 +76,13 @@ class Session:
         seed = assembly.sequence.seed if earlier is None else earlier.run.seed
         self.seed = secrets.randbits(63) if seed is None else seed
         self.run_dir: Path | None = None
-        # Before devices are opened: some vendors' libraries change the working folder.
-        self._folder, self._profile_key = Path.cwd(), assembly.hardware.key
+        # before devices are opened: some vendors' libraries change the working folder
+        self._cwd, self._profile_key = Path.cwd(), assembly.hardware.key
         self.stop_flag = StopFlag()
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
         self._observers = Observers(assembly.hardware.host, observer)
-        self._analyses = self._analyses_beside(before)
-        self._observers.after_shot = self._analyses.look
+        self._analyses = self._analysis_processes(before)
         self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._analyses)
-        self._hold: Callable[[str], None] = lambda _: None
-        self._sequencer: Sequencer | None = None
         self._lost = ""
 
     @classmethod
@@ -155,8 +162,7 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Make every device safe and close it; legal at any time."""
-        self._shut_down()
+        """Let other processes resume the run; legal at any time, for only :meth:`run` has devices open."""
         if self.earlier is not None:
             self.earlier.release()
 
@@ -173,28 +179,126 @@ class Session:
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
-        root = self.options.output or data_root()
-        root = root if self.earlier is None else self.earlier.root
-        root = root.absolute()  # some vendors' libraries change the folder
         for text in () if self.earlier is None else self.earlier.warnings:
             self._warn(text)
-        with ExitStack() as stack:
-            stack.enter_context(stop_on_signals(self.stop_flag))
-            hardware, what = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
-            self._hold = stack.enter_context(lock_devices(hardware, what, self._warn))
+        # before devices are opened: some vendors' libraries change the working folder
+        root = (self.earlier.root if self.earlier else self.options.output or data_root()).absolute()
+        hardware, purpose = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
+        with (
+            stop_on_signals(self.stop_flag),
+            lock_devices(hardware, purpose, self._warn) as describe_locks,
+            closing(self._observers),
+        ):
             make_safe_after_crash(hardware, self.stop_flag, self._observers)
             if not self.scan_run.shots:  # its process died between the last shot and the end of the run
-                _, writer = self._begin(root)
-                writer.finish("complete")
-                return open_run(writer.run_dir)
-            warnings = [str(problem) for problem in check(self, runs=True).warnings]
-            first, *others = self.scan_run.known_labs()
-            self.warm(lab := self.build_lab(first))
-            for point in others:
-                self.warm(self.build_lab(point))
-            gc.freeze()  # loaded modules stay: searching them for garbage would take 0.1 s of a shot
-            stack.callback(gc.unfreeze)
-            return self._run(lab, root, warnings)
+                self._begin(root)[1].finish("complete")
+            else:
+                lab, warnings = self._checked()
+                with self._folder(root, describe_locks) as (record, writer):
+                    for text in dict.fromkeys([*warnings, *hardware.host.notes]):
+                        self._warn(text)
+                    self._take_shots(lab, record, writer)
+                    if self.scan_run.is_adaptive:
+                        self._try(self._report_best, writer.run_dir)
+        assert self.run_dir is not None
+        return open_run(self.run_dir)
+
+    def _checked(self) -> tuple[Lab, list[str]]:
+        """Check the run and compile its kernels; returns the devices of the first shot, and warnings."""
+        warnings = [str(problem) for problem in check(self, runs=True).warnings]
+        # once more: what the check has rehearsed used up random numbers and the states of simulated devices
+        first, *others = self.scan_run.known_labs()
+        self.warm(lab := self.build_lab(first))
+        for point in others:
+            self.warm(self.build_lab(point))
+        return lab, warnings
+
+    def _take_shots(self, lab: Lab, record: RunRecord, writer: RunWriter) -> None:
+        """Open the devices, take the shots, and leave every device safe."""
+        log, pulse = writer.run_dir / WATCHDOG_LOG, self.stop_flag.pulse
+        watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
+        first, policy = self.scan_run.first, self.assembly.policy
+        taker = ShotTaker(lab, first, record, policy, self.stop_flag, writer, self._observers, watchdog)
+        settings, target = self.assembly.sequence.policy.checks, self.assembly.target
+        before = () if self.earlier is None else self.earlier.rows
+        # in the reverse order of these lines: devices safe, results of analyses waited for, the mark removed
+        with (
+            only_new_garbage(),
+            nullcontext() if lab.clock.virtual else real_time(),
+            self._marked_active(writer.run_dir, taker.sequencer),
+            self._analyses_finished(writer),
+            self._devices(taker.sequencer, record, writer),
+        ):
+            checks = Checks(settings, writer.run_dir, before, target, self._analyses, self._warn)
+            self.scan_run.run(taker, writer, checks, self._observers.event, self._analyses.look)
+
+    @contextmanager
+    def _folder(
+        self, root: Path, describe_locks: Callable[[str], None]
+    ) -> Generator[tuple[RunRecord, RunWriter]]:
+        """The run's folder, in which the way that the block ends is recorded."""
+        record, writer = self._begin(root)
+        describe_locks(f"the run {writer.run_dir}")
+        error: BaseException | None = None
+        with self._observers.logged_by(writer.event):
+            if self.earlier is None and (day := later_day(writer.run_dir)):
+                self._warn(
+                    f"the clock may be wrong: {visible(str(root))} has runs of {day}, later than this one"
+                )
+            try:
+                yield record, writer
+            except BaseException as failure:
+                error = failure
+                raise
+            finally:
+                status, text = ending(error)
+                self._try(writer.finish, status, text)
+                self._observers.event("run_finished", {"record": record, "status": status, "error": text})
+
+    @contextmanager
+    def _marked_active(self, run_dir: Path, sequencer: Sequencer) -> Generator[None]:
+        """Mark that devices may be on, so that the next run makes them safe if this process dies."""
+        profile = self.assembly.hardware
+        with nullcontext() if profile.identities else suppress(RecordingError):
+            mark_active(self._profile_key, profile.identities, run_dir)
+        try:
+            yield
+        finally:
+            if not sequencer.unsafe:
+                self._try(clear_active, self._profile_key, profile.identities)
+
+    @contextmanager
+    def _analyses_finished(self, writer: RunWriter) -> Generator[None]:
+        """Give the analyses time for the last shots."""
+        try:
+            yield
+        finally:
+            if not writer.is_given_up:
+                self._try(self._analyses.finish)
+
+    @contextmanager
+    def _devices(self, sequencer: Sequencer, record: RunRecord, writer: RunWriter) -> Generator[None]:
+        """Open the devices; whatever ends the block, they are safe and closed first of all.
+
+        Raises:
+            DeviceError: The watchdog was lost, or a device is not safe after the block has ended well.
+        """
+        about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
+        try:
+            self._observers.event("run_starting", about)
+            sequencer.open()
+            writer.set_devices(describe(sequencer.lab, sequencer.guard))
+            self._analyses.start(writer.run_dir)
+            self._observers.event("run_started", about)
+            yield
+        except BaseException as error:
+            sequencer.shut_down()
+            if self._lost:
+                raise DeviceError("watchdog", self._lost) from error
+            raise
+        if unsafe := sequencer.shut_down(ended_well=True):
+            reasons = "; ".join(str(failure) for failure in unsafe.values())
+            raise DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
 
     def build_lab(self, point: Point | None = None) -> Lab:
         """Construct the object of every role with the run's clock; no device is opened.
@@ -209,58 +313,12 @@ class Session:
         """Compile the kernels of a lab; see :func:`labseq.session.lab.warm`."""
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
-    def _run(self, lab: Lab, root: Path, warnings: Sequence[str]) -> Run:
-        record, writer = self._begin(root)
-        for text in dict.fromkeys([*warnings, *self.assembly.hardware.host.notes]):
-            self._warn(text)
-        error: BaseException | None = None
-        try:
-            with nullcontext() if lab.clock.virtual else real_time():
-                self._take_shots(lab, writer, record)
-        except BaseException as failure:  # noqa: BLE001 - raised again once the run is over
-            error = DeviceError("watchdog", self._lost) if self._lost else failure
-        unsafe = self._shut_down(ended_well=error is None)
-        if not writer.is_given_up:
-            self._try(self._analyses.finish)
-        if error is None and self.scan_run.is_adaptive:
-            self._try(self._report_best, writer.run_dir)
-        if error is None and unsafe:
-            reasons = "; ".join(str(failure) for failure in unsafe.values())
-            error = DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
-        self._finish(writer, record, error)
-        if not unsafe:
-            self._try(clear_active, self._profile_key, self.assembly.hardware.identities)
-        self._observers.end()
-        if error is not None:
-            raise error
-        return open_run(writer.run_dir)
-
-    def _take_shots(self, lab: Lab, writer: RunWriter, record: RunRecord) -> None:
-        about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
-        log, pulse = writer.run_dir / WATCHDOG_LOG, self.stop_flag.pulse
-        watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
-        first, policy = self.scan_run.first, self.assembly.policy
-        own = OwnShots(lab, first, record, policy, self.stop_flag, writer, self._observers, watchdog)
-        sequencer = self._sequencer = own.sequencer
-        profile = self.assembly.hardware
-        with nullcontext() if profile.identities else suppress(RecordingError):
-            mark_active(self._profile_key, profile.identities, writer.run_dir)
-        self._observers.event("run_starting", about)
-        sequencer.open()
-        writer.set_devices(describe(lab, sequencer.guard))
-        self._analyses.start(writer.run_dir)
-        self._observers.event("run_started", about)
-        before = () if self.earlier is None else self.earlier.rows
-        settings, target = self.assembly.sequence.policy.checks, self.assembly.target
-        checks = Checks(settings, writer.run_dir, before, target, self._analyses, self._warn)
-        self.scan_run.run(own, writer, checks, self._observers.event)
-
     def _end_without_watchdog(self, why: str) -> None:
         """Have the run end; called by the thread of the heartbeat."""
         self._lost = why
         self.stop_flag.request(signal.SIGTERM)
 
-    def _analyses_beside(self, run: Run | None) -> AnalysesBeside:
+    def _analysis_processes(self, run: Run | None) -> AnalysisProcesses:
         """The analyses of the sequence, and what the run needs of their results."""
         checks, search = self.assembly.sequence.policy.checks, self.assembly.search
         needed = {check.value: "" for check in checks}
@@ -268,25 +326,18 @@ class Session:
         if search is not None:
             needed[search.adaptive.quantity] = "to choose the next point"
         analyses = self.assembly.resolved["analysis"]
-        return AnalysesBeside(analyses, needed, self._observers, self.stop_flag, run)
+        return AnalysisProcesses(analyses, needed, self._observers, self.stop_flag, run)
 
     def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
         """Create the run's folder, or reopen that of a resumed run."""
         changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
-        record = run_record(self.assembly, self.seed, changes, scan, self._folder)
+        record = run_record(self.assembly, self.seed, changes, scan, self._cwd)
         if earlier is None:
             extra_files = copies(self.assembly.hardware.calibrations)
             writer = RunWriter.create(root, record, extra_files, self.stop_flag)
         else:
             writer = earlier.reopen(record, next(iter(self.scan_run.shots), None), self.stop_flag)
         self.run_dir = writer.run_dir
-        self._observers.log = writer.event
-        if earlier is None and (day := later_day(writer.run_dir)):
-            text = (
-                f"{visible(str(root))} has runs of {day}: this run is listed before them; is the clock right?"
-            )
-            self._warn(text)
-        self._hold(f"the run {writer.run_dir}")
         return record, writer
 
     def _report_best(self, run_dir: Path) -> None:
@@ -297,14 +348,6 @@ class Session:
 
     def _warn(self, text: str) -> None:
         self._observers.event("warning", {"text": text})
-
-    def _shut_down(self, *, ended_well: bool = False) -> Mapping[str, LabseqError]:
-        return self._sequencer.shut_down(ended_well=ended_well) if self._sequencer is not None else {}
-
-    def _finish(self, writer: RunWriter, record: RunRecord, error: BaseException | None) -> None:
-        status, text = ending(error)
-        self._try(writer.finish, status, text)
-        self._observers.event("run_finished", {"record": record, "status": status, "error": text})
 
     def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
         """Write to disk at the end of a run; a full disk must not hide the error that ended the run."""

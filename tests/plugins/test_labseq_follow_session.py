@@ -45,8 +45,8 @@ class Led:
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         assert self.session is not None
         if name == "run_started":
-            described = self.session._sequencer.lab.devices["leader"].describe()  # pyright: ignore[reportOptionalMemberAccess]
-            self.thread = threading.Thread(target=self._lead, args=(described["address"],))
+            devices = json.loads(Path(values["run_dir"], "run.json").read_text())["devices"]
+            self.thread = threading.Thread(target=self._lead, args=(devices["leader"]["address"],))
             self.thread.start()
         if name == self._stop_at:
             self.session.stop_flag.request()

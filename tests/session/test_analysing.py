@@ -15,7 +15,7 @@ from labseq.errors import ConfigError
 from labseq.processes import Lock
 from labseq.recording.results import results_file
 from labseq.roles import Analysis, RecordedShot
-from labseq.session import analyses_beside
+from labseq.session import analysis_processes
 from labseq.session.analyses import analyse_missing, analyses_of, prepare
 
 PLUGIN = """
@@ -134,7 +134,7 @@ def test_analyses_that_fail_leave_the_run_alone(tmp_path, monkeypatch):
 
 
 def test_an_analysis_that_does_not_finish_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(analyses_beside, "GRACE_S", 0.0)
+    monkeypatch.setattr(analysis_processes, "GRACE_S", 0.0)
     done = run(tmp_path, "[{use: hangs, finish_within: 0 s}]")
     assert done.status == "complete"
     ended, left = warnings(done)

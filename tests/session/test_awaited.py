@@ -13,7 +13,7 @@ import pytest
 
 import labseq
 from labseq.errors import CheckFailedError, ConfigError, DeviceError
-from labseq.session import analyses_beside
+from labseq.session import analysis_processes
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import PROFILE, interrupted, resumed, table
@@ -125,7 +125,7 @@ def test_a_result_that_does_not_come_is_no_value_and_an_analysis_that_dies_ends_
         return time.monotonic() + (1e4 if is_late else 0.0)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(analyses_beside, "time", SimpleNamespace(monotonic=now_s))
+    monkeypatch.setattr(analysis_processes, "time", SimpleNamespace(monotonic=now_s))
     rest = CLIMB.replace("mean", "trouble").replace("repeats: 2", "repeats: 1")
     path, seen = write(tmp_path, rest.replace("points: 4", "points: 6")), Going()
     with labseq.Session.open(path, seed=5, output=tmp_path / "data", observer=seen) as session:

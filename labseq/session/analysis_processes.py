@@ -1,4 +1,4 @@
-"""The analyses beside a run, a process each, and those of their results that the run waits for."""
+"""Runs each analysis in its own process, and waits for the results that the run depends on."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Rows = Mapping[int, Mapping[str, Any]]
 """Index of a shot -> its row in the results of an analysis."""
 
 
-class AnalysesBeside:
+class AnalysisProcesses:
     """The analyses of a run's shots: they neither stop nor slow it, unless it needs their results.
 
     An adaptive scan or a check may need a result: the run then waits for it between two shots. The results
