@@ -171,7 +171,7 @@ def check_address(address: str) -> None:
     """
     found = _ADDRESS.fullmatch(address)
     if found is None:
-        raise _problem(address, "this is no address of a scheduler", "tls://HOST:PORT")
+        raise _problem(address, "this is not an address of a scheduler", "tls://HOST:PORT")
     if found[1] == "tcp" and not is_loopback(found[2].strip("[]")):
         what = "without encryption, anybody on the network could have the workers run code"
         raise _problem(address, what, "tls://HOST:PORT", "'labseq campaign keys' makes the certificates")

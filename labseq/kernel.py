@@ -1,32 +1,29 @@
-"""Compiled functions: a numba decorator that takes explicit signatures, and a cache of machine code.
+"""Compiled functions: numba with explicit signatures, and a cache that knows what a kernel is made of.
 
 Because every kernel has explicit signatures, no new dtype or layout can cost a compile
 in the middle of a shot. :func:`load_kernels` compiles the kernels of all imported modules or
 loads them from the user's cache; otherwise the first call of a kernel does. Several processes
 compile what the cache lacks. numba itself is imported only then.
 
-What Python calls is kept as machine code, what other kernels call as bitcode for linking.
-Each is made when something needs it, and kept in a file named after everything that it is
-compiled from: the function's bytecode, the constants that it names, the same of all kernels
-that it calls, the processor, numba's settings, and the versions of Python, numba and numpy.
-An edit anywhere therefore leads to a new file.
+The cache is numba's own, which does not notice that a constant or a function in another file has changed.
+Each kernel therefore has a folder that is named after all that it is compiled from: its bytecode, the
+constants that it names, the same of all kernels that it calls, and the versions of Python, numba and numpy.
 """
 
 from __future__ import annotations
 
 import ctypes
-import gc
 import hashlib
 import importlib
 import os
-import pickle
+import shutil
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from functools import cached_property, update_wrapper
+from contextlib import closing, contextmanager, suppress
+from functools import cache, cached_property, partial, update_wrapper
+from importlib.metadata import version
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar, cast
@@ -35,17 +32,6 @@ import numpy as np
 
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.files import cache_root
-from labseq.machine_code import (
-    MachineCode,
-    calling,
-    compile_for_python,
-    environment,
-    load,
-    make_only_bitcode,
-    packed,
-    prefer_wide_vectors,
-    unpacked,
-)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -55,13 +41,14 @@ MAX_WORKERS: Final = 4
 """Maximum number of processes that compile; each needs about 200 MB."""
 WORTH_A_PROCESS_S: Final = 3.0
 """What would take less than this is compiled without starting processes."""
-COMPILE_S: Final = 0.0031
+COMPILE_S: Final = 0.0044
 """Scale of the estimates of the time for compiling, in seconds; measured on two cores."""
 
 _INTERPRETED = threading.Event()
 _PENDING: dict[_Kernel, None] = {}  # neither compiled nor loaded yet
 _ANNOUNCE: list[Callable[[float], None]] = []
 _LOADING = threading.RLock()
+_TEACH: list[Callable[[], object]] = []
 
 
 def const(dtype: str, ndim: int) -> str:
@@ -162,10 +149,33 @@ def _decorator(
     )
 
 
+@cache
 def _numba() -> Any:
+    """numba, which knows how kernels call other kernels."""
     import numba
+    from llvmlite import binding
+    from numba.extending import typeof_impl
 
+    # LLVM prefers vectors of 256 bits on all of Intel's processors. From Ice Lake on, rendering takes a
+    # quarter less time with 512 (Sapphire Rapids).
+    settings, features = cast("Any", numba).config, binding.get_host_cpu_features()
+    if features.get("avx512vbmi2") and settings.ENABLE_AVX and settings.CPU_FEATURES is None:
+        settings.CPU_FEATURES = f"{features.flatten()},-prefer-256-bit"
+
+    def typeof(value: _Kernel, _: object) -> Any:
+        return cast("Any", numba.types).Dispatcher(value.dispatcher)
+
+    cast("Any", typeof_impl).register(_Kernel)(typeof)
+    for teach in _TEACH:
+        teach()
     return numba  # as Any: it ships no types
+
+
+def with_numba(teach: Callable[[], object]) -> None:
+    """Call a function that teaches numba something, as soon as numba is needed."""
+    _TEACH.append(teach)
+    if _numba.cache_info().currsize:
+        teach()
 
 
 def _is_interpreted() -> bool:
@@ -184,90 +194,89 @@ class _Kernel:
         self.is_helper = is_helper
         self.for_c = for_c
         self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"} if fused else False}
-        self._dispatcher: Any = None  # for kernels that call it, and for itself while it is compiled
+        self._dispatchers: dict[str, Any] = {}
         self._call: Callable[..., Any] = self._first_call
-        self._c_address = 0
         _PENDING[self] = None
 
     def __call__(self, *args: Any) -> Any:
         return self._call(*args)
 
     def _first_call(self, *args: Any) -> Any:
-        if _is_interpreted():
-            self._call = self.function
-        else:
-            self.load()
+        self._call = self.function if _is_interpreted() else self._dispatcher("python")
         return self._call(*args)
 
     def __reduce__(self) -> str:
         return self.function.__qualname__
 
-    @property
-    def _numba_type_(self) -> Any:
-        """Numba asks for it when it compiles a call."""
-        return _numba().types.Dispatcher(self._dispatcher or self.compile())
-
-    def compile(self) -> Any:
-        """Compile it or load its bitcode from the cache: numba's object that lets kernels call it."""
-        from numba.core.compiler_lock import global_compiler_lock
-
-        with global_compiler_lock:
-            if self._dispatcher is None:
-                prefer_wide_vectors()
-                options = self._options | {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-                self._dispatcher = _numba().njit(**options)(self.function)
-                self._dispatcher._cache = _Bitcode(self)  # noqa: SLF001 - numba has no other way
-                try:
-                    for signature in self.signatures:
-                        self._dispatcher.compile(signature)
-                    self._dispatcher.disable_compile()
-                except BaseException:
-                    self._dispatcher = None
-                    raise
-                if self.is_helper:
-                    _PENDING.pop(self, None)
-        return self._dispatcher
-
     def load(self) -> None:
-        """Compile it or load its machine code from the cache, for Python."""
+        """Compile it, or load it from the cache, for those that call it: Python, C, or only kernels."""
+        _ = self.c_address if self.for_c else self.dispatcher
+
+    @property
+    def dispatcher(self) -> Any:
+        """What other kernels call, compiled or loaded from the cache; Python, too, unless it is a helper."""
+        return self._dispatcher("kernels" if self.is_helper else "python")
+
+    def _dispatcher(self, kind: str) -> Any:
         with _LOADING:
-            if self._call == self._first_call:
-                try:
-                    codes = [*map(self._load, range(len(self.signatures)))]
-                    self._c_address = codes[0][2]
-                    self._call = calling(self.function.__name__, codes)
-                except (AttributeError, ImportError, LookupError):  # another numba than machine_code knows
-                    self._call = _numba().njit(self.signatures, **self._options)(self.function)
-                if not self.is_helper:
-                    _PENDING.pop(self, None)
+            if kind not in self._dispatchers:
+                self._cached(kind, partial(self._compile, kind))
+                _PENDING.pop(self, None)
+        return self._dispatchers[kind]
+
+    def _compile(self, kind: str, cache: bool) -> None:
+        # only what Python calls can take Python's objects: that takes a fifth of the time for compiling
+        options = self._options | {"cache": cache, "no_cpython_wrapper": kind == "kernels"}
+        dispatcher = self._dispatchers[kind] = _numba().njit(**options)(self.function)
+        try:
+            for signature in self.signatures:
+                dispatcher.compile(signature)  # which may need the dispatcher, for calls of itself
+        except BaseException:
+            del self._dispatchers[kind]
+            raise
+        dispatcher.disable_compile()
 
     @cached_property
     def c_address(self) -> int:
         """See :func:`c_address`; of a function in Python where kernels are not compiled."""
-        if self._call == self._first_call and not _is_interpreted():
-            self.load()
-        if not self._c_address:
+        if _is_interpreted():
             word = ctypes.c_int64
-            self._for_c = ctypes.CFUNCTYPE(word, *[word] * self.function.__code__.co_argcount)(self)
-            self._c_address = ctypes.cast(self._for_c, ctypes.c_void_p).value or 0
-        return self._c_address
+            self._c = ctypes.CFUNCTYPE(word, *[word] * self.function.__code__.co_argcount)(self.function)
+            return ctypes.cast(self._c, ctypes.c_void_p).value or 0
+        with _LOADING:
+            self._cached("c", self._compile_for_c)
+            _PENDING.pop(self, None)
+        return int(self._c.address)
 
-    def _load(self, number: int) -> tuple[MachineCode, Callable[..., Any], int]:
-        path = self.path(number, "python")
-        with suppress(Exception):  # whatever is wrong with the cache, it can be compiled
-            return load(_read(path))
-        _announce_compiling(self)
-        code = compile_for_python(
-            [*self.compile().overloads.values()][number],
-            is_only=len(self.signatures) == 1,
-            for_c=self.for_c,
-        )
-        _write(path, pickle.dumps(code))
-        return load(code)
+    def _compile_for_c(self, cache: bool) -> None:
+        options = {key: value for key, value in self._options.items() if key != "nogil"}
+        self._c: Any = _numba().cfunc(self.signatures[0], cache=cache, **options)(self.function)
 
-    def path(self, number: int, kind: str) -> Path:
-        """File in the cache of the signature of that number: of the kind "python" or "kernels"."""
-        return cache_root() / "kernels" / f"{self.function.__name__}-{self.digest}-{number}.{kind}"
+    def _cached(self, kind: str, compile_it: Callable[[bool], None]) -> None:
+        """Compile with numba's cache in the kernel's folder."""
+        folder, settings = self.folder / kind, _numba().config
+        if not folder.is_dir():
+            _announce_compiling(self)
+        before, can_write = settings.CACHE_DIR, False
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            os.utime(folder.parent)
+            _delete_unused(folder.parents[1])
+            can_write = Path(self.function.__code__.co_filename).is_file()  # numba looks at its date
+        settings.CACHE_DIR = str(folder)
+        try:
+            compile_it(can_write)
+        except Exception:  # noqa: BLE001 - a crash may have truncated any file; other errors come again
+            shutil.rmtree(folder, ignore_errors=True)
+            _announce_compiling(self)
+            compile_it(can_write)
+        finally:
+            settings.CACHE_DIR = before
+
+    @property
+    def folder(self) -> Path:
+        """Its folder in the cache."""
+        return cache_root() / "kernels" / f"{self.function.__name__}-{self.digest}"
 
     @property
     def module(self) -> str:
@@ -283,8 +292,8 @@ class _Kernel:
         return getattr(sys.modules.get(self.module), "__dict__", None) is self.function.__globals__
 
     def is_cached(self) -> bool:
-        kind = "kernels" if self.is_helper else "python"
-        return all(self.path(number, kind).is_file() for number in range(len(self.signatures)))
+        kind = "c" if self.for_c else "kernels" if self.is_helper else "python"
+        return any(self.folder.glob(f"{kind}/*/*.nbi"))
 
     @cached_property
     def named(self) -> dict[str, Any]:
@@ -313,8 +322,15 @@ class _Kernel:
         reached = [self]
         for one in reached:
             reached += [callee for callee in one.callees if callee not in reached]
-        parts = [environment(), self.source, *sorted(one.source for one in reached)]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+        parts = [_environment(), self.source, *sorted(one.source for one in reached)]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+@cache
+def _environment() -> str:
+    """Text of everything but its source that a kernel depends on, and that numba does not look at."""
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    return repr((sys.version, *map(version, ("numba", "llvmlite", "numpy")), settings))
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -343,64 +359,17 @@ def _constant(name: str, value: object) -> str:
     return ""
 
 
-class _Bitcode:
-    """Keeps a kernel's bitcode in files; numba's dispatcher uses it as its cache."""
-
-    cache_path = None
-
-    def __init__(self, owner: _Kernel) -> None:
-        self._owner = owner
-
-    def _path(self, signature: str) -> Path:
-        return self._owner.path(self._owner.signatures.index(signature), "kernels")
-
-    def load_overload(self, signature: str, context: Any) -> Any:
-        """Numba's result of compiling, or None."""
-        with suppress(Exception):  # whatever is wrong with the cache, it can be compiled
-            return unpacked(_read(self._path(signature)), context)
-        _announce_compiling(self._owner)
-        return None
-
-    def save_overload(self, signature: str, result: Any) -> None:
-        """Write a file, unless that is impossible."""
-        with suppress(Exception):
-            _write(self._path(signature), packed(result))
-
-
 def _announce_compiling(kernel: _Kernel) -> None:
     while _ANNOUNCE:
         missing = {kernel, *(other for other in list(_PENDING) if not other.is_cached())}
         _ANNOUNCE.pop()(sum(other.compile_s for other in missing))
 
 
-def _read(path: Path) -> Any:
-    """The object in a file of the cache."""
-    data = path.read_bytes()
-    if hashlib.sha256(data[32:]).digest() != data[:32]:
-        raise ValueError("truncated by a crash")
-    found = pickle.loads(data[32:])  # noqa: S301
-    with suppress(OSError):
-        os.utime(path)
-    return found
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Write a file of the cache, unless that is impossible."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _delete_unused(path.parent)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(data).digest() + data)
-        try:
-            Path(file.name).replace(path)
-        except OSError:  # Windows: another process reads it
-            Path(file.name).unlink()
-
-
 def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> None:
     """Let several processes compile kernels into the cache, a module at a time; failures are ignored."""
-    from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
     from graphlib import TopologicalSorter
+
+    from labseq.workers import POLL_S, ProcessWorkers
 
     seconds, graph = dict[str, float](), dict[str, set[str]]()
     for one in kernels:
@@ -413,66 +382,34 @@ def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> N
         _ANNOUNCE.pop()(1.0 + max(sum(seconds.values()) / n_workers, *seconds.values()))
     order = TopologicalSorter({module: (on & seconds.keys()) - {module} for module, on in graph.items()})
     order.prepare()
-    with ThreadPoolExecutor(n_workers) as pool, ExitStack() as stack:
-        idle = [stack.enter_context(_Worker()) for _ in range(n_workers)]
-        busy: dict[Future[None], tuple[_Worker, str]] = {}
-        ready: list[str] = []
+    modules, ready, n_out = [*seconds], list[str](), 0
+    with closing(ProcessWorkers(n_workers, "module")) as workers, suppress(LabseqError):
+        workers.prepare(_make_compiler, None)
         while order.is_active():
-            ready += order.get_ready()
-            ready.sort(key=lambda module: seconds[module])
-            while idle and ready:
-                worker, module = idle.pop(), ready.pop()
-                busy[pool.submit(worker.compile, module)] = worker, module
-            for done in wait(busy, 0.1, FIRST_COMPLETED).done:
-                worker, module = busy.pop(done)
-                idle.append(worker)
-                order.done(module)
+            ready = sorted([*ready, *order.get_ready()], key=lambda module: seconds[module])
+            while ready and n_out < n_workers:
+                module = ready.pop()
+                workers.submit(modules.index(module), module)
+                n_out += 1
+            for number, _ in workers.finished(POLL_S):
+                order.done(modules[number])
+                n_out -= 1
             poll()
 
 
-class _Worker:
-    """A process that compiles the kernels of modules into the cache."""
+def _make_compiler(_: None) -> Callable[[str], None]:
+    """Prepare a process that compiles the kernels of modules into the cache."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    for output in (1, 2):  # a module may print
+        os.dup2(nothing, output)
 
-    def __enter__(self) -> _Worker:
-        import subprocess
-
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", "from labseq.kernel import serve; serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            text=True,
-        )
-        return self
-
-    def compile(self, module: str) -> None:
-        """Ask for a module, and wait; returns at once if the process has ended."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        with suppress(OSError, ValueError):
-            print(module, file=self._process.stdin, flush=True)
-            self._process.stdout.readline()
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        with self._process:
-            pass
-
-
-def serve() -> None:
-    """Compile the kernels of each module that standard input names, one per line."""
-    gc.disable()  # there are no cycles to speak of, and compiling takes a sixth less time
-    prefer_wide_vectors()
-    make_only_bitcode()
-    answer = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # a module may print
-    for line in sys.stdin:
+    def compile_module(name: str) -> None:
         with suppress(Exception):
-            importlib.import_module(line.strip())
-            for one in [one for one in _PENDING if one.module == line.strip()]:
-                one.compile() if one.is_helper else one.load()
-        print("done", file=answer, flush=True)
+            importlib.import_module(name)
+            for one in [one for one in _PENDING if one.module == name]:
+                one.load()
+
+    return compile_module
 
 
 def n_cores() -> int:
@@ -485,21 +422,16 @@ def n_cores() -> int:
 _CLEANED: set[Path] = set()
 
 
-def _delete_unused(folder: Path) -> None:
-    """Delete files that no process has loaded for long, once per process.
+def _delete_unused(root: Path) -> None:
+    """Delete folders of kernels that no process has loaded for long, once per process.
 
-    A clock that is ahead deletes none: the age of a file is at most that against the last one loaded.
+    A clock that is ahead deletes none: the age of a folder is at most that against the last one loaded.
     """
-    if folder in _CLEANED:
+    if root in _CLEANED:
         return
-    _CLEANED.add(folder)
-    used_s: dict[Path, float] = {}
-    for path in folder.iterdir():
-        with suppress(OSError):  # another process may be deleting it too
-            if path.is_file():
-                used_s[path] = path.stat().st_mtime
+    _CLEANED.add(root)
+    used_s = {path: path.stat().st_mtime for path in root.iterdir() if path.is_dir()}
     too_old = min(time.time(), max(used_s.values(), default=0.0)) - UNUSED_DAYS * 86400
     for path, last_s in used_s.items():
         if last_s < too_old:
-            with suppress(OSError):
-                path.unlink()
+            shutil.rmtree(path, ignore_errors=True)  # another process may be deleting it too

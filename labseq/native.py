@@ -13,112 +13,47 @@ import os
 import sys
 import time
 import weakref
-from collections.abc import Callable
-from functools import cached_property, partial
-from inspect import Parameter, Signature
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import helper_kernel, kernel
+from labseq.kernel import helper_kernel, kernel, with_numba
 
 Ints = NDArray[np.int64]
-
-
-class _Builtin:
-    """A function that kernels call and numba has to be taught; Python calls its own version."""
-
-    def __init__(self, in_python: Callable[..., Any], for_numba: Callable[[], Any]) -> None:
-        self._in_python = in_python
-        self._for_numba = for_numba
-
-    def __call__(self, *args: Any) -> Any:
-        return self._in_python(*args)
-
-    @cached_property
-    def _numba_type_(self) -> Any:
-        """Numba asks for it when it compiles a call."""
-        from numba.core.registry import cpu_target
-
-        function, known = self._for_numba(), cast("Any", cpu_target).typing_context
-        known.refresh()
-        return known.resolve_value_type(function)
 
 
 _FUNCTION: Final = ctypes.CFUNCTYPE(ctypes.c_uint32, *[ctypes.c_int64] * 3)
 
 
-def _call(address: int, a: int, b: int, c: int) -> int:
+def call_c(address: int, a: int, b: int, c: int) -> int:
+    """Call a C function with up to three integers or pointers; returns its uint32.
+
+    Arguments that it does not take are ignored, as in the calling conventions of all 64-bit systems.
+    """
     return int(_FUNCTION(int(address))(int(a), int(b), int(c)))
 
 
-def _array(address: int, shape: Any, dtype: Any) -> NDArray[Any]:
-    n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    memory: Any = (ctypes.c_char * n_bytes).from_address(int(address))
-    return np.frombuffer(memory, dtype).reshape(shape)
-
-
-def _pointer(address: int) -> int:
+def pointer(address: int) -> int:
+    """An address for :func:`carray`."""
     return address
 
 
-def _swap(address: int, value: int) -> int:
+def carray(pointer: int, shape: Any, dtype: Any) -> NDArray[Any]:
+    """The array at an address: ``carray(pointer(address), shape, dtype)``."""
+    n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory: Any = (ctypes.c_char * n_bytes).from_address(int(pointer))
+    return np.frombuffer(memory, dtype).reshape(shape)
+
+
+def swap(address: int, value: int) -> int:
+    """Set an int64 and return what it was, in one step for all threads."""
     word = ctypes.c_int64.from_address(int(address))
     before, word.value = word.value, value
     return before
 
 
-def _taught(n_arguments: int, result: str, write: Callable[..., Any]) -> Any:
-    """Numba's version of a function of int64, whose instructions ``write(ir, builder, values)`` adds."""
-    from llvmlite import ir
-    from numba import types
-    from numba.extending import intrinsic
-
-    signature = getattr(types, result)(*[types.int64] * n_arguments)
-
-    def code(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        return write(ir, builder, values)
-
-    def typing(_context: Any, *_arguments: Any) -> Any:
-        return signature, code
-
-    names = ["context", *(f"a{number}" for number in range(n_arguments))]
-    parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
-    cast("Any", typing).__signature__ = Signature(parameters)  # numba looks at it
-    return cast("Any", intrinsic)(typing)
-
-
-def _write_call(ir: Any, builder: Any, values: Any) -> Any:
-    function = ir.FunctionType(ir.IntType(32), [ir.IntType(64)] * 3).as_pointer()
-    builder.fence("seq_cst")  # other threads see in order what is written before and after
-    result = builder.call(builder.inttoptr(values[0], function), values[1:])
-    builder.fence("seq_cst")
-    return builder.zext(result, ir.IntType(64))
-
-
-def _write_pointer(ir: Any, builder: Any, values: Any) -> Any:
-    return builder.inttoptr(values[0], ir.IntType(8).as_pointer())
-
-
-def _write_swap(ir: Any, builder: Any, values: Any) -> Any:
-    word = builder.inttoptr(values[0], ir.IntType(64).as_pointer())
-    return builder.atomic_rmw("xchg", word, values[1], "seq_cst")
-
-
-call_c: Any = _Builtin(_call, partial(_taught, 4, "int64", _write_call))
-"""``call_c(address, a, b, c)`` calls a C function with up to three integers or pointers; returns its uint32.
-
-Arguments that it does not take are ignored, as in the calling conventions of all 64-bit systems."""
-
-pointer: Any = _Builtin(_pointer, partial(_taught, 1, "voidptr", _write_pointer))
-"""``pointer(address)`` for :data:`carray`."""
-
-carray: Any = _Builtin(_array, lambda: cast("Any", importlib.import_module("numba")).carray)
-"""``carray(pointer(address), shape, dtype)`` is the array at an address."""
-
-swap: Any = _Builtin(_swap, partial(_taught, 2, "int64", _write_swap))
-"""``swap(address, value)`` sets an int64 and returns what it was, in one step for all threads."""
+with_numba(lambda: importlib.import_module("labseq.native_code"))
 
 N_TIMER: Final = 10
 _CLOCK, _FIRST, _SECOND, _SCALE, _PER, _SLEEP, _SECONDS, _TICKS, _PAUSE = range(9)

@@ -76,7 +76,7 @@ def parse_quantity(text: str, dimension: str) -> float:
         The value in the SI unit of the dimension.
 
     Raises:
-        ValueError: The text is no quantity, or its unit is of another dimension.
+        ValueError: The text is not a quantity, or its unit is of another dimension.
 
     Example:
         >>> parse_quantity("45 ms", "time")
@@ -122,7 +122,7 @@ def parse_any(text: str) -> tuple[float, str]:
         The value, and its dimension; "fraction" for percents.
 
     Raises:
-        ValueError: The text is no number with a unit.
+        ValueError: The text is not a number with a unit.
 
     Example:
         >>> parse_any("45 ms")

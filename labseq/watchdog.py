@@ -36,7 +36,7 @@ BEAT_S: Final = 0.05
 HUNG_S: Final = 0.6
 """A run without a heartbeat for so long hangs; no call of a run holds the interpreter nearly as long."""
 WAITS_S: Final = 10.0
-"""The same while a thread waits for a disk, for memory that was swapped out, or for the processor."""
+"""The same at most while a thread waits for a disk, for memory that was swapped out, or for the processor."""
 STUCK_S: Final = 10.0
 """A run whose thread that takes the shots has neither waited nor got on for so long counts as dead."""
 TERM_S: Final = 0.1
@@ -265,7 +265,7 @@ class Hanging:
     def __init__(self, pid: int, hung_s: float = HUNG_S) -> None:
         self._pid = pid
         self._hung_s = hung_s
-        self._since: tuple[float, dict[str, float]] | None = None
+        self._since: dict[str, float] | None = None
 
     def __call__(self, silent_s: float) -> bool:
         """Whether it hangs; to be asked again and again, also while it does not."""
@@ -274,12 +274,14 @@ class Hanging:
             return False
         states, waited_s = _threads(self._pid)
         if self._since is None:
-            self._since = silent_s, waited_s
-        since_s, before_s = self._since
-        longest_s = max((all_s - before_s.get(one, all_s) for one, all_s in waited_s.items()), default=0.0)
-        is_starved = "R" in states and longest_s > (silent_s - since_s) / 2
-        waits = ("D" in states or is_starved) and "T" not in states
-        return silent_s > (WAITS_S if waits else self._hung_s)
+            self._since = waited_s
+        before_s = self._since
+        # time in which it could not run does not count, whatever its threads are doing
+        starved_s = max((all_s - before_s.get(one, all_s) for one, all_s in waited_s.items()), default=0.0)
+        may_be_silent_s = min(self._hung_s + starved_s, WAITS_S)
+        if "D" in states and "T" not in states:
+            may_be_silent_s = WAITS_S
+        return silent_s > may_be_silent_s
 
 
 def _threads(pid: int) -> tuple[str, dict[str, float]]:

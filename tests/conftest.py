@@ -21,7 +21,7 @@ from tests.needs import NEEDS, is_here
 # Read when numpy is imported, which is later; on small arrays, threads of linear algebra mostly wait.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-# A busy computer is no failure, and what passed once passes again; ``poe search`` looks for new examples.
+# A busy computer is not a failure, and what passed once passes again; ``poe search`` looks for new examples.
 settings.register_profile("labseq", deadline=None, derandomize=True, max_examples=30)
 settings.register_profile("search", deadline=None)
 settings.load_profile("labseq")

@@ -172,9 +172,11 @@ os._exit(0)
         ("SS", 0.0, 0.5, False),
         ("SS", 0.0, 0.7, True),
         ("TT", 0.0, 0.7, True),
-        ("RS", 0.2, 0.7, True),  # a C call that computes
-        ("RS", 0.4, 0.7, False),  # it wants to run, and hardly gets the processor
-        ("RS", 9.0, 11.0, True),
+        ("RS", 0.05, 0.7, True),  # a C call that computes
+        ("RS", 0.2, 0.7, False),  # the same, on a busy computer: it had the processor for half a second
+        ("SS", 0.2, 0.9, True),
+        ("RS", 2.0, 2.5, False),
+        ("RS", 10.5, 11.0, True),
         ("DS", 0.0, 5.0, False),  # it waits for a disk
         ("DS", 0.0, 11.0, True),
         ("DT", 0.0, 0.7, True),

@@ -129,7 +129,7 @@ def _about(name: str) -> str:
 
 
 def _values(campaign: Campaign, address: str, runs: Runs) -> list[Any]:
-    """The values of an axis, SI; all as written if one of them is no number."""
+    """The values of an axis, SI; all as written if one of them is not a number."""
     words, axis = campaign.axes[address], [*campaign.axes].index(address)
     values: list[Any] = [*words]
     for i, word in enumerate(words):

@@ -42,7 +42,7 @@ class Axis:
     Attributes:
         address: The address, and those that change together with it.
         words: Its different values as written, in the order of the scan.
-        numbers: The same as numbers, and the unit of these; None if they are no numbers of one dimension.
+        numbers: The same as numbers, and the unit of these; None if they are not numbers of one dimension.
     """
 
     address: str
@@ -75,7 +75,7 @@ class Scanned:
         return [quantity.over(point.shots) for point in self.points]
 
     def on_axis(self, number: int) -> tuple[list[float], str] | None:
-        """Each point's value on an axis, and the unit that it is written in; None if these are no numbers."""
+        """Each point's value on an axis, and the unit that it is written in; None if they are not numbers."""
         numbers = self.axes[number].numbers
         if numbers is None:
             return None

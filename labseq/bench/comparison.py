@@ -157,7 +157,7 @@ def parse_parallelism(text: str | None) -> tuple[int | None, ...]:
     except ValueError as error:
         expected = "whole numbers with commas between them, for example 7,15,20"
         raise ConfigError(
-            Problem("this is no degree of parallelism", clean(f"--dop {text}"), expected=expected)
+            Problem("this is not a degree of parallelism", clean(f"--dop {text}"), expected=expected)
         ) from error
 
 

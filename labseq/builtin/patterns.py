@@ -49,7 +49,7 @@ def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
         bool (rows, cols), True where an atom must be.
 
     Raises:
-        ConfigError: It cannot be read, or it is no drawing; with the line that is wrong.
+        ConfigError: It cannot be read, or it is not a drawing; with the line that is wrong.
     """
     data = read_bytes(path, "a text file or a PNG", _SUFFIXES, MAX_BYTES)
     name = visible(str(path))

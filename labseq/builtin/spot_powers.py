@@ -57,7 +57,7 @@ class SpotPowers:
         """The power of each spot, float64 (n_rows, n_cols), in counts.
 
         Raises:
-            DeviceError: A spot is saturated or missing, or the spots are no lattice such as the grid's.
+            DeviceError: A spot is saturated or missing, or the spots are not a lattice such as the grid's.
         """
         self._refuse_saturated(frame.image)
         known = self._known = self._known or self._find(frame)
@@ -119,13 +119,13 @@ class MobileTweezerMeter:
         settings: Which camera, and how long it exposes.
 
     Raises:
-        ConfigError: The device is no camera.
+        ConfigError: The device is not a camera.
     """
 
     def __init__(self, shot: Shot, settings: PowerMeterSettings) -> None:
         self._shot, self._settings, name = shot, settings, settings.device
         if name != "camera" and not hasattr(shot.device(name), "arm"):
-            raise ConfigError(f"'{name}' is no camera; mobile tweezers are measured on frames")
+            raise ConfigError(f"'{name}' is not a camera; mobile tweezers are measured on frames")
         self._spots = SpotPowers(shot.grid, name)
         self._motion = shot.motion
         shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.ramp, 0.0, OFF_S)

@@ -205,8 +205,8 @@ def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
     old = old if old is not None and same_grid(new.grid, old.grid) else None
     n_one_peak = new.quality.get("n_one_peak", 0.0)
     if n_one_peak > (old.quality.get("n_one_peak", 0.0) if old is not None else 0.0):
-        sites = "1 site shows" if n_one_peak == 1 else f"{n_one_peak:.0f} sites show"
-        return f"{sites} one peak only, and would take the other from the neighbours"
+        where = "at 1 site" if n_one_peak == 1 else f"at {n_one_peak:.0f} sites"
+        return f"{where} only one peak was found; the thresholds there would be borrowed from neighbours"
     if old is None:
         return ""
     deciding, now, before = DECIDING[new.kind], figure_of(new), figure_of(old)

@@ -70,7 +70,7 @@ class Document:
             kept: The text to use in place of the file's, which need not exist then.
 
         Raises:
-            ConfigError: It cannot be read, or is no strict YAML 1.2 with a mapping at the top.
+            ConfigError: It cannot be read, or is not strict YAML 1.2 with a mapping at the top.
         """
         text, name = (read_bytes(path), str(path)) if kept is None else kept
         return replace(cls.parse(text, visible(name)), path=path)
@@ -80,7 +80,7 @@ class Document:
         """Parse the content of a file; ``name`` is its name in messages.
 
         Raises:
-            ConfigError: It is no strict YAML 1.2 with a mapping at the top.
+            ConfigError: It is not strict YAML 1.2 with a mapping at the top.
         """
         decoded = decode(text, name) if isinstance(text, bytes) else text.removeprefix("\ufeff")
         root = compose(decoded, name)

@@ -222,7 +222,7 @@ def _parse(text: str) -> _Parsed:
     """Parse an expression with its "=".
 
     Raises:
-        ExpressionError: The text is no expression, or too long.
+        ExpressionError: The text is not an expression, or too long.
     """
     if len(text) > MAX_LENGTH:
         raise ExpressionError(f"the expression has {len(text)} characters", f"at most {MAX_LENGTH}", at=0)

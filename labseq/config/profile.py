@@ -92,8 +92,8 @@ class PowerMeterSettings(Settings):
     )
     value: Text = Field(
         default="spot_powers",
-        description="what to read of a device that is no camera: an array of rows and columns, or one number "
-        "for the light of all tweezers; each tone is then measured alone",
+        description="what to read of a device other than a camera: an array of rows and columns, or one "
+        "number for the light of all tweezers; each tone is then measured alone",
     )
     exposure: PositiveDuration = Field(
         default=1e-3, description="exposure time of a camera; its brightest pixels must not be saturated"

@@ -512,14 +512,15 @@ def numbers_of(nodes: Sequence[Node]) -> list[Number]:
     """Read numbers of one dimension, all in the unit of the first.
 
     Raises:
-        ConfigError: One is no number, or is of another dimension than the first.
+        ConfigError: One is not a number, or is of another dimension than the first.
     """
     numbers: list[Number] = []
     for node in nodes:
         number, first = _number(node), numbers[0] if numbers else None
         if first is not None and dimension_of(number.unit) != dimension_of(first.unit):
             dimension = dimension_of(first.unit)
-            what = f"{shown(node.plain(), node.raw)} does not go with {shown(nodes[0].plain(), nodes[0].raw)}"
+            both = f"{shown(node.plain(), node.raw)} and {shown(nodes[0].plain(), nodes[0].raw)}"
+            what = f"{both} have different dimensions"
             expected = f"a {dimension} with its unit" if dimension else "a number without a unit"
             raise node.mark.error(what, expected)
         if first is not None and number.unit != first.unit:
@@ -553,7 +554,7 @@ def values_of(node: Node, address: str) -> list[Node]:
         address: The address, for messages.
 
     Raises:
-        ConfigError: It is no list, ``linspace`` or ``range``, is empty, or has more than
+        ConfigError: It is not a list, ``linspace`` or ``range``, is empty, or has more than
             :data:`MAX_POINTS` values.
     """
     if isinstance(node.value, list):

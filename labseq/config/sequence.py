@@ -160,7 +160,7 @@ def _step(value: Any) -> StepSpec:
     item = cast("dict[str, Any]", value)
     kinds = [key for key in item if key not in _BESIDE]
     if not kinds:
-        raise setting_error("a step says nothing to do", "a mapping such as 'image: {exposure: 45 ms}'")
+        raise setting_error("this step has no action", "a mapping such as 'image: {exposure: 45 ms}'")
     if len(kinds) > 1:
         what = f"'{clean(kinds[1])}' is in the same step as '{clean(kinds[0])}'"
         hint = f"begin a new step with '- ', or indent settings of '{clean(kinds[0])}' further"

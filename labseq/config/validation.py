@@ -191,7 +191,7 @@ def _findings(
 
 
 def _place(error: Mapping[str, Any], top: Node) -> _Placed:
-    """Follow pydantic's location through the file; parts that are no key or index name a union's branch."""
+    """Follow pydantic's location through the file; parts that are neither key nor index name a branch."""
     steps: tuple[str | int, ...] = error["loc"]
     loc: Loc = ()
     union: Loc | None = None

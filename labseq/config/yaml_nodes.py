@@ -289,7 +289,7 @@ class _Composer(yaml.SafeLoader):
         return _Alias(self.anchors[name], event.start_mark)
 
     def _check_key(self, keys: dict[str, YamlMark], node: yaml.Node, value: yaml.Node) -> None:
-        """Report keys that are no text, merge keys, and duplicate keys."""
+        """Report keys that are not a text, merge keys, and duplicate keys."""
         key, mark, n_before = self.converted(node), node.start_mark, len(self.problems)
         if not isinstance(key.value, str):
             hint = f"write '{clean(key.raw)}' in quotes" if key.raw else ""

@@ -30,7 +30,7 @@ class Estimate:
             ('29.61(3)', '5990(10)', '1')
             >>> str(Estimate(0.4, 0.096)), str(Estimate(7.123456, math.nan))
             ('0.4(1)', '7.123')
-            >>> str(Estimate(99.555555555555543, 8e-15))  # rounding is no error
+            >>> str(Estimate(99.555555555555543, 8e-15))  # rounding is not an error
             '99.56'
         """
         if math.isnan(self.value):

@@ -87,7 +87,7 @@ def comb_sample_rate(
         clock_step_hz: Sample rates are multiples of this.
 
     Returns:
-        The rate in Hz, a whole number of clock steps. If the spacing is no round number
+        The rate in Hz, a whole number of clock steps. If the spacing is not a round number
         the teeth miss it by half a clock step divided by fs / D at most, which rendering
         takes into account.
 

@@ -218,7 +218,7 @@ def read_plan(
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
-        ConfigError: It is no plan, it does not fit the grid or breaks a rule, or the request
+        ConfigError: It is not a plan, it does not fit the grid or breaks a rule, or the request
             asks for something to be planned.
     """
     from labseq.kernel import announcing

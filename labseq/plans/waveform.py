@@ -143,7 +143,7 @@ def read_batches(text: str | None, plan: Plan) -> range:
     there_are = f"a number from 0 to {n - 1}, or two of them as in 0-{n - 1}" if n > 1 else "0, the only one"
     match = _BATCHES.fullmatch(text)
     if match is None:
-        raise ConfigError(Problem("these are no batches", option, expected=there_are))
+        raise ConfigError(Problem("these are not batches", option, expected=there_are))
     first, last = int(match[1]), int(match[2] or match[1])
     if not first <= last < n:
         raise ConfigError(Problem("there are no such batches", option, expected=there_are))

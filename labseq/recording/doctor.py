@@ -240,7 +240,7 @@ class _Check:
                     if name.endswith(".part"):
                         self._quarantine("half-written", folder / name)
             if (stop := self.folder / folders.STOP_FILE).exists():
-                self._quarantine("a request to stop that no run has followed", stop)
+                self._quarantine("a stop request that no run acted on", stop)
             self._check_state()
             self._check_shots(shots, str(record.get("run_id")))
             skipped = _LineFile(self.folder / folders.SKIPPED_FILE)

@@ -148,7 +148,7 @@ def find_run(path: Path) -> Path:
     if runs:
         holds = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
         raise RecordingError(
-            path, f"holds {holds} and is none itself", f"give one of them, for example {runs[-1]}"
+            path, f"contains {holds} but is not a run itself", f"give one of them, for example {runs[-1]}"
         )
     raise RecordingError(path, f"is not a run: it has no {RUN_FILE}", "give a run's folder")
 

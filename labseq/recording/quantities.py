@@ -320,7 +320,7 @@ def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
     for condition in conditions:
         match = _CONDITION.match(condition)
         if match is None:
-            what = f"this is no condition: '{clean(condition)}'"
+            what = f"this is not a condition: '{clean(condition)}'"
             raise ConfigError(Problem(what, "--where", expected="for example 'filling:before == 1'"))
         quantity, compare = find_quantity(run, match[1]), _COMPARE[match[2]]
         try:

@@ -36,7 +36,7 @@ def open_run(path: str | Path) -> Run:
         path: The run's folder or any file in it.
 
     Raises:
-        RecordingError: It is no run, is damaged, or has another format.
+        RecordingError: It is not a run, is damaged, or has another format.
     """
     try:
         path = Path(path)

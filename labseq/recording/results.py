@@ -52,7 +52,7 @@ class ResultsLog:
         """Check that a result can be written.
 
         Raises:
-            TypeError: It is no mapping of names to values.
+            TypeError: It is not a mapping of names to values.
         """
         if not isinstance(result, Mapping):
             raise TypeError(f"the result is {type(result).__name__}; expected a mapping of names to values")

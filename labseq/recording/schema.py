@@ -58,7 +58,7 @@ _getter: Final = cache(attrgetter)
 
 
 def unit_of(name: str) -> str:
-    """Unit of a value, from the suffix of its name; "" if that is no unit.
+    """Unit of a value, from the suffix of its name; "" if that is not a unit.
 
     Example:
         >>> unit_of("laser.power_w"), unit_of("spacing_m"), unit_of("seen"), unit_of("beat_hz")

@@ -111,7 +111,7 @@ class _Grid:
     """The axes of a scan.
 
     Attributes:
-        dims: The scanned addresses and "repeat"; or "point" and "repeat" where the scan is no product
+        dims: The scanned addresses and "repeat"; or "point" and "repeat" where the scan is not a product
             of its addresses.
         shape: Length of each.
         places: Indices of each shot along the axes.

@@ -384,9 +384,9 @@ class ServedDevice:
             number, call, args = message["n"], message["call"], message["args"]
             now_s, place, named = message["now"], message["shot"], message["named"]
             if type(number) is not int or type(call) is not str or not isinstance(args, list):
-                raise MessageError("it is no call")
+                raise MessageError("it is not a call")
             if not isinstance(named, dict) or type(now_s) not in (float, type(None)):
-                raise MessageError("it is no call")
+                raise MessageError("it is not a call")
         except MessageError as error:
             return self._refusal(0, f"the server cannot read a message: {error}")
         except (KeyError, TypeError) as error:
@@ -471,7 +471,7 @@ class ServedDevice:
         session.is_safe = session.is_safe and call in _WITHOUT_OPENING
         value = getattr(device, call)(*args, **named)
         if call == "leave_on" and value:
-            session.is_safe = True  # nobody is to switch it off
+            session.is_safe = True  # it must not be switched off
             self._give_up(session)
         return value
 

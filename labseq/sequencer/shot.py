@@ -470,7 +470,7 @@ class RunningShot:
         return occupancy
 
     def _catch_up(self) -> None:
-        """Have a simulated device do what was due while the virtual clock advanced: no light waits for it."""
+        """Let a simulated device catch up with virtual time while nothing depends on it."""
         mobile = self.lab.mobile_tweezers
         if self.clock.virtual and offers(mobile, "settle"):
             self.call("mobile_tweezers", self.call_timeout_s, mobile.settle)

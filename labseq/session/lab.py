@@ -127,7 +127,7 @@ def construct(
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
     """Construct the objects whose settings differ between two points; all others stay open.
 
-    A device of which a setting differs must be closed before and opened after. The mobile
+    A device whose settings change must be closed first and reopened afterwards. The mobile
     tweezers stay open if the motion differs only in what each program contains. A
     simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
     on to the simulation, and that to the motion.

@@ -126,7 +126,7 @@ def parse_text(data: bytes, name: str) -> Occupancy:
 def _text_row(line: str, name: str, number: int) -> list[bool]:
     for i, character in enumerate(line):
         if character not in _CHARACTERS and character not in _SEPARATORS:
-            what = f"{shown(character)} is no site"
+            what = f"{shown(character)} is not a site"
             expected = "0 or '.' for an empty site, 1 or '#' for an atom"
             raise ConfigError(Problem(what, name, number, i + 1, expected))
     return [_CHARACTERS[character] for character in line if character in _CHARACTERS]

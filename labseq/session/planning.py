@@ -197,7 +197,7 @@ def _origin(text: str | None) -> list[Override]:
         return []
     match = _ORIGIN.fullmatch(text)
     if match is None:
-        what, expected = "this is no site", "row and column of the target's top left site, for example 2,3"
+        what, expected = "this is not a site", "row and column of the target's top left site, for example 2,3"
         raise ConfigError(Problem(what, clean(f"--origin {text}"), expected=expected))
     return [Override("target.origin", f"[{match[1]}, {match[2]}]", f"--origin {text}")]
 

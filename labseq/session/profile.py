@@ -227,7 +227,7 @@ def choose_plugins(
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
         if choice.loc in document.replaced:
-            refused[role] = ConfigError("what the profile says of it is wrong")
+            refused[role] = ConfigError("its settings in the profile are invalid")
             continue
         try:
             chosen[role], warning = choose_role(host, document, spec, role, choice, dry_run)

@@ -64,7 +64,7 @@ class ResumableRun:
 
         Raises:
             ConfigError: It is complete or in progress, or another process resumes it.
-            RecordingError: It is no run, is damaged, has another format, or cannot be written to.
+            RecordingError: It is not a run, is damaged, has another format, or cannot be written to.
         """
         folder = find_run(path)
         _check(folder)  # before anything is written there
@@ -80,7 +80,7 @@ class ResumableRun:
                 f"{folder} does not support file locks: another process could resume the run at the same time"
             )
         if holder is not None:
-            raise _refused(folder, f"another process resumes it already: {holder}")
+            raise _refused(folder, f"another process is already resuming it: {holder}")
         try:
             return cls._read(folder, lock, warnings)
         except BaseException:
@@ -218,7 +218,7 @@ def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assem
 
     Raises:
         ConfigError: The run cannot be resumed, or something has changed.
-        RecordingError: It is no run, is damaged, has another format, or cannot be written to.
+        RecordingError: It is not a run, is damaged, has another format, or cannot be written to.
     """
     earlier = ResumableRun.open(path)
     try:

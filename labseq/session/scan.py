@@ -195,13 +195,13 @@ class ScanPoints:
         for axis in self.scan.axes:
             dependents, own = self._dependents(axis), clean(axis.address)
             if axis.loc[0] == VARIABLES and not dependents:
-                hint = f"write '= {own.removeprefix(PROFILE)}' in the setting that is to follow it"
-                what = f"nothing follows from '{own}'"
+                hint = f"write '= {own.removeprefix(PROFILE)}' in a setting"
+                what = f"no setting uses '{own}'"
                 raise axis.key.error(what, "an expression with it", hint)
             for loc in dependents:
                 if not _may_be_scanned(axis.of_profile, loc):
                     other = clean(_address(axis.of_profile, loc))
-                    what = f"'{other}' follows from '{own}', and a scan cannot change it"
+                    what = f"'{other}' depends on '{own}', and a scan cannot change it"
                     raise axis.key.error(what, "one value of it for the whole run")
 
 

@@ -144,7 +144,7 @@ class Session:
 
         Raises:
             ConfigError: The run is complete or in progress, or something has changed since it began.
-            RecordingError: It is no run, is damaged, of a newer labseq, or cannot be written to.
+            RecordingError: It is not a run, is damaged, of a newer labseq, or cannot be written to.
         """
         from labseq.session.resume import reopened
 

@@ -115,7 +115,7 @@ class Actions:
         if not isinstance(comment, str) or len(comment) > MAX_NOTE:
             raise ConfigError(Problem("the comment is too long", expected=f"at most {MAX_NOTE} characters"))
         if not isinstance(tags, list) or not all(isinstance(tag, str) for tag in tags):  # pyright: ignore[reportUnknownVariableType]
-            raise ConfigError(Problem("the tags are no list of texts"))
+            raise ConfigError(Problem("the tags are not a list of texts"))
         write_notes(run.folder, comment, tags)  # pyright: ignore[reportUnknownArgumentType]
         return {"done": "kept"}
 
@@ -130,12 +130,12 @@ class Actions:
     def _add(self, path: Path, values: Mapping[str, Any]) -> dict[str, str]:
         changes: Any = values.get("changes") or {}
         if not isinstance(changes, dict) or len(changes) > _MAX_CHANGES:  # pyright: ignore[reportUnknownArgumentType]
-            raise ConfigError("the changes are no mapping of addresses to values")
+            raise ConfigError("the changes are not a mapping of addresses to values")
         data = Document.read(path).data
         known = {field["address"] for field in form_fields(data, self._schemas())}
         if unknown := [*{str(address) for address in changes} - known]:  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
             # not what --set can do beyond: plugin folders and devices are the lab's own
-            raise ConfigError(Problem(f"'{clean(unknown[0])}' is no value of the form"))
+            raise ConfigError(Problem(f"'{clean(unknown[0])}' is not a value of the form"))
         options = [f"--set={address}={value}" for address, value in changes.items()]  # pyright: ignore[reportUnknownVariableType]
         if profile := str(values.get("profile") or ""):
             if is_path(profile):
@@ -203,7 +203,7 @@ def _known() -> dict[str, Path]:
 def _whole(values: Mapping[str, Any], name: str) -> int:
     value = values.get(name)
     if type(value) is not int:
-        raise ConfigError(Problem(f"'{name}' is no whole number"))
+        raise ConfigError(Problem(f"'{name}' is not a whole number"))
     return value
 
 

@@ -324,7 +324,7 @@ def _number(values: Mapping[str, Any], name: str, default: int) -> int:
     """
     text = str(values.get(name, default))
     if not (text.removeprefix("-").isdecimal() and len(text) < 12):
-        raise NoSuchRun(f"'{name}' is no whole number")
+        raise NoSuchRun(f"'{name}' is not a whole number")
     return max(int(text), -1)
 
 

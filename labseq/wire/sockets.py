@@ -49,7 +49,7 @@ def parse_address(address: str) -> tuple[str, int]:
     """Host and port of an address.
 
     Raises:
-        ValueError: It is no address.
+        ValueError: It is not an address.
 
     Example:
         >>> parse_address("tcp://camera-pc:5760")
@@ -58,7 +58,7 @@ def parse_address(address: str) -> tuple[str, int]:
     found = _ADDRESS.fullmatch(address)
     if found is None or not 0 < int(found[2]) < 65_536:
         raise ValueError(
-            f"'{clean(address)}' is no address; expected tcp://HOST:PORT, as tcp://camera-pc:5760"
+            f"'{clean(address)}' is not an address; expected tcp://HOST:PORT, as tcp://camera-pc:5760"
         )
     return found[1].strip("[]"), int(found[2])
 

@@ -295,7 +295,7 @@ def sierpinski(settings: SierpinskiSettings, grid: SiteGrid) -> TargetPattern:
     On a triangular grid the triangle is equilateral: its tip is the block's top
     right site (the top left one with ``shear: -1``), its base the whole lowest row.
     On a square grid it has a right angle at the lower left, below its tip. A block
-    that is no power of two is a larger triangle, cut below or at the side away
+    that is not a power of two is a larger triangle, cut below or at the side away
     from the tip.
 
     Args:

@@ -243,7 +243,7 @@ class Connection:
         who = who if self._joins is None else f"'{self._name}' at {who}"
         about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
-            raise self.failure("it is no server of this version of labseq")
+            raise self.failure("it is not a server of this version of labseq")
         return about
 
     def _about(self, context: Context) -> dict[str, Any]:

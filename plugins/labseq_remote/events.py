@@ -67,6 +67,6 @@ class Monitor:
             what = "the server does not know the key of this computer, or no longer"
             return f"{what}: its public key must be in the folder `known` there"
         if zmq.EVENT_CONNECTED in self._seen:
-            what = "it is no server of devices, or the keys do not fit"
+            what = "it is not a server of devices, or the keys do not fit"
             return f"{what}: both need keys, and each the public key of the other"
         return "nothing answers there; is `labseq serve-devices` running, and its port open in the firewall?"

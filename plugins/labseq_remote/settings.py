@@ -15,7 +15,7 @@ def _address(value: str) -> str:
         wire.parse_address(value)
     except ValueError as error:
         raise setting_error(
-            f"'{value[:60]}' is no address", "tcp://HOST:PORT, as tcp://camera-pc:5760"
+            f"'{value[:60]}' is not an address", "tcp://HOST:PORT, as tcp://camera-pc:5760"
         ) from error
     return value
 

@@ -33,7 +33,7 @@ class Template:
         """Parse a template.
 
         Raises:
-            ValueError: An unmatched brace, or a placeholder that is no name.
+            ValueError: An unmatched brace, or a placeholder that is not a name.
 
         Example:
             >>> Template.parse("FREQ {frequency:.3f}").names
@@ -164,7 +164,7 @@ def compiled(pattern: str) -> re.Pattern[str]:
     """Compile a pattern that a whole reply must match.
 
     Raises:
-        ValueError: It is no regular expression.
+        ValueError: It is not a regular expression.
     """
     try:
         return re.compile(pattern, re.DOTALL)

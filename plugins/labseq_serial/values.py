@@ -72,7 +72,7 @@ class Unit:
         """A number as the user gives it: SI, or text with a unit.
 
         Raises:
-            ValueError: It is no finite number, or one of another dimension.
+            ValueError: It is not a finite number, or one of another dimension.
         """
         number = self._number(given)
         if not math.isfinite(number):
@@ -187,7 +187,7 @@ class TypedSettings(Settings):
             if key in given and getattr(self, key) is not None and key not in allowed.get(self.type, ()):
                 kinds = " or ".join(kind for kind, keys in allowed.items() if key in keys)
                 raise setting_error(
-                    f"'{key}' does not go with type {self.type}", f"type {kinds}", at=(key,), key=True
+                    f"'{key}' is not for type {self.type}", f"type {kinds}", at=(key,), key=True
                 )
         if self.words[0] == self.words[1]:
             raise setting_error(f"false and true are both '{self.words[0]}'", "two words", at=("words",))
@@ -273,7 +273,7 @@ class ArgumentSettings(TypedSettings):
 
 
 def check_limits(unit: str | None, low: Number | None, high: Number | None, *at: str) -> None:
-    """Refuse limits that are no quantities of their unit, or the wrong way round.
+    """Refuse limits that are not quantities of their unit, or the wrong way round.
 
     Args:
         unit: The unit, as the profile has it.
@@ -469,7 +469,7 @@ class ValueSettings(TypedSettings):
         for key in wrong:
             if getattr(lock, key) not in (None, ()):
                 expected = "min and max" if self.is_number else "one_of"
-                what = f"'{key}' does not go with a value of type {self.type}"
+                what = f"'{key}' is not for a value of type {self.type}"
                 raise setting_error(what, expected, at=("interlock", key), key=True)
         kind = bool if self.type == "bool" else str
         for i, good in enumerate(lock.one_of):

@@ -30,7 +30,7 @@ STEP: Final = 1 << 16
 TURN: Final = 1 << 2  # and up to 3 for the choice of an end, all else equal
 
 Board = tuple[Bools, Bools, int]
-"""Where atoms are, the sites that are no margin, and the width."""
+"""Where atoms are, the sites that are not a margin, and the width."""
 BOARD: Final = f"Tuple(({SITES}, {SITES}, int64))"
 
 NO_END: Final = -1

@@ -108,7 +108,7 @@ class Conversation:
         raise DeviceTimeoutError(self._device, self._silence_text(question, max_wait_s), max_wait_s)
 
     def new_events(self, timeout_s: float = 0.0) -> list[str] | None:
-        """Wait for a message of the box that is no answer; returns its words, or None if none came."""
+        """Wait for a message of the box that is not an answer; returns its words, or None if none came."""
         return self._wait(lambda: self._news.popleft() if self._news else None, timeout_s)
 
     def drop_messages(self) -> None:

@@ -91,7 +91,7 @@ def test_shots_are_selected_by_any_quantity(lifetime: labseq.Run) -> None:
     ]
     assert 0 < len(chosen) < 6
     assert list(chosen) == wanted
-    with pytest.raises(ConfigError, match="this is no condition: 'before full'"):
+    with pytest.raises(ConfigError, match="this is not a condition: 'before full'"):
         select_shots(lifetime, ["before full"])
 
 

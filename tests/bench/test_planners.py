@@ -186,7 +186,7 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
             },
             "--dop 6: .*; expected 1 to 5, the most tones of an axis",
         ),
-        ({"dop": "7,x"}, "--dop 7,x: this is no degree of parallelism; expected whole numbers"),
+        ({"dop": "7,x"}, "--dop 7,x: this is not a degree of parallelism; expected whole numbers"),
         ({"planners": "psca:dop=3"}, "psca:dop=3: 'dop' is not a setting of planner 'psca'"),
         ({"overrides": ["planner.dop=3"]}, "--set planner.dop=3: 'dop' is not a setting"),
         ({"overrides": ["profile.mobile_tweezers.speed=3 ms"]}, "'3 ms' is a time, not a speed"),

@@ -53,7 +53,7 @@ def test_time_left_follows_the_pace_so_far(fake: Any) -> None:
     now = 100.0
     tally = Tally(lambda: now)
     tally.add("run_starting", {"record": fake.run(n_shots=10), "run_dir": "x"})
-    now = 107.0  # compiling and opening are no shots
+    now = 107.0  # compiling and opening are not shots
     tally.add("shot_started", {"shot": 0, "attempt": 0})
     assert math.isnan(tally.time_left_s)
     for i in range(2):

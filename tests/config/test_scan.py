@@ -161,7 +161,7 @@ BAD = [
     ("scan: {shot.sort.window: {linspace: [1 ms, 2 ms, 1]}}", "1:50: the number of values is 1"),
     (
         "scan: {shot.sort.window: {linspace: [1 ms, 2, 3]}}",
-        "1:44: 2 does not go with '1 ms'; expected a time",
+        "1:44: 2 and '1 ms' have different dimensions; expected a time",
     ),
     ("scan: {shot.sort.window: {linspace: [.nan, 2, 3]}}", "1:38: .nan is among the limits"),
     ("scan: {shot.sort.window: {range: [1, 5, 0]}}", "1:41: the step 0 does not lead from start to stop"),

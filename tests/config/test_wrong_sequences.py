@@ -1,4 +1,4 @@
-"""Wrong sequences: text that is no strict YAML, wrong keys and wrong steps. Each line is the first message."""
+"""Wrong sequences: text that is not strict YAML, wrong keys and wrong steps. Each line is the first message."""
 
 # ruff: noqa: E501 - messages are quoted as they are printed
 
@@ -152,7 +152,7 @@ shot:⏎ => shot: {}⏎rest:⏎
 - image: {exposure: 45 ms} => - 5
   16:5: a step is 5; expected a mapping such as 'image: {exposure: 45 ms}'
 - image: {exposure: 45 ms} => - name: look
-  16:5: a step says nothing to do; expected a mapping such as 'image: {exposure: 45 ms}'
+  16:5: this step has no action; expected a mapping such as 'image: {exposure: 45 ms}'
   - image: {exposure: 45 ms} =>     image: {exposure: 45 ms}
   16:5: 'image' is in the same step as 'load'; expected one step in each item of the list; begin a new step with '- ', or indent settings of 'load' further
 - image: {exposure: 45 ms} => - image:⏎    exposure: 45 ms

@@ -19,7 +19,7 @@ motion.check_plan(plan, [[True, False]], target, 1)
 program = motion.tone_program(plan, SiteGrid(1, 2))
 motion.render(program)
 print(sorted(name for name in set(sys.modules) - warm if name.startswith("labseq")))
-print([one for one in pending if one not in kernel._PENDING or one._dispatcher])
+print([one for one in pending if one not in kernel._PENDING or one._dispatchers])
 """
 
 

@@ -24,7 +24,7 @@ BAD = [
     ),
     (
         ["letter.txt", *COMPACT],
-        "letter.txt:2:5: 'o' is no site; expected 0 or '.' for an empty site, 1 or '#'",
+        "letter.txt:2:5: 'o' is not a site; expected 0 or '.' for an empty site, 1 or '#'",
     ),
     (["random:20x@0.75", *COMPACT], "random:20x@0.75: this is not an occupancy; expected random:ROWSxCOLS@P"),
     (["text.h5#1", *COMPACT], "text.h5: "),
@@ -43,7 +43,7 @@ BAD = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder full of files that are no occupancies."""
+    """A folder full of files that are not occupancies."""
     folder = tmp_path_factory.mktemp("bad")
     np.save(folder / "complex.npy", np.ones((2, 2), complex))
     (folder / "ragged.txt").write_text("101\n10\n", "utf-8")

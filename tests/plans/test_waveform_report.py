@@ -91,7 +91,7 @@ BAD = [
     (["half.json"], "half.json:1:13: this is not JSON: expecting value"),
     (["random:6x6@0.7"], "--target is missing"),
     ([*WORDS, "--batches", "9-99"], "there are no such batches; expected a number from 0 to "),
-    ([*WORDS, "--batches", "first"], "--batches first: these are no batches"),
+    ([*WORDS, "--batches", "first"], "--batches first: these are not batches"),
     ([*WORDS, "--sample-rate", "1"], "cannot be sampled at 1 Hz; expected more than 211.2 MHz"),
     ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),
     ([*WORDS, "--npz", "a.npy"], "a.npy: this is not the name of an NPZ file"),

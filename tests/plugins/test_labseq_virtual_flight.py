@@ -462,7 +462,7 @@ class CachedTransport(RfTransport):
 
 
 def test_a_slow_move_leaves_the_atoms_as_warm_as_they_were() -> None:
-    """By equipartition: the mean energy is 3 kT, and a few percent more as the well is no parabola."""
+    """By equipartition: the mean energy is 3 kT, and a few percent more as the well is not a parabola."""
     flight, rng, heat = CachedTransport(GRID, spec(), SURE), np.random.default_rng(1), list[float]()
     columns = np.array([0, 5, 10, 15])
     program = program_of(batch(*(((ROW, c), (ROW, c + 2)) for c in columns.tolist())))

@@ -87,11 +87,11 @@ def test_a_folder_of_runs_names_its_latest(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"no run\.json"):
         find_run(tmp_path)
     make_finished(tmp_path, "a")
-    with pytest.raises(RecordingError, match=r"holds 1 run and is none itself; .*0001_a"):
+    with pytest.raises(RecordingError, match=r"contains 1 run but is not a run itself; .*0001_a"):
         find_run(tmp_path)
     latest = make_finished(tmp_path, "b")
     for folder in (tmp_path, latest.parent):
-        with pytest.raises(RecordingError, match=r"holds 2 runs and is none itself; .*0002_b"):
+        with pytest.raises(RecordingError, match=r"contains 2 runs but is not a run itself; .*0002_b"):
             find_run(folder)
 
 

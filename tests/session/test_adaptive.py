@@ -202,7 +202,7 @@ BOTH = "from: 1, to: 9"
         (f"use: climb, {OVER}, minimise: success, points: 3", "'maximise' and 'minimise' are both given"),
         (
             f"use: climb, over: {{{DOP}: {{from: 1, to: 9 ms}}}}, maximise: success, points: 3",
-            "'9 ms' does not go with 1; expected a number without a unit",
+            "'9 ms' and 1 have different dimensions; expected a number without a unit",
         ),
         (
             f"use: climb, over: {{{DOP}: {{{BOTH}, steps: 3}}}}, maximise: success, points: 3",

@@ -71,7 +71,7 @@ def test_a_target_is_centred_or_at_its_origin() -> None:
         ("compact:0x3", {}, "--target compact:0x3: rows is 0; expected at least 1"),
         ("compact:21x20", {}, "21 rows x 20 columns; the limit is the grid of 20 rows x 20 columns"),
         ("compact:15x15", {"origin": "6,0"}, "row 6, column 0; the limit is rows 0 to 5 and columns 0 to 5"),
-        ("compact:15x15", {"origin": "1,x"}, "this is no site"),
+        ("compact:15x15", {"origin": "1,x"}, "this is not a site"),
         ("nowhere.yaml", {}, "nowhere.yaml: there is no such file"),
         ("compact:3x3", {"planner": "pcsa"}, "--planner pcsa: unknown planner 'pcsa'; expected"),
         ("compact:3x3", {"planner": "a b"}, "this is not the name of a planner"),

@@ -36,7 +36,7 @@ BROKEN = {  # what is wrong -> old and new text of the plugin, the shutter's ent
     "settings": ("", "", "{use: mine, gain: 5}", "'gain' is not a setting of device 'mine'"),
     "constructor": (f"{INIT}pass", INIT_FAILS, "{use: mine}", "raised OSError: no card"),
     "not its role": ("def read(", "def raed(", "{use: mine}", "device 'mine' has no read"),
-    "not a mapping": ("", "", "5", "what the profile says of it is wrong"),
+    "not a mapping": ("", "", "5", "its settings in the profile are invalid"),
 }
 
 
