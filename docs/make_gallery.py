@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from labseq import SiteGrid, TargetPattern
+from labseq.assembly.plugin_choice import construct_target, load_plugins, resolve
 from labseq.config.document import Document
 from labseq.pictures.targets import save_target
-from labseq.session.chosen import construct_target, load_plugins, resolve
 from labseq.settings import PatternChoice
 
 DOCS = Path(__file__).parent

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from labseq import motion as _motion
+from labseq.assembly.calibrations import calibrated_machine
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, construct_target, load_plugins
 from labseq.config.profile import load_profile
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
 from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
 from labseq.roles import Context, Planner
-from labseq.session.calibrations import calibrated_machine
-from labseq.session.chosen import ChosenPlugin, construct_one, construct_target, load_plugins
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""

@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 _FUNCTION: Final = ctypes.CFUNCTYPE(ctypes.c_uint32, *[ctypes.c_int64] * 3)
 
 
-def call_c(address: int, a: int, b: int, c: int) -> int:
+def call_c(address: Any, a: Any, b: Any, c: Any) -> Any:
     """Call a C function with up to three integers or pointers; returns its uint32.
 
     Arguments that it does not take are ignored, as in the calling conventions of all 64-bit systems.
@@ -34,19 +34,19 @@ def call_c(address: int, a: int, b: int, c: int) -> int:
     return int(_FUNCTION(int(address))(int(a), int(b), int(c)))
 
 
-def pointer(address: int) -> int:
+def pointer(address: Any) -> Any:
     """An address for :func:`carray`."""
     return address
 
 
-def carray(pointer: int, shape: Any, dtype: Any) -> NDArray[Any]:
+def carray(pointer: Any, shape: Any, dtype: Any) -> Any:
     """The array at an address: ``carray(pointer(address), shape, dtype)``."""
     n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
     memory: Any = (ctypes.c_char * n_bytes).from_address(int(pointer))
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
-def swap(address: int, value: int) -> int:
+def swap(address: Any, value: Any) -> Any:
     """Set an int64 and return what it was, in one step for all threads."""
     word = ctypes.c_int64.from_address(int(address))
     before, word.value = word.value, value

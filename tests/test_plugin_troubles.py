@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, construct_target, validate
 from labseq.cli import main
 from labseq.cli.devices import plugins_table as table
 from labseq.config.document import Document
@@ -26,7 +27,6 @@ from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo, call_plugin
 from labseq.registry import Entry, Owner
 from labseq.roles import Context
-from labseq.session.chosen import ChosenPlugin, construct_one, construct_target, validate
 
 GOOD = '''
 from labseq.plugin import Settings, hookimpl

@@ -12,6 +12,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.assembly.assemble import Assembly, assemble_recorded
+from labseq.assembly.lab import construct, parallelism_of
+from labseq.assembly.occupancies import image_before
+from labseq.assembly.options import Options
+from labseq.assembly.planning import call_planner
+from labseq.assembly.plugin_choice import ChosenPlugin, changed_settings, resolve
+from labseq.assembly.points import Point
+from labseq.assembly.recorded import calibrations_of, files_of, machine_of
 from labseq.config.addresses import Override, split_overrides
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.guard import Guard, StopFlag
@@ -30,14 +38,6 @@ from labseq.model.estimate import mean
 from labseq.motion import check_plan
 from labseq.recording import Run, Shot
 from labseq.roles import Context, Detector, NeedsWarmUp, Planner
-from labseq.session.assembly import Assembly, assemble_recorded
-from labseq.session.chosen import ChosenPlugin, changed_settings, resolve
-from labseq.session.lab import construct, parallelism_of
-from labseq.session.occupancies import image_before
-from labseq.session.options import Options
-from labseq.session.planning import call_planner
-from labseq.session.recorded import calibrations_of, files_of, machine_of
-from labseq.session.scan import Point
 from labseq.session.scan_run import point_of, scan_run_of
 from labseq.settings import Choice
 

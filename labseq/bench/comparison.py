@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from labseq.assembly.occupancies import MAX_SITES
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
-from labseq.session.occupancies import MAX_SITES
 from labseq.units import parse_quantity
 
 Words = tuple[tuple[str, str], ...]

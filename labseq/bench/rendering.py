@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.console.text import columns
 from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
 from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.units import format_quantity
 
 N_CHANNELS: Final = 2

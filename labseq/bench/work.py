@@ -12,6 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.assembly.lab import construct
+from labseq.assembly.planning import parse_target
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_target, dump, load_plugins, resolve
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.config.addresses import Override
 from labseq.config.document import Document
@@ -23,9 +26,6 @@ from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.roles import Context, NeedsWarmUp, Planner
-from labseq.session.chosen import ChosenPlugin, construct_target, dump, load_plugins, resolve
-from labseq.session.lab import construct
-from labseq.session.planning import parse_target
 from labseq.settings import Choice, PatternChoice
 
 _DOP: Final = "degree_of_parallelism"

@@ -12,6 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 import labseq
+from labseq.assembly.calibrations import store_of, why_left_out
+from labseq.assembly.plugin_choice import DryRun
+from labseq.assembly.profile import ResolvedProfile, resolve_profile
+from labseq.assembly.recorded import recorded_machine
 from labseq.calibration.compare import Difference, compare
 from labseq.calibration.method import AnalysisResult, CalibrationData, Method
 from labseq.calibration.methods import (
@@ -34,10 +38,6 @@ from labseq.pictures.figures import can_draw, encode_figure
 from labseq.plain import now_utc
 from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
-from labseq.session.calibrations import store_of, why_left_out
-from labseq.session.chosen import DryRun
-from labseq.session.profile import ResolvedProfile, resolve_profile
-from labseq.session.recorded import recorded_machine
 from labseq.session.session import Session
 
 PICTURE_DPI: Final = 110

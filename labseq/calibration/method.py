@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from labseq.assembly.lab import construct
+from labseq.assembly.profile import ResolvedProfile
+from labseq.assembly.recorded import recorded_machine
 from labseq.calibration.store import read_entry
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.guard import StopFlag
@@ -18,9 +21,6 @@ from labseq.recording import Run
 from labseq.recording.shot_file import read_frames
 from labseq.roles import Detector
 from labseq.sequencer.clock import VirtualClock
-from labseq.session.lab import construct
-from labseq.session.profile import ResolvedProfile
-from labseq.session.recorded import recorded_machine
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from labseq.assembly.profile import ResolvedProfile
 from labseq.builtin.equalise import READINGS
 from labseq.builtin.overlay import (
     MIN_P,
@@ -29,7 +30,6 @@ from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.model import MotionSpec, SiteGrid
 from labseq.motion.axes import drive
 from labseq.recording import Run
-from labseq.session.profile import ResolvedProfile
 from labseq.units import format_quantity
 
 Floats = NDArray[np.float64]

@@ -12,6 +12,8 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.assembly.calibrations import open_store
+from labseq.assembly.plugin_choice import DryRun
 from labseq.calibration.compare import Difference, age_s, compare, quality_text, quantity
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.calibration.store import Damaged, Store, Stored, grid_text
@@ -23,8 +25,6 @@ from labseq.console.text import age_text, columns
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationKind
-from labseq.session.calibrations import open_store
-from labseq.session.chosen import DryRun
 
 MAX_LISTED: Final = 4
 """Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""

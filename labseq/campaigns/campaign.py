@@ -12,13 +12,13 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from labseq.assembly.options import Options
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document, StoredText
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
-from labseq.session.options import Options
 from labseq.settings import Settings
 
 MAX_POINTS: Final = 10_000

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from labseq.assembly.plugin_choice import HARDWARE_KINDS
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun
 from labseq.config.document import Document
 from labseq.errors import ConfigError, LabseqError, Problem
@@ -19,7 +20,6 @@ from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.run_file import read_owner, read_state
 from labseq.roles import RunObserver
-from labseq.session.chosen import HARDWARE_KINDS
 from labseq.session.provenance import plugins_of
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop

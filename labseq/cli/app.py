@@ -163,8 +163,8 @@ def run(
     _plugins: Plugins = None,
 ) -> None:
     """Run a sequence and record every shot."""
+    from labseq.assembly.options import Options
     from labseq.cli.run import run_sequence
-    from labseq.session.options import Options
 
     changes = tuple(overrides or ())
     options = Options(profile, shots, seed, changes, output, dry_run_mode(dry_run), realtime)

@@ -10,6 +10,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, cast
 
+from labseq.assembly.assemble import Assembly
+from labseq.assembly.plugin_choice import HARDWARE_KINDS, DryRun
+from labseq.assembly.search import Search
 from labseq.calibration.compare import age_s, quality_text
 from labseq.config.scan import Axis
 from labseq.config.sequence import CheckSettings
@@ -21,10 +24,7 @@ from labseq.messages import clean
 from labseq.model import TimelineEntry
 from labseq.recording import data_root
 from labseq.sequencer.policies import StepPolicy
-from labseq.session.assembly import Assembly
 from labseq.session.check import CheckReport, Rehearsal, check
-from labseq.session.chosen import HARDWARE_KINDS, DryRun
-from labseq.session.search import Search
 from labseq.session.session import Session
 from labseq.units import format_quantity
 

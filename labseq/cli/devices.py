@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from labseq.assembly.plugin_choice import DryRun, load_plugins
 from labseq.config.document import plugin_paths
 from labseq.config.profile import load_profile
 from labseq.console.errors import json_errors, report
@@ -16,9 +17,8 @@ from labseq.errors import ConfigError, DeviceError
 from labseq.kernel import announcing
 from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
-from labseq.session.chosen import DryRun, load_plugins
-from labseq.session.devices import CheckedDevice, DevicesReport, check_devices
-from labseq.session.safe import make_profile_safe, stand_by
+from labseq.safety.devices import CheckedDevice, DevicesReport, check_devices
+from labseq.safety.safe import make_profile_safe, stand_by
 from labseq.units import format_quantity
 
 _HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from labseq.assembly.options import Options
 from labseq.console.errors import lines_of
 from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
@@ -23,7 +24,6 @@ from labseq.messages import install_hint, visible
 from labseq.queue.queue import Queue
 from labseq.recording import Run, data_root, open_run
 from labseq.roles import RunObserver
-from labseq.session.options import Options
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text, running_here
 

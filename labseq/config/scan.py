@@ -1,7 +1,7 @@
 """Scans in a sequence: lists of values, ranges, and adaptive scans, whose points a scanner chooses.
 
 Only the form of a scan is checked here. Whether plugins accept the values is checked where the plugins
-are known, in ``labseq.session.scan``; the scanner and its quantity in ``labseq.session.assembly``.
+are known, in ``labseq.assembly.points``; the scanner and its quantity in ``labseq.assembly.assemble``.
 """
 
 from __future__ import annotations

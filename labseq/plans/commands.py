@@ -95,8 +95,8 @@ def plan(
 
     Batches, cycles, rows and columns are counted from 0.
     """
+    from labseq.assembly.planning import PlanRequest
     from labseq.plans.plan import PlanOutput, plan_once
-    from labseq.session.planning import PlanRequest
 
     request = PlanRequest(occupancy, target, planner, dop, tuple(overrides or ()), seed, origin, profile)
     plan_once(request, PlanOutput(step=step, json=json, png=png))
@@ -145,9 +145,9 @@ def waveform(
     _plugins: Plugins = None,
 ) -> None:
     """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
+    from labseq.assembly.planning import PlanRequest
     from labseq.plans.waveform import WaveformRequest
     from labseq.plans.waveform_report import WaveformOutput, show_waveform
-    from labseq.session.planning import PlanRequest
 
     request = PlanRequest(plan, target, planner, dop, tuple(overrides or ()), seed, origin, profile)
     output = WaveformOutput(json=json, png=png, npz=npz)

@@ -12,14 +12,14 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from labseq.assembly.occupancies import read_source
+from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.console.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
 from labseq.console.text import columns, count_of, encodes, percent, plural
 from labseq.kernel import interpret
 from labseq.model import Batch, TonePaths
 from labseq.pictures.plans import occupancies, on_grid
-from labseq.session.occupancies import read_source
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.units import format_quantity
 
 INTERPRETED_SITES: Final = 64 * 64

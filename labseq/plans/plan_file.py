@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
+from labseq.assembly.occupancies import Source
+from labseq.assembly.planning import PlannedMoves, PlanRequest, read_machine
+from labseq.assembly.recorded import Machine
 from labseq.config.addresses import split_overrides
 from labseq.config.profile import Sites
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, PlanError, Problem
 from labseq.model import Batch, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern, TonePaths
 from labseq.motion import check_plan
-from labseq.session.occupancies import Source
-from labseq.session.planning import PlannedMoves, PlanRequest, read_machine
-from labseq.session.recorded import Machine
 from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
 

@@ -16,6 +16,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from labseq.assembly.occupancies import read_source
+from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
+from labseq.assembly.plugin_choice import choose, load_plugins
 from labseq.config.addresses import split_overrides
 from labseq.config.document import plugin_paths
 from labseq.config.profile import load_profile
@@ -27,9 +30,6 @@ from labseq.motion import Renderer, tone_program
 from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
 from labseq.plans.axis_statistics import AxisStatistics, measure_axes
 from labseq.plans.plan_file import MAX_BYTES, read_plan
-from labseq.session.chosen import choose, load_plugins
-from labseq.session.occupancies import read_source
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.text_files import check_output, read_bytes
 from labseq.units import format_quantity, parse_quantity
 

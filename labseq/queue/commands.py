@@ -57,8 +57,8 @@ def add(
 
     The entry keeps the text of the sequence as it is now: later changes of the file have no effect on it.
     """
+    from labseq.assembly.options import Options
     from labseq.queue.running import add_entry
-    from labseq.session.options import Options
 
     options = Options(
         profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime

@@ -15,6 +15,7 @@ from typing import Final, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
+from labseq.assembly.options import Options
 from labseq.config.document import StoredText
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained, read_file, write_file
@@ -23,7 +24,6 @@ from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Holder, Lock, Process
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.run_file import read_state
-from labseq.session.options import Options
 from labseq.text_files import MAX_BYTES, decode, read_bytes
 
 FOLDER: Final = "queue"

@@ -12,6 +12,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.assembly.assemble import assemble
+from labseq.assembly.options import Options
 from labseq.config.find import find_profile
 from labseq.console.errors import exit_code_of, report, warning_lines
 from labseq.console.output import say
@@ -23,9 +25,7 @@ from labseq.plain import dumps
 from labseq.processes import Process
 from labseq.queue.queue import Entry, Queue
 from labseq.roles import RunObserver
-from labseq.session.assembly import assemble
 from labseq.session.check import CheckReport, check
-from labseq.session.options import Options
 from labseq.session.session import Session
 
 POLL_S: Final = 0.5

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
+from labseq.assembly.lab import construct
+from labseq.assembly.plugin_choice import ChosenPlugin
 from labseq.errors import ConfigError, DeviceError, LabseqError, StopRequested
 from labseq.files import devices_root
 from labseq.guard import StopFlag
@@ -27,8 +29,6 @@ from labseq.roles import Clock, Context, offers
 from labseq.roles.simulation import JoinsRun
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import method_of
-from labseq.session.chosen import ChosenPlugin
-from labseq.session.lab import construct
 from labseq.watchdog import Watchdog
 from labseq.wire import MAX_CONNECTIONS, Connections, MessageError, pack, report_error, unpack
 

@@ -16,6 +16,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import labseq
+from labseq.assembly.lab import timeouts_of
+from labseq.assembly.plugin_choice import HARDWARE_KINDS, ChosenPlugin
+from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.errors import (
     ConfigError,
@@ -34,13 +37,10 @@ from labseq.recording import clear_active
 from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
 from labseq.remote.simulation import ServedSimulation
 from labseq.roles import offers
+from labseq.safety.devices import check_each_device
+from labseq.safety.locks import lock_devices
+from labseq.safety.safe import construct_hardware
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin
-from labseq.session.devices import check_each_device
-from labseq.session.lab import timeouts_of
-from labseq.session.locks import lock_devices
-from labseq.session.profile import ResolvedProfile, resolve_profile
-from labseq.session.safe import construct_hardware
 from labseq.wire import (
     LOST_S,
     PATIENT_S,

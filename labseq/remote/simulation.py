@@ -12,10 +12,10 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
+from labseq.assembly.lab import construct
 from labseq.errors import DeviceError
 from labseq.remote.served import CLOSED, Run, ServedDevice, Session
 from labseq.roles import Context
-from labseq.session.lab import construct
 from labseq.wire import MessageError, error_of, pack
 
 METHODS: Final = frozenset(

@@ -21,6 +21,7 @@ from string import Template
 from typing import Final
 
 from labseq import __version__
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.find import find_profile
 from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
@@ -36,7 +37,6 @@ from labseq.scaffold.schemas import (
     schema_text,
     write_schema,
 )
-from labseq.session.chosen import load_plugins
 
 MAX_LENGTH: Final = 40
 """Maximum length of a name."""

@@ -22,6 +22,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from labseq import builtin, errors, hookspecs, roles
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.profile import ProfileSpec
 from labseq.config.scan import AdaptiveChoice
 from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec, StepPolicySettings
@@ -34,7 +35,6 @@ from labseq.messages import clean, closest
 from labseq.registry import KINDS, Entry, Registry
 from labseq.roles import EVENTS
 from labseq.scaffold.words import default_of, docstring, summary, value_of
-from labseq.session.chosen import load_plugins
 from labseq.settings import Choice
 from labseq.units import EXAMPLES, UNITS, unit_names
 

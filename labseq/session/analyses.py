@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 import labseq
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
+from labseq.assembly.recorded import context_of, plugins_of, resolved_of
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import format_error
@@ -31,8 +33,6 @@ from labseq.recording.reader import Follower
 from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
 from labseq.session.analysis_processes import FAILED, FINISH_WITHIN, USE
-from labseq.session.chosen import ChosenPlugin, construct_one
-from labseq.session.recorded import context_of, plugins_of, resolved_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
+from labseq.assembly.lab import WARM_S
+from labseq.assembly.plugin_choice import changed_settings
+from labseq.assembly.points import Point
+from labseq.assembly.wiring import unsuitable_exposures
 from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, ProblemCollector, one_of
 from labseq.guard import Guard
 from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
@@ -22,11 +26,7 @@ from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
-from labseq.session.chosen import changed_settings
-from labseq.session.lab import WARM_S
 from labseq.session.rehearsal import Rehearsal, quantile, rehearse, windows_of
-from labseq.session.scan import Point
-from labseq.session.wiring import unsuitable_exposures
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:

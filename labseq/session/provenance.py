@@ -25,7 +25,7 @@ from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
 
 if TYPE_CHECKING:
-    from labseq.session.assembly import Assembly
+    from labseq.assembly.assemble import Assembly
 
 _GIT_TIMEOUT_S: Final = 5.0
 

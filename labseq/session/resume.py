@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self, cast
 
+from labseq.assembly.assemble import Assembly, assemble_recorded
+from labseq.assembly.options import Options
+from labseq.assembly.recorded import files_of
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import LineLog, explained
 from labseq.guard import StopFlag
@@ -21,10 +24,7 @@ from labseq.recording import Run, RunWriter, open_run
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
 from labseq.recording.points import SCANNER
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
-from labseq.session.assembly import Assembly, assemble_recorded
-from labseq.session.options import Options
 from labseq.session.provenance import run_record
-from labseq.session.recorded import files_of
 from labseq.session.scan_run import scan_run_of
 from labseq.text_files import decode, read_bytes
 

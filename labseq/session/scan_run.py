@@ -10,6 +10,10 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from labseq.assembly.lab import rebuild_lab
+from labseq.assembly.points import Point
+from labseq.assembly.policies import missing_quantity
+from labseq.assembly.search import CLIMBED, ScannerCall, Search
 from labseq.config.scan import Scan
 from labseq.errors import DeviceError
 from labseq.guard import StopFlag
@@ -26,15 +30,12 @@ from labseq.sequencer.leader import Emit
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer, ShotSink
 from labseq.session.analysis_processes import AnalysisProcesses
-from labseq.session.lab import rebuild_lab
-from labseq.session.policies import Checks, missing_quantity
-from labseq.session.scan import Point
-from labseq.session.search import CLIMBED, ScannerCall, Search
+from labseq.session.checks import Checks
 from labseq.session.stopping import check_stop_file
 from labseq.watchdog import Watchdog
 
 if TYPE_CHECKING:
-    from labseq.session.assembly import Assembly
+    from labseq.assembly.assemble import Assembly
 
 
 class ShotTaker:

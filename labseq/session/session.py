@@ -11,6 +11,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, Self
 
+from labseq.assembly.assemble import Assembly, assemble
+from labseq.assembly.lab import build_lab, clock_for, warm
+from labseq.assembly.options import Options, path_of
+from labseq.assembly.plugin_choice import DryRun
+from labseq.assembly.points import Point
 from labseq.errors import ConfigError, DeviceError, RecordingError
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
@@ -20,20 +25,15 @@ from labseq.recording import Run, RunWriter, clear_active, data_root, mark_activ
 from labseq.recording.best import best_point
 from labseq.recording.folders import later_day
 from labseq.roles import RunObserver
+from labseq.safety.locks import lock_devices
+from labseq.safety.safe import make_safe_after_crash
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer
 from labseq.session.analysis_processes import AnalysisProcesses
-from labseq.session.assembly import Assembly, assemble
 from labseq.session.check import check
-from labseq.session.chosen import DryRun
-from labseq.session.lab import build_lab, clock_for, warm
-from labseq.session.locks import lock_devices
+from labseq.session.checks import Checks
 from labseq.session.observers import Observers
-from labseq.session.options import Options, path_of
-from labseq.session.policies import Checks
 from labseq.session.provenance import copies, ending, run_record
-from labseq.session.safe import make_safe_after_crash
-from labseq.session.scan import Point
 from labseq.session.scan_run import ShotTaker, scan_run_of
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
@@ -310,7 +310,7 @@ class Session:
         return build_lab(point or self.assembly.first_point, self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
-        """Compile the kernels of a lab; see :func:`labseq.session.lab.warm`."""
+        """Compile the kernels of a lab; see :func:`labseq.assembly.lab.warm`."""
         warm(lab, self.stop_flag, self._observers, devices=devices)
 
     def _end_without_watchdog(self, why: str) -> None:

@@ -9,11 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, cast
 
+from labseq.assembly.calibrations import DRY_RUN_FOLDER, FOLDER
 from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of
 from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
 from labseq.queue.queue import Entry, Queue
-from labseq.session.calibrations import DRY_RUN_FOLDER, FOLDER
 from labseq.web.history import finite
 from labseq.web.runs import Catalogue, run_id, text_of
 

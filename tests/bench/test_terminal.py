@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.cli import main
-from labseq.session.planning import PlanRequest, plan_moves
 
 SMALL = ("--grid", "8x8", "--target", "compact:5x5", "--loadings", "20", "--workers", "1")
 

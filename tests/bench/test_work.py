@@ -11,9 +11,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from labseq import Plan
+from labseq.assembly.occupancies import read_source
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.bench.work import Job, PreparedCondition, draw, lines_to_cover, loading_seed, set_up, work
-from labseq.session.occupancies import read_source
 
 
 def fewest_lines(vacancies: NDArray[np.bool_]) -> int:

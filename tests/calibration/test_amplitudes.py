@@ -13,10 +13,10 @@ from labseq_virtual.settings import MobileLightSettings
 from numpy.typing import NDArray
 
 import labseq
+from labseq.assembly.profile import resolve_profile
 from labseq.config.profile import load_profile
 from labseq.errors import ConfigError, LabseqError
 from labseq.model import Plan, SegmentKind
-from labseq.session.profile import resolve_profile
 
 PROFILE = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
 detector: {use: threshold, frame: [150, 240], centre_px: [74.5, 119.5]}

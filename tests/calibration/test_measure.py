@@ -15,14 +15,14 @@ from labseq_virtual.images import site_spots
 from labseq_virtual.settings import ImageSettings
 
 import labseq
+from labseq.assembly.assemble import assemble
+from labseq.assembly.options import Options
+from labseq.assembly.profile import resolve_profile
 from labseq.calibration.measure import METHODS
 from labseq.calibration.method import PROBE_ADDRESS, CalibrationData, count_probed
 from labseq.calibration.methods import analyse_timing
 from labseq.errors import ConfigError, DeviceError
 from labseq.model import CalibrationKind, SiteGrid, StageTiming
-from labseq.session.assembly import assemble
-from labseq.session.options import Options
-from labseq.session.profile import resolve_profile
 from labseq.testing.fakes import fake_calibration
 
 PROFILE = """grid: {rows: 6, cols: 6, spacing: 4.49 um}

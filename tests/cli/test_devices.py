@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from labseq.errors import StopRequested
-from labseq.session.devices import CheckedDevice, DevicesReport
+from labseq.safety.devices import CheckedDevice, DevicesReport
 
 PROFILE = """labseq: 1
 name: bench

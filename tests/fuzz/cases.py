@@ -16,6 +16,8 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
+from labseq.assembly.assemble import assemble
+from labseq.assembly.options import Options
 from labseq.calibration.store import encode_entry, read_entry, stem_of
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
@@ -26,8 +28,6 @@ from labseq.recording import open_run
 from labseq.recording.doctor import examine
 from labseq.recording.run_file import summary_of
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies
-from labseq.session.assembly import assemble
-from labseq.session.options import Options
 from labseq.testing.fakes import fake_calibration
 from tests.config.mutations import PIECES
 from tests.recording.damages import LOST, REPAIRABLE, lost_line, write_whole_run

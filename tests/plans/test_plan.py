@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 from rich.text import Text
 
+from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.model import Batch
 from labseq.plans.plan import PlanOutput, moves_text, plan_once, print_plan, totals, warnings
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 
@@ -225,7 +225,7 @@ def test_a_planner_that_fails_or_hangs_is_named(
         BROKEN.replace("        batches = ", "        import time; time.sleep(1)\n        batches = "),
         "utf-8",
     )
-    monkeypatch.setattr("labseq.session.planning.MAX_PLAN_S", 0.01)
+    monkeypatch.setattr("labseq.assembly.planning.MAX_PLAN_S", 0.01)
     code, _, err = call(*command)
     assert code == 1
     assert all(fact in err for fact in ("'broken'", "0.01 s", "'timeouts: {plan: "))

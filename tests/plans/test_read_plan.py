@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError
 from labseq.plans.plan_file import read_plan
-from labseq.session.planning import PlanRequest, plan_moves
 
 
 def planned(**options: Any) -> dict[str, Any]:

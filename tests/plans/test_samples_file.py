@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.assembly.planning import PlanRequest
 from labseq.errors import ConfigError
 from labseq.plans.waveform import (
     PlannedWaveform,
@@ -16,7 +17,6 @@ from labseq.plans.waveform import (
     plan_waveform,
     save_samples,
 )
-from labseq.session.planning import PlanRequest
 
 REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import labseq
+from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Plan, SegmentKind
 from labseq.plans.waveform import (
@@ -19,7 +20,6 @@ from labseq.plans.waveform import (
     plan_waveform,
     read_batches,
 )
-from labseq.session.planning import PlanRequest, plan_moves
 
 RATE = "250 MHz"
 ONE_ATOM = json.dumps(

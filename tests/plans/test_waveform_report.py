@@ -8,10 +8,10 @@ import numba
 import numpy as np
 import pytest
 
+from labseq.assembly.planning import PlanRequest
 from labseq.messages import install_hint
 from labseq.plans.waveform import PlannedWaveform, WaveformRequest, plan_waveform
 from labseq.plans.waveform_report import WaveformOutput, note, report, show_waveform, title
-from labseq.session.planning import PlanRequest
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
 

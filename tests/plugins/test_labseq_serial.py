@@ -22,8 +22,8 @@ from labseq.config.find import find_profile
 from labseq.config.yaml_nodes import compose
 from labseq.plugin import Context
 from labseq.recording import Run
+from labseq.safety.devices import check_devices
 from labseq.session.check import check
-from labseq.session.devices import check_devices
 from labseq.testing import DeviceContract
 from labseq.testing.fakes import FakeClock
 

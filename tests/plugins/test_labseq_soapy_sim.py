@@ -18,8 +18,8 @@ from labseq import Session
 from labseq.errors import LabseqError
 from labseq.plugin import Context, DeviceError, RandomStream, TransientError, TweezerAmplitudes
 from labseq.roles import RfSource, ToneSource
+from labseq.safety.devices import check_devices
 from labseq.session.check import check
-from labseq.session.devices import check_devices
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 from .labseq_soapy_rig import GRID, Rig, opened, until

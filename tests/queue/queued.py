@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from labseq.assembly.options import Options
 from labseq.errors import LabseqError
 from labseq.queue.queue import Entry, Queue
 from labseq.queue.running import Opening, QueueRun, add_checked
-from labseq.session.options import Options
 
 SEQUENCE = """
 labseq: 1

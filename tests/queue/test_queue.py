@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from labseq.assembly.options import Options
 from labseq.errors import ConfigError, RecordingError
 from labseq.processes import Process
 from labseq.queue.queue import Entry, Queue
-from labseq.session.options import Options
 
 from .queued import SEQUENCE, add, queue
 

@@ -59,8 +59,8 @@ import sys
 from labseq.kernel import load_kernels
 from labseq.model import Plan
 from labseq.motion import tone_program
-from labseq.session.lab import construct
-from labseq.session.profile import resolve_profile
+from labseq.assembly.lab import construct
+from labseq.assembly.profile import resolve_profile
 from labseq.guard import StopFlag
 from labseq.sequencer.clock import RealClock
 

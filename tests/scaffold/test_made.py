@@ -17,9 +17,9 @@ import jsonschema
 import pytest
 
 import labseq
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.document import Document
 from labseq.registry import KINDS
-from labseq.session.chosen import load_plugins
 from tests.nested import run_pytest
 
 

@@ -12,11 +12,11 @@ import pytest
 from pydantic import Field, PlainValidator
 
 import labseq
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError
 from labseq.registry import Registry
 from labseq.scaffold.schemas import FileKind, file_schema, model_schema, quantity_schema
-from labseq.session.chosen import load_plugins
 from labseq.units import UNITS
 from tests.config import test_wrong_sequences
 from tests.config.test_profile import WRONG

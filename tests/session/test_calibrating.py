@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.assembly.calibrations import open_store
 from labseq.calibration.store import Store, read_entry
 from labseq.errors import ConfigError
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.motion import correct_overlay
-from labseq.session.calibrations import open_store
 from labseq.testing.fakes import fake_calibration
 
 from .small_runs import PROFILE

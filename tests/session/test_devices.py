@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
+from labseq.assembly.lab import timeouts_of
 from labseq.config.profile import load_profile
 from labseq.errors import ConfigError, DeviceTimeoutError, StopRequested
 from labseq.guard import StopFlag
 from labseq.roles import Context
+from labseq.safety.devices import N_READINGS, CheckedDevice, check_devices, check_each_device
 from labseq.sequencer.lab import Timeouts
-from labseq.session.devices import N_READINGS, CheckedDevice, check_devices, check_each_device
-from labseq.session.lab import timeouts_of
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation
 
 from .small_runs import PROFILE

@@ -17,14 +17,14 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.assembly.profile import resolve_profile
 from labseq.errors import DeviceError
 from labseq.plugin import port_identities
 from labseq.processes import HANG_S, Lock, Process
 from labseq.recording import find_dead_run, lock_file, mark_active
-from labseq.session.devices import check_devices
-from labseq.session.locks import lock_devices
-from labseq.session.profile import resolve_profile
-from labseq.session.safe import make_profile_safe
+from labseq.safety.devices import check_devices
+from labseq.safety.locks import lock_devices
+from labseq.safety.safe import make_profile_safe
 from labseq.testing.fakes import RecordingObserver
 from tests.plugins.labseq_soapy_rig import until
 
@@ -137,7 +137,7 @@ def test_a_process_that_hangs_or_is_to_end_is_ended_before_its_devices_are_made_
     end: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("END_S", "HUNG_END_S"):
-        monkeypatch.setattr(f"labseq.session.locks.{name}", 0.1)
+        monkeypatch.setattr(f"labseq.safety.locks.{name}", 0.1)
     seen, file = RecordingObserver(), lock_file(*resolve_profile("./p.yaml").identities)
     command = [sys.executable, "-c", HOLD, str(file)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
@@ -198,7 +198,7 @@ def child_of(stack: ExitStack, *arguments: str) -> Any:
 
 
 def test_a_process_that_uses_devices_gives_signs_of_life(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq.session.locks.BEAT_S", 0.001)
+    monkeypatch.setattr("labseq.safety.locks.BEAT_S", 0.001)
     other = Lock(lock_file(*resolve_profile("./p.yaml").identities), "other")
     with lock_devices(resolve_profile("./p.yaml"), "the run x", pytest.fail):
         long_ago = time.monotonic_ns() - 3600 * 10**9

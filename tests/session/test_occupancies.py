@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import labseq
+from labseq.assembly.occupancies import MAX_BYTES, parse_text, read_source
+from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError
 from labseq.model import Occupancy
-from labseq.session.occupancies import MAX_BYTES, parse_text, read_source
-from labseq.session.planning import PlanRequest, plan_moves
 from labseq.testing.strategies import occupancies
 
 ROOT = Path(__file__).parents[2]

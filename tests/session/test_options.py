@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from labseq.assembly.options import Options
 from labseq.errors import ConfigError
-from labseq.session.options import Options
 from labseq.session.session import Session
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from labseq.assembly.occupancies import Source, read_source
+from labseq.assembly.planning import PlanInputs, PlanRequest, parse_target, read_inputs
 from labseq.errors import ConfigError
-from labseq.session.occupancies import Source, read_source
-from labseq.session.planning import PlanInputs, PlanRequest, parse_target, read_inputs
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE = ROOT / "sequences" / "compact_225.yaml"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.errors import InvalidPlanError, PlanError
 from labseq.model import SiteGrid
-from labseq.session.planning import PlannedMoves, PlanRequest, plan_moves
 from tests.system.replay import replay
 
 PLANNERS = '''

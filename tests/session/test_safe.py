@@ -16,8 +16,8 @@ from labseq.cli.entry import main
 from labseq.errors import ConfigError
 from labseq.files import devices_root
 from labseq.recording import find_dead_run, mark_active
-from labseq.session.devices import check_devices
-from labseq.session.safe import SafeStateReport, make_each_safe, make_profile_safe
+from labseq.safety.devices import check_devices
+from labseq.safety.safe import SafeStateReport, make_each_safe, make_profile_safe
 from labseq.testing.fakes import RecordingObserver, fake_lab
 from tests.hostile import HOSTILE
 from tests.plugins.labseq_soapy_rig import until

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.assembly.lab import rebuild_lab
+from labseq.assembly.points import MAX_PROBLEMS
 from labseq.errors import ConfigError
 from labseq.recording.points import scan_points
 from labseq.session.check import check
-from labseq.session.lab import rebuild_lab
-from labseq.session.scan import MAX_PROBLEMS
 from labseq.testing.fakes import RecordingObserver
 
 from . import small_runs

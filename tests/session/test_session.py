@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.assembly.profile import resolve_profile
 from labseq.errors import ConfigError
-from labseq.session.profile import resolve_profile
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import write

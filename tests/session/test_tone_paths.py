@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError
 from labseq.plans.plan_file import parse_plan
-from labseq.session.planning import PlanRequest, plan_moves
 
 PLANNER = """
 from itertools import combinations

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import labseq
-from labseq.session.profile import resolve_profile
+from labseq.assembly.profile import resolve_profile
 
 PROFILE = """
 labseq: 1

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labseq.session.planning import PlanRequest, plan_moves
+from labseq.assembly.planning import PlanRequest, plan_moves
 
 pytestmark = pytest.mark.system
 

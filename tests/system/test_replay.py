@@ -18,8 +18,8 @@ from typing import Any
 import numba
 import pytest
 
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.cli import main
-from labseq.session.chosen import load_plugins
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import yaml
 
+from labseq.assembly.options import Options
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.queue.queue import Entry, Queue
 from labseq.queue.running import QueueRun
 from labseq.scaffold.schemas import file_schema
-from labseq.session.chosen import load_plugins
-from labseq.session.options import Options
 from labseq.web.acting import form_fields
 from tests.recording.damages import rewrite_state
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Final
 
+from labseq.assembly.profile import ResolvedProfile
 from labseq.errors import DeviceError
 from labseq.files import make_shared
 from labseq.processes import Holder, Lock, Process
 from labseq.recording import lock_file
-from labseq.session.profile import ResolvedProfile
 
 BEAT_S: Final = 0.5
 """How often a process that uses devices gives a sign of life."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
+from labseq.assembly.plugin_choice import DryRun
 from labseq.config.addresses import Override
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
-from labseq.session.chosen import DryRun
 
 NOT_SET: Final = ("profile", "dry_run")
 """Options that do not replace a value of the sequence."""

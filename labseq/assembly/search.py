@@ -7,6 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, cast
 
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, resolve
+from labseq.assembly.points import Point, ScanPoints
+from labseq.assembly.policies import check_quantity
 from labseq.config.scan import Adaptive, Axis, Ends
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
@@ -14,9 +17,6 @@ from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
 from labseq.recording.points import SCANNER
 from labseq.roles import Scanner, Step
-from labseq.session.chosen import ChosenPlugin, construct_one, resolve
-from labseq.session.policies import check_quantity
-from labseq.session.scan import Point, ScanPoints
 from labseq.units import written
 
 CLIMBED: Final = "to optimise"
@@ -97,7 +97,7 @@ def make_search(
 
     Args:
         scanned: The scan, its ends checked.
-        results: Names of the results of the analyses, see :func:`labseq.session.policies.check_quantity`.
+        results: Names of the results of the analyses, see :func:`labseq.assembly.policies.check_quantity`.
     """
     adaptive = scanned.scan.adaptive
     if adaptive is None:

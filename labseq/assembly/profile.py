@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from labseq.assembly.calibrations import ActiveCalibrations, calibrated, with_calibrations
+from labseq.assembly.plugin_choice import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
 from labseq.config.addresses import Override
 from labseq.config.document import Document, plugin_paths
 from labseq.config.profile import DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
@@ -24,12 +26,10 @@ from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import Clock, Context
 from labseq.sequencer.lines import trigger_line
-from labseq.session.calibrations import ActiveCalibrations, calibrated, with_calibrations
-from labseq.session.chosen import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
 from labseq.settings import Choice
 
 if TYPE_CHECKING:
-    from labseq.session.recorded import RecordedFiles
+    from labseq.assembly.recorded import RecordedFiles
 
 
 @dataclass(frozen=True, slots=True)

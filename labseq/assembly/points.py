@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_role, dump, named, resolve, validate
+from labseq.assembly.profile import ResolvedProfile
 from labseq.config.addresses import PROFILE, ROLES, VARIABLES
 from labseq.config.document import Document
 from labseq.config.scan import Axis, Scan, put
@@ -21,8 +23,6 @@ from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
 from labseq.messages import clean
 from labseq.roles import Step
-from labseq.session.chosen import ChosenPlugin, construct_role, dump, named, resolve, validate
-from labseq.session.profile import ResolvedProfile
 from labseq.settings import Choice
 from labseq.units import parse_any
 

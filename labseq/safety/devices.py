@@ -10,6 +10,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from labseq import realtime
+from labseq.assembly.lab import WARM_S, timeouts_of
+from labseq.assembly.plugin_choice import DryRun, check_dry_run
+from labseq.assembly.profile import resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.guard import Guard, StopFlag, stop_on_signals
@@ -17,13 +20,10 @@ from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.recording import find_dead_run
 from labseq.roles import Hardware, Simulation, offers
+from labseq.safety.locks import lock_devices
+from labseq.safety.safe import construct_hardware
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, attempt, method_of, open_device
-from labseq.session.chosen import DryRun, check_dry_run
-from labseq.session.lab import WARM_S, timeouts_of
-from labseq.session.locks import lock_devices
-from labseq.session.profile import resolve_profile
-from labseq.session.safe import construct_hardware
 from labseq.watchdog import Watchdog
 
 N_READINGS: Final = 5

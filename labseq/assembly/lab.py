@@ -8,6 +8,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq import motion
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
+from labseq.assembly.profile import ResolvedProfile
+from labseq.assembly.wiring import wrong_wiring
 from labseq.config.profile import MotionSettings, ProfileSpec
 from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
@@ -17,12 +20,9 @@ from labseq.plugins import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, offers
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
-from labseq.session.chosen import ChosenPlugin, construct_one
-from labseq.session.profile import ResolvedProfile
-from labseq.session.wiring import wrong_wiring
 
 if TYPE_CHECKING:
-    from labseq.session.scan import Point
+    from labseq.assembly.points import Point
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
 """Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""

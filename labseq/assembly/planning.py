@@ -13,6 +13,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.assembly.calibrations import calibrated_machine
+from labseq.assembly.lab import construct, parallelism_of
+from labseq.assembly.occupancies import Source, read_source
+from labseq.assembly.plugin_choice import (
+    ChosenPlugin,
+    changed_settings,
+    construct_target,
+    load_plugins,
+    resolve,
+)
+from labseq.assembly.recorded import Machine, recorded_machine
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.document import Document, plugin_paths
 from labseq.config.profile import load_profile
@@ -25,17 +36,6 @@ from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
 from labseq.roles import Context, Planner
-from labseq.session.calibrations import calibrated_machine
-from labseq.session.chosen import (
-    ChosenPlugin,
-    changed_settings,
-    construct_target,
-    load_plugins,
-    resolve,
-)
-from labseq.session.lab import construct, parallelism_of
-from labseq.session.occupancies import Source, read_source
-from labseq.session.recorded import Machine, recorded_machine
 from labseq.settings import Choice, PatternChoice
 from labseq.text_files import YAML_SUFFIXES
 
@@ -54,7 +54,7 @@ class PlanRequest:
     """The arguments of ``labseq plan``, as text.
 
     Attributes:
-        occupancy: See :func:`labseq.session.occupancies.read_source`.
+        occupancy: See :func:`labseq.assembly.occupancies.read_source`.
         target: "kagome:15x15", "kagome:rows=15,cols=15" or a sequence file; None
             for the target that a shot was taken with.
         planner: Its name.

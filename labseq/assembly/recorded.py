@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.calibration.store import read_entry
 from labseq.config.document import StoredText
 from labseq.config.profile import MOTION_KEYS, GridSettings, MotionSettings
@@ -19,7 +20,6 @@ from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
 from labseq.recording.reader import Run
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
-from labseq.session.chosen import load_plugins
 from labseq.text_files import beside
 
 

@@ -7,17 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
-from labseq.config.document import Document, StoredText, plugin_paths
-from labseq.config.find import find_sequence
-from labseq.config.scan import Scan
-from labseq.config.sequence import SequenceSpec, load_sequence
-from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
-from labseq.model import TargetPattern
-from labseq.recording.results import PREFIX
-from labseq.roles import Context, Step
-from labseq.sequencer.policies import RunPolicy
-from labseq.session.chosen import (
+from labseq.assembly.options import NOT_SET, Options
+from labseq.assembly.plugin_choice import (
     ChosenPlugin,
     DryRun,
     check_dry_run,
@@ -28,16 +19,25 @@ from labseq.session.chosen import (
     resolve,
     validate,
 )
-from labseq.session.options import NOT_SET, Options
-from labseq.session.policies import make_policy, with_policies
-from labseq.session.profile import ResolvedProfile, resolve_profile
-from labseq.session.scan import Point, ScanPoints, make_step, place_note
-from labseq.session.search import Search, make_search
+from labseq.assembly.points import Point, ScanPoints, make_step, place_note
+from labseq.assembly.policies import make_policy, with_policies
+from labseq.assembly.profile import ResolvedProfile, resolve_profile
+from labseq.assembly.search import Search, make_search
+from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
+from labseq.config.document import Document, StoredText, plugin_paths
+from labseq.config.find import find_sequence
+from labseq.config.scan import Scan
+from labseq.config.sequence import SequenceSpec, load_sequence
+from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
+from labseq.model import TargetPattern
+from labseq.recording.results import PREFIX
+from labseq.roles import Context, Step
+from labseq.sequencer.policies import RunPolicy
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of
 
 if TYPE_CHECKING:
-    from labseq.session.recorded import RecordedFiles
+    from labseq.assembly.recorded import RecordedFiles
 
 
 class Setting(NamedTuple):

@@ -11,6 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.assembly.lab import construct, timeouts_of
+from labseq.assembly.plugin_choice import HARDWARE_KINDS, load_plugins
+from labseq.assembly.profile import ResolvedProfile, choose_plugins
 from labseq.config.addresses import profile_overrides
 from labseq.config.document import plugin_paths
 from labseq.config.profile import load_profile
@@ -28,12 +31,9 @@ from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, find_dead_run, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation
+from labseq.safety.locks import end_holders, lock_devices, named
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, attempt, failure_of, in_safe_order, open_device
-from labseq.session.chosen import HARDWARE_KINDS, load_plugins
-from labseq.session.lab import construct, timeouts_of
-from labseq.session.locks import end_holders, lock_devices, named
-from labseq.session.profile import ResolvedProfile, choose_plugins
 from labseq.watchdog import TRY_AGAIN_S, Hanging, Watchdog, watchdog_lines
 
 _NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}

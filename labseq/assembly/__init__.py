@@ -1,0 +1,1 @@
+"""From files to objects: settings validated, plugins chosen and constructed; no device is opened."""
