@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 
 from labseq import Run, Session, ShotRecord, open_run
 from labseq.analysis.statistics import Statistics, statistics_of
+from labseq.data.points import scan_points
 from labseq.files import write_file
 from labseq.model.estimate import Estimate, Rate
-from labseq.recording.points import scan_points
 from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
 

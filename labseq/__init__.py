@@ -54,7 +54,7 @@ _HOMES = {
         "check_plan",
         "render",
     ),
-    "labseq.recording": (
+    "labseq.data": (
         "Run",
         "open_run",
     ),

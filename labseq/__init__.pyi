@@ -45,7 +45,7 @@ from labseq.motion import (
     check_plan as check_plan,
     render as render,
 )
-from labseq.recording import (
+from labseq.data import (
     Run as Run,
     open_run as open_run,
 )

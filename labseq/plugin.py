@@ -6,6 +6,7 @@ A plugin needs no other module of labseq, except :mod:`labseq.testing` in its te
 from __future__ import annotations
 
 from labseq import wire
+from labseq.data import Run, open_run
 from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle, wait_for
 from labseq.drivers.camera import check_step, nearest
 from labseq.drivers.serial_port import (
@@ -124,7 +125,6 @@ from labseq.native import (
 )
 from labseq.processes import Process
 from labseq.realtime import raise_priority
-from labseq.recording import Run, open_run
 from labseq.registry import Registry
 from labseq.roles import (
     WHOLE_SENSOR,

@@ -19,8 +19,8 @@ from labseq.campaigns.commands import run_file
 from labseq.campaigns.running import run_at_once, run_in_turn
 from labseq.cli import main
 from labseq.cluster import ClusterWorkers
+from labseq.data import Run
 from labseq.errors import ConfigError, StopRequested
-from labseq.recording import Run
 from labseq.session.session import Session
 from labseq.workers import ProcessWorkers
 from tests.session.small_runs import OWN_DEVICE, PROFILE, table, write

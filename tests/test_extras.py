@@ -26,10 +26,10 @@ from labseq import messages
 from labseq.builtin.patterns import read_drawing
 from labseq.campaigns.certificates import make_certificates
 from labseq.cluster import connect
+from labseq.data.export import check_export
 from labseq.errors import LabseqError
 from labseq.model import ScanSpace
 from labseq.pictures.figures import check_place
-from labseq.recording.export import check_export
 from labseq.recording.hdf5 import load_filter
 from labseq.web.serve import check_packages
 from labseq.wire import require_packages

@@ -14,14 +14,14 @@ from labseq.analysis.scanned import DEFAULT, WITHOUT_TARGET, Scanned, make_axis
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_runs
 from labseq.console.output import say
 from labseq.console.text import plural
+from labseq.data import Run, Shot
+from labseq.data.points import ScanPoint
+from labseq.data.quantities import Quantity, description_of
+from labseq.data.tables import check_installed
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained, whole_file
 from labseq.messages import clean, visible
-from labseq.recording import Run, Shot
 from labseq.recording.folders import RUN_FILE, find_run
-from labseq.recording.points import ScanPoint
-from labseq.recording.quantities import Quantity, description_of
-from labseq.recording.tables import check_installed
 from labseq.units import parse_any, si_unit_of
 
 if TYPE_CHECKING:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.timing import StageStatistics
+from labseq.data import Run, Shot
+from labseq.data.images import average_frame, signals_of
 from labseq.model import SiteGrid
 from labseq.model.estimate import Estimate, Estimated, Rate, mean
 from labseq.pictures.figures import (
@@ -23,8 +25,6 @@ from labseq.pictures.figures import (
     place_sites,
     show_plain_numbers,
 )
-from labseq.recording import Run, Shot
-from labseq.recording.images import average_frame, signals_of
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:

@@ -42,15 +42,15 @@ from labseq.analysis.scanned import (
 from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, statistics_of
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration.store import read_entry
+from labseq.data import Run, Shot
+from labseq.data.images import loading_map
+from labseq.data.quantities import Quantity, steps_that_load
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.estimate import Estimated, Rate
 from labseq.pictures.figures import make_figure, save_figure
-from labseq.recording import Run, Shot
-from labseq.recording.images import loading_map
-from labseq.recording.quantities import Quantity, steps_that_load
 from labseq.roles import Context
 from labseq.units import factor_of
 

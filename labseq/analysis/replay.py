@@ -21,6 +21,7 @@ from labseq.assembly.plugin_choice import ChosenPlugin, changed_settings, resolv
 from labseq.assembly.points import Point
 from labseq.assembly.recorded import calibrations_of, files_of, machine_of
 from labseq.config.addresses import Override, split_overrides
+from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean, format_error
@@ -36,7 +37,6 @@ from labseq.model import (
 )
 from labseq.model.estimate import mean
 from labseq.motion import check_plan
-from labseq.recording import Run, Shot
 from labseq.roles import Context, Detector, NeedsWarmUp, Planner
 from labseq.session.scan_run import point_of, scan_run_of
 from labseq.settings import Choice

@@ -12,13 +12,13 @@ import numpy as np
 
 from labseq.analysis.fits import Fit, fit_points
 from labseq.console.text import columns, count_of
+from labseq.data import Run
+from labseq.data.columns import Column, make_column
+from labseq.data.points import ScanPoint, scan_points
+from labseq.data.quantities import Quantity, description_of, find_quantity, select_shots
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate, as_mapping
-from labseq.recording import Run
-from labseq.recording.columns import Column, make_column
-from labseq.recording.points import ScanPoint, scan_points
-from labseq.recording.quantities import Quantity, description_of, find_quantity, select_shots
 from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of, split_quantity
 
 MIN_FULL: Final = 0.5
@@ -88,7 +88,7 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     Args:
         run: The run.
         conditions: Only shots that meet all of them are kept, see
-            :func:`labseq.recording.quantities.select_shots`.
+            :func:`labseq.data.quantities.select_shots`.
 
     Raises:
         RecordingError: The scan in run.json is damaged.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.overview import cannot_draw, grid_of, note_of, sites_of
+from labseq.data import Run, Shot
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern
@@ -37,7 +38,6 @@ from labseq.pictures.plans import (
     paint_numbers,
     paint_sites,
 )
-from labseq.recording import Run, Shot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,12 +11,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.model import Occupancy, TargetPattern, follow_atoms
 from labseq.model.estimate import Estimate, Rate, as_mapping, mean
 from labseq.plain import to_plain
 from labseq.recording.run_file import ShotSummary
-from labseq.recording.shot import Shot
 
 Counts = NDArray[np.int64]
 

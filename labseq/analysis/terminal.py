@@ -30,12 +30,12 @@ from labseq.config.document import Document
 from labseq.console.output import as_line, json_writer, report_compiling, say, stdout_to_stderr
 from labseq.console.runs import chosen_run
 from labseq.console.text import columns, count_of, percent, plural, settings_text
+from labseq.data import Run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import as_mapping, mean
 from labseq.pictures.figures import check_place
 from labseq.plain import to_plain
-from labseq.recording import Run
 from labseq.session.analyses import AnalysisOutcome, analyse_missing, analyses_of
 from labseq.session.analysis_processes import USE
 from labseq.units import format_quantity

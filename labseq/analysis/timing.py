@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.data import Run, Shot
 from labseq.errors import RecordingError
 from labseq.model import StageTiming
 from labseq.model.records import OVERSHOOT_S, STEP
-from labseq.recording import Run, Shot
 
 ORDER: Final = (
     *("load", "arm", "expose", "read_out", "detect", "plan", "check"),

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 from labseq.config.document import Document
 from labseq.config.sequence import SequenceSpec, StepPolicySettings, StepSpec
+from labseq.data.columns import QUANTITIES
+from labseq.data.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model.records import unique_names
-from labseq.recording.columns import QUANTITIES
-from labseq.recording.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.recording.results import PREFIX
 from labseq.roles import Step
 from labseq.sequencer.policies import RunPolicy, StepPolicy

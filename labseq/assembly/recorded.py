@@ -12,12 +12,12 @@ from labseq.calibration.store import read_entry
 from labseq.config.document import StoredText
 from labseq.config.profile import MOTION_KEYS, GridSettings, MotionSettings
 from labseq.config.validation import validate_values
+from labseq.data.reader import Run
 from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
 from labseq.plugins import PluginHost
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
-from labseq.recording.reader import Run
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
 from labseq.text_files import beside

@@ -11,11 +11,11 @@ from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, resolve
 from labseq.assembly.points import Point, ScanPoints
 from labseq.assembly.policies import check_quantity
 from labseq.config.scan import Adaptive, Axis, Ends
+from labseq.data.points import SCANNER
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
-from labseq.recording.points import SCANNER
 from labseq.roles import Scanner, Step
 from labseq.units import written
 

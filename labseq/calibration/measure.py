@@ -31,12 +31,12 @@ from labseq.calibration.thresholds import analyse_thresholds
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.console.runs import existing_run
+from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean, install_hint
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, SiteGrid, grid_facts, same_grid
 from labseq.pictures.figures import can_draw, encode_figure
 from labseq.plain import now_utc
-from labseq.recording import Run, open_run
 from labseq.roles import RunObserver
 from labseq.session.session import Session
 

@@ -14,10 +14,10 @@ from labseq.assembly.lab import construct
 from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.recorded import recorded_machine
 from labseq.calibration.store import read_entry
+from labseq.data import Run
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.guard import StopFlag
 from labseq.model import CalibrationKind, Frame, MotionSpec, SiteGrid
-from labseq.recording import Run
 from labseq.recording.shot_file import read_frames
 from labseq.roles import Detector
 from labseq.sequencer.clock import VirtualClock

@@ -24,12 +24,12 @@ from labseq.builtin.overlay import (
 )
 from labseq.calibration.method import AnalysisResult, CalibrationData, ProbeCounts, count_probed
 from labseq.calibration.pictures import draw_powers, draw_sites, draw_survival, draw_tone_offsets
+from labseq.data import Run
 from labseq.detection.lattice import FoundLattice, find_lattice
 from labseq.detection.sites import read_sites
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.model import MotionSpec, SiteGrid
 from labseq.motion.axes import drive
-from labseq.recording import Run
 from labseq.units import format_quantity
 
 Floats = NDArray[np.float64]

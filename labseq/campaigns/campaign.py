@@ -15,9 +15,9 @@ from pydantic import Field
 from labseq.assembly.options import Options
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document, StoredText
+from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
-from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
 from labseq.settings import Settings
 

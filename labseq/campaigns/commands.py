@@ -11,7 +11,7 @@ import typer
 
 if TYPE_CHECKING:
     from labseq.campaigns.campaign import Campaign, PlannedRun
-    from labseq.recording import Run
+    from labseq.data import Run
 
 campaign = typer.Typer(
     name="campaign",

@@ -12,11 +12,11 @@ from typing import Any, TypeAlias
 from labseq.assembly.plugin_choice import HARDWARE_KINDS
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun
 from labseq.config.document import Document
+from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.files import explained, write_file
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import clean, visible
-from labseq.recording import Run, open_run
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.run_file import read_owner, read_state
 from labseq.roles import RunObserver

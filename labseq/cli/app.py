@@ -247,7 +247,7 @@ def run_campaign(
     from labseq.campaigns.commands import run_file
     from labseq.cli.run import run_session
     from labseq.console.output import check_writable
-    from labseq.recording.tables import check_installed
+    from labseq.data.tables import check_installed
 
     folder = output.expanduser()
     if netcdf is not None:  # before the first run

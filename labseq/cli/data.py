@@ -11,12 +11,13 @@ from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.console.output import as_line, say
 from labseq.console.runs import chosen_run, existing_run
 from labseq.console.text import columns, plural
+from labseq.data import Run
+from labseq.data.export import ENDINGS, check_export, export_run, files_of, write_columns
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained
 from labseq.messages import visible
-from labseq.recording import Run, data_root
+from labseq.recording import data_root
 from labseq.recording.doctor import Report, examine as find_damage
-from labseq.recording.export import ENDINGS, check_export, export_run, files_of, write_columns
 
 MAX_ROWS: Final = 200
 """Maximum number of findings that are printed."""

@@ -22,9 +22,9 @@ from rich.text import Text
 from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
 from labseq.console.text import clock_time, count_of, plural
+from labseq.data.points import SCANNER, ChosenPoints
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
 from labseq.model.estimate import Estimate, jeffreys, mean
-from labseq.recording.points import SCANNER, ChosenPoints
 from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25

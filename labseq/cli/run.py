@@ -18,11 +18,12 @@ from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import existing_run
 from labseq.console.text import plural, quoted
+from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import install_hint, visible
 from labseq.queue.queue import Queue
-from labseq.recording import Run, data_root, open_run
+from labseq.recording import data_root
 from labseq.roles import RunObserver
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text, running_here

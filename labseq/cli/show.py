@@ -17,10 +17,10 @@ from labseq.console.events import outcome, scanned_values
 from labseq.console.output import as_line, say
 from labseq.console.runs import chosen_run
 from labseq.console.text import columns, percent, settings_text
+from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
 from labseq.model.records import STEP
-from labseq.recording import Run, Shot
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:

@@ -18,11 +18,11 @@ from labseq.analysis.scanned import (
 )
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.console.text import columns, count_of, plural, quoted
+from labseq.data import Run
+from labseq.data.best import best_point
 from labseq.messages import clean
 from labseq.model.estimate import mean
 from labseq.plain import to_plain
-from labseq.recording import Run
-from labseq.recording.best import best_point
 from labseq.recording.run_file import RunTime
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines

@@ -15,10 +15,10 @@ from labseq.cli.show import shot_time_s
 from labseq.cli.summary import summary_lines
 from labseq.console.output import say
 from labseq.console.runs import chosen_run
+from labseq.data import Run, Shot, open_run
 from labseq.errors import RecordingError
 from labseq.files import NewLines
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
-from labseq.recording import Run, Shot, open_run
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
 from labseq.recording.run_file import RunTime, is_index_row, read_state
 from labseq.roles import RunObserver

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import is_there
 from labseq.messages import clean, visible
-from labseq.recording import Run, data_root, open_run
+from labseq.recording import data_root
 from labseq.recording.folders import RUN_FILE, counter_of, find_run, runs_in
 
 

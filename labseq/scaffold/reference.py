@@ -349,7 +349,7 @@ def index_keys() -> list[Block]:
 
 def quantities() -> list[Block]:
     """A row per quantity of a shot, which a scan can optimise and a policy can watch."""
-    from labseq.recording.columns import DESCRIPTIONS, GROUPS, QUANTITIES
+    from labseq.data.columns import DESCRIPTIONS, GROUPS, QUANTITIES
 
     rows = {name: DESCRIPTIONS[name] for name in QUANTITIES}
     return [_named("quantity", rows | {f"{prefix}NAME": about for prefix, about in GROUPS.items()})]

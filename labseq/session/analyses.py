@@ -24,12 +24,12 @@ import labseq
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
 from labseq.assembly.recorded import context_of, plugins_of, resolved_of
 from labseq.config.validation import validate_values
+from labseq.data import Run, open_run
+from labseq.data.reader import Follower
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import format_error
 from labseq.plain import now_utc
 from labseq.processes import Lock, knows_no_locks
-from labseq.recording import Run, open_run
-from labseq.recording.reader import Follower
 from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
 from labseq.roles import Analysis, RecordedShot
 from labseq.session.analysis_processes import FAILED, FINISH_WITHIN, USE

@@ -11,11 +11,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.data import Run, open_run
 from labseq.errors import DeviceError, LabseqError
 from labseq.files import check_ordinary
 from labseq.guard import StopFlag
 from labseq.messages import clean, did_you_mean, listing
-from labseq.recording import Run, open_run
 from labseq.recording.results import ERROR, PREFIX, SHOT, Results, done, read_results, results_file
 from labseq.roles import RunObserver
 from labseq.units import format_quantity

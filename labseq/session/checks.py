@@ -12,12 +12,12 @@ import numpy as np
 
 from labseq.assembly.policies import missing_quantity
 from labseq.config.sequence import CheckSettings
+from labseq.data.columns import quantities_in
+from labseq.data.quantities import make_quantity
+from labseq.data.shot import Shot, caching_loader
 from labseq.errors import CheckFailedError
 from labseq.model import TargetPattern
-from labseq.recording.columns import quantities_in
-from labseq.recording.quantities import make_quantity
 from labseq.recording.results import PREFIX
-from labseq.recording.shot import Shot, caching_loader
 from labseq.session.analysis_processes import AnalysisProcesses
 
 

@@ -13,6 +13,8 @@ from typing import Any, Final, NamedTuple, Self, cast
 from labseq.assembly.assemble import Assembly, assemble_recorded
 from labseq.assembly.options import Options
 from labseq.assembly.recorded import files_of
+from labseq.data import Run, open_run
+from labseq.data.points import SCANNER
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import LineLog, explained
 from labseq.guard import StopFlag
@@ -20,9 +22,8 @@ from labseq.messages import visible
 from labseq.model import RunRecord
 from labseq.plain import dumps, now_utc
 from labseq.processes import Lock, knows_no_locks
-from labseq.recording import Run, RunWriter, open_run
+from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
-from labseq.recording.points import SCANNER
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
 from labseq.session.provenance import run_record
 from labseq.session.scan_run import scan_run_of

@@ -15,15 +15,16 @@ from labseq.assembly.points import Point
 from labseq.assembly.policies import missing_quantity
 from labseq.assembly.search import CLIMBED, ScannerCall, Search
 from labseq.config.scan import Scan
+from labseq.data import Run, Shot
+from labseq.data.columns import quantities_in
+from labseq.data.quantities import make_quantity
+from labseq.data.shot import caching_loader
 from labseq.errors import DeviceError
 from labseq.guard import StopFlag
 from labseq.model import RunRecord, VisitedPoint
 from labseq.plain import dumps
-from labseq.recording import Run, RunWriter, Shot
-from labseq.recording.columns import quantities_in
-from labseq.recording.quantities import make_quantity
+from labseq.recording import RunWriter
 from labseq.recording.results import PREFIX
-from labseq.recording.shot import caching_loader
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.leader import Emit

@@ -16,13 +16,14 @@ from labseq.assembly.lab import build_lab, clock_for, warm
 from labseq.assembly.options import Options, path_of
 from labseq.assembly.plugin_choice import DryRun
 from labseq.assembly.points import Point
+from labseq.data import Run, open_run
+from labseq.data.best import best_point
 from labseq.errors import ConfigError, DeviceError, RecordingError
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord
 from labseq.realtime import real_time
-from labseq.recording import Run, RunWriter, clear_active, data_root, mark_active, open_run
-from labseq.recording.best import best_point
+from labseq.recording import RunWriter, clear_active, data_root, mark_active
 from labseq.recording.folders import later_day
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices

@@ -13,15 +13,15 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Final, cast
 
+from labseq.data import Run, Shot
+from labseq.data.shot import caching_loader
 from labseq.errors import RecordingError
 from labseq.files import NewLines, read_file, write_file
 from labseq.messages import visible
 from labseq.model import TargetPattern
 from labseq.plain import dumps, now_utc, parse_object
-from labseq.recording import Run, Shot
 from labseq.recording.folders import EVENTS_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
 from labseq.recording.run_file import RunTime, read_run, read_state, target_of
-from labseq.recording.shot import caching_loader
 from labseq.web.history import RunHistory, finite, judged_values
 
 MAX_TEXT: Final = 2000

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from labseq.data import Shot
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, TargetPattern
 from labseq.plain import to_plain
-from labseq.recording import Shot
 from labseq.recording.shot_file import iter_frames
 from labseq.web.history import finite
 from labseq.web.runs import text_of

@@ -18,14 +18,14 @@ from labseq.analysis.timing import StageTotals
 from labseq.calibration.store import read_entry
 from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, percent, plural, size_text
+from labseq.data import Shot, open_run
+from labseq.data.points import SCANNER, ScanPoint
 from labseq.errors import LabseqError, RecordingError
 from labseq.model import StageTiming
 from labseq.model.estimate import Rate, mean
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
-from labseq.recording import Shot, open_run
 from labseq.recording.folders import STOP_FILE
-from labseq.recording.points import SCANNER, ScanPoint
 from labseq.recording.run_file import read_state
 from labseq.web.history import Columns, finite, judged_values
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.data import Run, open_run
 from labseq.model import ShotRecord
-from labseq.recording import Run, RunWriter, open_run
+from labseq.recording import RunWriter
 
 from .records import make_run
 

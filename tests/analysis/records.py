@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from labseq.data import Run
 from labseq.model import (
     CycleRecord,
     Frame,
@@ -21,7 +22,6 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
-from labseq.recording import Run
 
 ROOT = Path(__file__).parents[2]
 SHAPE = (4, 5)

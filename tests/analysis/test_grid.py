@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from labseq.analysis.overview import grid_of, sites_of
 from labseq.calibration.store import encode_entry
+from labseq.data import Run, open_run
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.calibration import grid_facts
-from labseq.recording import Run, open_run
 from labseq.recording.schema import RUN_FORMAT_VERSION
 
 Floats = NDArray[np.float64]

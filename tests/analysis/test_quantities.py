@@ -16,10 +16,10 @@ import labseq
 from labseq.analysis.fits import MODELS, RB87_U, Fit, fit_points
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
+from labseq.data.points import scan_points
+from labseq.data.quantities import OF_IMAGES, select_shots
 from labseq.errors import ConfigError
 from labseq.model.estimate import Estimate, Estimated, Rate
-from labseq.recording.points import scan_points
-from labseq.recording.quantities import OF_IMAGES, select_shots
 
 from .records import Write, make_shot
 

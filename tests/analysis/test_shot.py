@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from labseq.analysis.shot import DPI, ShotDrawing, ShotPanel, save_shot, shot_picture
+from labseq.data import Run
 from labseq.errors import ConfigError
 from labseq.model import SiteGrid, TargetPattern
 from labseq.pictures.figures import HEAD_IN
 from labseq.pictures.plans import ATOM_LOOK
-from labseq.recording import Run
 from tests.pictures.pixels import are_at, decoded, is_colour, on_lattice, spots
 
 from .records import SHAPE, Write, image, make_shot, target

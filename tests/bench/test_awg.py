@@ -17,7 +17,7 @@ import pytest
 
 from labseq import Run, Session
 from labseq.cli import main
-from labseq.recording.shot import Shot
+from labseq.data.shot import Shot
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "compact_225.yaml"
 N_SHOTS = int(os.environ.get("LABSEQ_SHOTS", "1"))

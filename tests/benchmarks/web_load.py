@@ -24,7 +24,7 @@ from urllib.request import urlopen
 import numpy as np
 import psutil
 
-from labseq.recording import Run, open_run
+from labseq.data import Run, open_run
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE, PROFILE = ROOT / "sequences" / "compact_225.yaml", ROOT / "hardware_profiles" / "virtual.yaml"
@@ -35,7 +35,8 @@ WRITE = """
 import sys, time
 from dataclasses import replace
 from pathlib import Path
-from labseq.recording import RunWriter, open_run
+from labseq.data import open_run
+from labseq.recording import RunWriter
 from tests.recording.records import make_run
 source, root = open_run(sys.argv[1]), Path(sys.argv[2])
 n_shots, interval_s = int(sys.argv[3]), float(sys.argv[4])

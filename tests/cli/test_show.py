@@ -15,9 +15,10 @@ from labseq.cli.show import Tables, show_run
 from labseq.cli.summary import MAX_ROWS, summary_lines
 from labseq.console.runs import newest_run
 from labseq.console.text import columns
+from labseq.data import open_run
 from labseq.errors import ConfigError
 from labseq.model import StageTiming
-from labseq.recording import RunWriter, open_run
+from labseq.recording import RunWriter
 
 NO_TERMINAL = pytest.mark.usefixtures("capsys")
 """Tables are as wide as the terminal."""

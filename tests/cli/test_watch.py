@@ -12,7 +12,8 @@ import pytest
 
 from labseq.cli.live import Tally
 from labseq.cli.watch import POLL_S, EventReader, NewLines, watch_run
-from labseq.recording import RunWriter, open_run
+from labseq.data import open_run
+from labseq.recording import RunWriter
 
 
 class WatchedRun:

@@ -15,7 +15,7 @@ from labseq.cli.show import Tables, show_run
 from labseq.cli.watch import EventReader
 from labseq.console.arrays import UNICODE
 from labseq.console.events import LogLines, event_text
-from labseq.recording.points import scan_points
+from labseq.data.points import scan_points
 from tests.session.small_runs import PROFILE
 
 DOP = "planner.degree_of_parallelism"

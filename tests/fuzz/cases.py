@@ -19,12 +19,12 @@ import numpy as np
 from labseq.assembly.assemble import assemble
 from labseq.assembly.options import Options
 from labseq.calibration.store import encode_entry, read_entry, stem_of
+from labseq.data import open_run
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
 from labseq.plans.plan_file import parse_plan
 from labseq.queue.queue import Entry, Queue
 from labseq.queue.running import list_entries
-from labseq.recording import open_run
 from labseq.recording.doctor import examine
 from labseq.recording.run_file import summary_of
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies

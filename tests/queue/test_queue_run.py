@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
+from labseq.data import open_run
 from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.processes import Process
 from labseq.queue.queue import Queue
 from labseq.queue.running import Opening, QueueRun
-from labseq.recording import open_run
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop
 

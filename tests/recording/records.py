@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from labseq.data import Run, open_run
 from labseq.model import (
     CycleRecord,
     Frame,
@@ -20,7 +21,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
-from labseq.recording import Run, RunWriter, open_run
+from labseq.recording import RunWriter
 
 START = "2026-11-20T10:00:00.000000+00:00"
 SHAPE = (4, 5)

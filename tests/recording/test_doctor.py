@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from labseq.recording import RunWriter, doctor, mark_active, open_run
+from labseq.data import open_run
+from labseq.recording import RunWriter, doctor, mark_active
 from labseq.recording.doctor import examine
 from tests.locking import held_elsewhere
 

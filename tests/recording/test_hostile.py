@@ -15,12 +15,12 @@ import h5py
 import numpy as np
 import pytest
 
+from labseq.data import open_run
+from labseq.data.columns import columns_of
+from labseq.data.export import export_run
+from labseq.data.reader import Follower
 from labseq.errors import RecordingError
-from labseq.recording import open_run
-from labseq.recording.columns import columns_of
 from labseq.recording.doctor import examine
-from labseq.recording.export import export_run
-from labseq.recording.reader import Follower
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies
 from labseq.watchdog import WATCHDOG_LOG, watchdog_lines
 

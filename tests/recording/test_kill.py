@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.recording import open_run
+from labseq.data import open_run
 from labseq.recording.doctor import examine
 
 WRITE_FOR_EVER = """

@@ -16,7 +16,7 @@ from labseq.analysis.overview import overview, picture_of
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.cli.show import shot_table
 from labseq.cli.summary import summary_lines
-from labseq.recording.images import average_frame, loading_map, signals_of
+from labseq.data.images import average_frame, loading_map, signals_of
 
 from .records import make_shot, write
 

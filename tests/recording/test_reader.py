@@ -13,10 +13,11 @@ import h5py
 import numpy as np
 import pytest
 
+from labseq.data import open_run
+from labseq.data.reader import Follower
 from labseq.errors import RecordingError
-from labseq.recording import RunWriter, open_run
+from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE
-from labseq.recording.reader import Follower
 
 from .records import make_run, make_shot, write
 

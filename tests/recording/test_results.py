@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from labseq.data import open_run
 from labseq.errors import RecordingError
-from labseq.recording import RunWriter, open_run
+from labseq.recording import RunWriter
 from labseq.recording.results import ResultsLog, done, read_results, results_file
 
 from .records import make_run

@@ -15,6 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
+from labseq.data import open_run
+from labseq.data.images import average_frame
 from labseq.errors import RecordingError
 from labseq.messages import install_hint
 from labseq.model import (
@@ -28,8 +30,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
-from labseq.recording import RunWriter, open_run
-from labseq.recording.images import average_frame
+from labseq.recording import RunWriter
 
 from .records import assert_same, make_run, make_shot, write
 

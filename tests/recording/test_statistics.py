@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from labseq.analysis.statistics import statistics_of
+from labseq.data import Run, open_run
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
 from labseq.model.estimate import Rate
-from labseq.recording import Run, RunWriter, open_run
+from labseq.recording import RunWriter
 from labseq.recording.run_file import summarise, summary_of
 
 from .records import make_run, make_shot

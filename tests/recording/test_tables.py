@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from labseq.data import Run, open_run
+from labseq.data.columns import columns_of
 from labseq.errors import ConfigError, RecordingError
 from labseq.messages import install_hint
-from labseq.recording import Run, RunWriter, open_run
-from labseq.recording.columns import columns_of
+from labseq.recording import RunWriter
 
 from .records import make_run, make_shot, write
 from .scanned import ADDRESSES, DEGREES, N_REPEATS, WINDOWS_S, write_scan
@@ -182,7 +183,7 @@ def test_a_missing_package_is_explained(run: Run, monkeypatch: pytest.MonkeyPatc
         return None if name == package else found(name)
 
     found = importlib.util.find_spec
-    monkeypatch.setattr("labseq.recording.tables.find_spec", without)
+    monkeypatch.setattr("labseq.data.tables.find_spec", without)
     with pytest.raises(
         ConfigError, match=re.escape(f"{package}, which is not installed; {install_hint('analysis')}")
     ):

@@ -17,9 +17,10 @@ from typing import Any
 
 import pytest
 
+from labseq.data import open_run
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
-from labseq.recording import RunWriter, open_run
+from labseq.recording import RunWriter
 from labseq.recording.run_file import summarise
 
 from .records import make_run, make_shot

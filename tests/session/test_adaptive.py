@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.data.points import scan_points
 from labseq.errors import ConfigError, DeviceError
 from labseq.recording import shot_file
-from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 

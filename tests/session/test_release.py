@@ -10,7 +10,7 @@ import pytest
 
 import labseq
 from labseq.analysis.fits import fit_points
-from labseq.recording.points import scan_points
+from labseq.data.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 

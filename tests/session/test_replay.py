@@ -12,10 +12,10 @@ import pytest
 import labseq
 from labseq.analysis.replay import ReplayRequest, replay, shots_of
 from labseq.calibration.store import Store
+from labseq.data import open_run
 from labseq.errors import ConfigError, RecordingError
 from labseq.files import packaged_profiles_dir
 from labseq.model import SiteGrid
-from labseq.recording import open_run
 from labseq.recording.folders import INDEX_FILE, STATE_FILE
 from labseq.testing.fakes.records import fake_calibration
 

@@ -13,8 +13,8 @@ import pytest
 import labseq
 from labseq.assembly.lab import rebuild_lab
 from labseq.assembly.points import MAX_PROBLEMS
+from labseq.data.points import scan_points
 from labseq.errors import ConfigError
-from labseq.recording.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
 

@@ -16,10 +16,10 @@ from numpy.testing import assert_allclose
 
 from labseq.analysis.statistics import statistics_of
 from labseq.calibration.store import encode_entry
+from labseq.data import open_run
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.model.estimate import mean
 from labseq.plain import now
-from labseq.recording import open_run
 from labseq.recording.run_file import is_index_row
 from labseq.web.history import RunHistory
 from tests.pictures.pixels import decoded

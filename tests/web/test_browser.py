@@ -24,9 +24,9 @@ from PIL import Image
 
 import labseq
 from labseq.calibration.store import Store
+from labseq.data import open_run
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.queue.queue import Queue
-from labseq.recording import open_run
 from tests.recording.records import make_shot
 
 from .clients import TOKEN, path_of, shot_of_frames, write_run

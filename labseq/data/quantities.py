@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, quantities_in
+from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
 from labseq.model import ImageRecord, TargetPattern, follow_atoms
 from labseq.model.estimate import Estimated, Rate, mean
-from labseq.recording.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, quantities_in
 from labseq.recording.results import PREFIX, result_columns
 from labseq.recording.schema import unit_of
-from labseq.recording.shot import Shot
 from labseq.units import parse_any
 
 if TYPE_CHECKING:
-    from labseq.recording.reader import Run
+    from labseq.data.reader import Run
 
 NOTHING: Final = (math.nan, 0.0)
 """Events and trials of a shot without a value."""

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from labseq.data.columns import Column, columns_of
+from labseq.data.reader import Run
+from labseq.data.tables import check_installed, dataframe_of, dataset_of, facts_of
 from labseq.errors import ConfigError, Problem, one_of
 from labseq.files import whole_file
-from labseq.recording.columns import Column, columns_of
-from labseq.recording.reader import Run
-from labseq.recording.tables import check_installed, dataframe_of, dataset_of, facts_of
 from labseq.text_files import check_output, is_file
 
 ENDINGS: Final = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc", "archive": ".h5"}
@@ -63,7 +63,7 @@ def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list
     """
     try:
         if kind == "archive":
-            from labseq.recording.archive import write_archive  # h5py takes 0.1 s to import
+            from labseq.data.archive import write_archive  # h5py takes 0.1 s to import
 
             return write_archive(run, path, frames=frames)
         _WRITERS[kind](run, path)

@@ -20,11 +20,14 @@ import h5py
 import numpy as np
 
 import labseq
+from labseq.data.columns import columns_of
+from labseq.data.reader import Run
+from labseq.data.shot import Shot
+from labseq.data.tables import facts_of
 from labseq.errors import RecordingError
 from labseq.files import read_file, whole_file
 from labseq.plain import plain_text
 from labseq.recording import folders, schema
-from labseq.recording.columns import columns_of
 from labseq.recording.hdf5 import (
     check_attributes,
     copy_attributes,
@@ -34,10 +37,7 @@ from labseq.recording.hdf5 import (
     set_attributes,
     text_array,
 )
-from labseq.recording.reader import Run
-from labseq.recording.shot import Shot
 from labseq.recording.shot_file import content_of, open_finished, opened
-from labseq.recording.tables import facts_of
 
 FORMAT: Final = "labseq-archive"
 FORMAT_VERSION: Final = "4.0"

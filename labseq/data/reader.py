@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from labseq.data.points import SCANNER, completed, reporting_damage
+from labseq.data.shot import Shot, caching_loader
 from labseq.errors import RecordingError
 from labseq.files import NewLines, read_lines
 from labseq.model import TargetPattern
@@ -15,16 +17,14 @@ from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
 from labseq.plain import to_plain
 from labseq.recording import folders
-from labseq.recording.points import SCANNER, completed, reporting_damage
 from labseq.recording.results import rows_of
 from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
-from labseq.recording.shot import Shot, caching_loader
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from labseq.recording.quantities import Quantity
+    from labseq.data.quantities import Quantity
 
 
 def open_run(path: str | Path) -> Run:
@@ -192,7 +192,7 @@ class Run:
         Example:
             ``run.quantity("survival:before,after").over(run.shots)`` is its mean, with the error.
         """
-        from labseq.recording.quantities import find_quantity
+        from labseq.data.quantities import find_quantity
 
         return find_quantity(self, name)
 
@@ -222,7 +222,7 @@ class Run:
         Raises:
             ConfigError: pandas is not installed.
         """
-        from labseq.recording.tables import dataframe_of
+        from labseq.data.tables import dataframe_of
 
         return dataframe_of(self, attempts=attempts)
 
@@ -241,7 +241,7 @@ class Run:
             ConfigError: xarray is not installed.
             RecordingError: A shot's file is missing or damaged, or the scan is.
         """
-        from labseq.recording.tables import dataset_of
+        from labseq.data.tables import dataset_of
 
         return dataset_of(self, occupancies=occupancies)
 

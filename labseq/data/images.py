@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.data.shot import Shot
 from labseq.errors import RecordingError
-from labseq.recording.shot import Shot
 
 Floats = NDArray[np.float64]
 

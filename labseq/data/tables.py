@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.data.columns import columns_of
+from labseq.data.points import reporting_damage
+from labseq.data.reader import Run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import install_hint
 from labseq.plain import dumps
-from labseq.recording.columns import columns_of
-from labseq.recording.points import reporting_damage
-from labseq.recording.reader import Run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,7 +56,7 @@ def facts_of(run: Run) -> dict[str, Any]:
 
 
 def dataframe_of(run: Run, *, attempts: bool = False) -> pd.DataFrame:
-    """See :meth:`labseq.recording.Run.to_dataframe`."""
+    """See :meth:`labseq.data.Run.to_dataframe`."""
     check_installed("pandas")
     import pandas as pd
 
@@ -70,7 +70,7 @@ def dataframe_of(run: Run, *, attempts: bool = False) -> pd.DataFrame:
 
 
 def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
-    """See :meth:`labseq.recording.Run.to_xarray`."""
+    """See :meth:`labseq.data.Run.to_xarray`."""
     check_installed("xarray")
     import xarray as xr
 

@@ -14,8 +14,8 @@ from labseq.recording.folders import RUN_FILE
 from labseq.units import written
 
 if TYPE_CHECKING:
-    from labseq.recording.reader import Run
-    from labseq.recording.shot import Shot
+    from labseq.data.reader import Run
+    from labseq.data.shot import Shot
 
 SCANNER: Final = "scanner"
 """Key in the record of an adaptive scan (and no other): the scanner and its settings."""

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.data.shot import Shot
 from labseq.model.records import STEP
 from labseq.plain import dumps, plain_text
 from labseq.recording import schema
 from labseq.recording.results import result_columns
 from labseq.recording.run_file import SIMULATION
 from labseq.recording.schema import unit_of
-from labseq.recording.shot import Shot
 
 if TYPE_CHECKING:
-    from labseq.recording.reader import Run
+    from labseq.data.reader import Run
 
 _Row: TypeAlias = Mapping[str, Any]
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.data.points import SCANNER, ScanPoint, reporting_damage, scan_points
+from labseq.data.quantities import Quantity, quantity_of
+from labseq.data.reader import Run
 from labseq.model import ScanRange
 from labseq.model.estimate import Estimated
-from labseq.recording.points import SCANNER, ScanPoint, reporting_damage, scan_points
-from labseq.recording.quantities import Quantity, quantity_of
-from labseq.recording.reader import Run
 from labseq.units import written
 
 
