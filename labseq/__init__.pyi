@@ -6,6 +6,10 @@ from labseq.api import (
     make_target as make_target,
     tone_program as tone_program,
 )
+from labseq.data import (
+    Run as Run,
+    open_run as open_run,
+)
 from labseq.errors import (
     ConfigError as ConfigError,
     DeviceError as DeviceError,
@@ -44,10 +48,6 @@ from labseq.model import (
 from labseq.motion import (
     check_plan as check_plan,
     render as render,
-)
-from labseq.data import (
-    Run as Run,
-    open_run as open_run,
 )
 from labseq.session.session import Session as Session
 

@@ -301,9 +301,15 @@ class _Kernel:
         code, cells = self.function.__code__, self.function.__closure__ or ()
         scope = self.function.__globals__ | dict(zip(code.co_freevars, cells, strict=True))
         found = {name: scope[name] for name in _names(code) if name in scope}
-        for module in [value for value in found.values() if isinstance(value, ModuleType)]:
-            found |= {f"{module.__name__}.{name}": vars(module).get(name) for name in _names(code)}
-        return {name: getattr(value, "cell_contents", value) for name, value in found.items()}
+        values = {name: getattr(value, "cell_contents", value) for name, value in found.items()}
+        modules = [value for value in values.values() if isinstance(value, ModuleType)]
+        for module in modules:  # and those in them: a.b.SPEED
+            of_module = {name: vars(module)[name] for name in _names(code) if name in vars(module)}
+            values |= {f"{module.__name__}.{name}": value for name, value in of_module.items()}
+            modules += [
+                one for one in of_module.values() if isinstance(one, ModuleType) and one not in modules
+            ]
+        return values
 
     @property
     def callees(self) -> list[_Kernel]:
@@ -330,7 +336,8 @@ class _Kernel:
 def _environment() -> str:
     """Text of everything but its source that a kernel depends on, and that numba does not look at."""
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    return repr((sys.version, *map(version, ("numba", "llvmlite", "numpy")), settings))
+    taught = Path(__file__).with_name("native_code.py").read_bytes()  # of functions that kernels call
+    return repr((sys.version, *map(version, ("numba", "llvmlite", "numpy")), settings, taught))
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -352,7 +359,11 @@ def _constant(name: str, value: object) -> str:
     """Text of a constant that a kernel is compiled with; "" for anything else."""
     if isinstance(value, np.ndarray):
         return repr((name, value.dtype.str, value.shape, value.tobytes()))
-    if isinstance(value, bool | int | float | complex | str | tuple | np.generic):
+    if isinstance(value, tuple):
+        return repr([_constant(name, one) for one in cast("tuple[object, ...]", value)])
+    if (function := getattr(value, "py_func", None)) is not None:  # compiled by numba itself
+        return repr((name, _code(function.__code__)))
+    if isinstance(value, bool | int | float | complex | str | np.generic):
         return repr((name, type(value).__name__, value))
     if isinstance(value, type) and hasattr(value, "__members__"):  # an enumeration
         return repr((name, list(cast("Any", value))))
@@ -367,6 +378,7 @@ def _announce_compiling(kernel: _Kernel) -> None:
 
 def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> None:
     """Let several processes compile kernels into the cache, a module at a time; failures are ignored."""
+    import multiprocessing
     from graphlib import TopologicalSorter
 
     from labseq.workers import POLL_S, ProcessWorkers
@@ -376,6 +388,8 @@ def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> N
         seconds[one.module] = seconds.get(one.module, 0.0) + one.compile_s
         graph.setdefault(one.module, set()).update(callee.module for callee in one.callees)
     n_workers = min(MAX_WORKERS, n_cores(), len(seconds))
+    if multiprocessing.current_process().daemon:
+        return  # it may not start processes: a worker of a campaign or a cluster
     if n_workers < 2 or sum(seconds.values()) < WORTH_A_PROCESS_S:
         return
     while _ANNOUNCE:

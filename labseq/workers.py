@@ -37,7 +37,8 @@ MAX_LOST: Final = 3
 """Workers that a task may end before the work ends too: perhaps it needs more memory than there is."""
 _START: Final = -1
 """In place of the number of a task: the preparation of a worker."""
-_FAREWELL_S: Final = 1.0
+_FAREWELL_S: Final = 10.0
+"""Time for a worker to end what it does, in seconds: a run makes its devices safe, and writes its end."""
 
 
 class Workers(Protocol):
@@ -214,6 +215,7 @@ _Answer = tuple[Literal["ready", "begins", "done", "failed"], int, Any]
 def _serve(connection: Connection, make: Make, recipe: Any) -> None:
     """Carry out tasks in a worker process until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def send(*answer: *_Answer) -> None:
         connection.send(answer)
@@ -231,6 +233,14 @@ def _serve(connection: Connection, make: Make, recipe: Any) -> None:
             raise
         except Exception as error:  # noqa: BLE001 - the first process raises it
             send("failed", task, portable(error))
+
+
+def _end_with_parent() -> None:
+    """End this process, as SIGTERM does, when the one that started it has died."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    signal.raise_signal(signal.SIGTERM)
 
 
 @contextmanager

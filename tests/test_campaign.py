@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +24,7 @@ from labseq.cli import main
 from labseq.cluster import ClusterWorkers
 from labseq.data import Run
 from labseq.errors import ConfigError, StopRequested
+from labseq.recording.run_file import read_state
 from labseq.session.session import Session
 from labseq.workers import ProcessWorkers
 from tests.session.small_runs import OWN_DEVICE, PROFILE, table, write
@@ -160,6 +164,45 @@ def test_a_stop_ends_the_runs_at_once_and_they_are_resumed(file: Path) -> None:
     assert len([*folder.glob("*/*/run.json")]) == 4
 
 
+def test_a_folder_is_used_by_one_command_and_by_runs_of_the_same_files(file: Path) -> None:
+    campaign, folder = Campaign.read(file), file.parent / "out"
+    with pytest.raises(StopRequested):
+        run_in_turn(running(2), campaign, folder)
+    sequence = campaign.sequence.read_text(encoding="utf-8")
+    campaign.sequence.write_text(f"{sequence}# another text\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="taken with another text of the sequence or the profile"):
+        run_in_turn(running(9), campaign, folder)
+    campaign.sequence.write_text(sequence, encoding="utf-8")
+    held = []
+
+    def run_session(opening: Callable[[Any], Session]) -> None:
+        with pytest.raises(ConfigError, match="this campaign is in progress: labseq campaign run") as refused:
+            run_in_turn(running(9), campaign, folder)
+        held.append(refused)
+        running(9)(opening)
+
+    run_in_turn(run_session, campaign, folder)
+    assert len(held) == 3
+    assert [run.status for run in all_runs(folder)] == ["complete"] * 4
+
+
+@pytest.mark.system
+def test_workers_compile_what_is_missing_and_end_with_the_first_process(file: Path) -> None:
+    folder = file.parent / "out"
+    command = [sys.executable, "-m", "labseq", "campaign", "run", str(file), "--output", str(folder)]
+    file.write_text(FILE.replace("repeats: 2", "repeats: 100000"), encoding="utf-8")
+    with subprocess.Popen([*command, "--workers", "2"]) as process:
+        while process.poll() is None and len([*folder.glob("*/*/index.jsonl")]) < 2:
+            time.sleep(0.05)
+        assert process.poll() is None
+        process.kill()
+    deadline = time.monotonic() + 60.0
+    while any(read_state(one.parent)[0] == "running" for one in folder.glob("*/*/run.json")):
+        assert time.monotonic() < deadline, "a worker goes on without the first process"
+        time.sleep(0.05)
+    assert {read_state(one.parent)[0] for one in folder.glob("*/*/run.json")} == {"stopped"}
+
+
 def test_real_hardware_is_not_used_by_several_runs_at_once(file: Path) -> None:
     (file.parent / "mine.py").write_text(OWN_DEVICE, encoding="utf-8")
     profile = f"{PROFILE}devices: {{laser: {{use: mine}}}}\nplugin_folders: [.]\n"
@@ -217,6 +260,9 @@ def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
         (FILE.replace("seed: 3", "runs: 2"), r"campaign.yaml:7:7: 'seed' is missing"),
         ("labseq: 1\nsequence: x\nrepeat: 2\naxes: {a: [1]}\n", r"campaign.yaml:3:1: .*'repeat'.*'repeats'"),
         ("labseq: 1\nsequence: x\naxes: {a: [1, 1]}\n", r"campaign.yaml:3:11: a value occurs twice"),
+        ("labseq: 1\nsequence: compakt_225\n", r"campaign.yaml:2:11: there is no sequence 'compakt_225'"),
+        ("labseq: 1\nsequence: x.yaml\n", r"campaign.yaml:2:11: there is no such file"),
+        (f"{FILE}profile: nothere\n", r"campaign.yaml:8:10: there is no hardware profile 'nothere'"),
         (FILE.replace("[1, 4]", "[1, 0]"), r"campaign.yaml:4:38: degree_of_parallelism is 0"),
     ],
 )

@@ -3,6 +3,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import importlib.util
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -156,6 +157,30 @@ def test_only_what_an_edit_touches_is_compiled_again(package: Package) -> None:
     assert compiled_modules(package.load) == []
 
 
+def test_constants_of_other_modules_and_in_tuples_and_functions_of_numba_belong_to_the_source(
+    package: Package,
+) -> None:
+    top = """
+        import {package}.constants
+        import {package}
+        from labseq.kernel import kernel
+        from {package}.helper import PAIR, double
+
+        @kernel("float64(float64)")
+        def top(x):
+            return double(x) * {package}.constants.OFFSET + PAIR[0][0]
+    """
+    helper = "import numba, numpy as np\nPAIR = np.array([{}]), np.zeros(2)\n"
+    double = "@numba.njit\ndef double(x):\n    return {} * x\n"
+    package.write("top", top.format(package=package.name))
+    results = []
+    for constant, pair, factor in ((1, 0.5, 2), (3, 0.5, 2), (3, 0.5000000001, 2), (3, 0.5, 7)):
+        package.write("constants", f"OFFSET = {constant}")
+        package.write("helper", helper.format(pair) + double.format(factor))
+        results.append(package.load().top(1.0))
+    assert results == [2.5, 6.5, 6.5000000001, 21.5]
+
+
 def test_the_values_of_an_enclosing_function_belong_to_the_source(cache: Path) -> None:
     def adding(step: int) -> Any:
         @kernel("int64(int64)")
@@ -227,6 +252,15 @@ def test_processes_fill_the_cache(package: Package, monkeypatch: pytest.MonkeyPa
     package.write("top", TOP.format(package=package.name).replace("MIDDLE(x)", "MIDDLE(y)"))
     with pytest.raises(labseq.PluginLoadError, match=r"'top' cannot be compiled: TypingError(.|\n)*'y'"):
         package.load()
+
+
+def test_a_worker_that_may_start_no_processes_compiles_by_itself(
+    package: Package, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(labseq.kernel, "WORTH_A_PROCESS_S", 0.0)
+    monkeypatch.setattr(labseq.kernel, "n_cores", lambda: 2)
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    assert package.result() == 102
 
 
 def test_a_cache_that_cannot_be_written_does_no_harm(

@@ -15,11 +15,13 @@ from pydantic import Field
 from labseq.assembly.options import Options
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document, StoredText
+from labseq.config.find import find_profile, find_sequence
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem
-from labseq.messages import clean, visible
+from labseq.messages import visible
 from labseq.recording.folders import RUN_FILE
 from labseq.settings import Settings
+from labseq.text_files import read_bytes
 
 MAX_POINTS: Final = 10_000
 CAMPAIGN_FILE: Final = "campaign.yaml"
@@ -98,7 +100,8 @@ class Campaign:
             what = f"{settings.runs} runs cannot share {settings.repeats} shots"
             raise document.error(("runs",), what, "at most 'repeats'")
         if settings.runs > 1 and settings.seed is None:
-            raise document.error(("runs",), "'seed' is missing, which those of the runs are made from")
+            what = "'seed' is missing, which those of the runs are made from"
+            raise document.error(("runs",), what, "'seed: 1', or another whole number")
         return cls(document, settings, axes)
 
     @property
@@ -136,16 +139,29 @@ class Campaign:
             return seed
         return int(np.random.SeedSequence(seed, spawn_key=(part,)).generate_state(1, np.uint64)[0] >> 1)
 
+    def find_files(self) -> None:
+        """Raise if there is no such sequence or profile.
+
+        Raises:
+            ConfigError: There is none; at its place in this file.
+        """
+        finds = {
+            "sequence": lambda: read_bytes(find_sequence(self.sequence)),
+            "profile": lambda: find_profile(self.settings.profile or "", self.document.path.parent),
+        }
+        for name, find in finds.items():
+            try:
+                if getattr(self.settings, name) is not None:
+                    find()
+            except ConfigError as error:
+                [problem] = error.problems
+                raise self.document.error((name,), problem.what, problem.expected, problem.hint) from error
+
     def placed(self, error: ConfigError, run: PlannedRun) -> ConfigError:
         """An error of a run, at the place of the value in the campaign file if that is wrong."""
         return ConfigError([self._placed(problem, run) for problem in error.problems])
 
     def _placed(self, problem: Problem, run: PlannedRun) -> Problem:
-        for name in ("sequence", "profile"):  # one that does not exist
-            if problem.source == getattr(self.settings, name) and not problem.line:
-                line, column = self.document.locate((name,))
-                what = f"{name} is '{clean(problem.source)}': {problem.what}"
-                return replace(problem, what=what, source=self.document.name, line=line, column=column)
         for option, address, i in zip(run.options.overrides, self.axes, run.point, strict=True):
             overrides = itertools.chain(*split_overrides([option]))
             if any(problem.source == override.source for override in overrides):

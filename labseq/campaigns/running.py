@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from labseq.assembly.plugin_choice import HARDWARE_KINDS
-from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun
+from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point
 from labseq.config.document import Document
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.files import explained, write_file
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import clean, visible
-from labseq.recording.folders import RUN_FILE
-from labseq.recording.run_file import read_owner, read_state
+from labseq.processes import Lock
+from labseq.recording.folders import LOCK_FILE, RUN_FILE
+from labseq.recording.run_file import read_owner, read_state, sha256_of_text
 from labseq.roles import RunObserver
 from labseq.session.provenance import plugins_of
 from labseq.session.session import Session
@@ -31,45 +32,79 @@ Missing: TypeAlias = "list[tuple[PlannedRun, Path | None]]"
 """Runs to take, and the folder of the one that was begun, to be resumed."""
 
 
-def check_campaign(campaign: Campaign, *, in_turn: bool) -> frozenset[tuple[str, ...]]:
-    """Check the sequence at every point, before the first run.
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What the runs of a campaign are made from, as they would be today.
+
+    Attributes:
+        texts: Point -> SHA-256 of sequence and profile.
+        plugins: Name, origin and version of each plugin that is used.
+    """
+
+    texts: Mapping[Point, tuple[str, str]]
+    plugins: frozenset[tuple[str, ...]]
+
+
+def check_campaign(campaign: Campaign, *, in_turn: bool) -> Checked:
+    """Check the sequence at every point, before the first run, and compile its kernels.
 
     Args:
         in_turn: Whether the runs are taken one after the other: only simulated ones can be taken at once.
 
-    Returns:
-        Name, origin and version of each plugin that is used.
-
     Raises:
         ConfigError: It has an error; at the place of the value in the campaign file, if that is wrong.
     """
-    plugins = set[tuple[str, ...]]()
+    campaign.find_files()
+    plugins, texts = set[tuple[str, ...]](), dict[Point, tuple[str, str]]()
     for run in campaign.runs():
+        if run.point in texts:
+            continue
         try:
-            assembly = Session.open(campaign.sequence, **asdict(run.options)).assembly
+            session = Session.open(campaign.sequence, **asdict(run.options))
         except ConfigError as error:
             raise campaign.placed(error, run) from error
+        assembly = session.assembly
         if not (in_turn or assembly.virtual_time):
             chosen = assembly.hardware.chosen.items()
             real = [role for role, one in chosen if one.entry.kind in HARDWARE_KINDS and not one.virtual_time]
             what = f"the profile '{assembly.hardware.profile.name}' has real hardware ({', '.join(real)})"
             expected = "simulated hardware, to take several runs at once"
             raise ConfigError(Problem(what, expected=expected, hint="leave out --workers and --scheduler"))
+        if not in_turn and not texts:
+            session.warm(session.build_lab())  # here, as several processes would each compile the same
+        documents = assembly.document, assembly.hardware.document
+        sequence, profile = (sha256_of_text(document.text) for document in documents)
+        texts[run.point] = sequence, profile
         plugins |= _plugins(assembly)
-    return frozenset(plugins)
+    return Checked(texts, frozenset(plugins))
 
 
 def _plugins(assembly: Any) -> set[tuple[str, ...]]:
     return {tuple(plugin.values()) for plugin in plugins_of(assembly)}
 
 
-def begin(campaign: Campaign, folder: Path) -> Missing:
-    """Create the folder of a campaign, or find out what it lacks.
+@contextmanager
+def begun(campaign: Campaign, folder: Path, checked: Checked) -> Generator[Missing]:
+    """Use a campaign's folder, alone, and find out which runs it lacks; it is created if need be.
 
     Raises:
-        ConfigError: The runs in the folder are not its own.
+        ConfigError: Another process uses it; or the runs in it are of other files, or not of this campaign.
         RecordingError: A run is damaged, or the folder cannot be written to.
     """
+    with explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    lock = Lock(folder / LOCK_FILE, "labseq campaign run")
+    with suppress(OSError):  # some network drives have no locks
+        if (holder := lock.take()) is not None:
+            what, hint = f"this campaign is in progress: {holder}", "wait for its end, or stop that command"
+            raise ConfigError(Problem(what, visible(str(folder)), hint=hint))
+    try:
+        yield _missing(campaign, folder, checked)
+    finally:
+        lock.release()
+
+
+def _missing(campaign: Campaign, folder: Path, checked: Checked) -> Missing:
     wanted = {_key(run): run for run in campaign.runs()}
     found: dict[Any, Run] = {}
     for file in sorted(folder.glob(f"*/*/{RUN_FILE}")):
@@ -78,6 +113,11 @@ def begin(campaign: Campaign, folder: Path) -> Missing:
         if key not in wanted:
             what = "this run belongs to no point of the campaign, which may have been changed since"
             raise ConfigError(Problem(what, visible(str(run.path)), expected="another folder"))
+        texts = run.record.get("sequence_sha256"), run.record.get("profile_sha256")
+        if texts != checked.texts[wanted[key].point]:
+            what = "this run was taken with another text of the sequence or the profile"
+            expected, hint = "another folder", "or the files as they were, which are in the run's folder"
+            raise ConfigError(Problem(what, visible(str(run.path)), expected=expected, hint=hint))
         if (key not in found or found[key].status != "complete") and not _is_elsewhere(run.path):
             found[key] = run
     _keep(campaign, folder, is_new=not found)
@@ -106,8 +146,6 @@ def _keep(campaign: Campaign, folder: Path, *, is_new: bool) -> None:
     if is_new and kept.exists():
         what, hint = "this file is of another campaign", "delete it if that campaign has ended"
         raise ConfigError(Problem(what, visible(str(kept)), expected="another folder", hint=hint))
-    with explained(kept):
-        folder.mkdir(parents=True, exist_ok=True)
     write_file(kept, text.encode())
 
 
@@ -132,13 +170,13 @@ def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> No
         ConfigError: The campaign has an error, or the runs in the folder are not its own.
         LabseqError: What ended a run; the campaign is continued by the same command.
     """
-    check_campaign(campaign, in_turn=True)
-    for run, begun in begin(campaign, folder):
+    with begun(campaign, folder, check_campaign(campaign, in_turn=True)) as missing:
+        for run, earlier in missing:
 
-        def start(observer: RunObserver | None, run: Any = run, begun: Any = begun) -> Session:
-            return open_session(campaign, run, folder, begun, observer)
+            def start(observer: RunObserver | None, run: Any = run, earlier: Any = earlier) -> Session:
+                return open_session(campaign, run, folder, earlier, observer)
 
-        run_session(start)
+            run_session(start)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,29 +253,42 @@ def run_at_once(
 
     Raises:
         ConfigError: The campaign has an error, or the runs in the folder are not its own.
-        StopRequested: Ctrl-C or SIGTERM; the runs in progress end after their current shot.
+        StopRequested: Ctrl-C or SIGTERM; the runs in progress are stopped, and resumed by the next command.
         LabseqError: What ended a run; the campaign is continued by the same command.
     """
     stop = StopFlag()
     with closing(workers), stop_on_signals(stop):
-        plugins = check_campaign(campaign, in_turn=False)
-        missing = {_key(run) for run, _ in begin(campaign, folder)}
-        left = {number: run for number, run in enumerate(campaign.runs()) if _key(run) in missing}
-        recipe = Recipe(campaign.document.path.resolve(), campaign.document.text, folder.resolve(), plugins)
-        workers.prepare(RunTaker, recipe)
-        waiting, n_out = iter([*left]), 0
-        try:
-            while left:
-                while n_out < workers.n_workers and (number := next(waiting, None)) is not None:
-                    workers.submit(number, number)
-                    n_out += 1
-                stop.check()
-                for number, (run_dir, error) in workers.finished(POLL_S):
-                    if error is not None:
-                        raise error
-                    report(left.pop(number), open_run(run_dir))
-                    n_out -= 1
-        finally:
-            for file in folder.glob(f"*/*/{RUN_FILE}") if left else ():
-                if read_state(file.parent)[0] == "running":  # perhaps on another computer
-                    ask_to_stop(file.parent)
+        checked = check_campaign(campaign, in_turn=False)
+        with begun(campaign, folder, checked) as missing, closing(workers):  # before the folder is free
+            keys = {_key(run) for run, _ in missing}
+            left = {number: run for number, run in enumerate(campaign.runs()) if _key(run) in keys}
+            document = campaign.document
+            recipe = Recipe(document.path.resolve(), document.text, folder.resolve(), checked.plugins)
+            workers.prepare(RunTaker, recipe)
+            try:
+                _share_out(left, workers, report, stop)
+            finally:
+                for file in folder.glob(f"*/*/{RUN_FILE}") if left else ():
+                    if read_state(file.parent)[0] == "running":  # perhaps on another computer
+                        ask_to_stop(file.parent)
+
+
+def _share_out(
+    left: dict[int, PlannedRun],
+    workers: Workers,
+    report: Callable[[PlannedRun, Run], None],
+    stop: StopFlag,
+) -> None:
+    """Give each worker a run at a time; runs that are complete are removed from those that are left."""
+    waiting, n_out = iter([*left]), 0
+    while left:
+        while n_out < workers.n_workers and (number := next(waiting, None)) is not None:
+            workers.submit(number, number)
+            n_out += 1
+        stop.check()
+        for number, (run_dir, error) in workers.finished(POLL_S):
+            if error is not None:
+                stop.check()  # Ctrl-C reaches all processes
+                raise error
+            report(left.pop(number), open_run(run_dir))
+            n_out -= 1

@@ -29,7 +29,7 @@ from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import make_safe_after_crash
 from labseq.sequencer.lab import Lab, describe
-from labseq.sequencer.run import Sequencer
+from labseq.sequencer.run import Sequencer, State
 from labseq.session.analysis_processes import AnalysisProcesses
 from labseq.session.check import check
 from labseq.session.checks import Checks
@@ -260,12 +260,12 @@ class Session:
     def _marked_active(self, run_dir: Path, sequencer: Sequencer) -> Generator[None]:
         """Mark that devices may be on, so that the next run makes them safe if this process dies."""
         profile = self.assembly.hardware
-        with nullcontext() if profile.identities else suppress(RecordingError):
-            mark_active(self._profile_key, profile.identities, run_dir)
         try:
+            with nullcontext() if profile.identities else suppress(RecordingError):
+                mark_active(self._profile_key, profile.identities, run_dir)
             yield
         finally:
-            if not sequencer.unsafe:
+            if sequencer.state is State.CLOSED and not sequencer.unsafe:
                 self._try(clear_active, self._profile_key, profile.identities)
 
     @contextmanager
