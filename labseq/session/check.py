@@ -71,7 +71,8 @@ class _Checks:
         return self._points[key]
 
     def raise_problems(self) -> None:
-        """Raise what was found."""
+        """Raise what was found, unless the check was stopped: calls that end early find nothing."""
+        self.session.stop_flag.check()
         try:
             self.found.raise_any()
         except ConfigError as error:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.errors import ConfigError, Problem
+from labseq.errors import ConfigError, Problem, StopRequested
 from labseq.session import check as checking
 from labseq.session.check import CheckReport, check
 
@@ -28,6 +28,18 @@ def test_a_good_sequence_has_no_warnings():
     assert 0.02 < report.rehearsal.duration_s.mean() < 0.06
     assert report.n_images == 12
     assert report.shot_bytes == pytest.approx(12 * 2 * 512 * 512, rel=0.02)
+
+
+def test_a_check_that_is_stopped_says_so_and_blames_no_device(monkeypatch: pytest.MonkeyPatch):
+    session, ask_tweezers = labseq.Session.open(COMPACT), checking._PointCheck.ask_tweezers
+
+    def stopping(one: Any, plans: Any) -> None:
+        session.stop_flag.request(15)
+        ask_tweezers(one, plans)
+
+    monkeypatch.setattr(checking._PointCheck, "ask_tweezers", stopping)
+    with pytest.raises(StopRequested):
+        check(session)
 
 
 def test_durations_span_from_no_cycle_to_all():
