@@ -34,7 +34,7 @@ def test_fewer_sites_are_worse() -> None:
 def test_a_peak_taken_from_the_neighbours_is_the_users_choice() -> None:
     good, lame = entry("thresholds", 1e-4, n_one_peak=0), entry("thresholds", 1e-4, n_one_peak=2)
     for in_use in (None, good):
-        assert why_worse(lame, in_use).startswith("2 sites ")
+        assert why_worse(lame, in_use).startswith("at 2 sites ")
     assert not why_worse(lame, lame)
 
 
