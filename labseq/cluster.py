@@ -44,7 +44,7 @@ class ClusterWorkers:
     Args:
         address: Address of its scheduler: "tls://lab-pc:8786", or "tcp://127.0.0.1:8786" on this computer.
         keys: Folder of the certificates, as `labseq campaign keys` writes it; only for tls.
-        what: What a task is, in messages: "shot".
+        what: What a task is, in messages: "run".
 
     Raises:
         ConfigError: The address is not allowed, a certificate is missing, the scheduler does not answer, no

@@ -192,6 +192,7 @@ class _Kernel:
         self.function = function
         self.signatures = signatures
         self.is_helper = is_helper
+        self._kind = "kernels" if is_helper else "python"
         self.for_c = for_c
         self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"} if fused else False}
         self._dispatchers: dict[str, Any] = {}
@@ -215,13 +216,12 @@ class _Kernel:
     @property
     def dispatcher(self) -> Any:
         """What other kernels call, compiled or loaded from the cache; Python, too, unless it is a helper."""
-        return self._dispatcher("kernels" if self.is_helper else "python")
+        return self._dispatcher(self._kind)
 
     def _dispatcher(self, kind: str) -> Any:
         with _LOADING:
             if kind not in self._dispatchers:
                 self._cached(kind, partial(self._compile, kind))
-                _PENDING.pop(self, None)
         return self._dispatchers[kind]
 
     def _compile(self, kind: str, cache: bool) -> None:
@@ -245,7 +245,6 @@ class _Kernel:
             return ctypes.cast(self._c, ctypes.c_void_p).value or 0
         with _LOADING:
             self._cached("c", self._compile_for_c)
-            _PENDING.pop(self, None)
         return int(self._c.address)
 
     def _compile_for_c(self, cache: bool) -> None:
@@ -272,6 +271,7 @@ class _Kernel:
             compile_it(can_write)
         finally:
             settings.CACHE_DIR = before
+        _PENDING.pop(self, None)
 
     @property
     def folder(self) -> Path:
@@ -292,8 +292,7 @@ class _Kernel:
         return getattr(sys.modules.get(self.module), "__dict__", None) is self.function.__globals__
 
     def is_cached(self) -> bool:
-        kind = "c" if self.for_c else "kernels" if self.is_helper else "python"
-        return any(self.folder.glob(f"{kind}/*/*.nbi"))
+        return any(self.folder.glob(f"{'c' if self.for_c else self._kind}/*/*.nbi"))
 
     @cached_property
     def named(self) -> dict[str, Any]:

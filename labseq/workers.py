@@ -133,7 +133,7 @@ class ProcessWorkers:
 
     Args:
         n_workers: Their number.
-        what: What a task is, in messages: "shot".
+        what: What a task is, in messages: "run".
 
     Attributes:
         n_workers: Their number.
@@ -229,8 +229,6 @@ def _serve(connection: Connection, make: Make, recipe: Any) -> None:
                 task, argument = connection.recv()
                 send("begins", task, None)
                 send("done", task, do(argument))
-        except (EOFError, OSError):
-            raise
         except Exception as error:  # noqa: BLE001 - the first process raises it
             send("failed", task, portable(error))
 

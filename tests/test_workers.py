@@ -86,3 +86,18 @@ def test_a_worker_that_cannot_be_prepared_is_an_error_of_its_own_kind() -> None:
         workers.submit(0, 0)
         with pytest.raises(ConfigError, match="this worker lacks a plugin"):
             finished(workers, 1)
+
+
+def make_one_that_finds_no_file(_: None) -> Callable[[int], int]:
+    def do(number: int) -> int:
+        raise FileNotFoundError(2, "No such file", f"{number}.yaml")
+
+    return do
+
+
+def test_an_error_of_the_system_in_a_task_is_its_own_and_not_the_death_of_its_worker() -> None:
+    with closing(ProcessWorkers(1, "job")) as workers:
+        workers.prepare(make_one_that_finds_no_file, None)
+        workers.submit(5, 5)
+        with pytest.raises(LabseqError, match=r"No such file: .5.yaml"):
+            finished(workers, 1)

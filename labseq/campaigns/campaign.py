@@ -19,7 +19,7 @@ from labseq.config.find import find_profile, find_sequence
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import visible
-from labseq.recording.folders import RUN_FILE
+from labseq.recording.folders import RUN_FILE, runs_in
 from labseq.settings import Settings
 from labseq.text_files import read_bytes
 
@@ -170,6 +170,11 @@ class Campaign:
         return problem
 
 
+def run_folders(folder: Path) -> list[Path]:
+    """The folders of a campaign's runs, without those that are just being made."""
+    return [path for path in runs_in(folder) if (path / RUN_FILE).is_file()]
+
+
 def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
     """The campaign of a folder, and the runs that it has so far: point -> its runs.
 
@@ -185,8 +190,8 @@ def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
         _shots_of(campaign.values(run.point), run.options.changes()): run.point for run in campaign.runs()
     }
     found: dict[Any, Run] = {}
-    for file in sorted(folder.glob(f"*/*/{RUN_FILE}")):
-        run = open_run(file.parent)
+    for path in run_folders(folder):
+        run = open_run(path)
         key = _shots_of([run.changes.get(address, "") for address in campaign.axes], run.changes)
         if key not in planned:
             what = f"this run belongs to no point of {CAMPAIGN_FILE}, which may have been changed since"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from labseq.assembly.plugin_choice import HARDWARE_KINDS
-from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point
+from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point, run_folders
 from labseq.config.document import Document
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem
@@ -18,12 +18,12 @@ from labseq.files import explained, write_file
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import clean, visible
 from labseq.processes import Lock
-from labseq.recording.folders import LOCK_FILE, RUN_FILE
+from labseq.recording.folders import LOCK_FILE
 from labseq.recording.run_file import read_owner, read_state, sha256_of_text
 from labseq.roles import RunObserver
 from labseq.session.provenance import plugins_of
 from labseq.session.session import Session
-from labseq.session.stopping import ask_to_stop
+from labseq.session.stopping import ask_to_stop, is_running
 from labseq.workers import POLL_S, Workers, portable
 
 RunSession: TypeAlias = "Callable[[Callable[[RunObserver | None], Session]], None]"
@@ -107,8 +107,8 @@ def begun(campaign: Campaign, folder: Path, checked: Checked) -> Generator[Missi
 def _missing(campaign: Campaign, folder: Path, checked: Checked) -> Missing:
     wanted = {_key(run): run for run in campaign.runs()}
     found: dict[Any, Run] = {}
-    for file in sorted(folder.glob(f"*/*/{RUN_FILE}")):
-        run = open_run(file.parent)
+    for path in run_folders(folder):
+        run = open_run(path)
         key = tuple(run.changes.items())
         if key not in wanted:
             what = "this run belongs to no point of the campaign, which may have been changed since"
@@ -135,7 +135,7 @@ def _key(run: PlannedRun) -> tuple[tuple[str, str], ...]:
 def _is_elsewhere(run_dir: Path) -> bool:
     """Whether another computer began a run and has not ended it: it may still write to the folder."""
     owner = read_owner(run_dir)
-    return read_state(run_dir)[0] == "running" and owner is not None and not owner.is_here
+    return is_running(run_dir) and owner is not None and not owner.is_here
 
 
 def _keep(campaign: Campaign, folder: Path, *, is_new: bool) -> None:
@@ -232,8 +232,7 @@ class RunTaker:
 
     def _begun(self, run: PlannedRun) -> Path | None:
         """The folder of a run that was begun here: by a worker that died, or an earlier command."""
-        for file in sorted(self._recipe.folder.glob(f"*/*/{RUN_FILE}"), reverse=True):
-            path = file.parent
+        for path in reversed(run_folders(self._recipe.folder)):
             is_open = read_state(path)[0] != "complete" and not _is_elsewhere(path)
             if is_open and open_run(path).changes == run.options.changes():
                 return path
@@ -268,9 +267,8 @@ def run_at_once(
             try:
                 _share_out(left, workers, report, stop)
             finally:
-                for file in folder.glob(f"*/*/{RUN_FILE}") if left else ():
-                    if read_state(file.parent)[0] == "running":  # perhaps on another computer
-                        ask_to_stop(file.parent)
+                for path in filter(is_running, run_folders(folder) if left else ()):  # perhaps elsewhere
+                    ask_to_stop(path)
 
 
 def _share_out(
