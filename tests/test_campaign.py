@@ -110,7 +110,8 @@ class Killing(ProcessWorkers):
 
     def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
         found = super().finished(timeout_s)
-        if self.n_kills < 2 and [*self.folder.glob(f"*/000{self.n_kills + 1}*/index.jsonl")]:
+        n_begun = len([*self.folder.glob("*/*/index.jsonl")])  # not of one killed while it made its folder
+        if self.n_kills < min(2, n_begun):
             multiprocessing.active_children()[0].kill()
             self.n_kills += 1
         return found
