@@ -1,15 +1,21 @@
 """Prints the size and shape of the code: ``python tests/measure_structure.py [ROOT]``, or ``poe structure``.
 
-Lines and modules of each package, modules with one importer, the longest chain of imports, the modules that
-``import labseq.session`` loads, and the lines of each driver without its simulator.
+Lines and modules of each package, the lines of each driver without its simulator, what a virtual run loads
+and how often it changes the file until the first shot, circles, modules with one importer, the longest chain
+of imports, branches, comments, and constants that are used once.
 """
 
 from __future__ import annotations
 
 import ast
+import io
+import json
+import re
 import subprocess
 import sys
-from collections import defaultdict
+import tempfile
+import tokenize
+from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
 
@@ -69,11 +75,94 @@ def count_lines(paths: list[Path]) -> int:
     return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
 
 
-def loaded_by(module: str, root: Path) -> int:
-    """Modules of labseq that a fresh process has loaded after it imported one."""
-    code = f"import sys, {module}; print(sum(n.split('.')[0] == 'labseq' for n in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    return int(done.stdout)
+PROFILED = """
+import json, os, sys
+from pathlib import Path
+import labseq
+from labseq.session import session
+
+folder, changes, last, opened = os.path.dirname(labseq.__file__), [0, 0], "", 0
+
+def follow(frame, event, argument):
+    global last, opened
+    code = frame.f_code
+    if not code.co_filename.startswith(folder):
+        return
+    if event == "call" and code.co_filename != last:
+        changes[opened] += 1
+        last = code.co_filename
+    if event == "return" and code.co_name == "open":
+        opened |= code is session.Session.open.__func__.__code__
+    if code.co_filename.endswith("shot.py") and code.co_qualname == "RunningShot.__init__":
+        sys.setprofile(None)
+
+sys.setprofile(follow)
+with session.Session.open(Path("sequences/compact_225.yaml"), shots=1, output=Path(sys.argv[1])) as run:
+    run.run()
+files = [module.__file__ for name, module in sys.modules.items() if name.split(".")[0] == "labseq"]
+print(json.dumps({"files": files, "changes": changes}))
+"""
+"""Runs one shot, and prints the modules of labseq that it loaded, and how often its calls entered another
+file: until the session was open, and from there until the shot began."""
+
+
+def virtual_run(root: Path) -> tuple[list[Path], list[int]]:
+    """What a run on virtual hardware loads of labseq, and how often its calls changed the file."""
+    with tempfile.TemporaryDirectory() as output:
+        command = [sys.executable, "-c", PROFILED, output]
+        done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+    printed = json.loads(done.stdout.splitlines()[-1])
+    return [Path(file) for file in printed["files"]], printed["changes"]
+
+
+def circles(graph: Graph) -> list[list[str]]:
+    """Groups of packages of labseq that import each other, directly or through others."""
+    reached: Graph = {name: set() for name in graph}
+    for name in graph:
+        waiting = [*graph[name]]
+        while waiting:
+            if (other := waiting.pop()) not in reached[name]:
+                reached[name].add(other)
+                waiting += graph[other]
+    groups = {frozenset({other for other in reached[name] if name in reached[other]}) for name in graph}
+    return [sorted(group) for group in groups if len(group) > 1]
+
+
+def by_package(graph: Graph) -> Graph:
+    """The imports between packages and modules at the top of labseq."""
+    joined: Graph = defaultdict(set)
+    for name, others in graph.items():
+        top = ".".join(name.split(".")[:2])
+        joined[top] |= {".".join(other.split(".")[:2]) for other in others} - {top, "labseq"}
+    return {name: others & set(joined) for name, others in joined.items()}
+
+
+BRANCHES = (ast.If, ast.IfExp, ast.For, ast.While, ast.ExceptHandler, ast.match_case, ast.comprehension)
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def density(paths: list[Path]) -> tuple[float, float, int]:
+    """Branches per function, share of lines with a comment, number of constants that are used once."""
+    n_branches = n_functions = n_comments = n_lines = n_once = 0
+    texts = [path.read_text(encoding="utf-8") for path in paths]
+    words = Counter(word for text in texts for word in re.findall(r"\w+", text))
+    for text in texts:
+        tree = ast.parse(text)
+        n_functions += sum(isinstance(node, FUNCTIONS) for node in ast.walk(tree))
+        for node in ast.walk(tree):  # as McCabe's complexity counts them
+            n_branches += isinstance(node, BRANCHES)
+            n_branches += len(getattr(node, "ifs", ()))
+            n_branches += len(node.values) - 1 if isinstance(node, ast.BoolOp) else 0
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        comments = {token.start[0] for token in tokens if token.type == tokenize.COMMENT}
+        n_comments += len(comments)
+        n_lines += len(text.splitlines())
+        for node in tree.body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            names = [target.id for target in targets if isinstance(target, ast.Name)]
+            constants = [name for name in names if re.fullmatch("_?[A-Z][A-Z0-9_]*", name)]
+            n_once += sum(words[name] == 2 for name in constants)
+    return n_branches / n_functions, n_comments / n_lines, n_once
 
 
 def main(root: Path) -> None:
@@ -114,7 +203,13 @@ def main(root: Path) -> None:
     print(f"modules of labseq with one importer: {len(single)}")
     chain = longest_chain(read_imports(core, lazy=False))
     print(f"longest import chain: {len(chain)}\n  " + " > ".join(chain))
-    print(f"modules that `import labseq.session` loads: {loaded_by('labseq.session', root)}")
+    print(f"circles: {circles(by_package(read_imports(core, lazy=False))) or 'none'}")
+    branches, comments, n_once = density(list(core.values()))
+    print(f"branches per function: {branches:.2f}; lines with a comment: {comments:.1%}")
+    print(f"constants that are used once: {n_once}")
+    files, changes = virtual_run(root)
+    print(f"a virtual run loads {count_lines(files)} lines in {len(files)} modules")
+    print(f"calls into another file: {changes[0]} until the session is open, then {changes[1]} until a shot")
 
 
 if __name__ == "__main__":
