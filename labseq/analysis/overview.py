@@ -41,7 +41,7 @@ from labseq.analysis.scanned import (
 )
 from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, statistics_of
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
-from labseq.calibration.store import read_entry
+from labseq.calibration_store import read_entry
 from labseq.data import Run, Shot
 from labseq.data.images import loading_map
 from labseq.data.quantities import Quantity, steps_that_load

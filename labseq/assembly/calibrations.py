@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from labseq.calibration.store import Store, Stored, check_grid
+from labseq.calibration_store import Store, Stored, check_grid
 from labseq.config.document import Document
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.errors import ConfigError, LimitError, ProblemCollector

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from labseq.assembly.plugin_choice import load_plugins
-from labseq.calibration.store import read_entry
+from labseq.calibration_store import read_entry
 from labseq.config.document import StoredText
 from labseq.config.profile import MOTION_KEYS, GridSettings, MotionSettings
 from labseq.config.validation import validate_values

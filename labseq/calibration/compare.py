@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.calibration.store import DECIDING, figure_of
+from labseq.calibration_store import DECIDING, figure_of
 from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationEntry
 from labseq.plain import now

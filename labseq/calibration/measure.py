@@ -26,8 +26,8 @@ from labseq.calibration.methods import (
     analyse_tweezers,
     read_site_file,
 )
-from labseq.calibration.store import Store, Stored, grid_text
 from labseq.calibration.thresholds import analyse_thresholds
+from labseq.calibration_store import Store, Stored, grid_text
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.console.runs import existing_run

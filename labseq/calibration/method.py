@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from labseq.assembly.lab import construct
 from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.recorded import recorded_machine
-from labseq.calibration.store import read_entry
+from labseq.calibration_store import read_entry
 from labseq.data import Run
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.guard import StopFlag

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import labseq
-from labseq.calibration.store import encode_entry
+from labseq.calibration_store import encode_entry
 from labseq.errors import StopRequested
 from labseq.messages import format_error
 from labseq.model import CalibrationEntry, RunRecord

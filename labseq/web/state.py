@@ -15,7 +15,7 @@ from typing import Any, Final, cast
 
 from labseq.analysis.scanned import Scanned, scanned
 from labseq.analysis.timing import StageTotals
-from labseq.calibration.store import read_entry
+from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, percent, plural, size_text
 from labseq.data import Shot, open_run

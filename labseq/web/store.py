@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from labseq.assembly.calibrations import DRY_RUN_FOLDER, FOLDER
-from labseq.calibration.store import DECIDING, Damaged, Store, Stored, figure_of
+from labseq.calibration_store import DECIDING, Damaged, Store, Stored, figure_of
 from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
 from labseq.queue.queue import Entry, Queue

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from labseq.analysis.overview import grid_of, sites_of
-from labseq.calibration.store import encode_entry
+from labseq.calibration_store import encode_entry
 from labseq.data import Run, open_run
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.calibration import grid_facts

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import erfc
 
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
-from labseq.calibration.store import Store
+from labseq.calibration_store import Store
 from labseq.model import SiteGrid
 from labseq.testing.fakes import RecordingObserver
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from labseq.calibration.store import encode_entry, read_entry
+from labseq.calibration_store import encode_entry, read_entry
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.testing.fakes import fake_calibration

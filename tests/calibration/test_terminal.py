@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from labseq.calibration.store import Store, Stored
+from labseq.calibration_store import Store, Stored
 from labseq.cli import main
 from labseq.cli.check import check_sequence
 from labseq.model import CalibrationKind, SiteGrid

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.calibration.store import Store
+from labseq.calibration_store import Store
 from labseq.cli import main
 from labseq.model import SiteGrid
 from labseq.testing.fakes import fake_calibration

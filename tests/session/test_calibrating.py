@@ -10,7 +10,7 @@ import pytest
 
 import labseq
 from labseq.assembly.calibrations import open_store
-from labseq.calibration.store import Store, read_entry
+from labseq.calibration_store import Store, read_entry
 from labseq.errors import ConfigError
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.motion import correct_overlay

@@ -11,7 +11,7 @@ import pytest
 
 import labseq
 from labseq.analysis.replay import ReplayRequest, replay, shots_of
-from labseq.calibration.store import Store
+from labseq.calibration_store import Store
 from labseq.data import open_run
 from labseq.errors import ConfigError, RecordingError
 from labseq.files import packaged_profiles_dir

@@ -15,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from labseq.analysis.statistics import statistics_of
-from labseq.calibration.store import encode_entry
+from labseq.calibration_store import encode_entry
 from labseq.data import open_run
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.model.estimate import mean

@@ -23,7 +23,7 @@ import pytest
 from PIL import Image
 
 import labseq
-from labseq.calibration.store import Store
+from labseq.calibration_store import Store
 from labseq.data import open_run
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.queue.queue import Queue

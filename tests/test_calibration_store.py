@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from labseq.calibration import store as store_module
-from labseq.calibration.store import Damaged, Store, Stored
+from labseq import calibration_store as store_module
+from labseq.calibration_store import Damaged, Store, Stored
 from labseq.errors import ConfigError
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.testing.fakes import fake_calibration
