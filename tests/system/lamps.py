@@ -1,6 +1,7 @@
 """A lab with a lamp that outlives its process, and what may happen to a run that has turned it on.
 
-``python -m tests.system.lamps --repeats 20`` prints how long the lamp stays on, for each cause.
+``python -m tests.system.lamps --repeats 20`` prints how long the lamp stays on, for each cause;
+``--shots 20000`` takes a long run to which nothing happens, and prints what its watchdog reported.
 """
 
 from __future__ import annotations
@@ -426,12 +427,29 @@ def print_replacements(repeats: int) -> None:
             )
 
 
+def print_alarms(n_shots: int) -> None:
+    """Take a run to which nothing happens, and print how it ended and what its watchdog reported: nothing."""
+    with lamps() as lab, lab.run("--shots", str(n_shots)) as process:
+        watchdog, begun_s = lab.watchdog, time.monotonic()
+        code = process.wait()
+        reports = [path.read_text() for path in lab.folder.glob("data/*/*/watchdog.jsonl")]
+        per_shot_ms = (time.monotonic() - begun_s) / n_shots * 1e3
+        print(
+            f"{lab.n_shots} shots, {per_shot_ms:.0f} ms each; exit code {code}; reports: {reports or 'none'}"
+        )
+        print(f"the watchdog was {'the same' if lab.watchdog == watchdog else 'replaced'} at the end")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--replacements", action="store_true", help="how long they take instead")
     parser.add_argument("--causes", nargs="+", choices=[*CAUSES, *TOO_SOON], default=[*CAUSES])
+    parser.add_argument("--shots", type=int, help="take so many shots instead, and look for false alarms")
     options = parser.parse_args()
+    if options.shots:
+        print_alarms(options.shots)
+        return
     if options.replacements:
         print_replacements(options.repeats)
         return
