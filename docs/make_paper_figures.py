@@ -136,7 +136,7 @@ def take(sequence: str, shots: Sequence[int], overrides: Sequence[str], seed: in
     lab = session.build_lab()
     session.warm(lab)
     tally = Tally(target=lab.target)
-    first = session.scan_run.first
+    first = session.assembly.first_point
     sequencer = Sequencer(
         lab,
         first.steps,
@@ -149,7 +149,8 @@ def take(sequence: str, shots: Sequence[int], overrides: Sequence[str], seed: in
     )
     try:
         sequencer.open()
-        sequencer.run(shots)
+        for shot in shots:
+            sequencer.take(shot)
     finally:
         sequencer.shut_down()
     return tally

@@ -23,7 +23,7 @@ from labseq.assembly.recorded import calibrations_of, files_of, machine_of
 from labseq.config.addresses import Override, split_overrides
 from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
-from labseq.guard import Guard, StopFlag
+from labseq.guard import Guard
 from labseq.messages import clean, format_error
 from labseq.model import (
     CycleRecord,
@@ -38,7 +38,6 @@ from labseq.model import (
 from labseq.model.estimate import mean
 from labseq.motion import check_plan
 from labseq.roles import Context, Detector, NeedsWarmUp, Planner
-from labseq.session.scan_run import point_of, scan_run_of
 from labseq.settings import Choice
 
 N_ATOMS_TRUE = "simulation.n_atoms_true"
@@ -330,13 +329,12 @@ class _Replayer:
         self.grid = machine_of(run).grid
         self._seed, self._host, self._changes = run.seed, assembly.hardware.host, changes
         self._calibrations = calibrations_of(run)
-        self._pipelines: dict[tuple[int, int], tuple[Point, _Pipeline]] = {}  # by the ids of a point's parts
+        self._pipelines: dict[tuple[int, int], tuple[Point, _Pipeline]] = {}
 
     def at(self, point: Point) -> _Pipeline:
-        key = id(point.planner), id(point.hardware)
-        if key not in self._pipelines:
-            self._pipelines[key] = point, self._make(point)
-        return self._pipelines[key][1]
+        if point.lab_key not in self._pipelines:
+            self._pipelines[point.lab_key] = point, self._make(point)
+        return self._pipelines[point.lab_key][1]
 
     def _make(self, point: Point) -> _Pipeline:
         own = {"planner": point.planner, "detector": point.hardware.chosen["detector"]}
@@ -376,7 +374,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
 
     changes, wanted = request.changes(), shots_of(run, request.shots)
     assembly = assembly_of(run)
-    scan_run = scan_run_of(assembly, run.seed, StopFlag())
+    point_of_shot = assembly.point_of_shot(run.seed)
     replayer = _Replayer(run, assembly, changes)
     plans: list[ReplayedPlan] = []
     images = ReplayedImages.none(replayer.grid.shape)
@@ -384,7 +382,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
     with announcing(announce):
         chosen = replayer.at(assembly.first_point).chosen
         for shot in wanted:
-            pipeline = replayer.at(point_of(assembly, shot, scan_run))
+            pipeline = replayer.at(_point_of(shot, assembly, point_of_shot))
             for stream in pipeline.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:
@@ -404,6 +402,13 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
         images=images,
         unreadable=unreadable,
     )
+
+
+def _point_of(shot: Shot, assembly: Assembly, point_of_shot: Sequence[int]) -> Point:
+    """The settings that a recorded shot was taken with."""
+    if assembly.search is None:
+        return assembly.at(point_of_shot[shot.index])
+    return assembly.search.at(assembly.search.values_in(shot.row))
 
 
 def assembly_of(run: Run) -> Assembly:

@@ -26,7 +26,7 @@ from labseq.assembly.search import Search, make_search
 from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
-from labseq.config.scan import Scan
+from labseq.config.scan import AdaptiveScan, Scan
 from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
 from labseq.model import TargetPattern
@@ -145,6 +145,21 @@ class Assembly:
         """The settings of a point of the scan."""
         return self._alone if self.scanned is None else self.scanned.at(point)
 
+    def point_of_shot(self, seed: int) -> list[int]:
+        """Number of the point of each shot; without a scan all are at one point."""
+        n_shots = self.sequence.shots
+        if self.scanned is None:
+            return [0] * n_shots
+        return self.scanned.scan.points_of_shots(seed)[:n_shots].tolist()
+
+    def scan_record(self, seed: int) -> dict[str, Any]:
+        """The scan for the run's record, JSON-ready; empty without one."""
+        if self.scanned is None:
+            return {}
+        if self.search is not None:
+            return self.search.record()
+        return self.scanned.record(self.point_of_shot(seed))
+
     @property
     def _alone(self) -> Point:
         """The settings of the files."""
@@ -229,10 +244,11 @@ def _assembled(
     search: Search | None = None
     try:
         if scan is not None and is_whole:
-            scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
+            scan = scan.bound(hardware.document)
+            scanned = ScanPoints(scan, document, sequence, hardware)
             scanned.check(found)
-            if not found.problems:
-                search = make_search(scanned, steps, results, found)
+            if isinstance(scan, AdaptiveScan) and not found.problems:
+                search = make_search(scan, scanned, steps, results, found)
         found.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None

@@ -58,6 +58,11 @@ class Point:
     parameters: Mapping[str, Any]
     document: Document
 
+    @property
+    def lab_key(self) -> tuple[int, int]:
+        """The same for points that need the same devices and planner, as long as these points exist."""
+        return id(self.planner), id(self.hardware)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPoints:
@@ -134,6 +139,23 @@ class ScanPoints:
                 parameters[address] = _setting(made, hardware, axis.of_profile, loc)
         steps = tuple((spec.name or spec.kind, made[spec.loc].plugin) for spec in self.sequence.shot)
         return Point(made[_PLANNER].plugin, steps, hardware, parameters, document)
+
+    def record(self, point_of_shot: Sequence[int]) -> dict[str, Any]:
+        """The scan for the run's record, JSON-ready.
+
+        ``addresses``: the scanned addresses; ``points``: the values of each point, SI; ``written``: the
+        same in the units of the sequence; ``point_of_shot``: the point of each shot, counted from 0.
+        """
+        points, addresses = range(self.scan.n_points), [axis.address for axis in self.scan.axes]
+        at = [self.at(point).parameters for point in points]
+        return {
+            "addresses": addresses,
+            "points": [[parameters[address] for address in addresses] for parameters in at],
+            "written": [[str(node.raw or node.plain()) for _, node in self.scan.values(p)] for p in points],
+            "repeats": self.scan.repeats,
+            "order": self.scan.order,
+            "point_of_shot": point_of_shot,
+        }
 
     def present(self, axis: Axis) -> Any:
         """The value of an axis in the files, SI; None if it is missing."""

@@ -179,7 +179,8 @@ def measure_latency(
         )
         try:
             sequencer.open()
-            sequencer.run(range(N_WARM + request.n_loadings))
+            for shot in range(N_WARM + request.n_loadings):
+                sequencer.take(shot)
             device = dict(lab.mobile_tweezers.describe())
         finally:
             sequencer.shut_down()

@@ -232,14 +232,14 @@ def _scanned(assembly: Assembly) -> list[str]:
 
 def _chosen(search: Search) -> list[str]:
     """A line for each range of an adaptive scan, and one for the scanner."""
-    scan, adaptive = search.scanned.scan, search.adaptive
+    scan, choice = search.scan, search.scan.choice
     lines: list[str] = []
-    for axis, ends in zip(scan.axes, adaptive.ends, strict=True):
-        steps = f" in {plural(ends.n_steps, 'step')}" if ends.n_steps else ""
+    for axis in scan.ranges:
+        steps = f" in {plural(axis.n_steps, 'step')}" if axis.n_steps else ""
         lines.append(f"{axis.address} from {_ends(axis)}{steps}")
     repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
-    what = f"points chosen during the run by {search.chosen.entry.name}, at most {adaptive.n_points}{repeats}"
-    aim = f"{'highest' if adaptive.maximise else 'lowest'} {clean(adaptive.quantity)}"
+    what = f"points chosen during the run by {choice.use}, at most {scan.n_points}{repeats}"
+    aim = f"{'lowest' if choice.maximise is None else 'highest'} {clean(choice.quantity)}"
     return [*lines, f"{what}, for the {aim}; everything else here is for the values in the files"]
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,15 +69,12 @@ class Scan:
         repeats: Number of shots at each point.
         order: "sequential" or "shuffled".
         notes: Warnings, for example that ``--set`` replaced an axis.
-        adaptive: The scanner, if it chooses the points during the run: each group is then one
-            axis, whose two values are the ends of its range.
     """
 
     groups: tuple[Group, ...]
     repeats: int
     order: ScanOrder
     notes: tuple[str, ...] = ()
-    adaptive: Adaptive | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -86,8 +83,8 @@ class Scan:
 
     @property
     def n_points(self) -> int:
-        """Number of points; for an adaptive scan, the largest possible number."""
-        return math.prod(self.shape) if self.adaptive is None else self.adaptive.n_points
+        """Number of points."""
+        return math.prod(self.shape)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -114,14 +111,7 @@ class Scan:
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_ORDER_KEY,)))
         return np.concatenate([rng.permutation(points) for _ in range(self.repeats)])
 
-    def at(self, values: Sequence[float]) -> Scan:
-        """A point of an adaptive scan, as a scan with only this point; ``values`` of the axes in SI."""
-        assert self.adaptive is not None
-        pairs = zip(self.axes, self.adaptive.ends, values, strict=True)
-        groups = tuple((replace(axis, values=(ends.node(value),)),) for axis, ends, value in pairs)
-        return replace(self, groups=groups)
-
-    def bound(self, document: Document) -> Scan:
+    def bound(self, document: Document) -> Self:
         """A copy in which the axes of the profile have their locations in the profile.
 
         Raises:
@@ -139,11 +129,8 @@ class Scan:
         return replace(self, groups=tuple(groups))
 
     def at_first_point(self, document: Document, *, profile: bool) -> Document:
-        """A copy of the sequence or of the profile with the values of the first point.
-
-        The first point of an adaptive scan is not known yet; the values of the file are then kept.
-        """
-        return document if self.adaptive is not None else put(self.values(0), document, profile=profile)
+        """A copy of the sequence or of the profile with the values of the first point."""
+        return put(self.values(0), document, profile=profile)
 
     def explained(self, error: ConfigError) -> ConfigError:
         """A copy of an error that adds to each invalid value its scanned address."""
@@ -218,16 +205,26 @@ class AdaptiveChoice(Choice):
             raise setting_error(what, "one of them", at=("minimise",), key=True)
         return self
 
+    @property
+    def quantity(self) -> str:
+        """The quantity to maximise or minimise."""
+        return self.maximise or self.minimise or ""
+
+    @property
+    def aim(self) -> Loc:
+        """Location of the name of the quantity."""
+        return (*self.loc, "minimise" if self.maximise is None else "maximise")
+
 
 @dataclass(frozen=True, slots=True)
-class Ends:
-    """The range of an address as written.
+class RangeAxis(Axis):
+    """An address whose values a scanner chooses; its two ``values`` are the ends of its range.
 
     Attributes:
         low: The lowest value.
         high: The highest value, in the unit of the lowest.
         n_steps: Number of equal steps; 0 if any value between the ends is allowed.
-        mark: Its place in the file.
+        mark: Place of the range in the file.
     """
 
     low: Number
@@ -240,39 +237,50 @@ class Ends:
         """The unit that values are written in; "" for plain numbers."""
         return self.low.unit
 
-    def node(self, value: float) -> Node:
-        """A value, SI, as a user would write it; without steps, rounded to a few digits of the range."""
+    def at(self, value: float) -> Axis:
+        """The axis at one value, SI, as a user would write it; without steps, rounded to a few digits."""
         if not isinstance(value, int) and not self.n_steps:
             low, high = self.low.amount, self.high.amount
             n_decimals = _DIGITS - math.floor(math.log10(high - low))
             amount = min(max(round(value / factor_of(self.unit), n_decimals), low), high)
             value = scaled(amount, factor_of(self.unit))
         text = written(value, self.unit)
-        return Node(text if self.unit else value, self.mark, raw=text)
+        node = Node(text if self.unit else value, self.mark, raw=text)
+        return Axis(self.address, self.loc, (node,), self.key)
 
 
 @dataclass(frozen=True, slots=True)
-class Adaptive:
-    """The scanner of a scan, the ranges, and the quantity to optimise.
+class AdaptiveScan(Scan):
+    """A scan whose points a scanner chooses during the run.
+
+    As a :class:`Scan`, its points are the corners of the ranges: the settings are validated there.
 
     Attributes:
-        choice: The scanner's name and place.
-        ends: The range of each axis.
-        n_points: Maximum number of points.
-        quantity: The quantity to maximise or minimise.
-        maximise: Whether the quantity is maximised.
+        choice: The scanner, and the quantity to optimise.
+        max_points: Maximum number of points.
     """
 
-    choice: Choice
-    ends: tuple[Ends, ...]
-    n_points: int
-    quantity: str
-    maximise: bool
+    choice: AdaptiveChoice = field(kw_only=True)
+    max_points: int = field(kw_only=True)
 
     @property
-    def aim(self) -> Loc:
-        """Location of the name of the quantity."""
-        return (*self.choice.loc, "maximise" if self.maximise else "minimise")
+    def n_points(self) -> int:
+        """The largest possible number of points."""
+        return self.max_points
+
+    @property
+    def ranges(self) -> tuple[RangeAxis, ...]:
+        """The axes, in the order written."""
+        return tuple(axis for axis in self.axes if isinstance(axis, RangeAxis))
+
+    def at(self, values: Sequence[float]) -> Scan:
+        """A scan of one point, with a value for each axis, SI."""
+        axes = zip(self.ranges, values, strict=True)
+        return Scan(tuple((axis.at(value),) for axis, value in axes), self.repeats, self.order)
+
+    def at_first_point(self, document: Document, *, profile: bool) -> Document:  # noqa: ARG002
+        """The document as it is: the first point is not known yet."""
+        return document
 
 
 def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None:
@@ -288,35 +296,48 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None
     Raises:
         ConfigError: All errors in its form.
     """
-    found = ProblemCollector()
     node = document.root.child("scan")
-    has_scan = node is not None and node.value is not None
-    for key in ("repeats", "order"):
-        if not has_scan and document.get((key,)) is not None:
-            what = f"'{key}' is given without a scan"
-            found.add(document.error((key,), what, "a 'scan' beside it", key=True))
-    if node is None or not has_scan:
+    if node is None or node.value is None:
+        found = ProblemCollector()
+        for key in ("repeats", "order"):
+            if document.get((key,)) is not None:
+                what = f"'{key}' is given without a scan"
+                found.add(document.error((key,), what, "a 'scan' beside it", key=True))
         found.raise_any()
         return None
-    repeats = document.get(("repeats",), 1)
-    if type(repeats) is not int or repeats < 1:  # an error that the model of the file reports
-        repeats = 1
     if isinstance(node.value, dict) and "use" in node.value:
-        return _read_adaptive(document, repeats, fixed, found)
-    notes: list[str] = []
-    groups: list[Group] = []
+        return _read_adaptive(document, fixed)
+    return _read_listed(document, node, fixed)
+
+
+def _repeats(document: Document) -> int:
+    """Number of shots at each point; 1 if it has an error, which the model of the file reports."""
+    repeats = document.get(("repeats",), 1)
+    return repeats if type(repeats) is int and repeats >= 1 else 1
+
+
+def _read_listed(document: Document, node: Node, fixed: Sequence[Override]) -> Scan:
+    """Read a scan that lists the values of each address.
+
+    Raises:
+        ConfigError: All errors in its form.
+    """
+    found, notes, groups = ProblemCollector(), list[str](), list[Group]()
     for mapping in _mappings(node, found):
-        axes = [_axis(document, address, *place, found) for address, place in mapping.items()]
-        group = tuple(axis for axis in axes if axis and _is_free(axis, fixed, document, notes))
+        axes: list[Axis] = []
+        for address, (key, values) in mapping.items():
+            with found:
+                axis = _placed(Axis(address, (), tuple(values_of(values, address)), key), document)
+                axes += [axis] if _is_free(axis, fixed, document, notes) else []
         with found:
-            _check_together(group)
-        groups += [group] if group else []
+            _check_together(axes)
+        groups += [tuple(axes)] if axes else []
     if not found.problems:
         with found:
             _refuse_twice(groups)
     found.raise_any()
     order: ScanOrder = "shuffled" if document.get(("order",)) == "shuffled" else "sequential"
-    scan = Scan(tuple(groups), repeats, order, tuple(notes))
+    scan = Scan(tuple(groups), _repeats(document), order, tuple(notes))
     if scan.n_points > MAX_POINTS:
         what = f"the scan has {' x '.join(map(str, scan.shape))} = {scan.n_points} points"
         raise node.mark.error(what, f"at most {MAX_POINTS}")
@@ -345,14 +366,7 @@ def _mappings(node: Node, found: ProblemCollector) -> list[_Written]:
     return groups
 
 
-def _axis(document: Document, address: str, key: Mark, node: Node, found: ProblemCollector) -> Axis | None:
-    """The axis of an address; None if it has an error."""
-    with found:
-        return placed_axis(address, key, values_of(node, address), document)
-    return None
-
-
-def _check_together(group: Group) -> None:
+def _check_together(group: Sequence[Axis]) -> None:
     """Raise for a group whose axes differ in length, or in which a combination of values occurs twice."""
     for axis in group[1:]:
         n, n_first = len(axis.values), len(group[0].values)
@@ -400,65 +414,59 @@ def _is_free(axis: Axis, fixed: Sequence[Override], document: Document, notes: l
     return True
 
 
-def _read_adaptive(
-    document: Document, repeats: int, fixed: Sequence[Override], found: ProblemCollector
-) -> Scan:
-    """Read an adaptive scan; each axis has two values, the ends of its range.
+def _read_adaptive(document: Document, fixed: Sequence[Override]) -> AdaptiveScan:
+    """Read an adaptive scan.
 
     Raises:
         ConfigError: All errors in its form.
     """
     choice = document.validate(AdaptiveChoice, ("scan",), called="an adaptive scan").placed("scan")
+    found, notes, groups, repeats = ProblemCollector(), list[str](), list[Group](), _repeats(document)
     if document.get(("order",)) is not None:
         what = "'order' is given, but the points are chosen one after another"
         found.add(document.error(("order",), what, "no 'order' beside 'use'", key=True))
-    notes: list[str] = []
-    groups: list[Group] = []
-    ends: list[Ends] = []
-    n_points = choice.points
     for address, range_ in choice.over.items():
         with found:
-            axis, own = _range_of(document, address, range_.steps or 0)
-            if _is_free(axis, fixed, document, notes):
-                groups.append((axis,))
-                ends.append(own)
+            axis = _range_axis(document, address, range_.steps or 0)
+            groups += [(axis,)] if _is_free(axis, fixed, document, notes) else []
     with found:
         _refuse_twice(groups)
-    if n_points is None:
-        shots = document.get(("shots",))
-        n_points = math.ceil(shots / repeats) if type(shots) is int and shots >= 1 else 0
-        if not n_points:
-            what = "'points' is missing from 'scan' (the maximum number of points)"
-            found.add(document.error(("scan",), what, "a whole number"))
+    shots, n_points = document.get(("shots",)), choice.points or 0
+    if not n_points and type(shots) is int and shots >= 1:
+        n_points = math.ceil(shots / repeats)
+    if not n_points:
+        what = "'points' is missing from 'scan' (the maximum number of points)"
+        found.add(document.error(("scan",), what, "a whole number"))
     found.raise_any()
     if not groups:
         raise document.error(("scan", "over"), "nothing is left to choose: options set every address")
-    quantity = choice.maximise or choice.minimise or ""
-    adaptive = Adaptive(choice, tuple(ends), n_points, quantity, choice.maximise is not None)
-    return Scan(tuple(groups), repeats, "sequential", tuple(notes), adaptive)
+    return AdaptiveScan(
+        tuple(groups), repeats, "sequential", tuple(notes), choice=choice, max_points=n_points
+    )
 
 
-def _range_of(document: Document, address: str, n_steps: int) -> tuple[Axis, Ends]:
+def _range_axis(document: Document, address: str, n_steps: int) -> RangeAxis:
     loc = ("scan", "over", address)
     key, mark = document.root.mark_at(loc, key=True), document.root.mark_at(loc)
     nodes = [document.root.at((*loc, end)) for end in ("from", "to")]
-    low_node, high_node = (node or Node(None, mark) for node in nodes)
-    low, high = numbers_of([low_node, high_node])
+    ends = low_node, high_node = tuple(node or Node(None, mark) for node in nodes)
+    low, high = numbers_of(ends)
     if not low.amount < high.amount:
         limits = [shown(node.plain(), node.raw) for node in (low_node, high_node)]
         what = f"'{clean(address)}' goes from {limits[0]} to {limits[1]}"
         raise document.error((*loc, "to"), what, "a greatest value above the least")
-    axis = placed_axis(address, key, [low_node, high_node], document)
-    return axis, Ends(low, high, n_steps, mark)
+    return _placed(RangeAxis(address, (), ends, key, low, high, n_steps, mark), document)
 
 
-def placed_axis(address: str, key: Mark, values: Sequence[Node], document: Document) -> Axis:
+_A = TypeVar("_A", bound=Axis)
+
+
+def _placed(axis: _A, document: Document) -> _A:
     """An axis with its location in the sequence; an axis of the profile is located later.
 
     Raises:
         ConfigError: The address does not exist, or a scan cannot change its setting.
     """
-    axis = Axis(address, (), tuple(values), key)
     if axis.of_profile:
         return axis
     axis = _found(axis, document)
@@ -476,7 +484,7 @@ def _placed_in_profile(axis: Axis, document: Document) -> Axis:
     raise _unscannable(axis)
 
 
-def _found(axis: Axis, document: Document) -> Axis:
+def _found(axis: _A, document: Document) -> _A:
     """An axis with the location of its address; a variable must exist."""
     try:
         loc = find(document.root, axis.address.removeprefix(PROFILE), may_add=MAY_ADD)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import sys
 import time
@@ -279,26 +278,22 @@ class Sequencer:
     def _open(self, lab: Lab, names: Collection[str]) -> None:
         open_devices(lab, self.guard, self._stop, self._emit, names, self._watchdog)
 
-    def run(self, shot_indices: Sequence[int]) -> dict[int, str]:
-        """Take the shots, and repeat those that fail, as the policy says.
+    def take(self, index: int) -> str:
+        """Take and write a shot; if it fails, repeat it as the policy says.
 
         Returns:
-            Shots that failed for good, and why; the points of the scan that they belong to are to be skipped.
+            Why it failed for good, and its point of the scan is to be skipped; "" for a shot that counts.
 
         Raises:
-            LabseqError: The error that ended the run before its last shot. The caller
-                must call :meth:`shut_down` in this case too.
+            LabseqError: The error that ended the run; the caller must call :meth:`shut_down` then, too.
         """
-        failed = dict[int, str]()
-        for index in shot_indices:
-            for attempt in itertools.count():
-                self._stop.check()
-                then, why = self._take(index, attempt)
-                if then == "skip_point":
-                    failed[index] = why
-                if then != "repeat_shot":
-                    break
-        return failed
+        attempt = 0
+        while True:
+            self._stop.check()
+            then, why = self._attempt(index, attempt)
+            if then != "repeat_shot":
+                return why
+            attempt += 1
 
     def shut_down(self, *, ended_well: bool = False) -> Mapping[str, LabseqError]:
         """Safe state of every device, then close; from any state, any number of times.
@@ -355,7 +350,7 @@ class Sequencer:
             return "warning", {"text": f"{name} cannot be left on, and are switched off: {failure}"}
         return ("left_on", {"device": name}) if left else None
 
-    def _take(self, index: int, attempt: int) -> tuple[Then | None, str]:
+    def _attempt(self, index: int, attempt: int) -> tuple[Then | None, str]:
         """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
         self._states.to(State.SHOT)
         self._warn_of_watchdog()

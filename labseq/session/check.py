@@ -9,10 +9,11 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from labseq.assembly.assemble import Assembly
 from labseq.assembly.lab import WARM_S
 from labseq.assembly.plugin_choice import changed_settings
 from labseq.assembly.points import Point
@@ -26,12 +27,9 @@ from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
 from labseq.sequencer.run import plan_timeline
+from labseq.session.prepared import PreparedRun
 from labseq.session.rehearsal import Rehearsal, quantile, rehearse, windows_of
 from labseq.units import format_quantity
-
-if TYPE_CHECKING:
-    from labseq.session.session import Session
-
 
 N_LOADINGS: Final = 200
 """Maximum number of random loadings for which the planner is run."""
@@ -51,8 +49,8 @@ Timeline: TypeAlias = Sequence[tuple[str, Sequence[TimelineEntry]]]
 class _Checks:
     """The checks of a run; points with the same settings are checked once."""
 
-    def __init__(self, session: Session, guard: Guard) -> None:
-        self.session = session
+    def __init__(self, run: PreparedRun, guard: Guard) -> None:
+        self.run = run
         self.guard = guard
         self.found = ProblemCollector()
         self.rehearsals: dict[tuple[object, ...], list[Rehearsal]] = {}
@@ -62,21 +60,20 @@ class _Checks:
 
     def of(self, point: Point) -> _PointCheck:
         """The checks of a point."""
-        parts = id(point.planner), id(point.hardware)
-        key = (*parts, *(id(step) for _, step in point.steps))
+        key = (*point.lab_key, *(id(step) for _, step in point.steps))
         if key not in self._points:
-            if parts not in self._labs:
-                self._labs[parts] = self.session.build_lab(point)
-            self._points[key] = _PointCheck(self, point, self._labs[parts])
+            if point.lab_key not in self._labs:
+                self._labs[point.lab_key] = self.run.build_lab(point)
+            self._points[key] = _PointCheck(self, point, self._labs[point.lab_key])
         return self._points[key]
 
     def raise_problems(self) -> None:
         """Raise what was found, unless the check was stopped: calls that end early find nothing."""
-        self.session.stop_flag.check()
+        self.run.stop_flag.check()
         try:
             self.found.raise_any()
         except ConfigError as error:
-            scanned = self.session.assembly.scanned
+            scanned = self.run.assembly.scanned
             raise error if scanned is None else scanned.scan.explained(error) from None
 
 
@@ -90,7 +87,7 @@ class _PointCheck:
         self.windows = windows_of(point.steps)
         # what is planned; the last windows do not change it
         self.rehearsal_key: tuple[object, ...] = (id(lab), *[*self.windows.values()][:-1])
-        self.shot = checks.session.assembly.sequence.shot
+        self.shot = checks.run.assembly.sequence.shot
         self._guard = checks.guard
 
     @property
@@ -266,7 +263,7 @@ def _timing_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
 
 def _timeout_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """Warnings about steps that may take longer than the timeout of their policy."""
-    assembly = one.checks.session.assembly
+    assembly = one.checks.run.assembly
     each = zip(assembly.sequence.shot, assembly.policy.steps, one.timeline, strict=True)
     for number, (spec, policy, (_, bars)) in enumerate(each):
         longest_s = sum(bar.duration_s for bar in bars)
@@ -325,22 +322,22 @@ class CheckReport:
         return sum(bar.n_images for bar in self.bars)
 
 
-def check(session: Session, *, runs: bool = False) -> CheckReport:
+def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
     """Compute timeline, duration, disk space and warnings of a run; no device is opened.
 
     Args:
-        session: An opened session; its sequence and profile have no errors.
+        run: The run; its sequence and profile have no errors.
         runs: Whether a run follows; then the kernels of the devices are compiled with those of the planner.
 
     Raises:
         ConfigError: What a device or plugin would refuse in the first shot at some point of the run.
     """
-    assembly, guard = session.assembly, Guard(session.stop_flag)
-    checks = _Checks(session, guard)
+    assembly, guard = run.assembly, Guard(run.stop_flag)
+    checks = _Checks(run, guard)
     try:
         first = checks.of(assembly.first_point)
         numbers: dict[_PointCheck, set[int]] = {first: {0}}
-        for known in session.scan_run.known_points():
+        for known in run.points.known(run.history):
             numbers.setdefault(checks.of(known.settings), set()).add(known.number)
         # the first points first, in whatever order the shots take them
         numbers = dict(sorted(numbers.items(), key=lambda item: min(item[1])))
@@ -361,16 +358,16 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
     finally:
         guard.end()
     rehearsals, bars = first.rehearsed, [bar for _, own in first.timeline for bar in own]
-    warnings += _judgement_warnings(session, [*rehearsals])
+    warnings += _judgement_warnings(assembly, [*rehearsals])
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         first.timeline,
         assembly.sequence.shots,
-        None if assembly.scanned is None else session.scan_run.n_points,
+        None if assembly.scanned is None else len({*run.history.point_of_shot}),
         run_s,
-        (*notes, *warnings, *_light_warnings(session, first.lab)),
+        (*notes, *warnings, *_light_warnings(assembly, first.lab)),
         next(iter(rehearsals.values()), None),
-        _shot_bytes(session, first.lab, bars),
+        _shot_bytes(assembly, first.lab, bars),
         spans_on(first.lab.line_specs, bars),
         {name: text for name, one in first.lab.hardware() if (text := getattr(one, "idle_output", ""))},
     )
@@ -378,18 +375,20 @@ def check(session: Session, *, runs: bool = False) -> CheckReport:
 
 def _run_s(checks: _Checks) -> tuple[float, float]:
     """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
-    run, least_s, most_s = checks.session.scan_run, list[float](), list[float]()
-    for _, point, n in run.known_points():
+    run, least_s, most_s = checks.run, list[float](), list[float]()
+    for _, point, n in run.points.known(run.history):
         bars = [bar for _, bars in checks.of(point).timeline for bar in bars]
         least_s.append(n * sum(bar.min_duration_s for bar in bars))
         most_s.append(n * sum(bar.duration_s for bar in bars))
-    return (min(least_s), max(most_s)) if run.is_adaptive else (sum(least_s), sum(most_s))
+    if run.assembly.search is not None:
+        return min(least_s), max(most_s)
+    return sum(least_s), sum(most_s)
 
 
 def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
     found: dict[Any, tuple[Problem, list[int]]] = {}
-    is_adaptive, n_points = checks.session.scan_run.is_adaptive, sum(map(len, numbers.values()))
+    is_adaptive, n_points = checks.run.assembly.search is not None, sum(map(len, numbers.values()))
     judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings
     for judge in (*judges, _timing_warnings, _device_warnings, _instance_warnings):
         for one, own in numbers.items():
@@ -409,7 +408,7 @@ def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -
 
 def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) -> None:
     """Rehearse the moves at every point that differs from those before it."""
-    session = checks.session
+    run = checks.run
     distinct: dict[tuple[object, ...], _PointCheck] = {}
     for one in points:
         distinct.setdefault(one.rehearsal_key, one)
@@ -420,7 +419,7 @@ def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) ->
             continue
         is_new = id(one.lab) not in asked
         if is_new:
-            session.warm(one.lab, devices=runs and n == 0)
+            run.warm(one.lab, devices=runs and n == 0)
         deadline = time.monotonic() + (wait_s if n else MAX_WAIT_S)
         n_loadings, windows = N_LOADINGS_ELSEWHERE if n else N_LOADINGS, [*one.windows.values()]
         found, plans, failure = rehearse(checks.guard, one.lab, windows, n_loadings, deadline)
@@ -429,14 +428,14 @@ def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) ->
             one.ask_tweezers(plans if n == 0 else plans[:1])
             asked.add(id(one.lab))
         if failure is not None:
-            what, hint = failure.what, failure.hint and f"{failure.hint} {_plan_options(session, one.point)}"
-            loc = (*session.assembly.sequence.planner.loc, "use")
-            checks.found.add(one.point.document.error(loc, what, hint=hint))
+            hint = failure.hint and f"{failure.hint} {_plan_options(run.assembly, one.point)}"
+            loc = (*run.assembly.sequence.planner.loc, "use")
+            checks.found.add(one.point.document.error(loc, failure.what, hint=hint))
 
 
-def _plan_options(session: Session, point: Point) -> str:
+def _plan_options(assembly: Assembly, point: Point) -> str:
     """The options by which `labseq plan` plans as a run does at a point."""
-    assembly, settings = session.assembly, changed_settings(point.planner.settings)
+    settings = changed_settings(point.planner.settings)
     options = ["--target", str(assembly.document.path), "--planner", point.planner.entry.name]
     options += ["--profile", str(assembly.hardware.document.path)]
     for key, value in settings.items():
@@ -467,13 +466,13 @@ def _window_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
         yield -1, document.problem(("target",), what, "a smaller target, or better loading")
 
 
-def _light_warnings(session: Session, lab: Lab) -> Iterator[Problem]:
+def _light_warnings(assembly: Assembly, lab: Lab) -> Iterator[Problem]:
     """Imaging light that nothing switches, and light that might harm the camera and is not declared."""
-    hardware = session.assembly.hardware
+    hardware = assembly.hardware
     document, lines, gain = hardware.document, hardware.profile.lines, lab.step_context.camera.em_gain
-    takes_image = any(step.takes_image for _, step in session.assembly.steps)
+    takes_image = any(step.takes_image for _, step in assembly.steps)
     others_may = any(
-        getattr(step, name, "") for _, step in session.assembly.steps for name in ("device_setting", "signal")
+        getattr(step, name, "") for _, step in assembly.steps for name in ("device_setting", "signal")
     )
     is_lit = others_may or any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
     if takes_image and not is_lit and hardware.chosen["camera"].identities("camera"):
@@ -489,9 +488,8 @@ def _light_warnings(session: Session, lab: Lab) -> Iterator[Problem]:
             yield document.problem(("lines", "channels", name), what, expected)
 
 
-def _judgement_warnings(session: Session, rearrangements: Sequence[int]) -> list[Problem]:
+def _judgement_warnings(assembly: Assembly, rearrangements: Sequence[int]) -> list[Problem]:
     """Warn if no ``image`` step judges the shots; a fixed number of cycles is judged by its own images."""
-    assembly = session.assembly
     images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
     if not rearrangements or max(images, default=-1) > rearrangements[-1]:
         return []
@@ -507,7 +505,7 @@ def _parallelism_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     asked = getattr(point.planner.settings, "degree_of_parallelism", None)
     limit = point.hardware.profile.motion.max_tweezers
     if isinstance(asked, int) and asked > limit:
-        loc = (*one.checks.session.assembly.sequence.planner.loc, "degree_of_parallelism")
+        loc = (*one.checks.run.assembly.sequence.planner.loc, "degree_of_parallelism")
         what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
         yield 0, point.document.problem(loc, f"{what}; at most {limit} are used")
 
@@ -554,10 +552,10 @@ def _device_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
             n_found += 1
 
 
-def _shot_bytes(session: Session, lab: Lab, bars: Sequence[TimelineEntry]) -> int | None:
+def _shot_bytes(assembly: Assembly, lab: Lab, bars: Sequence[TimelineEntry]) -> int | None:
     shape = lab.step_context.camera.frame_shape
     n_images = sum(bar.n_images for bar in bars)
-    kept = {"all": n_images, "last": min(1, n_images), "none": 0}[session.assembly.sequence.record_frames]
+    kept = {"all": n_images, "last": min(1, n_images), "none": 0}[assembly.sequence.record_frames]
     if shape is None and kept:
         return None
     per_image = BYTES_PER_SITE * lab.grid.n_rows * lab.grid.n_cols

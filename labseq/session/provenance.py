@@ -109,14 +109,11 @@ def _user() -> str:
         return ""
 
 
-def run_record(
-    assembly: Assembly, seed: int, changes: Mapping[str, str], scan: Mapping[str, Any], folder: Path
-) -> RunRecord:
+def run_record(assembly: Assembly, seed: int, changes: Mapping[str, str], folder: Path) -> RunRecord:
     """The record of a run before anything is opened.
 
     Args:
         changes: Changes by options, as they were typed: address -> value.
-        scan: Its scan, see :meth:`labseq.session.scan_run.ScanRun.record`.
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """
     spec, hardware = assembly.sequence, assembly.hardware
@@ -143,7 +140,7 @@ def run_record(
         record_frames=spec.record_frames,
         grid_spacing_m=hardware.grid.spacing_m,
         lattice=hardware.grid.lattice,
-        scan=scan,
+        scan=assembly.scan_record(seed),
         steps=unique_names([name for name, _ in assembly.steps]),
         calibrations={kind: entry.id for kind, entry in hardware.calibrations.items()},
     )

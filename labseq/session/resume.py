@@ -26,7 +26,6 @@ from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
 from labseq.session.provenance import run_record
-from labseq.session.scan_run import scan_run_of
 from labseq.text_files import decode, read_bytes
 
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
@@ -151,8 +150,7 @@ class ResumableRun:
             ConfigError: A change is not accepted, or the remaining shots would be different ones.
         """
         record, folder = self.run.record, self.run.path
-        scan_run = scan_run_of(assembly, self.run.seed, StopFlag())
-        today = run_record(assembly, self.run.seed, options.changes(), scan_run.record(), Path.cwd())
+        today = run_record(assembly, self.run.seed, options.changes(), Path.cwd())
         for what in ("n_shots", "scan", "target"):
             if found := differences(record, today, what):
                 raise _refused(folder, f"its shots would differ today: {found[0]}")

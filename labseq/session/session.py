@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import secrets
 import signal
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
@@ -12,14 +11,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, Self
 
 from labseq.assembly.assemble import Assembly, assemble
-from labseq.assembly.lab import build_lab, clock_for, warm
 from labseq.assembly.options import Options, path_of
 from labseq.assembly.plugin_choice import DryRun
 from labseq.assembly.points import Point
 from labseq.data import Run, open_run
 from labseq.data.best import best_point
 from labseq.errors import ConfigError, DeviceError, RecordingError
-from labseq.guard import StopFlag, stop_on_signals
+from labseq.guard import stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord
 from labseq.realtime import real_time
@@ -30,12 +28,11 @@ from labseq.safety.locks import lock_devices
 from labseq.safety.safe import make_safe_after_crash
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, State
-from labseq.session.analysis_processes import AnalysisProcesses
 from labseq.session.check import check
 from labseq.session.checks import Checks
-from labseq.session.observers import Observers
+from labseq.session.prepared import PreparedRun
 from labseq.session.provenance import copies, ending, run_record
-from labseq.session.scan_run import ShotTaker, scan_run_of
+from labseq.session.shots import Shots
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
@@ -55,7 +52,7 @@ def only_new_garbage() -> Generator[None]:
         gc.unfreeze()
 
 
-class Session:
+class Session(PreparedRun):
     """Opens a sequence, runs it, and leaves every device safe; a context manager.
 
     Example::
@@ -71,19 +68,13 @@ class Session:
         observer: RunObserver | None = None,
         earlier: ResumableRun | None = None,
     ) -> None:
-        self.assembly = assembly
+        before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
+        super().__init__(assembly, observer, paced=options.realtime, run=before, done=done)
         self.options = options
         self.earlier = earlier
-        seed = assembly.sequence.seed if earlier is None else earlier.run.seed
-        self.seed = secrets.randbits(63) if seed is None else seed
         self.run_dir: Path | None = None
         # before devices are opened: some vendors' libraries change the working folder
         self._cwd, self._profile_key = Path.cwd(), assembly.hardware.key
-        self.stop_flag = StopFlag()
-        before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
-        self._observers = Observers(assembly.hardware.host, observer)
-        self._analyses = self._analysis_processes(before)
-        self.scan_run = scan_run_of(assembly, self.seed, self.stop_flag, before, done, self._analyses)
         self._lost = ""
 
     @classmethod
@@ -181,69 +172,69 @@ class Session:
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
         for text in () if self.earlier is None else self.earlier.warnings:
-            self._warn(text)
+            self.warn(text)
         # before devices are opened: some vendors' libraries change the working folder
         root = (self.earlier.root if self.earlier else self.options.output or data_root()).absolute()
         hardware, purpose = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
         with (
             stop_on_signals(self.stop_flag),
-            lock_devices(hardware, purpose, self._warn) as describe_locks,
-            closing(self._observers),
+            lock_devices(hardware, purpose, self.warn) as describe_locks,
+            closing(self.observers),
         ):
-            make_safe_after_crash(hardware, self.stop_flag, self._observers)
-            if not self.scan_run.shots:  # its process died between the last shot and the end of the run
-                self._begin(root)[1].finish("complete")
+            make_safe_after_crash(hardware, self.stop_flag, self.observers)
+            first = self.points.next(self.history)
+            if first is None:  # its process died between the last shot and the end of the run
+                self._begin(root, first)[1].finish("complete")
             else:
-                lab, warnings = self._checked()
-                with self._folder(root, describe_locks) as (record, writer):
+                lab, warnings = self._checked(first)
+                with self._folder(root, first, describe_locks) as (record, writer):
                     for text in dict.fromkeys([*warnings, *hardware.host.notes]):
-                        self._warn(text)
-                    self._take_shots(lab, record, writer)
-                    if self.scan_run.is_adaptive:
+                        self.warn(text)
+                    self._take_shots(lab, first, record, writer)
+                    if self.assembly.search is not None:
                         self._try(self._report_best, writer.run_dir)
         assert self.run_dir is not None
         return open_run(self.run_dir)
 
-    def _checked(self) -> tuple[Lab, list[str]]:
+    def _checked(self, first: Point) -> tuple[Lab, list[str]]:
         """Check the run and compile its kernels; returns the devices of the first shot, and warnings."""
         warnings = [str(problem) for problem in check(self, runs=True).warnings]
         # once more: what the check has rehearsed used up random numbers and the states of simulated devices
-        first, *others = self.scan_run.known_labs()
+        points = {known.settings.lab_key: known.settings for known in self.points.known(self.history)}
+        points.pop(first.lab_key, None)
         self.warm(lab := self.build_lab(first))
-        for point in others:
+        for point in points.values():
             self.warm(self.build_lab(point))
         return lab, warnings
 
-    def _take_shots(self, lab: Lab, record: RunRecord, writer: RunWriter) -> None:
+    def _take_shots(self, lab: Lab, first: Point, record: RunRecord, writer: RunWriter) -> None:
         """Open the devices, take the shots, and leave every device safe."""
         log, pulse = writer.run_dir / WATCHDOG_LOG, self.stop_flag.pulse
         watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
-        first, policy = self.scan_run.first, self.assembly.policy
-        taker = ShotTaker(lab, first, record, policy, self.stop_flag, writer, self._observers, watchdog)
+        shots = Shots(self, lab, first, writer, watchdog)
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
         before = () if self.earlier is None else self.earlier.rows
         # in the reverse order of these lines: devices safe, results of analyses waited for, the mark removed
         with (
             only_new_garbage(),
             nullcontext() if lab.clock.virtual else real_time(),
-            self._marked_active(writer.run_dir, taker.sequencer),
+            self._marked_active(writer.run_dir, shots.sequencer),
             self._analyses_finished(writer),
-            self._devices(taker.sequencer, record, writer),
+            self._devices(shots.sequencer, record, writer),
         ):
-            checks = Checks(settings, writer.run_dir, before, target, self._analyses, self._warn)
-            self.scan_run.run(taker, writer, checks, self._observers.event, self._analyses.look)
+            shots.take_all(Checks(settings, writer.run_dir, before, target, self.analyses, self.warn))
 
     @contextmanager
     def _folder(
-        self, root: Path, describe_locks: Callable[[str], None]
+        self, root: Path, first: Point, describe_locks: Callable[[str], None]
     ) -> Generator[tuple[RunRecord, RunWriter]]:
         """The run's folder, in which the way that the block ends is recorded."""
-        record, writer = self._begin(root)
+        record, writer = self._begin(root, first)
         describe_locks(f"the run {writer.run_dir}")
         error: BaseException | None = None
-        with self._observers.logged_by(writer.event):
+        with self.observers.logged_by(writer.event):
             if self.earlier is None and (day := later_day(writer.run_dir)):
-                self._warn(
+                self.warn(
                     f"the clock may be wrong: {visible(str(root))} has runs of {day}, later than this one"
                 )
             try:
@@ -254,7 +245,7 @@ class Session:
             finally:
                 status, text = ending(error)
                 self._try(writer.finish, status, text)
-                self._observers.event("run_finished", {"record": record, "status": status, "error": text})
+                self.observers.event("run_finished", {"record": record, "status": status, "error": text})
 
     @contextmanager
     def _marked_active(self, run_dir: Path, sequencer: Sequencer) -> Generator[None]:
@@ -275,7 +266,7 @@ class Session:
             yield
         finally:
             if not writer.is_given_up:
-                self._try(self._analyses.finish)
+                self._try(self.analyses.finish)
 
     @contextmanager
     def _devices(self, sequencer: Sequencer, record: RunRecord, writer: RunWriter) -> Generator[None]:
@@ -286,11 +277,11 @@ class Session:
         """
         about = {"record": record, "run_dir": str(writer.run_dir), "n_before": writer.n_written}
         try:
-            self._observers.event("run_starting", about)
+            self.observers.event("run_starting", about)
             sequencer.open()
             writer.set_devices(describe(sequencer.lab, sequencer.guard))
-            self._analyses.start(writer.run_dir)
-            self._observers.event("run_started", about)
+            self.analyses.start(writer.run_dir)
+            self.observers.event("run_started", about)
             yield
         except BaseException as error:
             sequencer.shut_down()
@@ -301,43 +292,21 @@ class Session:
             reasons = "; ".join(str(failure) for failure in unsafe.values())
             raise DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
 
-    def build_lab(self, point: Point | None = None) -> Lab:
-        """Construct the object of every role with the run's clock; no device is opened.
-
-        Args:
-            point: Point of the scan; None for the first one.
-        """
-        clock = clock_for(self.stop_flag, virtual=self.assembly.virtual_time, paced=self.options.realtime)
-        return build_lab(point or self.assembly.first_point, self.assembly.target, clock, self.seed)
-
-    def warm(self, lab: Lab, *, devices: bool = True) -> None:
-        """Compile the kernels of a lab; see :func:`labseq.assembly.lab.warm`."""
-        warm(lab, self.stop_flag, self._observers, devices=devices)
-
     def _end_without_watchdog(self, why: str) -> None:
         """Have the run end; called by the thread of the heartbeat."""
         self._lost = why
         self.stop_flag.request(signal.SIGTERM)
 
-    def _analysis_processes(self, run: Run | None) -> AnalysisProcesses:
-        """The analyses of the sequence, and what the run needs of their results."""
-        checks, search = self.assembly.sequence.policy.checks, self.assembly.search
-        needed = {check.value: "" for check in checks}
-        needed |= {check.value: "for a check that stops it" for check in checks if check.then == "stop"}
-        if search is not None:
-            needed[search.adaptive.quantity] = "to choose the next point"
-        analyses = self.assembly.resolved["analysis"]
-        return AnalysisProcesses(analyses, needed, self._observers, self.stop_flag, run)
-
-    def _begin(self, root: Path) -> tuple[RunRecord, RunWriter]:
-        """Create the run's folder, or reopen that of a resumed run."""
-        changes, scan, earlier = self.options.changes(), self.scan_run.record(), self.earlier
-        record = run_record(self.assembly, self.seed, changes, scan, self._cwd)
+    def _begin(self, root: Path, first: Point | None) -> tuple[RunRecord, RunWriter]:
+        """Create the run's folder, or reopen that of a resumed run; ``first`` is its next point, if any."""
+        changes, earlier = self.options.changes(), self.earlier
+        record = run_record(self.assembly, self.seed, changes, self._cwd)
         if earlier is None:
             extra_files = copies(self.assembly.hardware.calibrations)
             writer = RunWriter.create(root, record, extra_files, self.stop_flag)
         else:
-            writer = earlier.reopen(record, next(iter(self.scan_run.shots), None), self.stop_flag)
+            first_shot = None if first is None else self.history.to_take[0]
+            writer = earlier.reopen(record, first_shot, self.stop_flag)
         self.run_dir = writer.run_dir
         return record, writer
 
@@ -345,14 +314,11 @@ class Session:
         """Record the best point of an adaptive scan, with its value and the suggested one."""
         best = best_point(open_run(run_dir))
         if best is not None:
-            self._observers.event("scan_result", best.as_dict())
-
-    def _warn(self, text: str) -> None:
-        self._observers.event("warning", {"text": text})
+            self.observers.event("scan_result", best.as_dict())
 
     def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
         """Write to disk at the end of a run; a full disk must not hide the error that ended the run."""
         try:
             act(*args, **kwargs)
         except Exception as failure:  # noqa: BLE001 - nothing hides the error that ended the run
-            self._warn(error_text(failure))
+            self.warn(error_text(failure))

@@ -50,7 +50,7 @@ def test_a_shot_of_null_steps(benchmark: Any, session: labseq.Session, n_steps: 
     sequencer = Sequencer(session.build_lab(), steps, StopFlag(), nowhere, nowhere, seed=1)
     sequencer.open()
     try:
-        benchmark(lambda: sequencer.run([next(shots)]))
+        benchmark(lambda: sequencer.take(next(shots)))
     finally:
         assert not sequencer.shut_down()
     assert nowhere.n_stages == n_steps

@@ -63,7 +63,7 @@ def run(lab: FakeLab, observer: RecordingObserver | None = None, **settings: Any
     sequencer = Sequencer(lab, [("equalise", step)], lab.stop, sink, observer or RecordingObserver(), seed=1)
     try:
         sequencer.open()
-        sequencer.run([0])
+        sequencer.take(0)
     finally:
         sequencer.shut_down()
     (shot,) = sink.shots

@@ -27,7 +27,7 @@ def run(step: ProbeStep, lab: FakeLab, *, before: bool = True) -> ListSink:
     sequencer = Sequencer(lab, steps, lab.stop, sink, RecordingObserver(), seed=1)
     try:
         sequencer.open()
-        sequencer.run([0])
+        sequencer.take(0)
     finally:
         sequencer.shut_down()
     return sink

@@ -72,7 +72,8 @@ def run(lab: FakeLab, steps: SEQUENCE, n_shots: int = 1) -> tuple[list[ShotRecor
     sequencer = Sequencer(lab, [image, *steps], lab.stop, sink, observer, seed=1)
     try:
         sequencer.open()
-        sequencer.run(range(n_shots))
+        for shot in range(n_shots):
+            sequencer.take(shot)
     finally:
         sequencer.shut_down()
     return sink.shots, observer

@@ -38,7 +38,7 @@ class Rig:
     def run(self, n_shots=1):
         try:
             self.sequencer.open()
-            self.given_up = self.sequencer.run(range(n_shots))
+            self.given_up = {shot: why for shot in range(n_shots) if (why := self.sequencer.take(shot))}
         finally:
             self.unsafe = self.sequencer.shut_down()
 

@@ -124,7 +124,7 @@ def test_a_recovery_that_fails_keeps_the_attempt():
 def test_between_shots_a_device_is_made_safe_closed_and_opened_again():
     rig = Rig()
     rig.sequencer.open()
-    rig.sequencer.run([0])
+    rig.sequencer.take(0)
     done = len(rig.lab.calls.names())
     rig.sequencer.change(rig.lab, (LOAD, IMAGE), {"profile.camera.gain": 2}, {"camera", "static_tweezers"})
     assert rig.lab.calls.names()[done:] == [
@@ -137,7 +137,7 @@ def test_between_shots_a_device_is_made_safe_closed_and_opened_again():
         "static_tweezers.load",
         "static_tweezers.start",
     ]
-    rig.sequencer.run([1])
+    rig.sequencer.take(1)
     assert rig.record().parameters == {"profile.camera.gain": 2}
     assert not rig.sequencer.shut_down()
 
@@ -159,7 +159,7 @@ def test_static_tweezers_stay_on_only_after_a_good_run_with_all_else_safe(ended_
     tweezers = rig.lab.static_tweezers
     tweezers.__class__ = type("LeftOn", (type(tweezers),), {"leave_on": leave_on})
     rig.sequencer.open()
-    rig.sequencer.run([0])
+    rig.sequencer.take(0)
     rig.sequencer.shut_down(ended_well=ended_well)
     assert asked == ([SAFE_ORDER[:-1]] if ended_well and not camera else [])
     assert rig.made_safe() == SAFE_ORDER, "of no effect on a device that has disconnected"
@@ -175,7 +175,7 @@ def test_a_change_of_planner_and_steps_touches_no_device():
     done = len(rig.lab.calls.names())
     rig.sequencer.change(rig.lab, (LOAD,), {})
     assert len(rig.lab.calls.names()) == done
-    rig.sequencer.run([0])
+    rig.sequencer.take(0)
     assert [t.stage for t in rig.record().timing if t.stage.startswith("step")] == ["step_0_load"]
     assert not rig.sequencer.shut_down()
 

@@ -1,0 +1,252 @@
+"""Where the shots of a run are taken: at points known in advance, or at those that a scanner chooses."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from labseq.assembly.points import Point
+from labseq.assembly.policies import missing_quantity
+from labseq.assembly.search import TO_OPTIMISE, Search
+from labseq.data import Run, Shot
+from labseq.data.columns import quantities_in
+from labseq.data.quantities import make_quantity
+from labseq.data.shot import caching_loader
+from labseq.errors import DeviceError
+from labseq.model import VisitedPoint
+from labseq.plain import dumps
+from labseq.recording.results import PREFIX
+
+if TYPE_CHECKING:
+    from labseq.assembly.assemble import Assembly
+    from labseq.session.prepared import PreparedRun
+
+
+class History:
+    """The shots of a run: those that were taken or given up, and those still to take.
+
+    Args:
+        run: The run before it was resumed; None for a new one.
+        done: Its shots that are not taken again.
+
+    Attributes:
+        point_of_shot: Number of the point of each shot of the run.
+        to_take: Shots still to take, in order.
+        shots: Number of a point -> index of a shot -> the shots taken there that count; of an adaptive scan.
+        given_up: Number of a point -> line of the index of a shot that was given up there; likewise.
+    """
+
+    def __init__(
+        self, assembly: Assembly, seed: int, run: Run | None = None, done: Collection[int] = ()
+    ) -> None:
+        self.point_of_shot = assembly.point_of_shot(seed)
+        self.to_take = [shot for shot in range(len(self.point_of_shot)) if shot not in done]
+        self.shots = defaultdict[int, dict[int, Shot]](dict)
+        self.given_up: dict[int, Mapping[str, Any]] = {}
+        self._is_scan, self._is_search = assembly.scanned is not None, assembly.search is not None
+        self._load = caching_loader()
+        if run is not None and self._is_search:
+            for shot in run.shots:
+                self.shots[self.point_of_shot[shot.index]][shot.index] = shot
+            skipped = (attempt for attempt in run.attempts if attempt.index in run.skipped)
+            self.given_up = {self.point_of_shot[attempt.index]: attempt.row for attempt in skipped}
+
+    @property
+    def next_point(self) -> int | None:
+        """Number of the point of the next shot; None if no shot is left."""
+        return self.point_of_shot[self.to_take[0]] if self.to_take else None
+
+    def add(self, run_dir: Path, row: Mapping[str, Any]) -> None:
+        """Add the next shot, which was taken or given up: its line of the index."""
+        self.to_take.remove(row["shot"])
+        if not self._is_search:  # nothing depends on the lines; those of a long run would fill the memory
+            return
+        point = self.point_of_shot[row["shot"]]
+        if row["counts"]:
+            # as it will be read when the run is resumed, so that the scanner then chooses the same points
+            self.shots[point][row["shot"]] = Shot(run_dir / row["file"], json.loads(dumps(row)), self._load)
+        else:
+            self.given_up[point] = row
+
+    def skip(self, shots: Collection[int]) -> None:
+        """Do not take these shots."""
+        self.to_take = [shot for shot in self.to_take if shot not in shots]
+
+    def later_at_its_point(self, shot: int) -> list[int]:
+        """Shots still to take at the point of a shot; none without a scan, where each shot is separate."""
+        point = self.point_of_shot[shot]
+        is_there = (later for later in self.to_take if later > shot and self.point_of_shot[later] == point)
+        return [*is_there] if self._is_scan else []
+
+
+class KnownPoint(NamedTuple):
+    """A point of a run that is known before its first shot.
+
+    Attributes:
+        number: Its number in the scan; of an adaptive scan, any number above 0.
+        settings: The settings of its shots.
+        n_shots: Shots of the run there; of an adaptive scan, as if all shots were taken there.
+    """
+
+    number: int
+    settings: Point
+    n_shots: int
+
+
+class Points(Protocol):
+    """Says where the shots of a run are taken."""
+
+    @property
+    def name(self) -> str:
+        """What chooses the points, for the run's events."""
+        ...
+
+    def next(self, history: History) -> Point | None:
+        """The point of the next shot, the same object for following shots of a point; None to end the run.
+
+        Raises:
+            DeviceError: A scanner failed.
+            StopRequested: The operator asked to stop.
+        """
+        ...
+
+    def result(self, history: History, shot: int) -> Mapping[str, Any]:
+        """The result of the point of a shot just taken, for the run's events; empty if there is none yet."""
+        ...
+
+    def known(self, history: History) -> list[KnownPoint]:
+        """The points that can be checked before the run."""
+        ...
+
+
+class ListedPoints:
+    """Points that are known in advance; without a scan, the settings of the files."""
+
+    name = "the scan"
+
+    def __init__(self, assembly: Assembly) -> None:
+        self._at = cache(assembly.at)  # the same object for the same point, so that nothing is built again
+
+    def next(self, history: History) -> Point | None:
+        """The point of the next shot."""
+        return None if history.next_point is None else self._at(history.next_point)
+
+    def result(self, history: History, shot: int) -> Mapping[str, Any]:  # noqa: ARG002
+        """Nothing: no quantity is optimised."""
+        return {}
+
+    def known(self, history: History) -> list[KnownPoint]:
+        """The points of the run."""
+        counts = Counter(history.point_of_shot)
+        return [KnownPoint(point, self._at(point), n) for point, n in counts.items()]
+
+
+class SearchedPoints:
+    """Points that a scanner chooses by the results of those before.
+
+    Its choice depends only on the shots on disk: a resumed run continues as the original would have, and a
+    shot that is repeated is taken at its old point.
+
+    Args:
+        run: The run; its stop flag ends a wait for the scanner.
+        search: The scanner, and its ranges.
+    """
+
+    def __init__(self, run: PreparedRun, search: Search) -> None:
+        self.name = search.name
+        self._run = run
+        self._search = search
+        self._scanner = search.make_scanner(run.seed)
+        choice, results = search.scan.choice, run.analyses.values
+        self._quantity = make_quantity(choice.quantity, run.assembly.target, results)
+        self._sign = 1.0 if choice.minimise is None else -1.0
+        self._current: tuple[int, Point | None] = -1, None
+        self._visited: list[VisitedPoint] = []
+        self._has_warned = self._quantity.name.startswith(PREFIX)  # the analyses warn of missing results
+
+    def next(self, history: History) -> Point | None:
+        """The point of the next shot; the scanner is asked when all shots of the one before are there."""
+        number = history.next_point
+        if number is None:
+            return None
+        if self._current[0] != number:
+            values = self._values(history, number) or self._choose(history, number)
+            self._current = number, None if values is None else self._search.at(values)
+        return self._current[1]
+
+    def _choose(self, history: History, number: int) -> dict[str, float] | None:
+        visited = [one for one in self._first(history, number) if one.values]
+        values = self._search.choose(self._scanner, visited, self._run.stop_flag)
+        if values is None and number == 0:
+            raise DeviceError(self.name, "next_point() gave no point at all; expected a first one")
+        return values
+
+    def result(self, history: History, shot: int) -> Mapping[str, Any]:
+        """The score of a point whose shots have all been taken, and the best one so far, JSON-ready."""
+        number = history.point_of_shot[shot]
+        self._warn_if_missing(history.shots[number].get(shot))
+        if history.later_at_its_point(shot):
+            return {}
+        visited = self._first(history, number + 1)
+        scores: dict[tuple[float, ...], tuple[int, list[float]]] = {}
+        for place, one in enumerate(visited):  # a point that is visited again has the mean score
+            if not math.isnan(one.score):
+                scores.setdefault((*one.values.values(),), (place, []))[1].append(one.score)
+
+        def plain(place: int, score: float) -> dict[str, Any]:
+            value = None if math.isnan(score) else self._sign * score
+            return {"point": place, "written": self._search.written(visited[place].values), "value": value}
+
+        means = [(sum(own) / len(own), -first) for first, own in scores.values()]
+        mean, first = max(means, default=(math.nan, 0))
+        return {
+            "figure": self._quantity.name,
+            **plain(number, visited[number].score),
+            "best": plain(-first, mean) if means else None,
+        }
+
+    def known(self, history: History) -> list[KnownPoint]:
+        """The point of the first shot to take, and the corners of the ranges."""
+        corners = self._search.corners
+        first = self.next(history)
+        points = [corners.at(n) for n in range(math.prod(corners.scan.shape))]
+        points = points if first is None else [first, *points]
+        n_shots = len(history.point_of_shot)
+        return [KnownPoint(n, point, n_shots) for n, point in enumerate(points, start=1)]
+
+    def _values(self, history: History, number: int) -> dict[str, float] | None:
+        """The values of a point; None if no shot was attempted there."""
+        rows = [shot.row for shot in history.shots[number].values()]
+        row = rows[0] if rows else history.given_up.get(number)
+        return None if row is None else self._search.values_in(row)
+
+    def _warn_if_missing(self, shot: Shot | None) -> None:
+        """Warn once if a shot does not have the quantity: its name may be misspelt."""
+        if shot is not None and not self._has_warned and math.isnan(self._quantity.of_shot(shot)):
+            self._has_warned = True
+            present = quantities_in(shot.row)
+            self._run.warn(missing_quantity(shot.index, self._quantity.name, TO_OPTIMISE, present))
+
+    def _first(self, history: History, n_points: int) -> list[VisitedPoint]:
+        """The results of the first points, whose shots have all been taken or skipped; worked out once."""
+        for number in range(len(self._visited), n_points):
+            self._visited.append(self._visit(history, number))
+        return self._visited[:n_points]
+
+    def _visit(self, history: History, number: int) -> VisitedPoint:
+        shots = [shot for _, shot in sorted(history.shots[number].items())]
+        name = self._quantity.name
+        self._run.analyses.await_shots(name, [shot.index for shot in shots])
+        quantities: list[Mapping[str, float]] = []
+        for shot in shots:
+            value = self._quantity.of_shot(shot)
+            own = {} if math.isnan(value) else {name: value}
+            quantities.append(MappingProxyType(quantities_in(shot.row) | own))
+        score = self._sign * self._quantity.over(shots).value
+        return VisitedPoint(MappingProxyType(self._values(history, number) or {}), score, tuple(quantities))
