@@ -57,7 +57,7 @@ def test_changes_that_are_accepted_are_recorded(stopped: Path) -> None:
 def test_uncommitted_code_is_compared(stopped: Path) -> None:
 
     with labseq.Session.resume(stopped) as session:
-        today = run_record(session.assembly, 5, session.options.changes(), {}, Path.cwd())
+        today = run_record(session.assembly, 5, session.options.changes(), Path.cwd())
     then = session.earlier.run.record if session.earlier is not None else {}
 
     def changes(was: Any, now: Any) -> list[str]:
