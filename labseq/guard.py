@@ -325,10 +325,13 @@ class Guard:
         """The same, even if the run is asked to stop; for opening, safe states and closing."""
         return self._named(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
 
-    def begin_despite_stop(
-        self, owner: str, timeout_s: float, work: partial[T]
+    def begin(
+        self, owner: str, timeout_s: float, work: partial[T], *, is_patient: bool = True
     ) -> tuple[threading.Event, Callable[[], T]]:
-        """Begin such a call.
+        """Begin a call, even if the run is asked to stop.
+
+        Args:
+            is_patient: False for a call that a second request to stop abandons, such as one of the disk.
 
         Returns:
             What is set when it has ended; and what waits for that, as :meth:`call_despite_stop` does.
@@ -337,25 +340,12 @@ class Guard:
         is_out = self._submit(owner, call)
 
         def result() -> T:
-            ended = self._wait(call, limit.deadline_s, math.inf) if is_out else call
+            ended = call
+            if is_out:
+                ended = self._wait(call, limit.deadline_s, math.inf, is_patient=is_patient)
             return self._result(limit, ended)
 
         return call.done, result
-
-    def begin_unless_urgent(self, owner: str, timeout_s: float, work: partial[T]) -> Callable[[], T]:
-        """Begin a call that a second request to stop abandons, such as one of the disk.
-
-        Returns:
-            What waits for its end, as :meth:`call_despite_stop` does.
-        """
-        limit, call = _limit(owner, timeout_s, work), GuardedCall(work)
-        is_out = self._submit(owner, call)
-
-        def result() -> T:
-            ended = self._wait(call, limit.deadline_s, math.inf, is_patient=False) if is_out else call
-            return self._result(limit, ended)
-
-        return result
 
     def check(self) -> None:
         """Raise ``StopRequested`` if the run was asked to stop, or if the calling shot was abandoned."""
@@ -377,7 +367,8 @@ class Guard:
             PlanError: The planner did not return in time.
         """
         self._stop.check()
-        self._named("step", math.inf, SHOT_GRACE_S, work, has_steps=True)
+        call = self.run("step", math.inf, work, SHOT_GRACE_S, has_steps=True)
+        self._result(_limit("step", math.inf, work), call)
 
     @contextmanager
     def step(self, what: str, timeout_s: float, owner: str = "step") -> Generator[None]:
@@ -485,16 +476,14 @@ class Guard:
             self._workers[owner] = worker
         return worker
 
-    def _named(
-        self, owner: str, timeout_s: float, grace_s: float, work: partial[T], *, has_steps: bool = False
-    ) -> T:
+    def _named(self, owner: str, timeout_s: float, grace_s: float, work: partial[T]) -> T:
         """Run a call; name owner and function in whatever is not one of labseq's own errors."""
         limit = _limit(owner, timeout_s, work)
         shot = current_call()
         if owner in self.direct and grace_s < math.inf and shot is not None and shot.has_steps:
             call = self._directly(shot, limit, work)
         else:
-            call = self.run(owner, timeout_s, work, grace_s, has_steps=has_steps)
+            call = self.run(owner, timeout_s, work, grace_s)
         return self._result(limit, call)
 
     def _result(self, limit: Limit, call: GuardedCall | None) -> Any:

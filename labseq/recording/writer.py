@@ -200,7 +200,7 @@ class RunWriter:
         refused = RecordingError(self.run_dir, "cannot be written: the disk does not answer")
         if self.is_given_up:
             raise refused
-        result = self._guard.begin_unless_urgent("disk", 2 * ANSWER_S, partial(work, *args, **kwargs))
+        _, result = self._guard.begin("disk", 2 * ANSWER_S, partial(work, *args, **kwargs), is_patient=False)
 
         def written() -> T:
             try:

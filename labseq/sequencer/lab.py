@@ -200,7 +200,7 @@ def end_safely(lab: Lab, guard: Guard) -> tuple[Outcome, dict[str, float]]:
         after_s[name] = time.monotonic() - begun_s
 
     for name, part in lab.safe_order():
-        has_ended, results[name] = guard.begin_despite_stop(
+        has_ended, results[name] = guard.begin(
             name, lab.timeouts.safe_state_s, partial(safe_state, name, part)
         )
         failure_of(name, "", partial(has_ended.wait, NEXT_S))  # Ctrl-C
