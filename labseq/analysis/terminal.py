@@ -287,8 +287,7 @@ def _changes(overrides: Sequence[str]) -> dict[str, Any]:
     if for_profile:
         what = "an analysis has no settings in the profile"
         raise ConfigError(Problem(what, for_profile[0].source, expected="key=value"))
-    parents = {one.address.rpartition(".")[0] for one in for_sequence}
-    return Document.parse("{}", "the command line").override_all(for_sequence, may_add=parents).data
+    return Document.of_options(for_sequence, "the command line").data
 
 
 def _report(done: AnalysisOutcome) -> None:

@@ -17,7 +17,7 @@ from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
-from labseq.roles import Clock, Context, NeedsWarmUp, RunObserver, Simulation, offers
+from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation, offers
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
 
@@ -122,6 +122,19 @@ def construct(
                 raise
             refused[role] = error
     return made, tuple(streams)
+
+
+def construct_planner(
+    chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int = 0
+) -> tuple[Planner, int]:
+    """Construct a planner without a run, and the maximum number of mobile tweezers in its batches.
+
+    Raises:
+        ConfigError: Its constructor refuses its settings.
+        PluginLoadError: Its constructor raised, or made no planner; names the plugin.
+    """
+    made, _ = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)
+    return made["planner"], parallelism_of(chosen, made["planner"], motion)
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.assembly.calibrations import calibrated_machine
-from labseq.assembly.lab import construct, parallelism_of
+from labseq.assembly.lab import construct_planner
 from labseq.assembly.occupancies import Source, read_source
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
@@ -35,7 +35,7 @@ from labseq.model import Batch, MotionSpec, Occupancy, Plan, PlanReport, SiteGri
 from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
-from labseq.roles import Context, Planner
+from labseq.roles import Planner
 from labseq.settings import Choice, PatternChoice
 from labseq.text_files import YAML_SUFFIXES
 
@@ -141,13 +141,12 @@ def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, Patt
     The pattern is None if the target is that of a recorded shot.
     """
     text, origin = request.target, _origin(request.origin)
-    empty = Document.parse("{}", "the command line")
     if text is None:
         if source.target is None:
             raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
         if origin:
             raise ConfigError(Problem("there is no --target to move", origin[0].source))
-        return empty, None, []
+        return Document.of_options([], "the command line"), None, []
     if text.lower().endswith(YAML_SUFFIXES):
         document, sequence, _ = load_sequence(Path(text), origin)
         if sequence.target is None:
@@ -156,9 +155,8 @@ def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, Patt
     name, settings = parse_target(text)
     option = f"--target {text}"
     overrides = [Override(f"target.{key}", value, option) for key, value in settings.items()]
-    document = empty.override_all(
-        [Override("target.pattern", name, option), *overrides, *origin], may_add=("target",)
-    )
+    overrides = [Override("target.pattern", name, option), *overrides, *origin]
+    document = Document.of_options(overrides, "the command line")
     return document, PatternChoice(pattern=name).placed("target"), []
 
 
@@ -223,9 +221,7 @@ def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override
     for setting in settings:
         address = f"planner.{setting.address.removeprefix('planner.')}"
         overrides.append(Override(address, setting.value, setting.source))
-    parts = [override.address.split(".") for override in overrides]
-    parents = {".".join(path[:n]) for path in parts for n in range(1, len(path))}
-    document = Document.parse("{}", "the command line").override_all(overrides, may_add=parents)
+    document = Document.of_options(overrides, "the command line")
     return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))
 
 
@@ -332,9 +328,7 @@ def plan_moves(
     occupancy, seed = source.occupancy, request.seed if source.seed is None else source.seed
     inputs = read_inputs(request, source)
     grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
-    made, _ = construct({"planner": inputs.planner}, Context(grid=grid, motion=motion), seed or 0)
-    planner: Planner = made["planner"]
-    dop = parallelism_of(inputs.planner, planner, motion)
+    planner, dop = construct_planner(inputs.planner, grid, motion, seed or 0)
     with announcing(announce):
         plan, refused = call_planner(planner, request.planner, occupancy, target), None
         try:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.assembly.lab import construct
+from labseq.assembly.lab import construct_planner
 from labseq.assembly.planning import parse_target
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_target, dump, load_plugins, resolve
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
@@ -25,7 +25,7 @@ from labseq.messages import format_error
 from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins import PluginHost
-from labseq.roles import Context, NeedsWarmUp, Planner
+from labseq.roles import NeedsWarmUp, Planner
 from labseq.settings import Choice, PatternChoice
 
 _DOP: Final = "degree_of_parallelism"
@@ -95,9 +95,7 @@ def _motion(condition: Condition) -> MotionSpec:
         Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
         for key, value in condition.motion
     ]
-    parts = [override.address.split(".") for override in overrides]
-    parents = {".".join(path[:n]) for path in parts for n in range(1, len(path))}
-    document = Document.parse("{}", _MOTION_ADDRESS).override_all(overrides, may_add=parents)
+    document = Document.of_options(overrides, _MOTION_ADDRESS)
     motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
     n = condition.degree_of_parallelism
     limit, what = min(
@@ -138,14 +136,12 @@ def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option:
     """Resolve a plugin that was named in an option."""
     kind = "pattern" if choice.key == "pattern" else "planner"
     named = Override(f"{kind}.{choice.key}", choice.use, option)
-    document = Document.parse("{}", option).override_all([named, *overrides], may_add=(kind,))
+    document = Document.of_options([named, *overrides], option)
     return resolve(host, document, kind, choice.placed(kind))
 
 
 def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
-    planner: Planner = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)[0]["planner"]
-    dop = getattr(planner, _DOP, None)
-    dop = dop if isinstance(dop, int) else motion.max_tweezers
+    planner, dop = construct_planner(chosen, grid, motion, seed)
     return Runner(planner, chosen.entry.name, dump(chosen.entry, chosen.settings), dop)
 
 

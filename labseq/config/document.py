@@ -168,6 +168,20 @@ class Document:
         node = compose(value, origin, is_option=True) or Node(None, Mark(origin))
         return self.with_values([(loc, node, None)])
 
+    @classmethod
+    def of_options(cls, overrides: Sequence[Override], called: str) -> Document:
+        """A document that contains only what options set.
+
+        Args:
+            called: Its name in messages.
+
+        Raises:
+            ConfigError: All the options that cannot be read.
+        """
+        paths = [override.address.split(".") for override in overrides]
+        parents = {".".join(path[:n]) for path in paths for n in range(1, len(path))}
+        return cls.parse("{}", called).override_all(overrides, may_add=parents)
+
     def override_all(
         self,
         overrides: Iterable[Override | tuple[str, str]],
