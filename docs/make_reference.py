@@ -27,12 +27,12 @@ import labseq
 from labseq import builtin
 from labseq.cli.app import app
 from labseq.config.sequence import StepPolicySettings
-from labseq.config.validation import models_at
 from labseq.errors import LabseqError, Problem
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import KINDS, Registry
 from labseq.scaffold import reference
 from labseq.scaffold.reference import Block, Code, Definition, Table, definition, docstring, summary
+from labseq.settings import models_at
 from labseq.testing import SUITES, fakes, strategies
 from labseq.testing.contracts import HardwareContract
 

@@ -7,8 +7,22 @@ import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar, cast, get_args
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    Self,
+    TypeAlias,
+    TypeGuard,
+    TypeVar,
+    cast,
+    get_args,
+    get_origin,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +37,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from labseq.errors import Loc
@@ -144,6 +159,98 @@ def _quantity(dimension: str) -> BeforeValidator:
     return BeforeValidator(Quantity(dimension))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """One key of a settings model: what messages, reference pages, units and addresses need to know of it.
+
+    Attributes:
+        key: The key in a file.
+        name: The attribute in Python.
+        annotation: Its type, with what annotates it.
+        default: The default; None for a key that must be given.
+        is_required: Whether the key must be given.
+        description: What it is.
+        dimension: The dimension of its quantity, or of all quantities in its list; "" for none or several.
+        models: The models of the mapping that it holds, of the items of its list or of its named entries.
+        is_by_name: Whether it holds a mapping of names that the user chooses.
+    """
+
+    key: str
+    name: str
+    annotation: Any
+    default: Any
+    is_required: bool
+    description: str
+    dimension: str
+    models: tuple[type[BaseModel], ...]
+    is_by_name: bool
+
+    @property
+    def si_unit(self) -> str:
+        """The SI unit of its quantity; "" if it has none."""
+        return "" if self.dimension in ("", "fraction") else unit_names(self.dimension)[0]
+
+
+@cache
+def settings_of(model: type[BaseModel] | None) -> tuple[Setting, ...]:
+    """The settings of a model, in the order of its declaration; none for a plugin that takes none."""
+    return tuple(_setting(name, field) for name, field in (model.model_fields if model else {}).items())
+
+
+def _setting(name: str, field: FieldInfo) -> Setting:
+    annotation = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    parts = list(_parts(annotation))
+    dimensions = {found for part in parts if (found := dimension_read_by(part))}
+    return Setting(
+        key=field.validation_alias if isinstance(field.validation_alias, str) else name,
+        name=name,
+        annotation=annotation,
+        default=None if field.is_required() else field.get_default(call_default_factory=True),
+        is_required=field.is_required(),
+        description=field.description or "",
+        dimension=dimensions.pop() if len(dimensions) == 1 else "",
+        models=tuple(dict.fromkeys(filter(_is_model, parts))),
+        is_by_name=any(get_origin(part) is dict for part in parts),
+    )
+
+
+def _parts(kind: Any) -> Iterator[Any]:
+    """The types, limits and validators that an annotation is made of, at any depth."""
+    yield kind
+    for part in (*getattr(kind, "__metadata__", ()), *get_args(kind)):
+        yield from _parts(part)
+
+
+def dimension_read_by(part: Any) -> str:
+    """The dimension of the quantity that a part of an annotation reads; "" for any other part."""
+    function = part.func if isinstance(part, BeforeValidator) else None
+    return function.dimension if isinstance(function, Quantity) else ""
+
+
+def _is_model(part: Any) -> TypeGuard[type[BaseModel]]:
+    return isinstance(part, type) and issubclass(part, BaseModel)
+
+
+def settings_at(model: type[BaseModel] | None, loc: Loc) -> Sequence[Setting]:
+    """The setting at a location below a model: several in a union, none at the top.
+
+    Indices, and names that the user chooses, count as the list or mapping that they are in.
+    """
+    found: Sequence[Setting] = ()
+    models: Sequence[type[BaseModel] | None] = [model]
+    for step in loc:
+        named = [one for inner in models for one in settings_of(inner) if one.key == step]
+        if named:
+            found, models = named, [inner for one in named for inner in one.models]
+    return found
+
+
+def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+    """The settings models of a location below a model: several in a union."""
+    settings = settings_at(model, loc)
+    return [inner for one in settings for inner in one.models] if settings else [model]
+
+
 def si_unit_at(model: type[BaseModel] | None, loc: Loc) -> str:
     """SI unit of the setting at a location in a settings model; "" for one that has or is none.
 
@@ -153,28 +260,7 @@ def si_unit_at(model: type[BaseModel] | None, loc: Loc) -> str:
         >>> si_unit_at(Mine, ("windows", 2))
         's'
     """
-    if model is None or not loc:
-        return ""
-    named = [one for name, one in model.model_fields.items() if loc[0] in (name, one.alias)]
-    if not named:
-        return ""
-    field = named[0]
-    parts = list(_parts(Annotated[field.annotation, "", *field.metadata]))
-    models = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
-    keys = [i for i, key in enumerate(loc) if i and isinstance(key, str)]
-    if models and keys:
-        return next(filter(None, (si_unit_at(one, loc[keys[0] :]) for one in models)), "")
-    units = {unit_names(part.dimension)[0] for part in parts if isinstance(part, Quantity)}
-    return units.pop() if len(units) == 1 and "%" not in units else ""
-
-
-def _parts(kind: Any) -> Iterator[Any]:
-    """The types and the functions of the validators that an annotation is made of."""
-    if isinstance(kind, BeforeValidator):
-        yield kind.func
-    yield kind
-    for part in (*getattr(kind, "__metadata__", ()), *get_args(kind)):
-        yield from _parts(part)
+    return next((one.si_unit for one in settings_at(model, loc) if one.si_unit), "")
 
 
 def _not_too_long(duration_s: float) -> float:
@@ -238,7 +324,7 @@ class Choice(Settings):
     @property
     def core_keys(self) -> frozenset[str]:
         """Keys of the mapping that labseq reads itself; all others are the plugin's settings."""
-        return frozenset({self.key, *(name for name in type(self).model_fields if name != "use")})
+        return frozenset(setting.key for setting in settings_of(type(self)))
 
     def placed(self, *loc: str | int) -> Self:
         """A copy that knows where its mapping is."""

@@ -23,7 +23,7 @@ from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
 from labseq.messages import clean
 from labseq.roles import Step
-from labseq.settings import Choice
+from labseq.settings import Choice, settings_of
 from labseq.units import parse_any
 
 MAX_PROBLEMS: Final = 20
@@ -264,8 +264,7 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
             names; with their place.
     """
     entry = named(hardware.host, document, "step", spec.kind, spec.loc, key=True)
-    fields = entry.settings_model.model_fields if entry.settings_model is not None else {}
-    for key in {"name", "policy"}.difference(fields):
+    for key in {"name", "policy"} - {setting.key for setting in settings_of(entry.settings_model)}:
         if document.root.at((*spec.loc, key)) is not None:
             what, hint = (
                 f"'{key}' is in the settings of '{spec.kind}'",

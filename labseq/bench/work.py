@@ -26,7 +26,7 @@ from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.roles import NeedsWarmUp, Planner
-from labseq.settings import Choice, PatternChoice
+from labseq.settings import Choice, PatternChoice, settings_at
 
 _DOP: Final = "degree_of_parallelism"
 _MOTION_ADDRESS: Final = "profile.mobile_tweezers"
@@ -127,7 +127,7 @@ def _planner(
     overrides = [Override(f"planner.{k}", v, f"--set planner.{k}={v}") for k, v in comparison.settings]
     overrides += [Override(f"planner.{k}", v, comparison.called) for k, v in planner_entry.settings]
     entry = host.registry.find("planner", name)
-    if entry is not None and dop is not None and _DOP in getattr(entry.settings_model, "model_fields", {}):
+    if entry is not None and dop is not None and settings_at(entry.settings_model, (_DOP,)):
         overrides.insert(0, Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
     return _choose(host, Choice(use=name), overrides, comparison.called)
 

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path, PurePath
-from typing import Any, Final, TypeVar, cast, get_args, overload
+from typing import Any, Final, TypeVar, cast, overload
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 
 from labseq.config.yaml_nodes import Mark, Node, comma_hint, resolve
 from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, closest, did_you_mean, format_error, listing, shown
-from labseq.settings import FOLDER, NEEDS_UNITS, NoSettings
+from labseq.settings import FOLDER, NEEDS_UNITS, NoSettings, Setting, models_at, settings_at, settings_of
 from labseq.units import expected as expected_quantity, with_units
 
 M = TypeVar("M", bound=BaseModel)
@@ -259,7 +258,7 @@ def _unknown_key(
 
 def _missing_key(loc: Loc, model: type[BaseModel], top: Node, context: ValidationContext) -> Finding:
     parent, key, around = top.at(loc[:-1]), str(loc[-1]), loc[:-1]
-    about = _description(models_at(model, around), key)
+    about = _description(settings_at(model, loc))
     where = f" from {context.mapping(around)}" if context.name or around else ""
     what = f"'{key}' is missing{where}" + (f" ({about})" if about else "")
     known = context.known_keys(model, around)
@@ -275,47 +274,16 @@ def _missing_item(loc: Loc, index: int, top: Node, context: ValidationContext) -
     return Finding(loc, Problem(what, expected=f"at least {index + 1}"))
 
 
-def _key(name: str, field: FieldInfo) -> str:
-    """The name of a field in the file."""
-    return field.validation_alias if isinstance(field.validation_alias, str) else name
-
-
 def keys_of(models: list[type[BaseModel]]) -> list[str]:
     """The keys of the models, in order."""
-    keys = [_key(name, field) for model in models for name, field in model.model_fields.items()]
-    return list(dict.fromkeys(keys))
+    return list(dict.fromkeys(setting.key for model in models for setting in settings_of(model)))
 
 
-def _field(model: type[BaseModel], key: str | int) -> FieldInfo | None:
-    return next((field for name, field in model.model_fields.items() if key == _key(name, field)), None)
-
-
-def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
-    """The settings models of a location below a model: several in a union."""
-    models = [model]
-    for step in loc:
-        # A step that is no field is a list index or the key of a dict of models.
-        fields = [found for one in models if (found := _field(one, step)) is not None]
-        if fields:
-            models = [inner for found in fields for inner in _models_in(found.annotation)]
-    return models
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models that an annotation names, inside of unions, lists, dicts and Annotated."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-        return
-    for inner in get_args(annotation):
-        yield from _models_in(inner)
-
-
-def _description(models: list[type[BaseModel]], key: str) -> str:
-    """First sentence of the description of a key's field, or ""."""
-    for model in models:
-        field = _field(model, key)
-        if field is not None and field.description:
-            sentence = field.description.split(". ")[0].rstrip(".")
+def _description(settings: Sequence[Setting]) -> str:
+    """First sentence of the description of a setting, or ""."""
+    for setting in settings:
+        if setting.description:
+            sentence = setting.description.split(". ")[0].rstrip(".")
             return sentence[0].lower() + sentence[1:] if sentence[1:2].islower() else sentence
     return ""
 

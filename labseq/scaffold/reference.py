@@ -16,17 +16,15 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from signal import SIGINT, SIGTERM
-from typing import Any, Final, TypeAlias, get_args, get_origin
+from typing import Any, Final, TypeAlias
 
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from labseq import builtin, errors, hookspecs, roles
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.profile import ProfileSpec
 from labseq.config.scan import AdaptiveChoice
 from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec, StepPolicySettings
-from labseq.config.validation import models_at
 from labseq.console.errors import EXIT_CODES, exit_code_of
 from labseq.console.output import say
 from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
@@ -35,7 +33,7 @@ from labseq.messages import clean, closest
 from labseq.registry import KINDS, Entry, Registry
 from labseq.roles import EVENTS
 from labseq.scaffold.words import default_of, docstring, summary, value_of
-from labseq.settings import Choice
+from labseq.settings import Choice, Setting, models_at, settings_of
 from labseq.units import EXAMPLES, UNITS, unit_names
 
 
@@ -153,7 +151,7 @@ FILES: Final[Mapping[str, type[BaseModel]]] = {"sequence": SequenceSpec, "profil
 """Kind of file -> its model."""
 _CHOSEN: Final = {"target": "pattern", "devices": "device", "shot": "step", "scan": "scanner"}
 """Key that names plugins -> their kind, if that is not the key itself."""
-_ADDED_BY_LOADER: Final[Mapping[tuple[type[BaseModel], str], str]] = {
+_ADDED_BY_LOADER: Final[Mapping[tuple[type[BaseModel] | None, str], str]] = {
     (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`",
     (SequenceSpec, "shots"): "required without `scan`",
 }
@@ -168,39 +166,31 @@ def settings(model: type[BaseModel] | None, *, top: bool = False) -> Block:
     Args:
         top: Leave out the keys of mappings.
     """
-    rows = [_row(key, owner, field) for key, owner, field in _keys_of(model, top=top)]
+    rows = [_row(key, owner, setting) for key, owner, setting in _keys_of(model, top=top)]
     return Table(_KEY_HEADER, rows) if rows else _NO_SETTINGS
 
 
 def _keys_of(
     model: type[BaseModel] | None, *, top: bool = False, prefix: str = ""
-) -> Iterator[tuple[str, type[BaseModel], FieldInfo]]:
-    """Every key of a model as a file spells it, whose key it is, and its field."""
-    for name, field in (model.model_fields if model is not None else {}).items():
-        key = prefix + (field.validation_alias if isinstance(field.validation_alias, str) else name)
-        yield key, model, field  # pyright: ignore[reportReturnType]
-        inner = _inner_model(field)
+) -> Iterator[tuple[str, type[BaseModel] | None, Setting]]:
+    """Every key of a model with those of the mappings in it, whose key it is, and its description."""
+    for setting in settings_of(model):
+        key = prefix + setting.key
+        yield key, model, setting
+        inner = _inner_model(setting)
         if inner is not None and not top:
-            named = ".NAME" if _is_by_name(field) else ""
-            yield from _keys_of(inner, prefix=f"{key}{named}.")
+            yield from _keys_of(inner, prefix=f"{key}.NAME." if setting.is_by_name else f"{key}.")
 
 
-def _inner_model(field: FieldInfo) -> type[BaseModel] | None:
+def _inner_model(setting: Setting) -> type[BaseModel] | None:
     """The model of a mapping, unless it is a plugin's choice, whose settings are its own."""
-    found = [field.annotation, *get_args(field.annotation)]
-    models = [one for one in found if isinstance(one, type) and issubclass(one, BaseModel)]
-    return next((one for one in models if not issubclass(one, Choice)), None)
+    return next((one for one in setting.models if not issubclass(one, Choice)), None)
 
 
-def _is_by_name(field: FieldInfo) -> bool:
-    return any(get_origin(one) is dict for one in (field.annotation, *get_args(field.annotation)))
-
-
-def _row(key: str, owner: type[BaseModel], field: FieldInfo) -> tuple[str, ...]:
-    default = _ADDED_BY_LOADER.get((owner, key)) or default_of(field)
-    if _inner_model(field) is not None and not field.is_required() and field.default is not None:
-        default = "as below"
-    return f"`{key}`", value_of(field), default, field.description or ""
+def _row(key: str, owner: type[BaseModel] | None, setting: Setting) -> tuple[str, ...]:
+    is_mapping = isinstance(setting.default, BaseModel)
+    default = "as below" if is_mapping else _ADDED_BY_LOADER.get((owner, key)) or default_of(setting)
+    return f"`{key}`", value_of(setting), default, setting.description
 
 
 def entry_blocks(entry: Entry) -> list[Block]:
@@ -493,18 +483,18 @@ def _row_topics(name: str, blocks: Iterable[Block]) -> Iterator[tuple[str, Topic
 def _key_topics(names: tuple[str, ...], model: type[BaseModel] | None) -> dict[str, Topic]:
     return {
         " ".join((*names, *key.replace(".NAME", "").split("."))): Topic(
-            field.description or "", partial(_key_blocks, key, owner, field)
+            setting.description, partial(_key_blocks, key, owner, setting)
         )
-        for key, owner, field in _keys_of(model)
+        for key, owner, setting in _keys_of(model)
     }
 
 
 def _key_blocks(
-    key: str, owner: type[BaseModel], field: FieldInfo, further: Iterable[Block] = ()
+    key: str, owner: type[BaseModel] | None, setting: Setting, further: Iterable[Block] = ()
 ) -> list[Block]:
     """The row of a key, those of the mapping that it holds, and what else there is."""
-    inner = _inner_model(field)
-    rows = [_row(key, owner, field)]
+    inner = _inner_model(setting)
+    rows = [_row(key, owner, setting)]
     rows += [_row(f"{key}.{name}", of, one) for name, of, one in _keys_of(inner)]
     return [Table(_KEY_HEADER, rows), *further]
 
@@ -512,7 +502,7 @@ def _key_blocks(
 def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
     """The keys of a file; those that name a plugin with the plugins that there are."""
     found = _key_topics((kind,), FILES[kind])
-    for key, owner, field in _keys_of(FILES[kind], top=True):
+    for key, owner, setting in _keys_of(FILES[kind], top=True):
         chosen = key if key in KINDS else _CHOSEN.get(key, "")
         if not chosen:
             continue
@@ -520,7 +510,7 @@ def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
         found |= _key_topics((kind, key), next((m for m in models if issubclass(m, Choice)), None))
         further = partial(_choice_blocks, models, [e for e in registry.entries() if e.kind == chosen])
         found[f"{kind} {key}"] = Topic(
-            field.description or "", lambda a=(key, owner, field), more=further: _key_blocks(*a, more())
+            setting.description, lambda a=(key, owner, setting), more=further: _key_blocks(*a, more())
         )
     return found | _key_topics((kind, "shot", "policy"), StepPolicySettings if kind == "sequence" else None)
 

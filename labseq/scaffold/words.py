@@ -7,40 +7,21 @@ import math
 import re
 import textwrap
 import types
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
-from pydantic import BaseModel, BeforeValidator
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from labseq import settings
 from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError
-from labseq.settings import Choice
+from labseq.settings import Choice, Setting, dimension_read_by
 from labseq.units import EXAMPLES, format_quantity, parse_quantity
 
-_ALIASES: Final = {
-    "time": settings.Duration,
-    "length": settings.Length,
-    "frequency": settings.Frequency,
-    "speed": settings.Speed,
-    "voltage": settings.Voltage,
-    "power": settings.Power,
-    "temperature": settings.Temperature,
-    "angle": settings.Angle,
-    "fraction": settings.Fraction,
-}
-_DIMENSIONS: Final = {
-    found: dimension
-    for dimension, alias in _ALIASES.items()
-    for found in get_args(alias)
-    if isinstance(found, BeforeValidator)
-}
-"""What reads a quantity -> its dimension."""
 _NOUNS: Final[dict[Any, str]] = {
     bool: "true or false",
     int: "whole number",
@@ -67,43 +48,19 @@ class Words:
         return f"{self.noun}; {self.limits}" if self.limits else self.noun
 
 
-def value_of(field: FieldInfo) -> str:
-    """What may be written for a field: its type, an example where no default shows one, its limits."""
-    words = _words(field.annotation, field.metadata)
-    dimension = dimension_of(field)
-    if dimension and field.is_required():
-        words = Words(f"{words.noun} such as `{EXAMPLES[dimension]}`", words.limits)
+def value_of(setting: Setting) -> str:
+    """What may be written for a setting: its type, an example where no default shows one, its limits."""
+    words = _words(setting.annotation, ())
+    if setting.dimension and setting.is_required:
+        words = Words(f"{words.noun} such as `{EXAMPLES[setting.dimension]}`", words.limits)
     return str(words)
 
 
-def default_of(field: FieldInfo) -> str:
+def default_of(setting: Setting) -> str:
     """The default as it would be written in a file; "required", or "none"."""
-    if field.is_required():
+    if setting.is_required:
         return "required"
-    default = field.get_default(call_default_factory=True)
-    if default is None:
-        return "none"
-    return f"`{_written(default, dimension_of(field))}`"
-
-
-def dimension_of(field: FieldInfo) -> str:
-    """The dimension of a quantity, or of a list of them; "" for anything else."""
-    return next(filter(None, map(_dimension, _parts(field.annotation, field.metadata))), "")
-
-
-def _dimension(part: Any) -> str:
-    return _DIMENSIONS.get(part, "") if isinstance(part, BeforeValidator) else ""
-
-
-def _parts(annotation: Any, metadata: Sequence[Any]) -> Iterable[Any]:
-    """Everything that annotates a type, at any depth."""
-    yield from metadata
-    inner = get_args(annotation)
-    if get_origin(annotation) is Annotated:
-        yield from _parts(inner[0], inner[1:])
-    elif get_origin(annotation) is not Literal:
-        for one in inner:
-            yield from _parts(one, ())
+    return "none" if setting.default is None else f"`{_written(setting.default, setting.dimension)}`"
 
 
 def _words(annotation: Any, metadata: Sequence[Any]) -> Words:
@@ -111,7 +68,7 @@ def _words(annotation: Any, metadata: Sequence[Any]) -> Words:
         plain, *more = get_args(annotation)
         return _words(plain, [*more, *metadata])
     flat = [one for item in metadata for one in (item.metadata if isinstance(item, FieldInfo) else [item])]
-    dimension = next(filter(None, map(_dimension, flat)), "")
+    dimension = next(filter(None, map(dimension_read_by, flat)), "")
     found = Words(dimension) if dimension else _noun(annotation)
     limits = [found.limits, _limits(flat, dimension), _lengths(flat, annotation)]
     return Words(found.noun, ", ".join(filter(None, limits)))

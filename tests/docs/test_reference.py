@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
-from typing import Any, get_args, get_origin
+from typing import Any
 
 import pytest
 from pydantic import BaseModel, create_model
@@ -21,7 +21,7 @@ from labseq.console.errors import EXIT_CODES, exit_code_of
 from labseq.registry import KINDS, Registry
 from labseq.scaffold import reference
 from labseq.scaffold.reference import Table, settings
-from labseq.settings import Choice, PatternChoice
+from labseq.settings import Choice, PatternChoice, models_at, settings_at, settings_of
 
 from .scripts import load_script
 
@@ -93,8 +93,8 @@ def test_every_model_of_a_file_is_on_a_page() -> None:
     shown = "".join(TEXTS.values())
     for file in FILES.values():
         for model in models_below(file):
-            for key in model.model_fields:
-                assert re.search(rf"\| `([\w.]+\.)?{key}` \|", shown), f"{model.__name__}.{key}"
+            for one in settings_of(model):
+                assert re.search(rf"\| `([\w.]+\.)?{one.key}` \|", shown), f"{model.__name__}.{one.key}"
 
 
 def test_every_topic_can_be_explained() -> None:
@@ -109,28 +109,12 @@ def test_every_topic_can_be_explained() -> None:
         assert "`" not in "".join(lines), name
 
 
-def settings_of(model: type[BaseModel] | None, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Every key of a model and of the mappings in it, with its field."""
-    for name, field in (model.model_fields if model is not None else {}).items():
-        key = prefix + (field.alias or name)
-        yield key, field
-        optional = get_args(field.annotation) if type(None) in get_args(field.annotation) else ()
-        by_name = get_args(field.annotation)[1:] if get_origin(field.annotation) is dict else ()
-        for inner in by_name:
-            if isinstance(inner, type) and issubclass(inner, BaseModel):
-                yield from settings_of(inner, f"{key}.NAME.")
-        listed = get_args(field.annotation) if get_origin(field.annotation) is tuple else ()
-        for inner in (field.annotation, *optional, *listed):
-            if isinstance(inner, type) and issubclass(inner, BaseModel) and not issubclass(inner, Choice):
-                yield from settings_of(inner, f"{key}.")
-
-
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
 def test_every_setting_says_what_it_is(model: type[BaseModel]) -> None:
     assert model.__doc__
-    for key, field in settings_of(model):
-        assert field.description, f"'{key}' of {model.__name__} has no description"
-        assert re.fullmatch(r"(?s)[a-z0-9\[].*[^.\s]", field.description), field.description
+    for one in (one for inner in (model, *models_below(model)) for one in settings_of(inner)):
+        assert one.description, f"'{one.key}' of {model.__name__} has no description"
+        assert re.fullmatch(r"(?s)[a-z0-9\[].*[^.\s]", one.description), one.description
 
 
 def rows_of(found: Any) -> dict[str, Sequence[str]]:
@@ -140,16 +124,17 @@ def rows_of(found: Any) -> dict[str, Sequence[str]]:
 
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_a_default_may_be_written_as_the_reference_writes_it(subject: str) -> None:
-    rows = rows_of(settings(SUBJECTS[subject]))
-    assert [*rows] == [key for key, _ in settings_of(SUBJECTS[subject])]
-    for key, field in settings_of(SUBJECTS[subject]):
-        default = rows[key][2].strip("`")
-        assert (default == "required") == field.is_required(), key
-        if default not in ("required", "none", "as below"):
+    model = SUBJECTS[subject]
+    for key, row in rows_of(settings(model)).items():
+        *loc, name = key.replace(".NAME", "").split(".")
+        default = row[2].strip("`")
+        if model is not None and default not in ("required", "none", "as below"):
+            (owner,) = models_at(model, tuple(loc))
+            (setting,) = settings_at(owner, (name,))
             node = compose(default, "the reference")
             assert node is not None
-            read = read_as(field, node.plain())
-            assert read == (pytest.approx(field.default) if isinstance(read, float) else field.default), key
+            read = read_as(owner.model_fields[setting.name], node.plain())
+            assert read == (pytest.approx(setting.default) if isinstance(read, float) else setting.default)
 
 
 def read_as(field: FieldInfo, value: object) -> object:
@@ -214,17 +199,10 @@ def test_every_public_name_says_what_it_is() -> None:
 
 def models_below(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
     """The models of all keys of a file, at any depth."""
-    for field in model.model_fields.values():
-        for inner in models_in(field.annotation):
+    for setting in settings_of(model):
+        for inner in setting.models:
             yield inner
             yield from models_below(inner)
-
-
-def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for part in get_args(annotation):
-        yield from models_in(part)
 
 
 def test_every_promise_and_strategy_says_what_it_is() -> None:
