@@ -141,9 +141,9 @@ class Assembly:
         alone = self.scanned is None or self.search is not None
         return self._alone if alone else self.at(0)
 
-    def at(self, point: int) -> Point:
-        """The settings of a point of the scan."""
-        return self._alone if self.scanned is None else self.scanned.at(point)
+    def at(self, number: int) -> Point:
+        """The settings of a point of the scan, by its number."""
+        return self._alone if self.scanned is None else self.scanned.at(number)
 
     def point_of_shot(self, seed: int) -> list[int]:
         """Number of the point of each shot; without a scan all are at one point."""

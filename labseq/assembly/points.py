@@ -94,9 +94,9 @@ class ScanPoints:
             return
         known = set(self.scan.explained(ConfigError(found.problems)).problems)
         n_before = len(found.problems)
-        for point in range(math.prod(self.scan.shape)):
+        for number in range(math.prod(self.scan.shape)):
             try:
-                self.at(point)
+                self.at(number)
             except ConfigError as error:
                 new = [one for one in self.scan.explained(error).problems if one not in known]
                 known.update(new)
@@ -104,13 +104,13 @@ class ScanPoints:
             if len(found.problems) >= n_before + MAX_PROBLEMS:
                 return
 
-    def at(self, point: int) -> Point:
-        """The settings of a point; of an adaptive scan, of a corner of its ranges.
+    def at(self, number: int) -> Point:
+        """The settings of a point, by its number; of an adaptive scan, of a corner of its ranges.
 
         Raises:
             ConfigError: All that plugins refuse of the values.
         """
-        return self._once(point, lambda: self.with_values([*self.scan.values(point)]))
+        return self._once(number, lambda: self.with_values([*self.scan.values(number)]))
 
     def with_values(self, values: Sequence[tuple[Axis, Node]]) -> Point:
         """The settings with a value for each axis.
@@ -146,12 +146,12 @@ class ScanPoints:
         ``addresses``: the scanned addresses; ``points``: the values of each point, SI; ``written``: the
         same in the units of the sequence; ``point_of_shot``: the point of each shot, counted from 0.
         """
-        points, addresses = range(self.scan.n_points), [axis.address for axis in self.scan.axes]
-        at = [self.at(point).parameters for point in points]
+        numbers, addresses = range(self.scan.n_points), [axis.address for axis in self.scan.axes]
+        at = [self.at(number).parameters for number in numbers]
         return {
             "addresses": addresses,
             "points": [[parameters[address] for address in addresses] for parameters in at],
-            "written": [[str(node.raw or node.plain()) for _, node in self.scan.values(p)] for p in points],
+            "written": [[str(node.raw or node.plain()) for _, node in self.scan.values(n)] for n in numbers],
             "repeats": self.scan.repeats,
             "order": self.scan.order,
             "point_of_shot": point_of_shot,

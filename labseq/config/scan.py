@@ -91,15 +91,15 @@ class Scan:
         """All axes, in the order written."""
         return tuple(axis for group in self.groups for axis in group)
 
-    def values(self, point: int) -> Iterator[tuple[Axis, Node]]:
-        """Each axis with its value at a point."""
-        positions = np.unravel_index(point, self.shape) if self.groups else ()
+    def values(self, number: int) -> Iterator[tuple[Axis, Node]]:
+        """Each axis with its value at the point of a number."""
+        positions = np.unravel_index(number, self.shape) if self.groups else ()
         for group, position in zip(self.groups, positions, strict=True):
             for axis in group:
                 yield axis, axis.values[position]
 
     def points_of_shots(self, seed: int) -> NDArray[np.int32]:
-        """The point of each shot, int32 (n_points * repeats,).
+        """Number of the point of each shot, int32 (n_points * repeats,).
 
         Sequential: all shots of a point, then the next. Shuffled: round by round; each round
         takes every point once, in an order drawn from the run's seed, so that a drift of the

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -58,7 +58,7 @@ class History:
             self.given_up = {self.point_of_shot[attempt.index]: attempt.row for attempt in skipped}
 
     @property
-    def next_point(self) -> int | None:
+    def next_number(self) -> int | None:
         """Number of the point of the next shot; None if no shot is left."""
         return self.point_of_shot[self.to_take[0]] if self.to_take else None
 
@@ -67,21 +67,22 @@ class History:
         self.to_take.remove(row["shot"])
         if not self._is_search:  # nothing depends on the lines; those of a long run would fill the memory
             return
-        point = self.point_of_shot[row["shot"]]
+        number = self.point_of_shot[row["shot"]]
         if row["counts"]:
             # as it will be read when the run is resumed, so that the scanner then chooses the same points
-            self.shots[point][row["shot"]] = Shot(run_dir / row["file"], json.loads(dumps(row)), self._load)
+            self.shots[number][row["shot"]] = Shot(run_dir / row["file"], json.loads(dumps(row)), self._load)
         else:
-            self.given_up[point] = row
+            self.given_up[number] = row
 
-    def skip(self, shots: Collection[int]) -> None:
+    def skip(self, shots: Sequence[int]) -> None:
         """Do not take these shots."""
-        self.to_take = [shot for shot in self.to_take if shot not in shots]
+        skipped = {*shots}
+        self.to_take = [shot for shot in self.to_take if shot not in skipped]
 
     def later_at_its_point(self, shot: int) -> list[int]:
         """Shots still to take at the point of a shot; none without a scan, where each shot is separate."""
-        point = self.point_of_shot[shot]
-        is_there = (later for later in self.to_take if later > shot and self.point_of_shot[later] == point)
+        number = self.point_of_shot[shot]
+        is_there = (later for later in self.to_take if later > shot and self.point_of_shot[later] == number)
         return [*is_there] if self._is_scan else []
 
 
@@ -135,7 +136,7 @@ class ListedPoints:
 
     def next(self, history: History) -> Point | None:
         """The point of the next shot."""
-        return None if history.next_point is None else self._at(history.next_point)
+        return None if history.next_number is None else self._at(history.next_number)
 
     def result(self, history: History, shot: int) -> Mapping[str, Any]:  # noqa: ARG002
         """Nothing: no quantity is optimised."""
@@ -172,7 +173,7 @@ class SearchedPoints:
 
     def next(self, history: History) -> Point | None:
         """The point of the next shot; the scanner is asked when all shots of the one before are there."""
-        number = history.next_point
+        number = history.next_number
         if number is None:
             return None
         if self._current[0] != number:
