@@ -29,7 +29,8 @@ from labseq.cli.app import app
 from labseq.config.sequence import StepPolicySettings
 from labseq.errors import LabseqError, Problem
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
-from labseq.registry import KINDS, Registry
+from labseq.registry import Registry
+from labseq.roles import ROLES
 from labseq.scaffold import reference
 from labseq.scaffold.reference import Block, Code, Definition, Table, definition, docstring, summary
 from labseq.settings import models_at
@@ -113,7 +114,7 @@ def registry() -> Registry:
 
 def settings(kind: str, *names: str) -> list[Block]:
     """The keys of a file, of a part of it, or of a plugin; "top" leaves out those of its parts."""
-    if kind in KINDS:
+    if kind in ROLES:
         return [reference.settings(registry().get(kind, *names).settings_model)]
     keys = [name for name in names if name != "top"]
     return [file_settings(kind, *keys, top="top" in names)]
@@ -226,7 +227,7 @@ def plugins(kind: str) -> list[Block]:
 
 def registry_methods() -> list[Block]:
     """A definition for each method by which a plugin offers something."""
-    return [definition(getattr(Registry, kind), name=f"registry.{kind}") for kind in KINDS]
+    return [definition(getattr(Registry, kind), name=f"registry.{kind}") for kind in ROLES]
 
 
 def error_list() -> list[Block]:

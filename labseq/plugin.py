@@ -155,7 +155,6 @@ from labseq.roles import (
     ToneSource,
     Trigger,
     find_leader,
-    offers,
     unknown_name,
 )
 from labseq.roles.shot import NeverStopped
@@ -336,7 +335,6 @@ __all__ = [
     "new_timer",
     "now_ns",
     "off_program",
-    "offers",
     "one_of",
     "open_port",
     "open_run",

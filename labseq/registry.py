@@ -12,22 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.errors import PluginLoadError, UnknownPluginError
-
-KINDS: Final = (
-    "planner",
-    "camera",
-    "static_tweezers",
-    "mobile_tweezers",
-    "detector",
-    "device",
-    "lines",
-    "step",
-    "pattern",
-    "simulation",
-    "scanner",
-    "analysis",
-)
-"""Kinds of plugin that the registry knows."""
+from labseq.roles.table import ROLES, Role
 
 VIRTUAL_TWIN: Final = "virtual"
 """Name under which a plugin offers the virtual twin of a hardware role."""
@@ -80,7 +65,7 @@ class Entry:
     """One thing that a plugin offers.
 
     Attributes:
-        kind: One of :data:`KINDS`.
+        kind: Name of its role, one of :data:`labseq.roles.ROLES`.
         name: The name that a sequence or profile uses.
         factory: ``factory(settings, context)``; steps: ``factory(settings)``;
             patterns: ``factory(settings, grid)``; scanners: ``factory(settings, space)``.
@@ -108,6 +93,11 @@ class Entry:
     simulated: Mapping[str, Any] | None = None
     owner: Owner = field(default=Owner("labseq"), compare=False, repr=False)
     no_simulator: str = ""
+
+    @property
+    def role(self) -> Role:
+        """The role that it plays."""
+        return ROLES[self.kind]
 
     @property
     def is_place(self) -> bool:
@@ -285,7 +275,8 @@ class Registry:
     def offers(self, origin: str | None = None) -> list[tuple[str, str]]:
         """Kind and name of all entries, or of those of one plugin, sorted; nothing is imported."""
         keys = [key for key, entry in self._entries.items() if origin in (None, entry.origin)]
-        return sorted(keys, key=lambda key: (KINDS.index(key[0]), key[1]))
+        order = [*ROLES]
+        return sorted(keys, key=lambda key: (order.index(key[0]), key[1]))
 
     def entries(self, origin: str | None = None) -> list[Entry]:
         """All entries, or those of one plugin, by kind and name."""

@@ -351,7 +351,7 @@ def make_steps(
             if step.needs_image and not image_seen:
                 what = f"'{spec.kind}' needs an image before it in the shot"
                 raise document.error(spec.loc, what, "an 'image' step before it", key=True)
-            if getattr(step, "needs_target", False) and sequence.target is None:
+            if step.needs_target and sequence.target is None:
                 what, hint = f"'{spec.kind}' needs a target", "target: {pattern: compact, rows: 10, cols: 10}"
                 raise document.error(spec.loc, what, "'target' in the sequence", f"write '{hint}'", key=True)
         # A wrong step counts as one that takes an image: the user may have intended one.

@@ -17,7 +17,7 @@ from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
-from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation, offers
+from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Blinding, Lab, Timeouts
 
@@ -105,7 +105,7 @@ def construct(
         simulation: Simulation | None = made.get("simulation", context.simulation)
         own = replace(context, name=role, simulation=simulation)
         if chosen[role].entry.kind == "camera" != role:  # no line triggers it
-            seen = simulation.seen_by(role) if simulation and offers(simulation, "seen_by") else simulation
+            seen = None if simulation is None else simulation.seen_by(role)
             own = replace(own, simulation=seen, lines=())
         if role == "simulation":
             stream = RandomStream(seed, "")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Literal, get_args
 
 from labseq import builtin as builtins
-from labseq.config.addresses import NAMED, PROFILE, ROLES
+from labseq.config import addresses
 from labseq.config.document import Document
 from labseq.errors import (
     ConfigError,
@@ -28,26 +28,10 @@ from labseq.messages import clean
 from labseq.model import ScanSpace, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost, call_plugin
 from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
-from labseq.roles import (
-    Analysis,
-    Camera,
-    Context,
-    Detector,
-    Device,
-    Lines,
-    MobileTweezers,
-    Planner,
-    Scanner,
-    Simulation,
-    StaticTweezers,
-    Step,
-)
+from labseq.roles import ROLES, Context
 from labseq.settings import Choice, NoSettings, Settings
 
 DryRun = Literal["off", "full", "fast"]
-
-
-HARDWARE_KINDS: Final = frozenset({"camera", "static_tweezers", "mobile_tweezers", "device", "lines"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +106,7 @@ def _with_advice(error: ConfigError, document: Document, choice: Choice) -> Conf
     """Add how to drop settings that the file has for another plugin, if an option chose this one."""
     if document.root.mark_at((*choice.loc, choice.key)).line:
         return error
-    prefix = PROFILE if choice.loc[0] in (*ROLES, *NAMED) else ""
+    prefix = addresses.PROFILE if choice.loc[0] in (*addresses.ROLES, *addresses.NAMED) else ""
     address = prefix + ".".join(map(str, choice.loc))
     hint = f'to drop the settings of another plugin, use --set "{address}={{{choice.key}: {choice.use}}}"'
     return ConfigError(
@@ -188,8 +172,7 @@ def choose(
     Returns:
         The choice, and a warning for the user or "".
     """
-    has_twin = kind in HARDWARE_KINDS or kind == "simulation"
-    if dry_run == "off" or not has_twin or choice.use == VIRTUAL_TWIN:
+    if dry_run == "off" or not ROLES[kind].has_twin or choice.use == VIRTUAL_TWIN:
         return resolve(host, document, kind, choice), ""
     entry = host.registry.get(kind, VIRTUAL_TWIN)
     twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
@@ -279,21 +262,6 @@ def load_plugins(
     return host
 
 
-_ROLES: Final[Mapping[str, type]] = {
-    "camera": Camera,
-    "static_tweezers": StaticTweezers,
-    "mobile_tweezers": MobileTweezers,
-    "device": Device,
-    "lines": Lines,
-    "detector": Detector,
-    "planner": Planner,
-    "simulation": Simulation,
-    "step": Step,
-    "scanner": Scanner,
-    "analysis": Analysis,
-}
-
-
 def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
     """Construct the object of one role; a scanner receives the ranges that it may choose from.
 
@@ -344,27 +312,24 @@ def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
 
 
 def check_role(entry: Entry, made: object) -> None:
-    """Raise if an object lacks a method or attribute of its role.
+    """Raise if an object cannot play its role; from then on its methods are called without asking.
 
     Raises:
-        PluginLoadError: A method or attribute is missing; names it.
+        PluginLoadError: It is not of the role's base class, or lacks its method.
     """
-    role = _ROLES[entry.kind]
-    called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{role.__name__}"
+    base = entry.role.base
+    called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{base.__name__}"
     if made is None or isinstance(made, type):
         raise entry.owner.fault(f"the factory of {called} made {_called(made)}; expected an object; {see}")
-    names = (
-        [*role.__annotations__, *getattr(role, "__abstractmethods__", ())]
-        if issubclass(role, ABC)
-        else dir(role)
-    )
-    names = sorted(name for name in names if not name.startswith("_"))
-    missing = [name for name in names if not hasattr(made, name)]
-    if missing:
-        raise entry.owner.fault(f"{called} has no {', '.join(missing)}; {see}")
-    methods = [name for name in names if callable(getattr(role, name, None))]
-    if wrong := [name for name in methods if not callable(getattr(made, name))]:
-        raise entry.owner.fault(f"{', '.join(wrong)} of {called} cannot be called; {see}")
+    if issubclass(base, ABC):
+        if not isinstance(made, base):
+            text = f"the factory of {called} made {_called(made)}, which is not derived from {base.__name__}"
+            raise entry.owner.fault(f"{text}; {see}")
+        return
+    # a Protocol: planners and others without state need no base class, only the method
+    methods = [name for name in vars(base) if not name.startswith("_")]
+    if missing := [name for name in methods if not callable(getattr(made, name, None))]:
+        raise entry.owner.fault(f"{called} has no method {', '.join(missing)}; {see}")
 
 
 def _called(made: object) -> str:

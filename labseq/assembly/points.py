@@ -276,9 +276,9 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
         step, dumped = construct_role(entry, settings), dump(entry, settings)
     except (ConfigError, PluginLoadError) as error:
         raise document.error(spec.loc, str(error)) from error
-    key, devices = getattr(step, "device_setting", ""), hardware.profile.devices
+    key, devices = step.device_setting, hardware.profile.devices
     name = getattr(settings, key, None) if key else None
-    may_be_camera = getattr(step, "device_may_be_camera", False)
+    may_be_camera = step.device_may_be_camera
     known = [one for one, choice in devices.items() if may_be_camera or choice.role == "device"]
     known += ["camera"] if may_be_camera else []
     if name is not None and name not in known:

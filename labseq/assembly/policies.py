@@ -94,7 +94,7 @@ def make_policy(
             policies[number] = _step_policy(document, spec, otherwise)
     is_whole = len(steps) == len(sequence.shot)
     for number, (spec, policy) in enumerate(zip(sequence.shot, policies, strict=True)):
-        if is_whole and policy.retries and not getattr(steps[number][1], "repeatable", False):
+        if is_whole and policy.retries and not steps[number][1].repeatable:
             what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
             hint = "write 'on_failure: repeat_shot'"
             found.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))

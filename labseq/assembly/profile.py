@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.assembly.calibrations import ActiveCalibrations, calibrated, with_calibrations
-from labseq.assembly.plugin_choice import HARDWARE_KINDS, ChosenPlugin, DryRun, choose, load_plugins
+from labseq.assembly.plugin_choice import ChosenPlugin, DryRun, choose, load_plugins
 from labseq.config.addresses import Override
 from labseq.config.document import Document, plugin_paths
 from labseq.config.profile import DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
@@ -24,7 +24,7 @@ from labseq.model import CalibrationEntry, MotionSpec, SiteGrid
 from labseq.model.lines import IDLE
 from labseq.plugins import PluginHost
 from labseq.registry import VIRTUAL_TWIN
-from labseq.roles import Clock, Context
+from labseq.roles import ROLES, Clock, Context
 from labseq.sequencer.lines import trigger_line
 from labseq.settings import Choice
 
@@ -106,11 +106,11 @@ class ResolvedProfile:
             with found:
                 own = document.validate(type(choice), loc).placed(*loc)
                 kind = kind_of(role, own)
-                if kind in HARDWARE_KINDS and own.use != choice.use:
+                if ROLES[kind].is_hardware and own.use != choice.use:
                     what = f"a scan cannot change the driver of {role}"
                     raise document.error((*loc, "use"), what, "one driver for the whole run")
                 one, _ = choose_role(self.host, document, profile, role, own, self.dry_run)
-                if kind in HARDWARE_KINDS and one.virtual_time != chosen[role].virtual_time:
+                if ROLES[kind].is_hardware and one.virtual_time != chosen[role].virtual_time:
                     what = f"the scan would change whether {role} is simulated"
                     raise document.error(loc, what, "all points simulated, or none")
                 chosen[role] = one
@@ -128,13 +128,13 @@ class ResolvedProfile:
     @property
     def identities(self) -> Mapping[str, str]:
         """What only one process can use of its hardware -> the role or device that uses it."""
-        hardware = {role: one for role, one in self.chosen.items() if one.entry.kind in HARDWARE_KINDS}
+        hardware = {role: one for role, one in self.chosen.items() if one.entry.role.is_hardware}
         return {identity: role for role, one in hardware.items() for identity in one.identities(role)}
 
     @property
     def virtual_time(self) -> bool:
         """Whether no device needs real time, so that the clock can be virtual."""
-        hardware = [one for one in self.chosen.values() if one.entry.kind in HARDWARE_KINDS]
+        hardware = [one for one in self.chosen.values() if one.entry.role.is_hardware]
         return self.dry_run != "off" or all(one.virtual_time for one in hardware)
 
 

@@ -9,7 +9,6 @@ from typing import Final
 from labseq.config.document import Document
 from labseq.errors import Loc, Problem, one_of
 from labseq.model import CameraFacts, LinesFacts, LineSpec, TimelineEntry
-from labseq.roles import offers
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import blinding_lines, trigger_line
 from labseq.units import format_quantity
@@ -27,20 +26,19 @@ def wrong_wiring(document: Document, lab: Lab) -> Iterator[Problem]:
         lab: The devices, not open.
     """
     camera, specs = lab.step_context.camera, lab.line_specs
-    if lab.lines is not None and offers(lab.lines, "lines_facts"):
-        channels = lab.lines.lines_facts.channels
-        for spec in (spec for spec in specs if spec.channel not in channels):
-            loc = ("lines", "channels", spec.name, "channel")
-            expected = f"one of {', '.join(map(str, channels))}"
-            yield document.problem(loc, f"the box has no channel {spec.channel}", expected)
+    channels = lab.step_context.lines_facts.channels
+    for spec in (spec for spec in specs if channels and spec.channel not in channels):
+        loc = ("lines", "channels", spec.name, "channel")
+        expected = f"one of {', '.join(map(str, channels))}"
+        yield document.problem(loc, f"the box has no channel {spec.channel}", expected)
     if camera.em_gain > 1.0:
         for name in blinding_lines(specs, "image"):
             what = f"'{name}' is blinding and on during `image`, with an EM gain of {camera.em_gain:g}"
             loc = ("lines", "channels", name, "on")
             yield document.problem(loc, what, "a line that is off in an exposure")
     yield from _trigger_of_camera(document, camera, trigger_line(specs, "camera"))
-    wired, mobile = trigger_line(specs, "mobile_tweezers"), lab.mobile_tweezers
-    if wired is not None and not (offers(mobile, "waits_for_trigger") and mobile.waits_for_trigger):
+    wired = trigger_line(specs, "mobile_tweezers")
+    if wired is not None and not lab.mobile_tweezers.waits_for_trigger:
         loc = ("lines", "channels", wired.name, "triggers")
         what = "the mobile tweezers take no external trigger"
         yield document.problem(loc, what, "mobile tweezers that do, such as `spcm`")

@@ -33,7 +33,6 @@ from labseq.plugin import (
     ToneProgram,
     check_plan,
     fitting_batches,
-    offers,
     setting_error,
     tone_program,
 )
@@ -182,10 +181,8 @@ class RearrangeStep(Step):
 
 def n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> int:
     """How many batches to start with: all, if the mobile tweezers take whole programs only."""
-    mobile = shot.mobile_tweezers
-    least_s = mobile.beginning_s if offers(mobile, "beginning_s") else math.inf
     played_s = report.batch_end_s[:n_batches] - shot.motion.overhead_per_cycle_s
-    n_first = int(np.searchsorted(played_s, least_s)) + 1
+    n_first = int(np.searchsorted(played_s, shot.mobile_tweezers.beginning_s)) + 1
     while n_first < n_batches and plan.linked[n_first]:
         n_first += 1
     return min(n_first, n_batches)
@@ -289,9 +286,8 @@ def prepare(
         upload = mobile.prepare if is_whole else mobile.prepare_beginning
         duration_s = _playing_time_s(shot.call("mobile_tweezers", limit_s, upload, program))
         took_s = shot.clock.now() - began_s
-        if offers(mobile, "timings"):
-            for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
-                shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
+        for part, host_s in shot.call("mobile_tweezers", limit_s, mobile.timings).items():
+            shot.stage_done(part, 0.0 if shot.clock.virtual else host_s, host_s, cycle=cycle)
         if shot.clock.virtual:
             shot.clock.sleep(max(0.0, overhead_s - (shot.clock.now() - start_s)))
     return duration_s, took_s

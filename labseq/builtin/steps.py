@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,6 +11,7 @@ from labseq.messages import format_error
 from labseq.plugin import (
     COMPUTER,
     ConfigError,
+    Device,
     Duration,
     Fraction,
     LabseqError,
@@ -26,7 +27,6 @@ from labseq.plugin import (
     empty_is,
     find_leader,
     format_quantity,
-    offers,
     setting_error,
 )
 
@@ -199,9 +199,9 @@ class DeviceStep(Step):
         devices: Mapping[str, object],
         context: StepContext,  # noqa: ARG002 - of the role
     ) -> Mapping[str, str | Problem]:
-        """Have the device check the command, if its driver can."""
-        device: Any = devices.get(self.settings.name)
-        if offers(device, "check_command"):
+        """Have the device check the command."""
+        device = devices.get(self.settings.name)
+        if isinstance(device, Device):  # not in a dry run of a profile without it
             try:
                 device.check_command(self.settings.do, **self.settings.arguments)
             except LabseqError as error:

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from labseq.assembly.plugin_choice import HARDWARE_KINDS
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point, run_folders
 from labseq.config.document import Document
 from labseq.data import Run, open_run
@@ -66,7 +65,7 @@ def check_campaign(campaign: Campaign, *, in_turn: bool) -> Checked:
         assembly = session.assembly
         if not (in_turn or assembly.virtual_time):
             chosen = assembly.hardware.chosen.items()
-            real = [role for role, one in chosen if one.entry.kind in HARDWARE_KINDS and not one.virtual_time]
+            real = [role for role, one in chosen if one.entry.role.is_hardware and not one.virtual_time]
             what = f"the profile '{assembly.hardware.profile.name}' has real hardware ({', '.join(real)})"
             expected = "simulated hardware, to take several runs at once"
             raise ConfigError(Problem(what, expected=expected, hint="leave out --workers and --scheduler"))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from labseq.assembly.assemble import Assembly
-from labseq.assembly.plugin_choice import HARDWARE_KINDS, DryRun
+from labseq.assembly.plugin_choice import DryRun
 from labseq.assembly.search import Search
 from labseq.calibration.compare import age_s, quality_text
 from labseq.config.scan import Axis
@@ -282,7 +282,7 @@ def _limits(assembly: Assembly) -> list[tuple[str, str]]:
     dop = assembly.planner.dump().get("degree_of_parallelism")
     uses = f"; the planner uses {min(dop, motion.max_tweezers)}" if dop else ""
     hardware = assembly.hardware.chosen.items()
-    real = [role for role, one in hardware if one.entry.kind in HARDWARE_KINDS and not one.virtual_time]
+    real = [role for role, one in hardware if one.entry.role.is_hardware and not one.virtual_time]
     waits = (("device call", timeouts.call), ("safe state", timeouts.safe_state), ("plan", timeouts.plan))
     return [
         *(("window", text) for text in _windows(assembly.resolved)),

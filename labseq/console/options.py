@@ -29,9 +29,9 @@ def new_kinds(incomplete: str) -> list[str]:
         >>> new_kinds("st")
         ['static_tweezers', 'step']
     """
-    from labseq.registry import KINDS
+    from labseq.roles import ROLES
 
-    return [kind for kind in (*_FILES, *KINDS) if kind.startswith(incomplete)]
+    return [kind for kind in (*_FILES, *ROLES) if kind.startswith(incomplete)]
 
 
 def file_kinds(incomplete: str) -> list[str]:

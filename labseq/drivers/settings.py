@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_
 from labseq.drivers import Cooling
 from labseq.errors import ConfigError, LimitError
 from labseq.model import CameraFacts, Flip, Orientation, SensorMode
-from labseq.roles import Context, Simulation, offers
+from labseq.roles import Context, Simulation
 from labseq.settings import Duration, PositiveDuration, Settings, Temperature
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
@@ -128,7 +128,7 @@ class CameraSettings(OrientationSettings):
             ConfigError: There is none, it does not describe its sensor, or the region is beyond it.
         """
         world = context.simulation
-        if world is None or not offers(world, "sensor_shape"):
+        if world is None or world.sensor_shape is None:
             text = "a simulated camera needs a simulation that describes its sensor"
             raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
         if setting_error := self.sensor_conflict(world.sensor_shape):

@@ -25,10 +25,9 @@ from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import RandomStream
 from labseq.recording import clear_active, mark_active
-from labseq.roles import Clock, Context, offers
+from labseq.roles import ROLES, Clock, Context, NeedsWarmUp, overrides
 from labseq.roles.simulation import JoinsRun
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.sequencer.lab import method_of
 from labseq.watchdog import Watchdog
 from labseq.wire import MAX_CONNECTIONS, Connections, MessageError, pack, report_error, unpack
 
@@ -453,7 +452,7 @@ class ServedDevice:
         if call not in self._methods:
             raise DeviceError(self.name, f"a client cannot call {call[:40]!r}")
         if call == "warm":
-            if offers(session.device, "warm"):
+            if isinstance(session.device, NeedsWarmUp):  # a simulation need not
                 session.device.warm()
             return load_kernels()
         value = self._call(session, args, named)
@@ -498,10 +497,15 @@ class ServedDevice:
         )
         session.device = self._construct(session, context, about)
         return {
-            "abilities": [name for name in self._methods if offers(session.device, name)],
+            "abilities": self._abilities(session.device),
             "plugin": self._chosen.entry.name,
             "settings": self._chosen.dump(),
         }
+
+    def _abilities(self, device: Any) -> list[str]:
+        """What its class does itself; for the rest, the client need not ask."""
+        base = ROLES[self.kind].base
+        return [name for name in self._methods if overrides(device, getattr(base, name))]
 
     def _construct(self, session: Session, context: Context, about: Mapping[str, Any]) -> Any:
         run, seed = session.run, about["seed"]
@@ -526,8 +530,8 @@ class ServedDevice:
             names = _LIVE
         else:
             return {}
-        state = {name: getattr(session.device, name) for name in names if offers(session.device, name)}
-        if self.kind == "mobile_tweezers" and offers(session.device, "timings"):
+        state = {name: getattr(session.device, name) for name in names}
+        if self.kind == "mobile_tweezers":
             state["timings"] = dict(session.device.timings())
         return state
 
@@ -541,7 +545,7 @@ class ServedDevice:
         self._mark()
         with session.abort.held():
             session.device.open()
-        emergency = session.device.emergency() if offers(session.device, "emergency") else None
+        emergency = session.device.emergency()
         if emergency is not None and session.watchdog is None:
             session.watchdog = Watchdog(
                 "labseq serve-devices", lost=partial(self.end_session, session), may_end=True
@@ -571,7 +575,7 @@ class ServedDevice:
         with session.abort.held():
             if not session.is_safe:
                 attempt(partial(self._make_safe, session), "safe_state()")
-            attempt(method_of(session.device, "close"), "close()")
+            attempt(session.device.close, "close()")
         if not session.is_safe:
             acts = "its watchdog switches it off" if session.watchdog else "nothing else can switch it off"
             failures.append(f"it is NOT SAFE: {acts}")

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import labseq
 from labseq.assembly.lab import timeouts_of
-from labseq.assembly.plugin_choice import HARDWARE_KINDS, ChosenPlugin
+from labseq.assembly.plugin_choice import ChosenPlugin
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.errors import (
@@ -36,7 +36,7 @@ from labseq.plain import now
 from labseq.recording import clear_active
 from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
 from labseq.remote.simulation import ServedSimulation
-from labseq.roles import offers
+from labseq.roles import NeedsWarmUp
 from labseq.safety.devices import check_each_device
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import construct_hardware
@@ -147,8 +147,7 @@ def _is_remote(chosen: ChosenPlugin) -> bool:
 
 def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> dict[str, ChosenPlugin]:
     """The devices that are served: those named, else the real ones, else all."""
-    kinds = HARDWARE_KINDS | {"simulation"}
-    able = {name: one for name, one in hardware.chosen.items() if one.entry.kind in kinds}
+    able = {name: one for name, one in hardware.chosen.items() if one.entry.role.has_twin}
     for name in names:
         if name not in able:
             expected = one_of([*able])
@@ -193,7 +192,7 @@ def _warm_simulation(hardware: ResolvedProfile) -> None:
     """Compile its kernels before devices of other servers, which it would keep waiting, act on it."""
     only = replace(hardware, chosen={"simulation": hardware.chosen["simulation"]})
     made, _ = construct_hardware(only, VirtualClock(StopFlag()))
-    if offers(made.get("simulation"), "warm"):
+    if isinstance(made.get("simulation"), NeedsWarmUp):
         made["simulation"].warm()
     load_kernels()
 

@@ -3,9 +3,10 @@
 Roles are synchronous. A constructor does no I/O; ``open()`` does. Hardware roles
 share ``open``, ``close``, ``safe_state`` (legal in any state, also before
 ``open``, and any number of times) and ``describe``. Optional abilities are methods
-with a default on the role's base class. The few Protocols that remain
-(``LeaderLink``, ``NeedsWarmUp``, ``ReportsSignals``, ``ReceivesOutput``)
-change what the core does where a plugin has them.
+of the role's base class that do nothing by default, so the core calls them without asking.
+The few Protocols that remain (``LeaderLink``, ``NeedsWarmUp``, ``ReportsSignals``,
+``ReceivesOutput``) change what the core does where a plugin has them. :data:`ROLES` lists the roles;
+what a factory makes is checked against it once.
 
 Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 ``LimitError`` before anything moves when the request is out of range, and
@@ -34,7 +35,6 @@ from labseq.roles.hardware import (
     Trigger,
     find_leader,
     leaders,
-    offers,
     unknown_name,
 )
 from labseq.roles.shot import EVENTS, Clock, Context, NeverStopped, RunObserver, Shot, Step, StepContext
@@ -46,9 +46,11 @@ from labseq.roles.simulation import (
     Simulation,
     ToneSource,
 )
+from labseq.roles.table import ROLES, in_opening_order, in_safe_order, overrides
 
 __all__ = [
     "EVENTS",
+    "ROLES",
     "WHOLE_SENSOR",
     "Analysis",
     "Camera",
@@ -80,7 +82,9 @@ __all__ = [
     "ToneSource",
     "Trigger",
     "find_leader",
+    "in_opening_order",
+    "in_safe_order",
     "leaders",
-    "offers",
+    "overrides",
     "unknown_name",
 ]

@@ -1,7 +1,6 @@
 """The roles of hardware: base classes of drivers.
 
-Every driver implements the abstract methods. The others are optional abilities: their defaults do
-nothing, and the core calls them only where a driver has its own version (see :func:`labseq.roles.offers`).
+Every driver implements the abstract methods. The others are optional abilities, whose defaults do nothing.
 """
 
 from __future__ import annotations
@@ -464,14 +463,3 @@ def unknown_name(device: str, what: str, name: str, known: Sequence[str]) -> Dev
     text = f"unknown {what} '{clean(name)}'; expected {one_of(known) if known else 'none: it has none'}"
     hint = did_you_mean(name, known)
     return DeviceError(device, f"{text}; {hint}" if hint else text)
-
-
-def offers(part: object, ability: str) -> bool:
-    """Whether a driver or simulation implements an optional ability.
-
-    Args:
-        part: The driver or simulation; it need not be derived from its role's base class.
-        ability: Name of the method or property, for example "self_test".
-    """
-    owner = next((cls for cls in type(part).__mro__ if ability in vars(cls)), None)
-    return owner is not None and not owner.__module__.startswith("labseq.roles.")

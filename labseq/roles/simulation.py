@@ -74,9 +74,9 @@ class Simulation(ABC):
         """Every constant of the model: JSON-ready values."""
 
     @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """(height, width) in pixels of the sensor that frames come from; also before ``open()``."""
-        raise NotImplementedError("this simulation does not describe its sensor")
+    def sensor_shape(self) -> tuple[int, int] | None:
+        """(height, width) in pixels of the sensor, also before ``open()``; None if it describes none."""
+        return None
 
     def warnings(self) -> Sequence[str]:
         """What ``labseq check`` and a run warn of, such as settings beyond the range of the model."""

@@ -19,18 +19,15 @@ from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.recording import find_dead_run
-from labseq.roles import Hardware, Simulation, offers
+from labseq.roles import Hardware, Simulation, in_opening_order, overrides
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import construct_hardware
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.sequencer.lab import Timeouts, attempt, method_of, open_device
+from labseq.sequencer.lab import Timeouts, attempt, open_device
 from labseq.watchdog import Watchdog
 
 N_READINGS: Final = 5
 """Number of ``describe()`` calls for the latency of a device, which is the median of their times."""
-
-_OPENING: Final = {"static_tweezers": 0, "camera": 1, "mobile_tweezers": 3}
-"""Place in the order of opening; devices that are not listed have 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +106,8 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         stack.enter_context(stop_on_signals(stop))
         made, refused = construct_hardware(hardware, clock)
         simulation = made.pop("simulation", None)
-        in_order = sorted(made.items(), key=lambda item: _OPENING.get(item[0], 2))
         devices = check_each_device(
-            in_order, timeouts_of(hardware.profile), stop, simulation, warnings.append
+            in_opening_order(made), timeouts_of(hardware.profile), stop, simulation, warnings.append
         )
     if not hardware.virtual_time and (text := realtime.refused()):
         warnings.append(text)
@@ -145,7 +141,7 @@ def check_each_device(
     guard, watchdog = Guard(stop), Watchdog("labseq devices", pulse=stop.pulse)
     tried: list[CheckedDevice] = []
     if simulation is not None and not stop.is_set:
-        tried.append(_examined(guard, "simulation", simulation, timeouts, watchdog))
+        tried.append(_examined_simulation(guard, simulation, timeouts))
     try:
         for name, device in devices:
             if stop.is_set:
@@ -154,8 +150,8 @@ def check_each_device(
                 found = _examined(guard, name, device, timeouts, watchdog)
             finally:
                 with stop.held():
-                    unsafe = attempt(guard, name, timeouts.safe_state_s, device, "safe_state")
-                    unclosed = attempt(guard, name, timeouts.safe_state_s, device, "close")
+                    unsafe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
+                    unclosed = attempt(guard, name, timeouts.safe_state_s, device.close)
                     if unsafe is None:
                         watchdog.forget([name])
             tried.append(replace(found, unsafe=unsafe, unclosed=unclosed))
@@ -165,30 +161,41 @@ def check_each_device(
             warn(text)
         if simulation is not None and tried:
             with stop.held():
-                unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation, "close")
+                unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation.close)
             tried[0] = replace(tried[0], unclosed=unclosed)
         guard.end()
     return tried
 
 
-def _examined(guard: Guard, name: str, device: Any, timeouts: Timeouts, watchdog: Watchdog) -> CheckedDevice:
+def _examined_simulation(guard: Guard, simulation: Simulation, timeouts: Timeouts) -> CheckedDevice:
+    """Open and identify the simulation."""
+    name = "simulation"
+    try:
+        guard.call_despite_stop(name, timeouts.call_s, simulation.open)
+        described = guard.call(name, timeouts.call_s, simulation.describe)
+        readings_s = [_reading_s(guard, name, simulation, timeouts.call_s) for _ in range(N_READINGS)]
+        return CheckedDevice(name, described, latency_s=statistics.median(readings_s))
+    except LabseqError as failure:
+        return CheckedDevice(name, failure=failure)
+
+
+def _examined(
+    guard: Guard, name: str, device: Hardware, timeouts: Timeouts, watchdog: Watchdog
+) -> CheckedDevice:
     """Open, identify and test a device; stops at the first failure."""
     found = CheckedDevice(name)
     try:
-        if name != "simulation" and offers(device, "warm"):
-            guard.call(name, WARM_S, device.warm)
-            load_kernels()  # else a self test might have to compile within its timeout
+        guard.call(name, WARM_S, device.warm)
+        load_kernels()  # else a self test might have to compile within its timeout
         open_device(guard, name, device, timeouts.call_s, watchdog, 0)
-        described: Any = guard.call(name, timeouts.call_s, method_of(device, "describe"))
+        described: Any = guard.call(name, timeouts.call_s, device.describe)
         if not isinstance(described, Mapping):
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
         found = replace(found, described=described)
-        if offers(device, "versions"):
-            found = _versions_read(guard, found, device, timeouts.call_s)
-        if offers(device, "self_test"):
-            guard.call(name, timeouts.call_s, device.self_test)
-            found = replace(found, tested=True)
+        found = _versions_read(guard, found, device, timeouts.call_s)
+        guard.call(name, timeouts.call_s, device.self_test)
+        found = replace(found, tested=overrides(device, Hardware.self_test))
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
         return replace(found, latency_s=statistics.median(readings_s))
     except LabseqError as failure:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.assembly.lab import construct, timeouts_of
-from labseq.assembly.plugin_choice import HARDWARE_KINDS, load_plugins
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.assembly.profile import ResolvedProfile, choose_plugins
 from labseq.config.addresses import profile_overrides
 from labseq.config.document import plugin_paths
@@ -30,13 +30,11 @@ from labseq.messages import clean
 from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, find_dead_run, lock_file
-from labseq.roles import Clock, Hardware, RunObserver, Simulation
+from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
 from labseq.safety.locks import end_holders, lock_devices, named
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.sequencer.lab import Timeouts, attempt, failure_of, in_safe_order, open_device
+from labseq.sequencer.lab import Timeouts, attempt, failure_of, open_device
 from labseq.watchdog import TRY_AGAIN_S, Hanging, Watchdog, watchdog_lines
-
-_NEEDED_KINDS: Final = HARDWARE_KINDS | {"simulation"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +77,14 @@ def make_each_safe(
     stop = StopFlag()
     guard, watchdog = Guard(stop), Watchdog("labseq safe", pulse=stop.pulse)
     outcome: dict[str, LabseqError | None] = {}
-    if simulation is not None and (
-        failure := attempt(guard, "simulation", timeouts.call_s, simulation, "open")
-    ):
+    if simulation is not None and (failure := attempt(guard, "simulation", timeouts.call_s, simulation.open)):
         outcome["simulation"] = failure
     for order, (name, device) in enumerate(devices):
         opening = partial(open_device, guard, name, device, timeouts.call_s, watchdog, order)
         opened = failure_of(name, "open()", opening)
         # it may be possible to make it safe even if it did not open
-        safe = attempt(guard, name, timeouts.safe_state_s, device, "safe_state")
-        closed = attempt(guard, name, timeouts.safe_state_s, device, "close")
+        safe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
+        closed = attempt(guard, name, timeouts.safe_state_s, device.close)
         if safe is None:
             watchdog.forget([name])
         outcome[name] = opened or safe
@@ -98,7 +94,7 @@ def make_each_safe(
     for text in watchdog.notes():
         warn(observer, text)
     if simulation is not None:
-        attempt(guard, "simulation", timeouts.call_s, simulation, "close")
+        attempt(guard, "simulation", timeouts.call_s, simulation.close)
     guard.end()
     return outcome
 
@@ -125,7 +121,7 @@ def construct_hardware(
     Returns:
         Role or device name -> object; and name -> why it could not be constructed, with its place.
     """
-    chosen = {role: c for role, c in hardware.chosen.items() if c.entry.kind in _NEEDED_KINDS}
+    chosen = {role: c for role, c in hardware.chosen.items() if c.entry.role.has_twin}
     failures: dict[str, LabseqError] = {}
     truth = hardware.profile.grid_model(), hardware.profile.motion
     made, _ = construct(chosen, hardware.context(clock), 0, truth=truth, refused=failures)

@@ -28,7 +28,8 @@ from labseq.errors import ConfigError, Problem
 from labseq.files import PLUGINS, packaged_profiles_dir
 from labseq.messages import clean, did_you_mean, install_hint, listing, visible
 from labseq.plugins import PluginHost
-from labseq.registry import KINDS, Registry
+from labseq.registry import Registry
+from labseq.roles import ROLES
 from labseq.scaffold.schemas import (
     KINDS as FILE_KINDS,
     SCHEMA_FOLDER,
@@ -71,18 +72,18 @@ class CreatedFiles:
 
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
     """Make a plugin, a sequence or a profile, and print its files and what to do next."""
-    if kind not in (*KINDS, *FILE_KINDS):
-        known = (*KINDS, *FILE_KINDS)
+    if kind not in (*ROLES, *FILE_KINDS):
+        known = (*ROLES, *FILE_KINDS)
         what = f"there is no kind '{clean(kind)}'"
         raise ConfigError(Problem(what, expected=listing(known), hint=did_you_mean(kind, known)))
     if package and kind in FILE_KINDS:
         raise ConfigError(Problem(f"--package does not apply to a {kind}", hint="leave it out"))
     if profile is not None and kind != "sequence":
         raise ConfigError(Problem(f"--profile does not apply to a {_called(kind)}", hint="leave it out"))
-    if kind in KINDS:
-        made = make_plugin(kind, name, folder, package=package)
-    else:
+    if kind in FILE_KINDS:
         made = make_file(kind, name, folder, profile=profile or "virtual")
+    else:
+        made = make_plugin(kind, name, folder, package=package)
     say(*lines_of(kind, name, made))
 
 

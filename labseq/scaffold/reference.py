@@ -30,8 +30,8 @@ from labseq.console.output import say
 from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
 from labseq.files import PLUGINS
 from labseq.messages import clean, closest
-from labseq.registry import KINDS, Entry, Registry
-from labseq.roles import EVENTS
+from labseq.registry import Entry, Registry
+from labseq.roles import EVENTS, ROLES
 from labseq.scaffold.words import default_of, docstring, summary, value_of
 from labseq.settings import Choice, Setting, models_at, settings_of
 from labseq.units import EXAMPLES, UNITS, unit_names
@@ -503,7 +503,7 @@ def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
     """The keys of a file; those that name a plugin with the plugins that there are."""
     found = _key_topics((kind,), FILES[kind])
     for key, owner, setting in _keys_of(FILES[kind], top=True):
-        chosen = key if key in KINDS else _CHOSEN.get(key, "")
+        chosen = key if key in ROLES else _CHOSEN.get(key, "")
         if not chosen:
             continue
         models = [AdaptiveChoice] if key == "scan" else models_at(FILES[kind], (key,))

@@ -10,9 +10,9 @@ from typing import Any
 
 from labseq.errors import DeviceError
 from labseq.guard import DRIVER_MARGIN_S
-from labseq.model import CameraFacts, Frame, TimedBy, TimelineEntry
+from labseq.model import Frame, TimedBy, TimelineEntry
 from labseq.model.lines import IDLE
-from labseq.roles import Camera, StepContext, Trigger, offers
+from labseq.roles import Camera, StepContext, Trigger
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import blinding_lines, trigger_line
 
@@ -36,7 +36,7 @@ def take_frame(
     Raises:
         DeviceError: It has an EM gain, only an external trigger, or returned something else than a frame.
     """
-    facts = camera.facts if offers(camera, "facts") else CameraFacts()
+    facts = camera.facts
     if facts.em_gain > 1:
         text = f"no frame of other light than that of atoms with an EM gain of {facts.em_gain:g}"
         raise DeviceError(name, f"{text}: it would age the EM register; set `em_gain` of this camera to 1")
@@ -144,8 +144,8 @@ class CameraSeries:
             self.end()
 
     def end(self) -> None:
-        """Disarm the camera, if it is armed and its driver can."""
-        if self._is_armed and offers(self._camera, "disarm"):
+        """Disarm the camera, if it is armed."""
+        if self._is_armed:
             self._call(self._camera.disarm)
         self.forget()
 

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from labseq.errors import DeviceError, LabseqError
 from labseq.guard import Guard
 from labseq.messages import format_error
 from labseq.model import (
     CalibrationEntry,
-    CameraFacts,
     LinesFacts,
     LineSpec,
     MotionSpec,
     RandomStream,
     SiteGrid,
     TargetPattern,
-    TweezersFacts,
 )
 from labseq.roles import (
     Camera,
@@ -35,7 +33,8 @@ from labseq.roles import (
     Simulation,
     StaticTweezers,
     StepContext,
-    offers,
+    in_opening_order,
+    in_safe_order,
 )
 from labseq.sequencer.lines import blinding_lines
 from labseq.watchdog import Watchdog
@@ -131,47 +130,37 @@ class Lab:
     @property
     def step_context(self) -> StepContext:
         """The context from which steps lay out their timelines."""
-        camera = self.camera.facts if offers(self.camera, "facts") else CameraFacts()
-        tweezers = self.static_tweezers.facts if offers(self.static_tweezers, "facts") else TweezersFacts()
-        lines = LinesFacts(())
-        if self.lines is not None and offers(self.lines, "lines_facts"):
-            lines = self.lines.lines_facts
-        return StepContext(self.grid, self.motion, self.target, camera, self.line_specs, lines, tweezers)
+        return StepContext(
+            self.grid,
+            self.motion,
+            self.target,
+            self.camera.facts,
+            self.line_specs,
+            LinesFacts(()) if self.lines is None else self.lines.lines_facts,
+            self.static_tweezers.facts,
+        )
 
-    def hardware(self) -> Iterator[tuple[str, Hardware]]:
-        """Name and device, in the order of opening: static tweezers first."""
-        yield "static_tweezers", self.static_tweezers
-        yield "camera", self.camera
-        yield from self.devices.items()
+    def hardware(self) -> list[tuple[str, Hardware]]:
+        """Name and device, in the order of opening."""
+        devices: dict[str, Hardware] = {
+            "camera": self.camera,
+            "static_tweezers": self.static_tweezers,
+            "mobile_tweezers": self.mobile_tweezers,
+            **self.devices,
+        }
         if self.lines is not None:
-            yield "lines", self.lines
-        yield "mobile_tweezers", self.mobile_tweezers
+            devices["lines"] = self.lines
+        return in_opening_order(devices)
 
     @property
     def direct_calls(self) -> frozenset[str]:
         """Devices and plugins that a shot calls in the thread of its steps."""
-        any_thread = (name for name, part in self.hardware() if getattr(part, "any_thread", False) is True)
+        any_thread = (name for name, device in self.hardware() if device.any_thread)
         return frozenset({"detector", "planner", *any_thread})
 
-    def safe_order(self) -> Iterator[tuple[str, Hardware]]:
+    def safe_order(self) -> list[tuple[str, Hardware]]:
         """Name and device, in the order of the safe state."""
         return in_safe_order(dict(self.hardware()))
-
-
-T = TypeVar("T")
-
-
-def in_safe_order(devices: Mapping[str, T]) -> Iterator[tuple[str, T]]:
-    """Name and device, in the order of the safe state.
-
-    Mobile tweezers ramp down first, then devices, lines and camera, static tweezers last; missing devices are
-    left out.
-    """
-    ends = ("mobile_tweezers", "camera", "static_tweezers")
-    others = tuple(name for name in devices if name not in ends)
-    for name in (ends[0], *others, *ends[1:]):
-        if name in devices:
-            yield name, devices[name]
 
 
 Outcome = dict[str, LabseqError | None]
@@ -212,32 +201,36 @@ def make_safe(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Ou
 
     Each device has its own timeout.
     """
-    return _each(lab.safe_order(), guard, "safe_state", lab.timeouts.safe_state_s, names)
+    methods = {name: device.safe_state for name, device in lab.safe_order()}
+    return _each(methods, guard, lab.timeouts.safe_state_s, names)
 
 
 def close_all(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Outcome:
     """Close every device in the safe order, then the simulation; or those of these names."""
-    parts: list[tuple[str, Hardware | Simulation]] = list(lab.safe_order())
+    methods = {name: device.close for name, device in lab.safe_order()}
     if lab.simulation is not None:
-        parts.append(("simulation", lab.simulation))
-    return _each(parts, guard, "close", lab.timeouts.safe_state_s, names)
+        methods["simulation"] = lab.simulation.close
+    return _each(methods, guard, lab.timeouts.safe_state_s, names)
 
 
 def _each(
-    parts: Iterable[tuple[str, Hardware | Simulation]],
+    methods: Mapping[str, Callable[[], object]],
     guard: Guard,
-    method: str,
     timeout_s: float,
     names: Container[str] | None,
 ) -> Outcome:
-    chosen = [part for part in parts if names is None or part[0] in names]
-    return {name: attempt(guard, name, timeout_s, part, method) for name, part in chosen}
+    """Call the methods in their order; those of these names, if names are given."""
+    return {
+        name: attempt(guard, name, timeout_s, method)
+        for name, method in methods.items()
+        if names is None or name in names
+    }
 
 
-def attempt(guard: Guard, name: str, timeout_s: float, part: object, method: str) -> LabseqError | None:
+def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], object]) -> LabseqError | None:
     """Call a method of a device even if the run is asked to stop; returns why it failed, or None."""
-    act = partial(guard.call_despite_stop, name, timeout_s, method_of(part, method))
-    return failure_of(name, f"{method}()", act)
+    act = partial(guard.call_despite_stop, name, timeout_s, method)
+    return failure_of(name, f"{method.__name__}()", act)
 
 
 def failure_of(name: str, what: str, act: Callable[[], object]) -> LabseqError | None:
@@ -261,9 +254,7 @@ def open_device(
     Raises:
         LabseqError: It cannot be opened, or ``emergency()`` fails.
     """
-    guard.call_despite_stop(name, timeout_s, method_of(device, "open"))
-    if not offers(device, "emergency"):
-        return
+    guard.call_despite_stop(name, timeout_s, device.open)
 
     def emergency() -> Emergency | None:
         found = device.emergency()
@@ -273,22 +264,9 @@ def open_device(
         watchdog.add(name, order, found.script, found.arguments)
 
 
-def method_of(part: object, method: str) -> Callable[[], Any]:
-    """A method that is only looked up when it is called, because a driver may fail even then."""
-
-    def act() -> Any:
-        return getattr(part, method)()
-
-    act.__name__ = method
-    return act
-
-
 def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:
     """The description of each device: name -> JSON-ready values."""
     parts: dict[str, Hardware | Simulation] = dict(lab.hardware())
     if lab.simulation is not None:
         parts["simulation"] = lab.simulation
-    return {
-        name: guard.call(name, lab.timeouts.call_s, method_of(part, "describe"))
-        for name, part in parts.items()
-    }
+    return {name: guard.call(name, lab.timeouts.call_s, part.describe) for name, part in parts.items()}

@@ -19,7 +19,7 @@ from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
 from labseq.plain import now_utc
-from labseq.roles import RunObserver, Step, offers
+from labseq.roles import RunObserver, Step
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import (
     Lab,
@@ -27,7 +27,6 @@ from labseq.sequencer.lab import (
     close_all,
     end_safely,
     make_safe,
-    method_of,
     open_device,
 )
 from labseq.sequencer.leader import Emit, LeaderAnswers
@@ -102,7 +101,7 @@ def open_devices(
     """
     timeout_s = lab.timeouts.call_s
     if lab.simulation is not None and "simulation" in names:
-        guard.call_despite_stop("simulation", timeout_s, method_of(lab.simulation, "open"))
+        guard.call_despite_stop("simulation", timeout_s, lab.simulation.open)
     order = {name: n for n, (name, _) in enumerate(lab.safe_order())}
     for name, part in lab.hardware():
         if name in names:
@@ -116,7 +115,7 @@ def open_devices(
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
     for name, device in lab.hardware():
-        if name not in names or not offers(device, "settle"):
+        if name not in names:
             continue
         longest_s = guard.call(name, timeout_s, partial(getattr, device, "settling_timeout_s"))
         if longest_s > 0:
@@ -177,7 +176,7 @@ def _named(number: int, name: str, step: Step) -> Generator[None]:
 def _line(error: BaseException, step: Step) -> str:
     """The last line of the step's own file that an error came through, as " (FILE:LINE)"; "" if none."""
     file = getattr(sys.modules.get(type(step).__module__), "__file__", None)
-    frames = traceback.walk_tb(vars(BaseException)["__traceback__"].__get__(error))
+    frames = traceback.walk_tb(error.__traceback__)
     lines = [line for frame, line in frames if frame.f_code.co_filename == file]
     return f" ({file}:{lines[-1]})" if lines else ""
 
@@ -342,8 +341,6 @@ class Sequencer:
     def _leave_on(self) -> tuple[str, dict[str, Any]] | None:
         """Leave the static tweezers on if they are to be; returns the event that reports it, or why not."""
         name, device = "static_tweezers", self.lab.static_tweezers
-        if not offers(device, "leave_on"):
-            return None
         try:
             left = self.guard.call_despite_stop(name, self.lab.timeouts.safe_state_s, device.leave_on)
         except LabseqError as failure:

@@ -34,7 +34,7 @@ from labseq.model import (
 )
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.realtime import raise_priority, restore_priority
-from labseq.roles import Device, ReportsSignals, RunObserver, StepContext, offers
+from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
 from labseq.sequencer.images import CameraSeries, take_frame
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
@@ -324,7 +324,7 @@ class RunningShot:
     def poll(self) -> None:
         """Record the values that are read at the start of a shot: from devices, and the thresholds."""
         for name, device in self.lab.hardware():
-            if offers(device, "poll"):
+            if overrides(device, Hardware.poll):
                 values = self.call(name, self.call_timeout_s, device.poll)
                 self.record.readings.update({f"{name}.{value}": read for value, read in values.items()})
         self.call("detector", self.call_timeout_s, self._record_thresholds)
@@ -340,7 +340,7 @@ class RunningShot:
     def check_interlocks(self) -> None:
         """Check the interlocks of every device; see ``labseq.plugin.Shot``."""
         for name, device in self.lab.hardware():
-            if offers(device, "check_interlocks"):
+            if overrides(device, Hardware.check_interlocks):
                 try:
                     self.call(name, self.call_timeout_s, device.check_interlocks)
                 except DeviceError as error:
@@ -393,10 +393,9 @@ class RunningShot:
         """Record how long after the frame the light of the mobile tweezers came, and report what was kept."""
         if start is not None and self._frame_s is not None:
             mobile, (frame_s, host_s) = self.mobile_tweezers, self._frame_s
-            delay_s = mobile.start_delay_s if offers(mobile, "start_delay_s") else 0.0
             cycle = self.record.images[-1].cycle + 1 if self.record.images else -1
             host_taken_s = time.perf_counter() - host_s
-            taken_s = self.clock.now() - frame_s + delay_s
+            taken_s = self.clock.now() - frame_s + mobile.start_delay_s
             self._frame_s = None
             self.stage_done("light", taken_s, host_taken_s, cycle=cycle)
         self._events.release()
@@ -471,9 +470,8 @@ class RunningShot:
 
     def _catch_up(self) -> None:
         """Let a simulated device catch up with virtual time while nothing depends on it."""
-        mobile = self.lab.mobile_tweezers
-        if self.clock.virtual and offers(mobile, "settle"):
-            self.call("mobile_tweezers", self.call_timeout_s, mobile.settle)
+        if self.clock.virtual:
+            self.call("mobile_tweezers", self.call_timeout_s, self.lab.mobile_tweezers.settle)
 
     def _name_of_image(self, cycle: int) -> str:
         """A name that no other image of the shot has: that of the step, with the cycle or a number."""
@@ -561,18 +559,15 @@ class RunningShot:
         simulation, readings, timeout_s = self.simulation, self.record.readings, self.call_timeout_s
         if simulation is None:
             return
-        if offers(simulation, "truth"):
-            truth = self.call("simulation", timeout_s, simulation.truth)
-            if truth is not None:
-                readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
-                if not self.target.is_none:
-                    readings["simulation.n_defects_true"] = self.target.n_defects(truth)
-        if offers(simulation, "losses"):
-            losses = self.call("simulation", timeout_s, simulation.losses)
-            readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})
-        if offers(simulation, "atom_events"):
-            events = self.call("simulation", timeout_s, simulation.atom_events, self.start_s)
-            self.record.atom_events.update(events)
+        truth = self.call("simulation", timeout_s, simulation.truth)
+        if truth is not None:
+            readings["simulation.n_atoms_true"] = int(np.count_nonzero(truth))
+            if not self.target.is_none:
+                readings["simulation.n_defects_true"] = self.target.n_defects(truth)
+        losses = self.call("simulation", timeout_s, simulation.losses)
+        readings.update({f"simulation.lost.{cause}": n for cause, n in losses.items()})
+        events = self.call("simulation", timeout_s, simulation.atom_events, self.start_s)
+        self.record.atom_events.update(events)
 
     def _detected(self, answer: Any) -> tuple[Occupancy, Any, Any]:
         """The detector's answer, checked: occupancy, confidence and, if it gives them, signals."""

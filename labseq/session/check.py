@@ -22,7 +22,7 @@ from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, Pr
 from labseq.guard import Guard
 from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
 from labseq.motion import tone_program
-from labseq.roles import Detector, Step, find_leader, offers
+from labseq.roles import Detector, Step, find_leader
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
@@ -109,10 +109,9 @@ class _PointCheck:
     def ask_steps(self) -> None:
         """Have every step check its settings against the devices."""
         for spec, (name, step) in zip(self.shot, self.point.steps, strict=True):
-            if offers(step, "check_devices"):
-                for setting, one in _wrong_settings(self._guard, self.lab, name, step).items():
-                    loc = (*spec.loc, setting) if setting else spec.loc
-                    self._add(loc, one.what, one.expected, one.hint)
+            for setting, one in _wrong_settings(self._guard, self.lab, name, step).items():
+                loc = (*spec.loc, setting) if setting else spec.loc
+                self._add(loc, one.what, one.expected, one.hint)
 
     @cached_property
     def timeline(self) -> Timeline:
@@ -182,7 +181,7 @@ class _PointCheck:
 
     def _ask_lines(self, kind: str, duration_s: float) -> None:
         lab = self.lab
-        if lab.lines is not None and offers(lab.lines, "check_program"):
+        if lab.lines is not None:
             program = line_program(lab.line_specs, kind, duration_s)
             self._guard.call("lines", lab.timeouts.call_s, lab.lines.check_program, program)
 
@@ -200,9 +199,7 @@ class _PointCheck:
         for plan in plans:
             try:
                 program = tone_program(plan, grid=lab.grid, motion=lab.motion)
-                if offers(lab.mobile_tweezers, "check_program"):
-                    check_program = lab.mobile_tweezers.check_program
-                    self._guard.call("mobile_tweezers", WARM_S, check_program, program)
+                self._guard.call("mobile_tweezers", WARM_S, lab.mobile_tweezers.check_program, program)
                 self._ask_lines("rearrange", program.total_duration_s)
             except LimitError as error:
                 self._add_to_profile(error.setting or loc, f"moving atoms: {error}")
@@ -369,7 +366,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         next(iter(rehearsals.values()), None),
         _shot_bytes(assembly, first.lab, bars),
         spans_on(first.lab.line_specs, bars),
-        {name: text for name, one in first.lab.hardware() if (text := getattr(one, "idle_output", ""))},
+        {name: text for name, one in first.lab.hardware() if (text := one.idle_output)},
     )
 
 
@@ -471,9 +468,7 @@ def _light_warnings(assembly: Assembly, lab: Lab) -> Iterator[Problem]:
     hardware = assembly.hardware
     document, lines, gain = hardware.document, hardware.profile.lines, lab.step_context.camera.em_gain
     takes_image = any(step.takes_image for _, step in assembly.steps)
-    others_may = any(
-        getattr(step, name, "") for _, step in assembly.steps for name in ("device_setting", "signal")
-    )
+    others_may = any(step.device_setting or step.signal for _, step in assembly.steps)
     is_lit = others_may or any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
     if takes_image and not is_lit and hardware.chosen["camera"].identities("camera"):
         what = "nothing of this profile switches the imaging light"
@@ -493,7 +488,7 @@ def _judgement_warnings(assembly: Assembly, rearrangements: Sequence[int]) -> li
     images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
     if not rearrangements or max(images, default=-1) > rearrangements[-1]:
         return []
-    if getattr(assembly.steps[rearrangements[-1]][1], "judges_shot", False):
+    if assembly.steps[rearrangements[-1]][1].judges_shot:
         return []
     loc = assembly.sequence.shot[rearrangements[-1]].loc
     what = "no image follows the last rearrangement, so the shots are not judged"
@@ -513,7 +508,7 @@ def _parallelism_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
 def _deadline_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
     timeline, lab, point = one.timeline, one.lab, one.point
-    waits = [bool(getattr(step, "signal", "")) for _, step in point.steps]
+    waits = [bool(step.signal) for _, step in point.steps]
     for number, (_, step) in enumerate(point.steps):
         if not waits[number]:
             continue
@@ -536,7 +531,7 @@ def _instance_warnings(one: _PointCheck) -> Iterator[tuple[str, Problem]]:
     """What the simulation and the mobile tweezers themselves warn of."""
     lab = one.lab
     for name, instance in (("simulation", lab.simulation), ("mobile_tweezers", lab.mobile_tweezers)):
-        if instance is not None and offers(instance, "warnings"):
+        if instance is not None:
             for text in one.checks.guard.call(name, WARM_S, instance.warnings):
                 yield text, Problem(text)
 

@@ -14,7 +14,7 @@ from labseq.errors import LabseqError, Problem, StopRequested
 from labseq.guard import Guard
 from labseq.model import Plan, PlanReport
 from labseq.motion import check_plan, fitting_batches
-from labseq.roles import Step, offers
+from labseq.roles import Step
 from labseq.sequencer.lab import Lab
 
 PAPERS_LOADING: Final = 0.75
@@ -54,7 +54,7 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
 
 def windows_of(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]]:
     """Step number -> window per cycle, of each rearrangement."""
-    windows = {number: getattr(step, "windows_s", ()) for number, (_, step) in enumerate(steps)}
+    windows = {number: step.windows_s for number, (_, step) in enumerate(steps)}
     return {number: windows_s for number, windows_s in windows.items() if windows_s}
 
 
@@ -66,9 +66,7 @@ def rehearse(
     Returns:
         The results of each rearrangement, some of the plans, and the planner's failure.
     """
-    loading = None
-    if lab.simulation is not None and offers(lab.simulation, "loading_probability"):
-        loading = lab.simulation.loading_probability
+    loading = None if lab.simulation is None else lab.simulation.loading_probability
     if loading is None:
         loading = PAPERS_LOADING
     shots: list[list[tuple[Plan, PlanReport]]] = []

@@ -21,7 +21,6 @@ from labseq.plugin import (
     ExposureResult,
     LabseqError,
     SensorMode,
-    offers,
     trigger_line,
     wait_for,
 )
@@ -50,7 +49,7 @@ class SimulatedAndorLibrary(AndorLibrary):
         if world is None:
             text = "the simulated camera needs a simulation; add `simulation: {use: virtual}`"
             raise ConfigError(f"{text} to the profile")
-        shape = world.sensor_shape if offers(world, "sensor_shape") else IXON_897.sensor_shape
+        shape = world.sensor_shape or IXON_897.sensor_shape
         self.head: Head = simulated_head(settings, shape)
         self.sensor_shape = shape
         self.folder = ""
@@ -63,11 +62,10 @@ class SimulatedAndorLibrary(AndorLibrary):
 
     def warm(self, em_gain: float) -> None:
         """Compute what all simulated frames have in common."""
-        if offers(self._world, "sensor_shape"):
-            region = self._settings.mode.region
-            is_whole = region == (0, 0, *self._world.sensor_shape)
-            mode = SensorMode(None if is_whole else region, self._settings.binning, em_gain)
-            self._world.prepare_sensor(mode)
+        region = self._settings.mode.region
+        is_whole = region == (0, 0, *self.sensor_shape)
+        mode = SensorMode(None if is_whole else region, self._settings.binning, em_gain)
+        self._world.prepare_sensor(mode)
 
     def connect(self, andor: Any) -> tuple[int, ...]:
         """Connect the cameras to the computer."""

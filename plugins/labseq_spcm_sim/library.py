@@ -34,7 +34,6 @@ from labseq.plugin import (
     RfTones,
     Simulation,
     c_address,
-    offers,
 )
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
@@ -328,7 +327,7 @@ class SimulatedLibrary:
             name = ""
         else:
             return self._name
-        if self._simulation is not None and offers(self._simulation, "wire"):
+        if self._simulation is not None:
             self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: card.trigger_at(t_s))
         if isinstance(self._simulation, ReceivesOutput):
             self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))

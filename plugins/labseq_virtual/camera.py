@@ -18,7 +18,6 @@ from labseq.plugin import (
     SensorMode,
     Series,
     SimulatedSensor,
-    offers,
     settle,
     trigger_line,
 )
@@ -97,11 +96,11 @@ class VirtualCamera(CameraDriver):
         )
         self._current = self._idle
         self._readout_s, self._frame_shape = settings.readout, None
-        if offers(self._simulation, "sensor_shape"):
-            if setting_error := settings.sensor_conflict(self._simulation.sensor_shape):
+        if (sensor_shape := self._simulation.sensor_shape) is not None:
+            if setting_error := settings.sensor_conflict(sensor_shape):
                 raise ConfigError(setting_error)
             self._readout_s *= self._simulation.readout_fraction(self._mode)
-            self._frame_shape = settings.frame_shape(self._simulation.sensor_shape)
+            self._frame_shape = settings.frame_shape(sensor_shape)
         cooling = settings.cooling
         self._cooling = None if cooling is None else cooling.spec()
         self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)
@@ -118,8 +117,7 @@ class VirtualCamera(CameraDriver):
 
     def warm(self) -> None:
         """Compute what all frames have in common, and compile or load their kernels."""
-        if offers(self._simulation, "sensor_shape"):
-            self._simulation.prepare_sensor(self._mode)
+        self._simulation.prepare_sensor(self._mode)
 
     @property
     def settling_timeout_s(self) -> float:

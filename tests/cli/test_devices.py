@@ -47,8 +47,12 @@ class Fine(VirtualDevice):
         return {"library": ("1.3", "1.2, 1.3"), "firmware": ("2.4", "2.3"), "board": ("", "")}
 
 
-def jam(self):
-    raise OSError("jammed")
+def jam(method):
+    def fail(self):
+        raise OSError("jammed")
+
+    fail.__name__ = method
+    return fail
 
 
 def refuse(self, settings, context):
@@ -60,7 +64,7 @@ def labseq_register(registry):
     registry.device("fine", Fine, DeviceSettings)
     registry.device("refusing", type("Refusing", (Fine,), {"__init__": refuse}), DeviceSettings)
     for method in ("open", "describe", "self_test", "safe_state", "close", "versions"):
-        broken = type("Broken", (Fine,), {method: jam})
+        broken = type("Broken", (Fine,), {method: jam(method)})
         registry.device(f"no_{method}", broken, DeviceSettings)
 """
 OTHERS = ["simulation", "static_tweezers", "camera", "mobile_tweezers"]

@@ -18,7 +18,8 @@ from labseq.config.profile import MotionSettings, ProfileSpec, load_profile
 from labseq.config.sequence import SequenceSpec, StepPolicySettings, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
-from labseq.registry import KINDS, Registry
+from labseq.registry import Registry
+from labseq.roles import ROLES
 from labseq.scaffold import reference
 from labseq.scaffold.reference import Table, settings
 from labseq.settings import Choice, PatternChoice, models_at, settings_at, settings_of
@@ -80,7 +81,7 @@ def test_everything_is_on_a_page() -> None:
     found = {" ".join(("command", *names)) for names, _ in reference.commands_below(SCRIPT.PROGRAM)}
     found |= {f"role {name}" for name in reference.roles_by_name() if name in plugin.__all__}
     found |= {f"contract {kind}" for kind in (*testing.SUITES, "hardware")}
-    found |= {f"plugins {kind}" for kind in KINDS if kind not in ("step", "pattern")}
+    found |= {f"plugins {kind}" for kind in ROLES if kind not in ("step", "pattern")}
     registry: Registry = SCRIPT.registry()
     found |= {f"settings {kind} {name}" for kind in ("step", "pattern") for name in registry.names(kind)}
     found |= {f"settings {kind} top" for kind in FILES} | {"settings sequence shot policy", "command"}
@@ -99,7 +100,7 @@ def test_every_model_of_a_file_is_on_a_page() -> None:
 
 def test_every_topic_can_be_explained() -> None:
     found = reference.topics(SCRIPT.registry(), SCRIPT.PROGRAM)
-    assert {*KINDS, *FILES, "unit", "command", "quantity", "event", "role", "error"} <= found.keys()
+    assert {*ROLES, *FILES, "unit", "command", "quantity", "event", "role", "error"} <= found.keys()
     for name, topic in found.items():
         assert topic.about, name
         lines = reference.plain(topic.blocks(), 80)
@@ -179,10 +180,10 @@ def test_every_argument_has_its_help() -> None:
 
 
 def test_every_method_of_the_registry_is_a_kind() -> None:
-    offers = {name for name, one in vars(Registry).items() if isinstance(one, FunctionType)} & {*KINDS}
-    assert offers == {*KINDS}
+    offers = {name for name, one in vars(Registry).items() if isinstance(one, FunctionType)} & {*ROLES}
+    assert offers == {*ROLES}
     every = [name for name in reference.roles_by_name() if name in plugin.__all__]
-    assert {*KINDS} - {"pattern"} <= {snake_case(name) for name in every}
+    assert {*ROLES} - {"pattern"} <= {snake_case(name) for name in every}
 
 
 def snake_case(name: str) -> str:

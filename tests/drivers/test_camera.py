@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.plugin import CameraFacts, Context, DeviceError, DeviceTimeoutError, LimitError
-from labseq.roles import Trigger, offers
+from labseq.roles import Hardware, Trigger, overrides
 from labseq.testing import CameraContract
 
 from .cameras import SHAPE, Bench, TinyCamera
@@ -210,7 +210,7 @@ def test_the_em_gain_is_on_in_a_series_and_1_in_the_self_test() -> None:
 )
 def test_the_self_test_takes_a_short_frame(facts: Mapping[str, Any], exposure_s: float) -> None:
     bench = Bench(**facts)
-    assert offers(bench.camera, "self_test")
+    assert overrides(bench.camera, Hardware.self_test)
     bench.camera.self_test()
     assert bench.camera.log == ["start", "fire", "take"]
     assert bench.camera.series[0].exposure_s == exposure_s

@@ -17,7 +17,7 @@ from labseq_andor_sim.library import FUNCTIONS
 
 from labseq import DeviceError, DeviceTimeoutError, LimitError
 from labseq.plugin import Context
-from labseq.roles import NeverStopped, offers
+from labseq.roles import Hardware, NeverStopped, overrides
 
 from .labseq_camera_rig import Rig, assert_shown, opened_rig
 
@@ -128,7 +128,7 @@ def status(lab: Rig) -> int:
 
 def test_it_waits_until_the_sensor_is_cold_and_the_camera_calls_it_stabilized() -> None:
     with rig(cooling=COLD) as lab:
-        assert offers(lab.camera, "settle")
+        assert overrides(lab.camera, Hardware.settle)
         assert lab.camera.settling_timeout_s == 900.0
         assert status(lab) == Code.TEMP_NOT_REACHED
         lab.camera.settle()

@@ -44,7 +44,7 @@ from labseq.plugin import (
     SiteGrid,
     TransientError,
 )
-from labseq.roles import offers
+from labseq.roles import Hardware, overrides
 from labseq.testing import MobileTweezersContract
 from labseq.testing.fakes import FakeClock
 
@@ -549,7 +549,7 @@ def test_any_stretch_of_a_program_is_rendered_as_in_the_whole(row_channel: int) 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> None:
     with driver(mode) as lab:
-        assert offers(lab.tweezers, "self_test")
+        assert overrides(lab.tweezers, Hardware.self_test)
         lab.tweezers.self_test()
         assert lab.card.outputs_on == (False, False)
         lab.tweezers.prepare(lab.program(1))

@@ -24,7 +24,7 @@ from labseq.plugin import (
     SiteGrid,
     TransientError,
 )
-from labseq.roles import offers
+from labseq.roles import Hardware, overrides
 from labseq.testing.fakes import FakeClock, RecordingSimulation
 
 
@@ -289,7 +289,7 @@ def test_a_sensor_cools_from_room_temperature_past_its_set_point_and_back() -> N
 
 def test_the_camera_waits_until_it_is_cold() -> None:
     lab = Lab(cooling=COLD)
-    assert offers(lab.camera, "settle")
+    assert overrides(lab.camera, Hardware.settle)
     assert lab.camera.settling_timeout_s == 900.0
     assert lab.said("temperature_k") == ROOM_K
     start_s = lab.clock.now()

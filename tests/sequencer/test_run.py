@@ -16,7 +16,7 @@ from labseq.sequencer.lab import Timeouts
 from labseq.sequencer.run import TRANSITIONS, State
 from labseq.testing.fakes import ListSink
 from labseq.watchdog import Watchdog
-from tests.hostile import HOSTILE, LOST
+from tests.hostile import HOSTILE
 from tests.sequencer.rig import EMPTY, FULL, IMAGE, LOAD, SAFE_ORDER, Rig, given
 
 
@@ -366,21 +366,6 @@ def test_any_error_of_any_call_leaves_every_device_safe_and_closed_once(error):
         assert rig.sequencer.state is State.CLOSED
 
 
-def test_a_driver_that_fails_when_a_method_is_looked_up_never_stops_the_others():
-    rig = Rig()
-
-    def gone(device):
-        raise OSError("gone")
-
-    methods = {"safe_state": property(gone), "close": property(gone)}
-    rig.lab.camera.__class__ = type("Gone", (type(rig.lab.camera),), methods)
-    rig.run()
-    others = [name for name in SAFE_ORDER if name != "camera"]
-    assert rig.made_safe() == others
-    assert [c.device for c in rig.lab.calls if c.method == "close"] == others
-    assert str(rig.unsafe["camera"]) == "camera: safe_state() raised OSError: gone"
-
-
 def test_without_threads_the_devices_are_made_safe_all_the_same(monkeypatch):
     rig = Rig()
     rig.sequencer.open()
@@ -392,15 +377,6 @@ def test_without_threads_the_devices_are_made_safe_all_the_same(monkeypatch):
     monkeypatch.setattr(threading.Thread, "start", refuse)
     assert not rig.sequencer.shut_down()
     assert rig.made_safe() == SAFE_ORDER
-
-
-def test_a_transient_failure_with_an_unusable_text_still_repeats_the_shot():
-    rig = Rig(fail_on={"camera.read": [LOST]})
-    rig.run()
-    failed, done = rig.sink.shots
-    assert (failed.status, done.status) == ("failed", "complete")
-    assert failed.error.isprintable()
-    assert len(failed.error) < 2 * MAX_ERROR
 
 
 def test_safety_comes_before_the_record():

@@ -43,7 +43,7 @@ import labseq
 LABSEQ_API = 1
 
 
-class Mine:
+class Mine(labseq.plugin.Device):
     def __init__(self, settings, context): pass
     def open(self): pass
     def close(self): pass

@@ -216,13 +216,15 @@ class Settings(labseq.plugin.Settings):
         return [f"card {self.card}"]
 
 
-class Mine:"""
+class Mine(labseq.plugin.Device):"""
 
 
 def test_locks_and_markers_follow_the_hardware_not_the_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = OWN_DEVICE.replace("class Mine:", IDENTIFIED).replace('("mine", Mine)', '("mine", Mine, Settings)')
+    text = OWN_DEVICE.replace("class Mine(labseq.plugin.Device):", IDENTIFIED).replace(
+        '("mine", Mine)', '("mine", Mine, Settings)'
+    )
     Path("plugins/mine.py").write_text(text, encoding="utf-8")
     Path("copies").mkdir()
     write("mine", "copies/copy.yaml")

@@ -49,9 +49,7 @@ class Settings(labseq.plugin.Settings):
         return size
 
 
-class Look:
-    needs_image = takes_image = False
-
+class Look(labseq.plugin.Step):
     def __init__(self, settings):
         pass  # constructor
 
@@ -121,10 +119,10 @@ def test_code_that_fails_is_named(where: str, error: str, says: str) -> None:
     assert f"mine.py:{line})" in str(caught.value) or where in ("timeline", "validator")
 
 
-def test_a_step_without_an_attribute_of_its_role_is_named() -> None:
-    write(PLUGIN.replace("needs_image = takes_image = False", "needs_image = False"))
+def test_a_step_without_the_base_class_of_its_role_is_named() -> None:
+    write(PLUGIN.replace("class Look(labseq.plugin.Step):", "class Look:"))
     with pytest.raises(
-        ConfigError, match=r"s\.yaml:8:11: .*step 'mine' has no takes_image; see labseq\.plugin\.Step"
+        ConfigError, match=r"s\.yaml:8:11: .*a Look, which is not derived from Step; see labseq\.plugin\.Step"
     ):
         labseq.Session.open("s.yaml")
 

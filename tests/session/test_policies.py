@@ -19,7 +19,7 @@ from .small_runs import Interrupting, interrupted, resumed, table, write
 PLUGIN = '''
 """A step that fails at some shots."""
 
-from labseq.plugin import DeviceError, Duration, Settings, hookimpl
+from labseq.plugin import DeviceError, Duration, Settings, Step, hookimpl
 
 LABSEQ_API = 1
 
@@ -31,10 +31,9 @@ class Failing(Settings):
     gain: int = 1
 
 
-class FailingStep:
+class FailingStep(Step):
     """Fails."""
 
-    needs_image = takes_image = False
     repeatable = True
 
     def __init__(self, settings):

@@ -41,7 +41,7 @@ class Settings(labseq.plugin.Settings):
         return ["the lamp"]
 
 
-class Lamp:
+class Lamp(labseq.plugin.Device):
     def __init__(self, settings, context): pass
     def open(self):
         if PORT and not OPENED:  # as a serial line, which only one process can open

@@ -9,7 +9,7 @@ PLUGIN = '''
 
 import numpy as np
 
-from labseq.plugin import Frame, hookimpl
+from labseq.plugin import Camera, Frame, MobileTweezers, StaticTweezers, Step, hookimpl
 
 LABSEQ_API = 1
 
@@ -28,19 +28,25 @@ class Null:
     def describe(self):
         return {"model": "null"}
 
-    def read(self, timeout_s):
-        return self.frame
-
-    def prepare(self, program):
-        return 1e-3
-
     def detect(self, frame):
         return self.occupancy, self.confidence
 
 
-class NullStep:
-    needs_image = takes_image = False
+class NullCamera(Null, Camera):
+    def read(self, timeout_s):
+        return self.frame
 
+
+class NullStaticTweezers(Null, StaticTweezers):
+    pass
+
+
+class NullMobileTweezers(Null, MobileTweezers):
+    def prepare(self, program):
+        return 1e-3
+
+
+class NullStep(Step):
     def __init__(self, settings):
         pass
 
@@ -53,9 +59,9 @@ class NullStep:
 
 @hookimpl
 def labseq_register(registry):
-    registry.camera("nothing", Null, virtual_time=True)
-    registry.static_tweezers("nothing", Null, virtual_time=True)
-    registry.mobile_tweezers("nothing", Null, virtual_time=True)
+    registry.camera("nothing", NullCamera, virtual_time=True)
+    registry.static_tweezers("nothing", NullStaticTweezers, virtual_time=True)
+    registry.mobile_tweezers("nothing", NullMobileTweezers, virtual_time=True)
     registry.detector("nothing", Null)
     registry.step("nothing", NullStep)
 '''

@@ -11,7 +11,7 @@ import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import Frame
-from labseq.roles import Camera, Trigger, offers
+from labseq.roles import Camera, Trigger, overrides
 from labseq.testing.contracts.hardware import (
     ALWAYS_SAFE,
     WORKS,
@@ -97,7 +97,7 @@ class CameraContract(HardwareContract[Camera]):
 
         def arm(trigger: Trigger) -> Action[Camera]:
             def enter(camera: Camera) -> None:
-                has_it = trigger in triggers_of(camera)
+                has_it = trigger in camera.facts.triggers
                 camera.arm(1, self.exposure_s, trigger if has_it else "software")
 
             return enter
@@ -168,7 +168,7 @@ class CameraContract(HardwareContract[Camera]):
         """Otherwise the run would wait for an edge that never comes."""
         with self.opened(factory) as (camera, _):
             for trigger in get_args(Trigger):
-                if trigger not in triggers_of(camera):
+                if trigger not in camera.facts.triggers:
                     arm = partial(camera.arm, 1, self.exposure_s, trigger)
                     refusal(DeviceError, f"arm() for the {trigger} trigger", arm)
             self.take(camera)
@@ -177,7 +177,7 @@ class CameraContract(HardwareContract[Camera]):
     def test_exposes_by_itself(self, factory: Factory[Camera]) -> None:
         """For a camera that has it."""
         with self.opened(factory) as (camera, _):
-            if "internal" not in triggers_of(camera):
+            if "internal" not in camera.facts.triggers:
                 return
             camera.arm(3, self.exposure_s, "internal")
             refusal(DeviceError, "trigger() in a series with the internal trigger", camera.trigger)
@@ -219,10 +219,10 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("trigger() without arm() raises DeviceError")
     def test_refuses_trigger_without_arm(self, factory: Factory[Camera]) -> None:
-        """Also after safe_state() and, if the driver has it, disarm(), which end the series."""
+        """Also after safe_state() and, if the driver has its own, disarm(), which end the series."""
         with self.opened(factory) as (camera, _):
             refusal(DeviceError, "trigger() after open()", camera.trigger)
-            for name in [*(["disarm"] if offers(camera, "disarm") else []), "safe_state"]:
+            for name in [*(["disarm"] if overrides(camera, Camera.disarm) else []), "safe_state"]:
                 camera.arm(2, self.exposure_s, "software")
                 getattr(camera, name)()
                 getattr(camera, name)()
@@ -235,7 +235,7 @@ class CameraContract(HardwareContract[Camera]):
     def test_ignores_edges_after_safe_state(self, factory: Factory[Camera]) -> None:
         """For a camera with the external trigger."""
         with self.wired(factory, "image") as (camera, context, pulse):
-            if camera is None or "external" not in triggers_of(camera):
+            if camera is None or "external" not in camera.facts.triggers:
                 return
             camera.arm(1, self.exposure_s, "external")
             camera.safe_state()
@@ -243,8 +243,3 @@ class CameraContract(HardwareContract[Camera]):
             pulse(self.exposure_s)
             context.clock.sleep(self.exposure_s)
             assert n_calls(context) == before, "an edge after safe_state() started an exposure"
-
-
-def triggers_of(camera: Camera) -> tuple[str, ...]:
-    """The camera's triggers: those of its facts, or software triggers alone."""
-    return camera.facts.triggers if offers(camera, "facts") else ("software",)

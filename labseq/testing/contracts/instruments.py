@@ -10,7 +10,7 @@ import numpy as np
 
 from labseq.errors import DeviceError
 from labseq.model import LineProgram, LineSpec
-from labseq.roles import Context, Device, Lines, offers
+from labseq.roles import Context, Device, Lines, overrides
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait
 from labseq.testing.contracts.promises import doing, promise, refusal
@@ -151,7 +151,7 @@ class LinesContract(HardwareContract[Lines]):
         """More edges, and edges closer to one another, than any box can play."""
 
         def check(lines: Lines) -> None:
-            if offers(lines, "check_program"):
+            if overrides(lines, Lines.check_program):
                 lines.check_program(self._many(3, 1e-12))
             else:
                 lines.compile(self._many(3, 1e-12))

@@ -12,7 +12,7 @@ import pytest
 
 from labseq.errors import LabseqError, LimitError
 from labseq.model import DepthRamp, Frame, RandomStream, SiteGrid
-from labseq.roles import Context, Simulation, offers
+from labseq.roles import Context, Simulation
 from labseq.testing.contracts.promises import doing, no_factory, promise, promised, quietly, refusal
 from labseq.testing.fakes import FakeClock
 
@@ -145,7 +145,7 @@ class SimulationContract:
     def test_loads_atoms(self, factory: Factory) -> None:
         """For a simulation that reports the truth."""
         with self.opened(factory) as (simulation, context):
-            if not offers(simulation, "truth"):
+            if simulation.truth() is None:
                 return
             shape = context.grid.shape
             self.shot(simulation, context, 0)

@@ -114,7 +114,7 @@ class StepContract:
     def test_runs_again(self, factory: Factory) -> None:
         """So that a failed attempt can be repeated; by default a step is not repeatable."""
         step = factory()
-        repeatable: Any = getattr(step, "repeatable", False)
+        repeatable: Any = step.repeatable
         assert isinstance(repeatable, bool), f"repeatable is {repeatable!r}"
         if not repeatable:
             return

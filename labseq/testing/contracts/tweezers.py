@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from labseq.errors import DeviceError, LimitError
 from labseq.model import Plan, SiteGrid, ToneProgram
 from labseq.motion import tone_program
-from labseq.roles import Context, MobileTweezers, StaticTweezers, offers
+from labseq.roles import Context, MobileTweezers, StaticTweezers, overrides
 from labseq.testing.contracts.hardware import Action, Factory, HardwareContract, Wait, n_calls
 from labseq.testing.contracts.promises import doing, promise, quietly, refusal
 from labseq.testing.fakes.lab import RecordingSimulation
@@ -118,7 +118,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
     def test_releases(self, factory: Factory[StaticTweezers]) -> None:
         """The device itself turns the light on again."""
         with self.opened(factory) as (tweezers, context):
-            shortest_s = tweezers.facts.shortest_release_s if offers(tweezers, "facts") else math.inf
+            shortest_s = tweezers.facts.shortest_release_s
             if shortest_s == math.inf:
                 return
             tweezers.start()
@@ -186,7 +186,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         duration_s = device.prepare(self.program())
         device.play()
         device.wait(duration_s + self.timeout_s)
-        if offers(device, "append") and math.isfinite(device.beginning_s):
+        if math.isfinite(device.beginning_s):
             device.prepare_beginning(self.program())
             device.play()
             device.append(self.program())
@@ -222,7 +222,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
             return lambda tweezers: tweezers.prepare(excessive)
 
         def check(tweezers: MobileTweezers) -> None:
-            if offers(tweezers, "check_program"):
+            if overrides(tweezers, MobileTweezers.check_program):
                 tweezers.check_program(too_far)
             else:
                 tweezers.prepare(too_far)
@@ -294,7 +294,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
                 tweezers.safe_state()
                 refusal(DeviceError, f"play() after safe_state() {state}", tweezers.play)
         with self.wired(factory, "rearrange") as (tweezers, context, pulse):
-            if tweezers is None or not (offers(tweezers, "waits_for_trigger") and tweezers.waits_for_trigger):
+            if tweezers is None or not tweezers.waits_for_trigger:
                 return
             duration_s = tweezers.prepare(self.program())
             tweezers.play()
@@ -310,8 +310,6 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
     def test_tells_its_timings(self, factory: Factory[MobileTweezers]) -> None:
         """They are recorded for every cycle, in the middle of a shot."""
         with self.opened(factory) as (tweezers, _):
-            if not offers(tweezers, "timings"):
-                return
             start_s = perf_counter()
             tweezers.prepare(self.program())
             limit_s = perf_counter() - start_s + CLOCK_S

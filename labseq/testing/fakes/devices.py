@@ -14,7 +14,18 @@ from numpy.typing import NDArray
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError
 from labseq.guard import StopFlag
 from labseq.model import DepthRamp, Frame, LineProgram, ToneProgram, TweezersFacts
-from labseq.roles import Clock, Context, Trigger, unknown_name
+from labseq.roles import (
+    Camera,
+    Clock,
+    Context,
+    Device,
+    Hardware,
+    Lines,
+    MobileTweezers,
+    StaticTweezers,
+    Trigger,
+    unknown_name,
+)
 from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lines import idle_program, off_program
 
@@ -154,7 +165,7 @@ class FakeClock(VirtualClock):
         self.sleeps.append(duration_s)
 
 
-class RecordingHardware:
+class RecordingHardware(Hardware):
     """A device in memory that keeps the promises of its role and records every call.
 
     Args:
@@ -238,7 +249,7 @@ MAX_EXPOSURE_S: Final = 10.0
 BAND_HZ: Final = (50e6, 150e6)
 
 
-class RecordingCamera(RecordingHardware):
+class RecordingCamera(RecordingHardware, Camera):
     """A camera whose frame k is full of k: uint16 (16, 16)."""
 
     role: ClassVar[str] = "camera"
@@ -293,7 +304,7 @@ class RecordingCamera(RecordingHardware):
         return self._frames.popleft()
 
 
-class RecordingStaticTweezers(RecordingHardware):
+class RecordingStaticTweezers(RecordingHardware, StaticTweezers):
     """Static tweezers that only know their depth.
 
     Attributes:
@@ -351,7 +362,7 @@ class RecordingStaticTweezers(RecordingHardware):
         self.depth = depth
 
 
-class RecordingMobileTweezers(RecordingHardware):
+class RecordingMobileTweezers(RecordingHardware, MobileTweezers):
     """Mobile tweezers that keep the programs they were given.
 
     Attributes:
@@ -404,7 +415,7 @@ class RecordingMobileTweezers(RecordingHardware):
         self.clock.sleep(max(0.0, left_s))
 
 
-class RecordingLines(RecordingHardware):
+class RecordingLines(RecordingHardware, Lines):
     """A timing box whose programs take their time and act on the simulation.
 
     Attributes:
@@ -474,7 +485,7 @@ class RecordingLines(RecordingHardware):
             self.simulation.play(self.name, program, self.clock.now())
 
 
-class RecordingDevice(RecordingHardware):
+class RecordingDevice(RecordingHardware, Device):
     """An instrument whose commands do nothing but set ``values["state"]``.
 
     Attributes:
