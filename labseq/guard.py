@@ -17,20 +17,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, ParamSpec, TypeVar, cast
+from typing import Any, Final, ParamSpec, TypeVar
 
-from labseq.errors import (
-    ConfigError,
-    DeviceError,
-    DeviceHungError,
-    LabseqError,
-    PlanError,
-    StopRequested,
-)
-from labseq.messages import error_text, format_error, one_line
+from labseq.errors import DeviceError, DeviceHungError, LabseqError, PlanError, StopRequested
+from labseq.messages import format_error
 from labseq.processes import Pulse
 
 P = ParamSpec("P")
@@ -147,28 +140,6 @@ def stop_on_signals(stop: StopFlag) -> Generator[None]:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
-def readable(error: LabseqError) -> LabseqError:
-    """One of labseq's own errors as a plugin raised it, or one of the same kind if its text is unusable.
-
-    A text is unusable if it cannot be read, is longer than ``MAX_ERROR``, or has control characters.
-    """
-    text, given, is_config = error_text(error), "", issubclass(type(error), ConfigError)
-    with suppress(BaseException):
-        given = str(error)
-    if text == given or (is_config and given and all(c.isprintable() or c == "\n" for c in given)):
-        return error  # a ConfigError may have many problems, a line each
-    if is_config:
-        return ConfigError(text)
-    kinds: list[type[LabseqError]] = [k for k in type(error).__mro__ if issubclass(k, LabseqError)]
-    kind = next(one for one in kinds if one.__module__ == LabseqError.__module__)
-    made = kind.__new__(kind, text)
-    with suppress(BaseException):
-        for name, value in vars(error).items():
-            made.__dict__[name] = one_line(value) if isinstance(value, str) else value
-    made.args = (text,)
-    return made
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Limit:
     """The time limit of what a thread does within a call, enforced by the thread that waits for the call.
@@ -193,8 +164,6 @@ class GuardedCall:
         done: Set when it has returned.
         result: What it returned.
         error: What it raised, or None.
-        own_error: The same if it is one of labseq's own errors, else None.
-        text: Kind and text of the error, or "".
         has_steps: Whether it is the steps of a shot.
         is_abandoned: Whether nothing waits for it any longer; it must call nothing any more.
     """
@@ -206,8 +175,6 @@ class GuardedCall:
         self.done = threading.Event()
         self.result: Any = None
         self.error: BaseException | None = None
-        self.own_error: LabseqError | None = None
-        self.text = ""
         self.has_steps = has_steps
         self.is_abandoned = False
 
@@ -218,9 +185,6 @@ class GuardedCall:
             self.result = self._work()
         except BaseException as error:  # noqa: BLE001 - handed to the thread that waits
             self.error = error
-            self.text = format_error(error)  # in this thread, because it may take long
-            if issubclass(type(error), LabseqError):  # isinstance() asks the object itself
-                self.error = self.own_error = readable(cast("LabseqError", error))
         _here.call = outer
         self.done.set()
 
@@ -492,9 +456,9 @@ class Guard:
             raise _hung(limit)
         if call.error is None:
             return call.result
-        if call.own_error is not None or call.has_steps:
-            raise call.own_error or call.error
-        owner, text = limit.owner, f"{limit.what}raised {call.text}"
+        if isinstance(call.error, LabseqError) or call.has_steps:
+            raise call.error
+        owner, text = limit.owner, f"{limit.what}raised {format_error(call.error)}"
         raise (PlanError(text) if owner == "planner" else DeviceError(owner, text)) from call.error
 
     def _directly(self, shot: GuardedCall, limit: Limit, work: partial[Any]) -> GuardedCall:

@@ -50,42 +50,27 @@ def clean(text: str) -> str:
 
 
 def error_text(error: BaseException) -> str:
-    r"""The text of any error, whatever a plugin made of it: one line of limited length, "" if it has none.
+    r"""The text of an error: one line of limited length, "" if it has none.
 
     Example:
         >>> print(error_text(ValueError("no\nanswer\x1b[2J")))
         no answer\x1b[2J
     """
-    try:
-        text = str.__str__(str(error))  # of a subclass of str, too
-    except BaseException as another:  # noqa: BLE001 - its __str__ may raise anything
-        return f"(its text cannot be read: {_kind_name(another)})"
-    return one_line(text)
+    return one_line(str(error))
 
 
 def format_error(error: BaseException) -> str:
-    """Kind and text of any error, see :func:`error_text`; of a group, also those of its first error.
+    """Kind and text of an error, see :func:`error_text`; of a group, also those of its first error.
 
     Example:
         >>> format_error(KeyError("typo"))
         "KeyError: 'typo'"
     """
-    text = error_text(error)
-    text = f"{_kind_name(error)}: {text}" if text else _kind_name(error)
-    try:
-        if issubclass(type(error), BaseExceptionGroup):
-            first: BaseException = vars(BaseExceptionGroup)["exceptions"].__get__(error)[0]
-            return one_line(f"{text}; the first: {format_error(first)}")
-    except BaseException:  # noqa: BLE001, S110 - too deep
-        pass
+    kind, text = type(error).__name__, error_text(error)
+    text = f"{kind}: {text}" if text else kind
+    if isinstance(error, BaseExceptionGroup):
+        return one_line(f"{text}; the first: {format_error(error.exceptions[0])}")
     return text
-
-
-def _kind_name(error: BaseException) -> str:
-    try:
-        return clean(str.__str__(type(error).__name__))
-    except BaseException:  # noqa: BLE001 - of a metaclass
-        return "an error"
 
 
 def one_line(text: str) -> str:

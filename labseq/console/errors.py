@@ -6,20 +6,17 @@ import codecs
 import errno
 import re
 import shutil
-import signal
 import sys
 import traceback
 from contextlib import suppress
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 from labseq.console.output import as_line, say
 from labseq.console.text import plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
-from labseq.guard import Guard, readable
-from labseq.messages import MAX_ERROR, format_error, visible
+from labseq.messages import MAX_ERROR, error_text, format_error, visible
 
 _WIDEST: Final = 100
 _MARGIN: Final = 8  # "   12 | "
@@ -74,8 +71,6 @@ def _line_of(problem: Problem) -> str | None:
 
 EXIT_SIGNALLED: Final = 128
 """Added to the signal's number, as shells do: 130 for Ctrl-C, 143 for SIGTERM."""
-TRACEBACK_S: Final = 5.0
-"""Longest time for printing a traceback with --debug, in seconds."""
 EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
 EXIT_INTERNAL: Final = 1
 EXIT_CODES: Final = {
@@ -96,10 +91,7 @@ def report(error: BaseException, *, debug: bool = False) -> int:
     Returns:
         The exit code.
     """
-    try:
-        lines = format_config_error(error) if isinstance(error, ConfigError) else lines_of(error)
-    except Exception:  # noqa: BLE001 - its class may do anything
-        lines = [f"internal error: {format_error(error)}"]
+    lines = format_config_error(error) if isinstance(error, ConfigError) else lines_of(error)
     if debug:
         lines = [*_traceback(error), *lines]
     with suppress(OSError, RecordingError):  # the exit code reports it, too
@@ -108,9 +100,8 @@ def report(error: BaseException, *, debug: bool = False) -> int:
 
 
 def _traceback(error: BaseException) -> list[str]:
-    """The traceback of an error, in a thread: its exceptions may fail, or take long, to print."""
-    call = Guard().run("traceback", TRACEBACK_S, partial(traceback.format_exception, error))
-    parts = call.result if call is not None and call.error is None else ["(its traceback cannot be read)"]
+    """The traceback of an error; a text in it may be very long, or have control characters."""
+    parts = traceback.format_exception(error)
     return [visible(line) for part in parts for line in part[:MAX_ERROR].splitlines()]
 
 
@@ -147,7 +138,7 @@ def lines_of(error: BaseException) -> list[str]:
         case StopRequested():
             return [str(error)]
         case LabseqError():
-            return [f"error: {readable(error)}"]
+            return [f"error: {error_text(error)}"]
         case KeyboardInterrupt():
             return ["stopped by Ctrl-C"]
         case OSError(errno=errno.ENOSPC):
@@ -164,9 +155,8 @@ def exit_code_of(error: BaseException) -> int:
         >>> exit_code_of(StopRequested(15))
         143
     """
-    kind = type(error)  # isinstance() asks the object itself
-    if issubclass(kind, StopRequested):
-        return EXIT_SIGNALLED + getattr(error, "signal_number", signal.SIGINT)
-    if issubclass(kind, LabseqError):
-        return kind.exit_code
-    return EXIT_INTERRUPTED if issubclass(kind, KeyboardInterrupt) else EXIT_INTERNAL
+    if isinstance(error, StopRequested):
+        return EXIT_SIGNALLED + error.signal_number
+    if isinstance(error, LabseqError):
+        return error.exit_code
+    return EXIT_INTERRUPTED if isinstance(error, KeyboardInterrupt) else EXIT_INTERNAL

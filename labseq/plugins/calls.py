@@ -7,15 +7,14 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from contextvars import Context
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, TypeVar, cast
 
 from labseq.errors import LabseqError, PluginLoadError
-from labseq.guard import Guard, readable
-from labseq.messages import error_text, format_error
+from labseq.guard import Guard
+from labseq.messages import format_error, one_line
 from labseq.registry import Owner
 
 T = TypeVar("T")
@@ -46,9 +45,7 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     guard, printed = Guard(reuses_threads=True), _PrintsToStderr(sys.stdout)
     try:
         with redirect_stdout(cast("Any", printed)):
-            # a context of its own: what code sets there, such as decimal's precision, ends with the call;
-            # what it keeps in the thread itself lasts until its own next call
-            call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(Context().run, work))
+            call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(work))
     finally:
         guard.end()
         if text := printed.end():
@@ -94,12 +91,11 @@ class _PrintsToStderr:
 
 
 def _named(owner: Owner, what: str, error: BaseException) -> LabseqError:
-    kind = type(error)  # isinstance() asks the object itself
-    if issubclass(kind, LabseqError) and (what or getattr(error, "plugin", None) == owner.name):
-        return readable(cast("LabseqError", error))
+    if isinstance(error, LabseqError) and (what or getattr(error, "plugin", None) == owner.name):
+        return error
     text = format_error(error)
-    if issubclass(kind, SyntaxError):
-        text = f"{kind.__name__}: {error_text(ValueError(getattr(error, 'msg', '')))}"
+    if isinstance(error, SyntaxError):
+        text = f"{type(error).__name__}: {one_line(error.msg)}"
     if place := error_location(error, owner.home):
         text = f"{text} ({place})"
     return owner.fault(f"{what} raised {text}" if what else text)
@@ -107,28 +103,17 @@ def _named(owner: Owner, what: str, error: BaseException) -> LabseqError:
 
 def error_location(error: BaseException, home: Path | None) -> str:
     """File and line that an error came from, in the plugin's own code if possible; "" if unknown."""
-    if issubclass(type(error), SyntaxError) and getattr(error, "filename", None):
-        return f"{error.filename}:{error.lineno or 1}"  # pyright: ignore[reportAttributeAccessIssue]
-    chain, seen = [error], {id(error)}
-    while (cause := _cause(chain[0])) is not None and id(cause) not in seen:
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.filename}:{error.lineno or 1}"
+    chain = [error]
+    while (cause := chain[0].__cause__ or chain[0].__context__) is not None and cause not in chain:
         chain.insert(0, cause)
-        seen.add(id(cause))
-    frames = [frame for one in chain for frame in traceback.extract_tb(_TRACE(one))]
+    frames = [frame for one in chain for frame in traceback.extract_tb(one.__traceback__)]
     own = [f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)]
     labseqs = (Path(__file__).parent, Path(__file__).parent.parent / "guard.py")
     foreign = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & {*labseqs}]
     frame = (own or foreign or [None])[-1]
     return "" if frame is None else f"{frame.filename}:{frame.lineno}"
-
-
-_CAUSE: Final[Callable[[BaseException], BaseException | None]] = vars(BaseException)["__cause__"].__get__
-_CONTEXT: Final[Callable[[BaseException], BaseException | None]] = vars(BaseException)["__context__"].__get__
-_TRACE: Final = vars(BaseException)["__traceback__"].__get__
-
-
-def _cause(error: BaseException) -> BaseException | None:
-    """What an error came from, whatever its class makes of these attributes."""
-    return _CAUSE(error) or _CONTEXT(error)
 
 
 def import_file(name: str, path: Path) -> ModuleType:

@@ -5,6 +5,7 @@ import pytest
 from labseq.console.errors import MAX_REPORTED, exit_code_of, lines_of, report
 from labseq.errors import (
     ConfigError,
+    DeviceError,
     DeviceTimeoutError,
     LabseqError,
     PlanError,
@@ -13,6 +14,7 @@ from labseq.errors import (
     StopRequested,
     UnknownPluginError,
 )
+from labseq.messages import MAX_ERROR
 
 
 @pytest.mark.parametrize(
@@ -47,6 +49,13 @@ def test_problems_start_with_their_place() -> None:
         "--set a.b=1: no such address",
         "error: no place at all",
     ]
+
+
+def test_a_text_from_a_device_cannot_disturb_the_terminal() -> None:
+    (line,) = lines_of(DeviceError("camera", "stuck\x1b[2J" + "x" * 5_000_000))
+    assert line.startswith(r"error: camera: stuck\x1b[2Jxxx")
+    assert line.isprintable()
+    assert len(line) < 2 * MAX_ERROR
 
 
 def test_a_full_disk_is_no_internal_error() -> None:

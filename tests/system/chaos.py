@@ -55,10 +55,7 @@ PAUSE_S = 0.004  # so that faults meet every call
 
 
 class Broken(BaseException):
-    def __str__(self):
-        raise RuntimeError("no text")
-
-    __repr__ = __str__
+    pass
 
 
 def fail(how):
