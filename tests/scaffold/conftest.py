@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from labseq.registry import KINDS
+from labseq.roles import ROLES
 from labseq.scaffold.new import CreatedFiles, make_file, make_plugin
 
 
@@ -37,7 +37,7 @@ def name_of(kind: str) -> str:
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     folder = tmp_path_factory.mktemp("made")
-    plugins = {kind: make_plugin(kind, name_of(kind), folder) for kind in KINDS}
+    plugins = {kind: make_plugin(kind, name_of(kind), folder) for kind in ROLES}
     package = make_plugin("planner", "packed", folder, package=True)
     sequence = make_file("sequence", "first", folder)
     profile = make_file("profile", "mine", folder)

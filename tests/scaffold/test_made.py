@@ -19,7 +19,7 @@ import pytest
 import labseq
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.document import Document
-from labseq.registry import KINDS
+from labseq.roles import ROLES
 from tests.nested import run_pytest
 
 
@@ -71,7 +71,7 @@ def test_their_types_are_right(made: Any) -> None:
     run("pyright", "--pythonpath", sys.executable, cwd=made.path)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ROLES)
 def test_a_run_goes_through_with_each(kind: str, made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(made.path)
     overrides = options_of(made.plugins[kind].commands[-1])
@@ -81,7 +81,7 @@ def test_a_run_goes_through_with_each(kind: str, made: Any, monkeypatch: pytest.
     assert result.status == "complete"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ROLES)
 def test_the_readme_says_how(kind: str, made: Any) -> None:
     plugin = made.plugins[kind]
     text = (plugin.path / "README.md").read_text(encoding="utf-8")

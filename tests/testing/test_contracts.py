@@ -16,8 +16,7 @@ import pytest
 
 from labseq.errors import DeviceError, LimitError, PlanError
 from labseq.model import Occupancy, Plan, TargetPattern, ToneProgram
-from labseq.registry import KINDS
-from labseq.roles import Context
+from labseq.roles import ROLES, Context
 from labseq.testing import SUITES, CameraContract, ContractViolation, MobileTweezersContract, PlannerContract
 from labseq.testing.contracts import HardwareContract
 from labseq.testing.contracts.promises import failure_text
@@ -135,7 +134,7 @@ def test_a_right_plugin_keeps_all_promises(kind: str) -> None:
 
 
 def test_every_kind_of_plugin_has_a_suite_and_every_promise_a_fault() -> None:
-    assert {*KINDS} == {*SUITES}
+    assert {*ROLES} == {*SUITES}
     broken = {(kind, tests[0]) for kind, planted in ALL.items() for _, tests in planted.each()}
     shared = {*promised_by(HardwareContract())}
     assert shared == {test for kind, test in broken if kind == "hardware"}
