@@ -30,19 +30,9 @@ from labseq_virtual.rf_analysis import HOPS, RfPulse
 from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
-from labseq.plugin import (
-    AxisTones,
-    FrequencyCourse,
-    MotionSpec,
-    Plan,
-    RfSamples,
-    RfSpec,
-    SiteGrid,
-    ToneProgram,
-    kernel,
-    render,
-    tone_program,
-)
+from labseq.plugin import AxisTones, MotionSpec, Plan, SiteGrid, ToneProgram, kernel
+from labseq.plugin.motion import FrequencyCourse, RfSpec, render, tone_program
+from labseq.plugin.simulation import RfSamples
 
 Floats = NDArray[np.float64]
 

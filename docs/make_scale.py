@@ -31,17 +31,8 @@ from labseq.model import CycleRecord, ImageRecord, PlanReport, RunRecord, ShotRe
 from labseq.model.grid import centred_comb
 from labseq.motion import Renderer, check_plan, tone_program
 from labseq.plain import now_utc
-from labseq.plugin import (
-    Context,
-    Frame,
-    MotionSpec,
-    Occupancy,
-    Plan,
-    RfSpec,
-    SiteGrid,
-    TargetPattern,
-    ToneProgram,
-)
+from labseq.plugin import Context, Frame, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern, ToneProgram
+from labseq.plugin.motion import RfSpec
 from labseq.recording import RunWriter
 
 PAGE: Final = Path(__file__).parent / "explanation" / "scale.md"

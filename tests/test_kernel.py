@@ -405,7 +405,9 @@ def test_kernels_are_interpreted_unless_numba_is_loaded_or_the_user_decides(
 def test_kernels_are_plain_python_without_the_compiler() -> None:
     code = """
         import numpy as np
-        from labseq.plugin import Context, MotionSpec, SiteGrid, TargetPattern, check_plan, tone_program
+        from labseq.plugin import Context, MotionSpec, SiteGrid, TargetPattern
+        from labseq.plugin.motion import tone_program
+        from labseq.plugin.planning import check_plan
         from labseq_psca.planner import PscaPlanner, PscaSettings
 
         atoms = np.random.default_rng(3).random((8, 7)) < 0.7

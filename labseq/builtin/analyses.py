@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from labseq.plugin import Context, CycleRecord, ImageRecord, Occupancy, RecordedShot, Settings, follow_atoms
+from labseq.plugin import Context, CycleRecord, ImageRecord, Occupancy, RecordedShot, Settings
+from labseq.plugin.planning import follow_atoms
 
 
 class SurvivalSettings(Settings):

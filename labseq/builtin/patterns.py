@@ -12,18 +12,9 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from labseq.geometry import DrawingError, read_bitmap
 from labseq.messages import install_hint
-from labseq.plugin import (
-    ConfigError,
-    FilePath,
-    Problem,
-    Settings,
-    SiteGrid,
-    TargetPattern,
-    check_size,
-    pattern,
-    setting_error,
-    visible,
-)
+from labseq.plugin import ConfigError, FilePath, Problem, Settings, SiteGrid, TargetPattern, setting_error
+from labseq.plugin.geometry import check_size, pattern
+from labseq.plugin.messages import visible
 from labseq.text_files import decode, read_bytes
 
 MAX_PIXELS: Final = 1024

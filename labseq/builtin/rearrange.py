@@ -22,7 +22,6 @@ from labseq.plugin import (
     Duration,
     Plan,
     PlanError,
-    PlanReport,
     PositiveDuration,
     Settings,
     Shot,
@@ -31,11 +30,10 @@ from labseq.plugin import (
     TimedBy,
     TimelineEntry,
     ToneProgram,
-    check_plan,
-    fitting_batches,
     setting_error,
-    tone_program,
 )
+from labseq.plugin.motion import tone_program
+from labseq.plugin.planning import PlanReport, check_plan, fitting_batches
 
 
 class RearrangeSettings(Settings):

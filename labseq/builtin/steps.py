@@ -25,10 +25,10 @@ from labseq.plugin import (
     TimedBy,
     TimelineEntry,
     empty_is,
-    find_leader,
     format_quantity,
     setting_error,
 )
+from labseq.plugin.lines import find_leader
 
 
 class LoadSettings(Settings):

@@ -1,7 +1,7 @@
 """Switches a device on a serial line off from another process, with pyserial alone.
 
 The watchdog loads this file by its path when the run that used the device has died; see
-``labseq.plugin.serial_emergency``. Messages are ``SerialMessage``s as JSON values.
+``labseq.plugin.serial.serial_emergency``. Messages are ``SerialMessage``s as JSON values.
 """
 
 from __future__ import annotations

@@ -10,20 +10,17 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.plugin import (
-    ZERO_CELSIUS_K,
-    CameraDriver,
     CameraFacts,
     ConfigError,
     Context,
     DeviceError,
     DeviceTimeoutError,
-    ExposureResult,
     LimitError,
-    Series,
     format_quantity,
-    one_of,
-    settle,
 )
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series, settle
+from labseq.plugin.messages import one_of
+from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_andor.codes import (
     GONE,
     OVERRUN,

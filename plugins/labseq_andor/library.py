@@ -12,7 +12,9 @@ from importlib import metadata
 from types import SimpleNamespace
 from typing import Any, Final
 
-from labseq.plugin import Context, DeviceError, ExposureResult, install_hint, missing_package, wait_for
+from labseq.plugin import Context, DeviceError, wait_for
+from labseq.plugin.camera import ExposureResult
+from labseq.plugin.messages import install_hint, missing_package
 from labseq_andor.settings import SIMULATED, AndorSettings
 
 OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"

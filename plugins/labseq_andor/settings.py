@@ -6,7 +6,8 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
-from labseq.plugin import CameraSettings, CoolingSettings, Duration, Frequency, PositiveDuration
+from labseq.plugin import Duration, Frequency, PositiveDuration
+from labseq.plugin.camera import CameraSettings, CoolingSettings
 from labseq_andor.heads import IXON_897, Head, known_head, readout_s
 
 SIMULATED: Final = "simulated"

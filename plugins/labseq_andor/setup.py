@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from labseq.plugin import ZERO_CELSIUS_K, ConfigError, DeviceError, format_quantity, one_of
+from labseq.plugin import ConfigError, DeviceError, format_quantity
+from labseq.plugin.messages import one_of
+from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_andor.codes import EM_GAIN_REAL, FULL_IMAGE, REAL_GAIN_MODE, AcqModes, Features, SetFunctions
 from labseq_andor.sdk import Sdk
 from labseq_andor.settings import HIGH_GAIN, AndorSettings

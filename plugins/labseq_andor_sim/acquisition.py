@@ -13,7 +13,8 @@ from typing import Any, Final
 import numpy as np
 from labseq_andor.codes import Code
 
-from labseq.plugin import Clock, Frame, Series, SimulatedSensor, Trigger
+from labseq.plugin import Clock, Frame, Trigger
+from labseq.plugin.camera import Series, SimulatedSensor
 from labseq_andor_sim.configuration import (
     EXTERNAL,
     EXTERNAL_EXPOSURE,

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, Final
 from labseq_andor.codes import EM_GAIN_REAL, AcqModes, Code, Features, GetFunctions, SetFunctions, Triggers
 from labseq_andor.heads import Head
 
-from labseq.plugin import Clock, SimulatedSensor, Simulation
+from labseq.plugin import Clock, Simulation
+from labseq.plugin.camera import SimulatedSensor
 from labseq_andor_sim.acquisition import Acquisition, Faults
 from labseq_andor_sim.configuration import Amplifiers, Optics, Timing
 from labseq_andor_sim.functions import Function, functions_of, implements, require

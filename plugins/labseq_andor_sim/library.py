@@ -15,15 +15,9 @@ from labseq_andor.heads import HEADS, IXON_897, Head
 from labseq_andor.library import AndorLibrary, bind
 from labseq_andor.settings import AndorSettings
 
-from labseq.plugin import (
-    ConfigError,
-    Context,
-    ExposureResult,
-    LabseqError,
-    SensorMode,
-    trigger_line,
-    wait_for,
-)
+from labseq.plugin import ConfigError, Context, LabseqError, SensorMode, wait_for
+from labseq.plugin.camera import ExposureResult
+from labseq.plugin.lines import trigger_line
 from labseq_andor_sim.acquisition import Acquisition
 from labseq_andor_sim.camera import Cooler, SimulatedCamera
 from labseq_andor_sim.configuration import Amplifiers, Optics, Timing

@@ -13,9 +13,9 @@ from labseq.plugin import (
     DeviceError,
     DeviceTimeoutError,
     format_quantity,
-    one_of,
     wait_for,
 )
+from labseq.plugin.messages import one_of
 from labseq_follow.links import Event, Link, SerialLink, SimulatedLink, TcpLink, load_atoms
 from labseq_follow.protocol import GO, VERSION, About, Dialogue, Splitter, encoded
 from labseq_follow.settings import SIMULATED, LeaderSettings, SerialLeaderSettings, TcpLeaderSettings

@@ -16,18 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
-from labseq.plugin import (
-    BROKEN,
-    Context,
-    DeviceError,
-    DeviceTimeoutError,
-    Port,
-    Simulation,
-    clean,
-    format_quantity,
-    open_port,
-    state_root,
-)
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, Simulation, format_quantity
+from labseq.plugin.messages import clean
+from labseq.plugin.serial import BROKEN, Port, open_port
+from labseq.plugin.system import state_root
 from labseq_follow.protocol import GO, MAX_LINE, encoded
 from labseq_follow.settings import LeaderSettings, SerialLeaderSettings, TcpLeaderSettings
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from labseq.plugin import clean, visible
+from labseq.plugin.messages import clean, visible
 
 GO: Final = "go"
 VERSION: Final = 2

@@ -6,16 +6,9 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import (
-    Duration,
-    FilePath,
-    PositiveDuration,
-    Settings,
-    clean,
-    port_identities,
-    setting_error,
-    wire,
-)
+from labseq.plugin import Duration, FilePath, PositiveDuration, Settings, setting_error, wire
+from labseq.plugin.messages import clean
+from labseq.plugin.serial import port_identities
 
 SIMULATED: Final = "simulated"
 

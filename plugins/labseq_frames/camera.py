@@ -11,18 +11,8 @@ from typing import Any, Final, Literal
 
 from pydantic import Field
 
-from labseq.plugin import (
-    CameraDriver,
-    CameraFacts,
-    ConfigError,
-    Context,
-    DeviceError,
-    Duration,
-    ExposureResult,
-    FilePath,
-    OrientationSettings,
-    Series,
-)
+from labseq.plugin import CameraFacts, ConfigError, Context, DeviceError, Duration, FilePath
+from labseq.plugin.camera import CameraDriver, ExposureResult, OrientationSettings, Series
 from labseq_frames.files import BadFramesError, Picture, Source, find_source, format_shape
 
 MAX_EXPOSURE_S: Final = 3600.0

@@ -16,7 +16,9 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Problem, RecordingError, Run, install_hint, open_run
+from labseq.plugin import Problem
+from labseq.plugin.messages import install_hint
+from labseq.plugin.runs import RecordingError, Run, open_run
 
 PNG: Final = (".png",)
 TIFF: Final = (".tif", ".tiff")

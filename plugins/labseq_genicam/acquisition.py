@@ -8,7 +8,8 @@ from typing import Final
 
 from labseq_aravis import Buffer, Camera, Stream, StreamOptions
 
-from labseq.plugin import DeviceError, ExposureResult, LimitError, Series, Trigger, format_quantity
+from labseq.plugin import DeviceError, LimitError, Trigger, format_quantity
+from labseq.plugin.camera import ExposureResult, Series
 from labseq_genicam.connection import Link
 from labseq_genicam.settings import GenicamSettings
 

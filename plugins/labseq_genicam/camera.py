@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from labseq_aravis import library_version
 
-from labseq.plugin import CameraDriver, CameraFacts, Context, DeviceError, ExposureResult, Series, wait_for
+from labseq.plugin import CameraFacts, Context, DeviceError, wait_for
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series
 from labseq_genicam.acquisition import Acquisition
 from labseq_genicam.connection import Link, connection_for
 from labseq_genicam.settings import GenicamSettings

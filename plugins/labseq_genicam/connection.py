@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 from labseq_aravis import AravisError, Camera, LibraryMissingError, load_library
 
-from labseq.plugin import Context, DeviceError, ExposureResult, Series, Trigger
+from labseq.plugin import Context, DeviceError, Trigger
+from labseq.plugin.camera import ExposureResult, Series
 from labseq_genicam.settings import SIMULATED, GenicamSettings
 
 if TYPE_CHECKING:

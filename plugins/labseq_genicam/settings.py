@@ -6,7 +6,8 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field, NonNegativeInt
 
-from labseq.plugin import Duration, Fraction, Frequency, IndustrialCameraSettings, PositiveDuration, Settings
+from labseq.plugin import Duration, Fraction, Frequency, PositiveDuration, Settings
+from labseq.plugin.camera import IndustrialCameraSettings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"]
 

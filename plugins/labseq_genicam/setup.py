@@ -6,7 +6,10 @@ from typing import Any
 
 from labseq_aravis import Camera
 
-from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, check_step, nearest, one_of
+from labseq.plugin import DeviceError, LimitError
+from labseq.plugin.camera import check_step, nearest
+from labseq.plugin.messages import one_of
+from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_genicam.acquisition import SERIES, WIDTH, series_trigger
 from labseq_genicam.connection import Link
 from labseq_genicam.settings import FORMATS, GenicamSettings, PixelFormat

@@ -14,16 +14,9 @@ from labseq_genicam.connection import CameraConnection, translated_errors
 from labseq_genicam.settings import GenicamSettings
 from numpy.typing import NDArray
 
-from labseq.plugin import (
-    Context,
-    DeviceError,
-    ExposureResult,
-    Frame,
-    Series,
-    SimulatedSensor,
-    Trigger,
-    trigger_line,
-)
+from labseq.plugin import Context, DeviceError, Frame, Trigger
+from labseq.plugin.camera import ExposureResult, Series, SimulatedSensor
+from labseq.plugin.lines import trigger_line
 from labseq_genicam_sim.description import EXPOSURE_US
 from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure, Faults

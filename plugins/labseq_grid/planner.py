@@ -21,8 +21,8 @@ from labseq.plugin import (
     SiteGrid,
     TargetPattern,
     as_occupancy,
-    nearest_to_centre,
 )
+from labseq.plugin.geometry import nearest_to_centre
 
 
 class GridSettings(Settings):

@@ -15,7 +15,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from labseq.plugin import ConfigError, ScanRange, ScanSpace, Settings, VisitedPoint, install_hint
+from labseq.plugin import ConfigError, ScanRange, ScanSpace, Settings, VisitedPoint
+from labseq.plugin.messages import install_hint
 
 
 class OptunaSettings(Settings):

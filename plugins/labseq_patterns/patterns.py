@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from labseq.plugin import ConfigError, Problem, Settings, SiteGrid, TargetPattern, block, pattern
+from labseq.plugin import ConfigError, Problem, Settings, SiteGrid, TargetPattern
+from labseq.plugin.geometry import block, pattern
 
 Index: TypeAlias = Annotated[int, Field(ge=0)]
 """Index of a row or a column, from 0."""

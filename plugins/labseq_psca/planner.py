@@ -12,18 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from labseq.plugin import (
-    Context,
-    Occupancy,
-    Plan,
-    PlanError,
-    Settings,
-    SiteGrid,
-    TargetPattern,
-    as_occupancy,
-    choose_plan,
-    nearest_to_centre,
-)
+from labseq.plugin import Context, Occupancy, Plan, PlanError, Settings, SiteGrid, TargetPattern, as_occupancy
+from labseq.plugin.geometry import nearest_to_centre
+from labseq.plugin.planning import choose_plan
 
 Kernel = Callable[..., tuple[NDArray[np.int16], NDArray[np.int32]]]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]

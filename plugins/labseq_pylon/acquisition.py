@@ -11,12 +11,12 @@ from labseq.plugin import (
     Clock,
     DeviceError,
     DeviceTimeoutError,
-    ExposureResult,
     LimitError,
     Trigger,
     format_quantity,
     wait_for,
 )
+from labseq.plugin.camera import ExposureResult
 from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.setup import WIDTH, series_trigger, ticks_per_s
 

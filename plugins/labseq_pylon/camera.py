@@ -7,7 +7,8 @@ from contextlib import suppress
 from importlib import metadata
 from typing import Any
 
-from labseq.plugin import CameraDriver, CameraFacts, Context, DeviceError, ExposureResult, Series
+from labseq.plugin import CameraFacts, Context, DeviceError
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series
 from labseq_pylon.acquisition import Acquisition
 from labseq_pylon.connection import connection_for, open_camera
 from labseq_pylon.library import Nodes, Sdk, load_pypylon

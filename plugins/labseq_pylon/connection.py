@@ -6,7 +6,8 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from labseq.plugin import Context, DeviceError, ExposureResult, Series, Trigger, wait_for
+from labseq.plugin import Context, DeviceError, Trigger, wait_for
+from labseq.plugin.camera import ExposureResult, Series
 from labseq_pylon.acquisition import Acquisition
 from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.settings import SIMULATED, PixelFormat, PylonSettings

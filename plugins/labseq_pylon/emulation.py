@@ -24,16 +24,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import (
-    Context,
-    DeviceError,
-    ExposureResult,
-    Series,
-    SimulatedSensor,
-    Trigger,
-    trigger_line,
-    wait_for,
-)
+from labseq.plugin import Context, DeviceError, Trigger, wait_for
+from labseq.plugin.camera import ExposureResult, Series, SimulatedSensor
+from labseq.plugin.lines import trigger_line
 from labseq_pylon.acquisition import Acquisition
 from labseq_pylon.connection import EMULATION, CameraConnection
 from labseq_pylon.library import Nodes, Sdk

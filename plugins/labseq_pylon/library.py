@@ -9,7 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
-from labseq.plugin import DeviceError, LimitError, check_step, install_hint, missing_package, one_of
+from labseq.plugin import DeviceError, LimitError
+from labseq.plugin.camera import check_step
+from labseq.plugin.messages import install_hint, missing_package, one_of
 
 OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
 

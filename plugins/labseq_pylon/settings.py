@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import IndustrialCameraSettings
+from labseq.plugin.camera import IndustrialCameraSettings
 
 PixelFormat: TypeAlias = Literal["Mono8", "Mono10", "Mono12", "Mono16"]
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from labseq.plugin import ZERO_CELSIUS_K, DeviceError, LimitError, nearest, one_of
+from labseq.plugin import DeviceError, LimitError
+from labseq.plugin.camera import nearest
+from labseq.plugin.messages import one_of
+from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_pylon.library import Nodes, Sdk
 from labseq_pylon.settings import BITS, PixelFormat, PylonSettings
 

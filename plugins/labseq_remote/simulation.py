@@ -7,15 +7,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeAlias
 
-from labseq.plugin import (
-    Context,
-    DeviceError,
-    LabseqError,
-    RfSource,
-    Simulation,
-    ToneSource,
-    wire,
-)
+from labseq.plugin import Context, DeviceError, LabseqError, Simulation, wire
+from labseq.plugin.simulation import RfSource, ToneSource
 from labseq_remote.connection import Connection, Joins, run_of
 from labseq_remote.link import Link, called, known
 from labseq_remote.settings import RemoteSimulationSettings

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from labseq.plugin import Settings, SiteGrid, TargetPattern, check_size, pattern
+from labseq.plugin import Settings, SiteGrid, TargetPattern
+from labseq.plugin.geometry import check_size, pattern
 
 Index = Annotated[int, Field(ge=0)]
 

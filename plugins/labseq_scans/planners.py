@@ -21,9 +21,9 @@ from labseq.plugin import (
     SiteGrid,
     TargetPattern,
     as_occupancy,
-    nearest_to_centre,
-    site_time_s,
 )
+from labseq.plugin.geometry import nearest_to_centre
+from labseq.plugin.motion import site_time_s
 
 Growing = tuple[NDArray[np.int32], int, int]
 """Log of atom moves (batch, from row, from column, to row, to column); how many moves and batches."""

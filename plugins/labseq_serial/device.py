@@ -15,13 +15,11 @@ from labseq.plugin import (
     Emergency,
     LabseqError,
     LimitError,
-    SerialMessage,
     TransientError,
-    clean,
     format_quantity,
-    serial_emergency,
-    unknown_name,
 )
+from labseq.plugin.messages import clean, unknown_name
+from labseq.plugin.serial import SerialMessage, serial_emergency
 from labseq_serial.line import Line, open_line
 from labseq_serial.patterns import compiled
 from labseq_serial.settings import Call, SerialSettings, call_of

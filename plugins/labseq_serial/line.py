@@ -7,20 +7,9 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
-from labseq.plugin import (
-    BROKEN,
-    Clock,
-    DeviceError,
-    DeviceTimeoutError,
-    Port,
-    TransientError,
-    clean,
-    format_quantity,
-    is_write_timeout,
-    open_port,
-    ports_text,
-    wait_for,
-)
+from labseq.plugin import Clock, DeviceError, DeviceTimeoutError, TransientError, format_quantity, wait_for
+from labseq.plugin.messages import clean
+from labseq.plugin.serial import BROKEN, Port, is_write_timeout, open_port, ports_text
 from labseq_serial.settings import SIMULATED, SerialSettings, UsbSettings
 from labseq_serial.simulated import SimulatedPort
 

@@ -8,19 +8,9 @@ from typing import Any, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import (
-    Duration,
-    PositiveDuration,
-    Settings,
-    Text,
-    clean,
-    closest,
-    is_network_port,
-    one_of,
-    port_identities,
-    ports_here,
-    setting_error,
-)
+from labseq.plugin import Duration, PositiveDuration, Settings, Text, setting_error
+from labseq.plugin.messages import clean, closest, one_of
+from labseq.plugin.serial import is_network_port, port_identities, ports_here
 from labseq_serial.patterns import Sent, Template, compiled, example_of
 from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
 

@@ -9,21 +9,9 @@ from typing import Final, Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from labseq.plugin import (
-    UNITS,
-    ZERO_CELSIUS_K,
-    Duration,
-    PositiveDuration,
-    Settings,
-    Text,
-    clean,
-    expected,
-    format_quantity,
-    one_of,
-    parse_quantity,
-    scaled,
-    setting_error,
-)
+from labseq.plugin import Duration, PositiveDuration, Settings, Text, format_quantity, setting_error
+from labseq.plugin.messages import clean, one_of
+from labseq.plugin.units import UNITS, ZERO_CELSIUS_K, expected, parse_quantity, scaled
 from labseq_serial.patterns import VALUE, Sent, compiled, example_of
 
 _DIMENSION_OF: Final = {unit: dimension for dimension, units in UNITS.items() for unit in units if unit}

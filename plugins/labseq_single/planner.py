@@ -9,7 +9,8 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from labseq.plugin import Context, Plan, PlanError, TargetPattern, as_occupancy, from_the_centre
+from labseq.plugin import Context, Plan, PlanError, TargetPattern, as_occupancy
+from labseq.plugin.geometry import from_the_centre
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Clock, Context, DeviceError, Process, state_root, wait_for
+from labseq.plugin import Clock, Context, DeviceError, wait_for
+from labseq.plugin.system import Process, state_root
 from labseq_soapy.settings import SoapySettings
 
 if TYPE_CHECKING:

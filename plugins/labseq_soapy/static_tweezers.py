@@ -13,7 +13,6 @@ from typing import Any, Final
 from labseq_soapy_stream.messages import REF_LOCKED, Facts, Setup, unlocked
 
 from labseq.plugin import (
-    Amplitudes,
     Context,
     DeviceError,
     Emergency,
@@ -21,9 +20,8 @@ from labseq.plugin import (
     StaticTweezers,
     TransientError,
     TweezersFacts,
-    calibrated_amplitudes,
-    check_ramp,
 )
+from labseq.plugin.tweezers import Amplitudes, calibrated_amplitudes, check_ramp
 from labseq_soapy.access import choose_radio, end_stale_process, marker_of
 from labseq_soapy.link import Link
 from labseq_soapy.settings import SoapySettings

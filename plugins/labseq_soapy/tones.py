@@ -15,7 +15,8 @@ from labseq_soapy_stream.messages import Facts
 from labseq_soapy_stream.output import Samples
 from numpy.typing import NDArray
 
-from labseq.plugin import Amplitudes, DeviceError, LimitError, check_amplitudes, format_quantity
+from labseq.plugin import DeviceError, LimitError, format_quantity
+from labseq.plugin.tweezers import Amplitudes, check_amplitudes
 from labseq_soapy.radios import tunes_digitally
 from labseq_soapy.settings import SoapySettings
 

@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 class CapturedOutputs:
     """The two connectors of a simulated radio.
 
-    Implements ``labseq.plugin.ToneSource``. Amplitudes are measured at the frequencies where the tones
-    should be: a signal at another frequency, because the local oscillator or the sample rate is wrong,
+    Implements ``labseq.plugin.simulation.ToneSource``. Amplitudes are measured at the frequencies where the
+    tones should be: a signal at another frequency, because the local oscillator or the sample rate is wrong,
     makes no tweezers; nor does the leakage of the oscillator, unless it is on a tone.
 
     Args:

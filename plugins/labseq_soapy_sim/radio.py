@@ -12,7 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import ReceivesOutput, Simulation, clean, closest, one_of, setting_error
+from labseq.plugin import Simulation, setting_error
+from labseq.plugin.messages import clean, closest, one_of
+from labseq.plugin.simulation import ReceivesOutput
 from labseq_soapy_sim.outputs import CapturedOutputs
 from labseq_soapy_sim.ring import Ring
 

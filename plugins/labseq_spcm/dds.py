@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from labseq.plugin import (
     AxisTones,
     ConfigError,
-    FrequencyCourse,
     LimitError,
     MotionSpec,
     SiteGrid,
     ToneProgram,
     TransientError,
 )
+from labseq.plugin.motion import FrequencyCourse
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard
 from labseq_spcm.keep_warm import KeepWarm
@@ -161,7 +161,7 @@ def compile_commands(
 
     Args:
         name: Name of the device, for messages.
-        program: A program that passed :func:`labseq.plugin.check_tone_program`.
+        program: A program that passed :func:`labseq.plugin.motion.check_tone_program`.
         cores: The cores of each axis.
         keep_warm: The tones before and after the program; None for silence.
 

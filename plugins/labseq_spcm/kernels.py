@@ -29,7 +29,7 @@ RAMP_STEPS: Final = 8
 SHORT_STEPS: Final = 8
 """Duration of the first step of a ramp, at least, in shortest times of the DDS: one step in 2 us."""
 BENDS: Final = (0.0, 10 / math.sqrt(3), 6.0)
-"""Greatest second derivative of each course (:class:`labseq.plugin.FrequencyCourse`). With n straight steps
+"""Greatest second derivative of each course (:class:`FrequencyCourse`). With n straight steps
 of equal duration a tone is within bend / (8 n^2) of its way from the course."""
 SAME_HZ: Final = 1.0
 """A tone that starts within this of where another ended keeps that tone's core."""
@@ -76,7 +76,7 @@ def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
 
 @helper_kernel("float64(int64, float64)")
 def course_at(course: int, u: float) -> float:
-    """Part of its change that a frequency has covered; as :meth:`labseq.plugin.FrequencyCourse.fraction`."""
+    """Part of its change that a frequency has covered; as :meth:`FrequencyCourse.fraction`."""
     if course == 0:
         return u
     if course == 1:

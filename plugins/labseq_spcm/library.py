@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from labseq.plugin import Context, DeviceError, Emergency, install_hint, missing_package
+from labseq.plugin import Context, DeviceError, Emergency
+from labseq.plugin.messages import install_hint, missing_package
 from labseq_spcm.settings import SpcmSettings
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq.plugin import LimitError, RfSpec, format_quantity
+from labseq.plugin import LimitError, format_quantity
+from labseq.plugin.motion import RfSpec
 
 FAMILY: Final = 0x66
 """Second byte of the card type: M4i.66xx."""

@@ -26,12 +26,10 @@ from labseq.plugin import (
     MobileTweezers,
     ToneProgram,
     TransientError,
-    check_tone_program,
-    comb_sample_rate,
     format_quantity,
-    trigger_line,
-    warm_rendering,
 )
+from labseq.plugin.lines import trigger_line
+from labseq.plugin.motion import check_tone_program, comb_sample_rate, warm_rendering
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.dds import Dds, choose_cores, compile_commands, worst_distance_m

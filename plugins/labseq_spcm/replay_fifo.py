@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, Renderer, ToneProgram, TransientError
+from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, ToneProgram, TransientError
+from labseq.plugin.motion import Renderer
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, Loop
 from labseq_spcm.limits import FRAME_BYTES, SAMPLE_STEP

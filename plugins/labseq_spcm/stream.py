@@ -17,18 +17,12 @@ from labseq.plugin import (
     DeviceError,
     LabseqError,
     Plan,
-    Renderer,
     ToneProgram,
     TransientError,
-    WakeSignal,
     format_quantity,
-    n_cores,
-    new_timer,
-    raise_priority,
-    render_address,
-    set_signal,
-    tone_program,
 )
+from labseq.plugin.motion import Renderer, render_address, tone_program
+from labseq.plugin.native import WakeSignal, n_cores, new_timer, raise_priority, set_signal
 from labseq_spcm import stream_kernels as k
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples

@@ -14,13 +14,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import (
+from labseq.plugin import const, helper_kernel, kernel
+from labseq.plugin.native import (
     N_SIGNAL,
     call_c,
     carray,
-    const,
-    helper_kernel,
-    kernel,
     now_ns,
     pointer,
     set_signal,
@@ -43,7 +41,7 @@ READY: Final = 0x4
 """M2STAT_CARD_READY: it does not run."""
 
 (GET, SET, HANDLE, RENDER, RING, N_RING, BLOCK, ON_CARD, AHEAD, SILENCE, SCRATCH, VALUE) = range(12)
-"""Set before the loop: the library's functions and the card's handle, :func:`labseq.plugin.render_address`,
+"""Set before the loop: the library's functions and the card's handle, :func:`render_address`,
 address and samples of the ring, samples of a block, on the card, and from what was fetched to where a program
 may begin; addresses of a block of silence, of room for 2 x CHUNK samples, and of the next word but one."""
 FOUND: Final = 12
@@ -71,7 +69,7 @@ N_WORDS: Final = 44
 LENGTH, ROW_CHANNEL, CUTS, N_CUTS, READY_MADE, ROOM, AXES, N_AXIS, BASE, N_READY, BEGAN = range(11)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples
 where pieces end, address of and room for samples that are rendered before their place in the stream is known,
-address of :meth:`labseq.plugin.Renderer.words`, and words of an axis. The loop writes the first of those
+address of :meth:`Renderer.words`, and words of an axis. The loop writes the first of those
 samples, their number, and where in the stream the program begins."""
 N_PROGRAM: Final = 11
 

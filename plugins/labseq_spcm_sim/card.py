@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Clock, new_timer
+from labseq.plugin import Clock
+from labseq.plugin.native import new_timer
 from labseq_spcm_sim import fifo_kernels as k, registers as r
 from labseq_spcm_sim.machine import Machine
 from labseq_spcm_sim.modes import Buffer

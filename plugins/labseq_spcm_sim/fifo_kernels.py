@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import call_c, carray, helper_kernel, kernel, now_ns, pointer, sleep_ns, swap
+from labseq.plugin import helper_kernel, kernel
+from labseq.plugin.native import call_c, carray, now_ns, pointer, sleep_ns, swap
 
 Words = NDArray[np.int64]
 Bytes = NDArray[np.uint8]

@@ -24,17 +24,9 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from labseq.plugin import (
-    Clock,
-    DeviceError,
-    Emergency,
-    ReceivesOutput,
-    RfSamples,
-    RfSpan,
-    RfTones,
-    Simulation,
-    c_address,
-)
+from labseq.plugin import Clock, DeviceError, Emergency, Simulation
+from labseq.plugin.native import c_address
+from labseq.plugin.simulation import ReceivesOutput, RfSamples, RfSpan, RfTones
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
 from labseq_spcm_sim.emergency import PREFIX as SHARED
@@ -375,7 +367,7 @@ class SimulatedLibrary:
 class CardOutputs:
     """The two output connectors of a simulated card, for a simulation that receives their signals.
 
-    Implements ``labseq.plugin.RfSource``. Each span is reported once and then dropped by the card.
+    Implements ``labseq.plugin.simulation.RfSource``. Each span is reported once and then dropped by the card.
 
     Args:
         card: The card.

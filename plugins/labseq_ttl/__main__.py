@@ -6,7 +6,8 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
 
-from labseq.plugin import LabseqError, NeverStopped
+from labseq.plugin import LabseqError
+from labseq.plugin.system import NeverStopped
 from labseq_ttl.access import MAX_WAIT_S
 from labseq_ttl.box import Box, open_box
 

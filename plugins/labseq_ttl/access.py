@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from labseq.plugin import Context, LineProgram, Port
+from labseq.plugin import Context, LineProgram
+from labseq.plugin.serial import Port
 from labseq_ttl.box import open_box
 from labseq_ttl.settings import TtlSettings
 

@@ -9,20 +9,9 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final, NamedTuple, TypeVar
 
-from labseq.plugin import (
-    BROKEN,
-    Clock,
-    DeviceError,
-    DeviceTimeoutError,
-    Emergency,
-    Port,
-    SerialMessage,
-    clean,
-    format_quantity,
-    open_port,
-    serial_emergency,
-    wait_for,
-)
+from labseq.plugin import Clock, DeviceError, DeviceTimeoutError, Emergency, format_quantity, wait_for
+from labseq.plugin.messages import clean
+from labseq.plugin.serial import BROKEN, Port, SerialMessage, open_port, serial_emergency
 from labseq_ttl.protocol import NAME, PER_LINE, STOP, VERSION, Edge, framed, unframed
 
 T = TypeVar("T")

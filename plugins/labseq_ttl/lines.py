@@ -19,10 +19,9 @@ from labseq.plugin import (
     Lines,
     LinesFacts,
     format_quantity,
-    idle_program,
-    off_program,
-    one_of,
 )
+from labseq.plugin.lines import idle_program, off_program
+from labseq.plugin.messages import one_of
 from labseq_ttl.access import choose_box
 from labseq_ttl.box import Box, Identity, cause_text, late_error
 from labseq_ttl.programs import MAX_EDGES, edges_of, mask_of

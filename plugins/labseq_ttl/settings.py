@@ -7,7 +7,8 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import AfterValidator, Field, model_validator
 
-from labseq.plugin import Duration, Settings, port_identities, setting_error
+from labseq.plugin import Duration, Settings, setting_error
+from labseq.plugin.serial import port_identities
 from labseq_ttl.protocol import CHANNELS
 
 SIMULATED: Final = "simulated"

@@ -8,7 +8,8 @@ from labseq_ttl.box import late_error
 from labseq_ttl.programs import as_played
 from labseq_ttl.settings import TtlSettings
 
-from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LineProgram, Port, format_quantity
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LineProgram, format_quantity
+from labseq.plugin.serial import Port
 from labseq_ttl_sim.model import ModelBox
 from labseq_ttl_sim.simavr import SimavrBox, runner
 

@@ -30,7 +30,7 @@ from labseq_ttl.protocol import (
     unframed,
 )
 
-from labseq.plugin import Port
+from labseq.plugin.serial import Port
 
 IDLE_S: Final = 1e-3
 """How long a read waits if nothing came, in seconds."""

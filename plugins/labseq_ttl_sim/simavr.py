@@ -16,7 +16,9 @@ import labseq_ttl
 from labseq_ttl.box import open_box
 from labseq_ttl.protocol import OUTPUTS, Edge
 
-from labseq.plugin import BROKEN, Clock, DeviceError, Port, cache_root, wait_for
+from labseq.plugin import Clock, DeviceError, wait_for
+from labseq.plugin.serial import BROKEN, Port
+from labseq.plugin.system import cache_root
 
 SOURCE: Final = Path(__file__).with_name("runner.c")
 FIRMWARE: Final = Path(labseq_ttl.__file__).parent / "firmware" / "labseq_ttl.hex"

@@ -8,19 +8,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from labseq.plugin import (
-    CameraDriver,
-    CameraFacts,
-    Clock,
-    ConfigError,
-    Context,
-    ExposureResult,
-    SensorMode,
-    Series,
-    SimulatedSensor,
-    settle,
-    trigger_line,
-)
+from labseq.plugin import CameraFacts, Clock, ConfigError, Context, SensorMode
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series, SimulatedSensor, settle
+from labseq.plugin.lines import trigger_line
 from labseq_virtual.settings import CameraSettings
 from labseq_virtual.tweezers import require_simulation
 

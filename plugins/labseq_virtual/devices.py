@@ -18,10 +18,9 @@ from labseq.plugin import (
     Lines,
     LinesFacts,
     format_quantity,
-    idle_program,
-    off_program,
-    unknown_name,
 )
+from labseq.plugin.lines import idle_program, off_program
+from labseq.plugin.messages import unknown_name
 from labseq_virtual.settings import DeviceSettings, LinesSettings, SpotMeterSettings
 from labseq_virtual.tweezers import VirtualDriver
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import WHOLE_SENSOR, Occupancy, RandomStream, SensorMode, SiteGrid
+from labseq.plugin import Occupancy, RandomStream, SensorMode, SiteGrid
+from labseq.plugin.simulation import WHOLE_SENSOR
 from labseq_virtual.sensors import Emccd, Qcmos, View, normal_below
 from labseq_virtual.settings import ImageSettings, SimulationSettings
 

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import MotionSpec, RandomStream, RfSpan, SiteGrid, ToneProgram
+from labseq.plugin import MotionSpec, RandomStream, SiteGrid, ToneProgram
+from labseq.plugin.simulation import RfSpan
 from labseq_virtual.handover import full_amplitudes, full_volts
 from labseq_virtual.rf_analysis import bands, track_tones
 from labseq_virtual.settings import MobileLightSettings

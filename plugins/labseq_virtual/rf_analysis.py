@@ -16,16 +16,8 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import (
-    LimitError,
-    MotionSpec,
-    RfSamples,
-    RfSource,
-    RfSpan,
-    RfTones,
-    SiteGrid,
-    format_quantity,
-)
+from labseq.plugin import LimitError, MotionSpec, SiteGrid, format_quantity
+from labseq.plugin.simulation import RfSamples, RfSource, RfSpan, RfTones
 
 BLOCK: Final = 1024
 """Samples tested together in the search for silence."""
@@ -191,7 +183,7 @@ MIN_TURNS: Final = 2.0
 MAX_SITES: Final = 0.6
 """Largest motion of a tweezer in a transit time: a faster chirp is as broad as the gap to the next tone."""
 PEAK_SPEED: Final = {"constant": 1.0, "minimum_jerk": 15 / 8, "constant_jerk": 3 / 2}
-"""Greatest speed over the mean, see :class:`labseq.plugin.FrequencyCourse`."""
+"""Greatest speed over the mean, see :class:`labseq.plugin.motion.FrequencyCourse`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from labseq.plugin import WHOLE_SENSOR, LimitError, SensorMode
+from labseq.plugin import LimitError, SensorMode
+from labseq.plugin.simulation import WHOLE_SENSOR
 from labseq_virtual.settings import ImageSettings
 
 NEVER: Final = 1e-13

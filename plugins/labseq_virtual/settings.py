@@ -14,7 +14,6 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_
 import labseq
 from labseq.plugin import (
     Angle,
-    CoolingSettings,
     Duration,
     Fraction,
     Frequency,
@@ -25,6 +24,7 @@ from labseq.plugin import (
     Voltage,
     format_quantity,
 )
+from labseq.plugin.camera import CoolingSettings
 
 PositiveLength = Annotated[Length, Field(gt=0)]
 
@@ -479,7 +479,7 @@ class CameraFaults(Settings):
     late_by: Duration = Field(default=2.0, description="delay of a late frame")
 
 
-class CameraSettings(labseq.plugin.CameraSettings):
+class CameraSettings(labseq.plugin.camera.CameraSettings):
     """The virtual camera; what it sees is set in the simulation."""
 
     readout: Duration = Field(

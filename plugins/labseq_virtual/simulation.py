@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import (
-    WHOLE_SENSOR,
     Context,
     DepthRamp,
     DeviceError,
@@ -22,14 +21,13 @@ from labseq.plugin import (
     LineProgram,
     Occupancy,
     RandomStream,
-    RfSource,
     SensorMode,
     Signal,
     Simulation,
     ToneProgram,
-    ToneSource,
     TweezerAmplitudes,
 )
+from labseq.plugin.simulation import WHOLE_SENSOR, RfSource, ToneSource
 from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import RfTransport
 from labseq_virtual.handover import noise_hz, recoil_heat

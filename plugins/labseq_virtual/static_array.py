@@ -7,7 +7,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import DepthRamp, SiteGrid, ToneSource, TweezerAmplitudes
+from labseq.plugin import DepthRamp, SiteGrid, TweezerAmplitudes
+from labseq.plugin.simulation import ToneSource
 from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import KELVIN, draw_atoms
 from labseq_virtual.responses import lowering

@@ -33,7 +33,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import FrequencyCourse, MotionSpec, SiteGrid, ToneProgram
+from labseq.plugin import MotionSpec, SiteGrid, ToneProgram
+from labseq.plugin.motion import FrequencyCourse
 from labseq_virtual.atoms import Atoms
 from labseq_virtual.handover import (
     ATOM,

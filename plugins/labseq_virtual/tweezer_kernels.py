@@ -15,7 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import FrequencyCourse, const, helper_kernel
+from labseq.plugin import const, helper_kernel
+from labseq.plugin.motion import FrequencyCourse
 from labseq_virtual.handover import (
     ADIABATIC_DEPTH,
     DEPTH_DROP,

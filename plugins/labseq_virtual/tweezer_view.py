@@ -8,16 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import (
-    WHOLE_SENSOR,
-    Frame,
-    LimitError,
-    RandomStream,
-    SensorMode,
-    Signal,
-    Simulation,
-    SiteGrid,
-)
+from labseq.plugin import Frame, LimitError, RandomStream, SensorMode, Signal, Simulation, SiteGrid
+from labseq.plugin.simulation import WHOLE_SENSOR
 from labseq_virtual.images import Images, Light
 from labseq_virtual.mobile_light import MobileLight, MobileTones
 from labseq_virtual.sensors import View

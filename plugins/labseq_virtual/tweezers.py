@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.plugin import (
-    Amplitudes,
     AxisTones,
     ConfigError,
     Context,
@@ -26,13 +25,11 @@ from labseq.plugin import (
     ToneProgram,
     TweezerAmplitudes,
     TweezersFacts,
-    calibrated_amplitudes,
-    check_amplitudes,
-    check_ramp,
-    check_tone_program,
     format_quantity,
-    trigger_line,
 )
+from labseq.plugin.lines import trigger_line
+from labseq.plugin.motion import check_tone_program
+from labseq.plugin.tweezers import Amplitudes, calibrated_amplitudes, check_amplitudes, check_ramp
 from labseq_virtual.settings import MobileTweezersSettings, StaticTweezersSettings
 
 

@@ -18,7 +18,8 @@ from labseq_genicam.settings import GenicamSettings
 from labseq_pylon.camera import PylonCamera
 from labseq_pylon.settings import PylonSettings
 
-from labseq.plugin import CameraDriver, Context, Frame, SensorMode, SiteGrid
+from labseq.plugin import Context, Frame, SensorMode, SiteGrid
+from labseq.plugin.camera import CameraDriver
 from labseq.roles import WHOLE_SENSOR, NeverStopped
 from labseq.testing.fakes import RecordingSimulation
 

@@ -15,7 +15,9 @@ from labseq_psca.planner import PscaPlanner, PscaSettings
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from labseq.plugin import Context, MotionSpec, Plan, SiteGrid, TargetPattern, check_plan, tone_program
+from labseq.plugin import Context, MotionSpec, Plan, SiteGrid, TargetPattern
+from labseq.plugin.motion import tone_program
+from labseq.plugin.planning import check_plan
 
 Bools = NDArray[np.bool_]
 SIZES = {"20 -> 15": (20, 15), "64 -> 48": (64, 48)}

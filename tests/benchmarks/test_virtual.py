@@ -13,7 +13,8 @@ from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.transport import Transport
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
-from labseq.plugin import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid, tone_program
+from labseq.plugin import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid
+from labseq.plugin.motion import tone_program
 
 GRID = SiteGrid()
 

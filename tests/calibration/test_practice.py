@@ -20,7 +20,8 @@ from labseq.detection.sites import known_sites, region_corners, spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import CalibrationEntry
 from labseq.motion import correct_overlay
-from labseq.plugin import Context, DepthRamp, RandomStream, Run, TweezerAmplitudes
+from labseq.plugin import Context, DepthRamp, RandomStream, TweezerAmplitudes
+from labseq.plugin.runs import Run
 
 Floats = NDArray[np.float64]
 

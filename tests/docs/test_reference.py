@@ -13,6 +13,8 @@ from pydantic import BaseModel, create_model
 from pydantic.fields import FieldInfo
 
 import labseq
+import labseq.plugin.simulation
+import labseq.plugin.system
 from labseq import errors, plugin, roles, testing
 from labseq.config.profile import MotionSettings, ProfileSpec, load_profile
 from labseq.config.sequence import SequenceSpec, StepPolicySettings, load_sequence
@@ -27,6 +29,7 @@ from labseq.settings import Choice, PatternChoice, models_at, settings_at, setti
 from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
+IN_PLUGIN = {*plugin.__all__, *plugin.simulation.__all__, *plugin.system.__all__}
 SCRIPT: Any = load_script("make_reference")
 TEXTS: dict[Path, str] = {path: path.read_text("utf-8") for path in SCRIPT.pages()}
 PARTS = {part for text in TEXTS.values() for part, _ in SCRIPT.PART.findall(text)}
@@ -79,7 +82,7 @@ def test_the_generated_parts_of_a_page_are_current(page: Path) -> None:
 
 def test_everything_is_on_a_page() -> None:
     found = {" ".join(("command", *names)) for names, _ in reference.commands_below(SCRIPT.PROGRAM)}
-    found |= {f"role {name}" for name in reference.roles_by_name() if name in plugin.__all__}
+    found |= {f"role {name}" for name in reference.roles_by_name() if name in IN_PLUGIN}
     found |= {f"contract {kind}" for kind in (*testing.SUITES, "hardware")}
     found |= {f"plugins {kind}" for kind in ROLES if kind not in ("step", "pattern")}
     registry: Registry = SCRIPT.registry()
@@ -182,7 +185,7 @@ def test_every_argument_has_its_help() -> None:
 def test_every_method_of_the_registry_is_a_kind() -> None:
     offers = {name for name, one in vars(Registry).items() if isinstance(one, FunctionType)} & {*ROLES}
     assert offers == {*ROLES}
-    every = [name for name in reference.roles_by_name() if name in plugin.__all__]
+    every = [name for name in reference.roles_by_name() if name in IN_PLUGIN]
     assert {*ROLES} - {"pattern"} <= {snake_case(name) for name in every}
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from labseq.plugin import CameraDriver, CameraFacts, Context, ExposureResult, Frame, Series
+from labseq.plugin import CameraFacts, Context, Frame
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series
 from labseq.testing.fakes import FakeClock
 
 SHAPE = (3, 4)

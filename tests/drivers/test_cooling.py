@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.drivers.camera import LOOK_S
-from labseq.plugin import Cooling, DeviceTimeoutError, StopRequested, settle
+from labseq.plugin import DeviceTimeoutError, StopRequested
+from labseq.plugin.camera import Cooling, settle
 from labseq.testing.fakes import FakeClock
 
 COOLING = Cooling(203.15, tolerance_k=1.0, steady_s=5.0, timeout_s=100.0)

@@ -3,7 +3,8 @@
 import pytest
 from hypothesis import given, strategies as st
 
-from labseq.plugin import LimitError, check_step, nearest
+from labseq.plugin import LimitError
+from labseq.plugin.camera import check_step, nearest
 
 
 @given(

@@ -9,7 +9,8 @@ from hypothesis import given, strategies as st
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
-from labseq.plugin import Context, SensorMode, Series, SimulatedSensor
+from labseq.plugin import Context, SensorMode
+from labseq.plugin.camera import Series, SimulatedSensor
 from labseq.roles import WHOLE_SENSOR
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 

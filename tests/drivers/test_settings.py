@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
-from labseq.plugin import CameraSettings, Cooling, CoolingSettings, SensorMode
+from labseq.plugin import SensorMode
+from labseq.plugin.camera import CameraSettings, Cooling, CoolingSettings
 
 sizes = st.integers(1, 600)
 corners = st.integers(0, 600)

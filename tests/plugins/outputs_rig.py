@@ -30,7 +30,8 @@ from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.settings import TtlSettings
 from labseq.kernel import load_kernels
 from labseq.motion import tone_program
-from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
+from labseq.plugin import Context, MotionSpec, Plan, SiteGrid
+from labseq.plugin.motion import RfSpec
 from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import FakeClock
 from labseq.watchdog import Watchdog

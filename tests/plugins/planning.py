@@ -12,16 +12,8 @@ from labseq_scans.planners import LineSettings, Mta1Planner, TetrisPlanner
 from labseq_single.planner import CompressionPlanner, HcaPlanner, LsapPlanner, LsapSquaredPlanner
 from numpy.typing import NDArray
 
-from labseq.plugin import (
-    Context,
-    MotionSpec,
-    Occupancy,
-    Plan,
-    PlanReport,
-    SiteGrid,
-    TargetPattern,
-    check_plan,
-)
+from labseq.plugin import Context, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
+from labseq.plugin.planning import PlanReport, check_plan
 
 Bools = NDArray[np.bool_]
 MakePlanner = Callable[[Context, int], Any]

@@ -17,7 +17,8 @@ from labseq_andor.settings import AndorSettings
 from labseq_andor_sim import SimulatedCamera
 
 from labseq import ConfigError, DeviceError, DeviceTimeoutError, TransientError
-from labseq.plugin import Context, install_hint
+from labseq.plugin import Context
+from labseq.plugin.messages import install_hint
 
 from .labseq_camera_rig import Rig, opened_rig
 

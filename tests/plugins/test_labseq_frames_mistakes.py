@@ -16,7 +16,8 @@ from labseq_frames.camera import FramesCamera, FramesSettings
 from labseq_frames.files import natural
 from PIL import Image
 
-from labseq.plugin import ConfigError, Context, DeviceError, install_hint
+from labseq.plugin import ConfigError, Context, DeviceError
+from labseq.plugin.messages import install_hint
 from labseq.testing.fakes import FakeClock
 
 from .test_labseq_frames import stack_of, write_run

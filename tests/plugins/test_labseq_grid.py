@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_grid.planner import GridPlanner, GridSettings
 
-from labseq.plugin import Context, LimitError, MotionSpec, RfSpec, SiteGrid, TargetPattern, check_plan
+from labseq.plugin import Context, LimitError, MotionSpec, SiteGrid, TargetPattern
+from labseq.plugin.motion import RfSpec
+from labseq.plugin.planning import check_plan
 from labseq.testing import PlannerContract
 
 from .planning import COMPACT, grid, in_the_middle, loadings, plan_and_check

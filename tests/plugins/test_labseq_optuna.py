@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 import pytest
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 
-from labseq.plugin import ConfigError, ScanRange, ScanSpace, VisitedPoint, install_hint
+from labseq.plugin import ConfigError, ScanRange, ScanSpace, VisitedPoint
+from labseq.plugin.messages import install_hint
 from labseq.testing import ScannerContract
 from labseq.testing.contracts.deciders import ScannerFactory
 

@@ -18,8 +18,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from labseq import Occupancy, SiteGrid, TargetPattern, check_plan, make_target
+from labseq.model import LossSpec
 from labseq.motion import predict_survival
-from labseq.plugin import Context, LossSpec, MotionSpec, Plan
+from labseq.plugin import Context, MotionSpec, Plan
 from labseq.testing.strategies import cases
 
 from .planning import COMPACT, loadings, plan_and_check, psca

@@ -14,7 +14,7 @@ from labseq_pylon.library import load_pypylon
 from labseq_pylon.settings import PylonSettings
 
 from labseq import DeviceError, LimitError, TransientError
-from labseq.plugin import install_hint
+from labseq.plugin.messages import install_hint
 
 from .labseq_camera_rig import Rig, opened_rig
 

@@ -11,7 +11,8 @@ from labseq_scans.pattern import InterleavedSettings, interleaved
 from labseq_scans.planners import ScannedPlan
 from pydantic import ValidationError
 
-from labseq.plugin import Context, LimitError, MotionSpec, Plan, SiteGrid, TargetPattern, check_plan
+from labseq.plugin import Context, LimitError, MotionSpec, Plan, SiteGrid, TargetPattern
+from labseq.plugin.planning import check_plan
 
 from .planning import Bools, loadings, mta1, tetris
 

@@ -39,11 +39,11 @@ from labseq.plugin import (
     LimitError,
     MotionSpec,
     Plan,
-    RfSpec,
-    RfTones,
     SiteGrid,
     TransientError,
 )
+from labseq.plugin.motion import RfSpec
+from labseq.plugin.simulation import RfTones
 from labseq.roles import Hardware, overrides
 from labseq.testing import MobileTweezersContract
 from labseq.testing.fakes import FakeClock

@@ -32,7 +32,8 @@ LABSEQ = """
 import json, sys, threading
 import numpy as np
 from labseq.motion import tone_program
-from labseq.plugin import Context, MotionSpec, Plan, RfSpec, SiteGrid
+from labseq.plugin import Context, MotionSpec, Plan, SiteGrid
+from labseq.plugin.motion import RfSpec
 from labseq_spcm import card, replay_fifo
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings

@@ -29,17 +29,9 @@ from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, vendor_lib
 from labseq_spcm_sim.emergency import Connection
 
 from labseq.motion import tone_program
-from labseq.plugin import (
-    Context,
-    DeviceError,
-    DeviceTimeoutError,
-    LabseqError,
-    LimitError,
-    MotionSpec,
-    Plan,
-    RfSpec,
-    install_hint,
-)
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError, LimitError, MotionSpec, Plan
+from labseq.plugin.messages import install_hint
+from labseq.plugin.motion import RfSpec
 from labseq.testing.fakes import FakeClock
 
 from .small_run import run

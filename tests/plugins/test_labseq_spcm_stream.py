@@ -19,16 +19,8 @@ from labseq_spcm.stream import Stream, check_rendering, made_of
 from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
 
 from labseq.motion import render, tone_program
-from labseq.plugin import (
-    Context,
-    DeviceError,
-    MotionSpec,
-    Plan,
-    RfSpec,
-    SiteGrid,
-    ToneProgram,
-    TransientError,
-)
+from labseq.plugin import Context, DeviceError, MotionSpec, Plan, SiteGrid, ToneProgram, TransientError
+from labseq.plugin.motion import RfSpec
 
 from .conftest import RATE_HZ, Lab
 

@@ -19,7 +19,8 @@ from labseq_virtual.settings import (
 
 from labseq.config.profile import MOTION_KEYS, load_profile
 from labseq.detection.threshold import ThresholdSettings
-from labseq.plugin import MotionSpec, RfSpec, Settings, SiteGrid
+from labseq.plugin import MotionSpec, Settings, SiteGrid
+from labseq.plugin.motion import RfSpec
 
 MODELS: Mapping[str, type[Settings]] = {
     "camera": CameraSettings,

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from labseq.motion import predict_survival
-from labseq.plugin import Context, MotionSpec, SiteGrid, TargetPattern, check_plan
+from labseq.plugin import Context, MotionSpec, SiteGrid, TargetPattern
+from labseq.plugin.planning import check_plan
 
 from .planning import COMPACT, PLANNERS, VARIANTS, Bools, in_the_middle, loadings
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
 
-from labseq.plugin import Context, Occupancy, PlanError, Registry, SiteGrid, TargetPattern, check_plan
+from labseq.plugin import Context, Occupancy, PlanError, Registry, SiteGrid, TargetPattern
+from labseq.plugin.planning import check_plan
 from labseq.roles import NeedsWarmUp
 from labseq.testing import PlannerContract
 from labseq.testing.strategies import cases

@@ -19,7 +19,7 @@ import pytest
 import labseq
 from labseq.assembly.profile import resolve_profile
 from labseq.errors import DeviceError
-from labseq.plugin import port_identities
+from labseq.plugin.serial import port_identities
 from labseq.processes import HANG_S, Lock, Process
 from labseq.recording import find_dead_run, lock_file, mark_active
 from labseq.safety.devices import check_devices

@@ -18,7 +18,8 @@ from itertools import combinations
 
 import numpy as np
 
-from labseq.plugin import Batch, Plan, TonePaths, hookimpl
+from labseq.plugin import Batch, Plan, hookimpl
+from labseq.plugin.motion import TonePaths
 
 LABSEQ_API = 1
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from labseq.model import CameraFacts, Frame
-from labseq.plugin import CameraDriver, ExposureResult, Series
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series
 from labseq.roles import Context, Trigger
 from labseq.testing import CameraContract
 from labseq.testing.fakes import RecordingCamera

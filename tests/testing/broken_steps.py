@@ -7,13 +7,13 @@ from typing import Any
 
 from labseq.errors import DeviceError, StopRequested
 from labseq.model import TimelineEntry
-from labseq.roles import Shot, StepContext
+from labseq.roles import Shot, Step, StepContext
 from labseq.testing import StepContract
 
 from .planted import Planted
 
 
-class Right:
+class Right(Step):
     """Waits, then takes an image."""
 
     needs_image = False

@@ -7,17 +7,8 @@ from typing import Any
 
 from pydantic import Field
 
-from labseq.plugin import (
-    CameraDriver,
-    CameraFacts,
-    Context,
-    DeviceError,
-    Duration,
-    ExposureResult,
-    OrientationSettings,
-    Series,
-    wait_for,
-)
+from labseq.plugin import CameraFacts, Context, DeviceError, Duration, wait_for
+from labseq.plugin.camera import CameraDriver, ExposureResult, OrientationSettings, Series
 
 
 class MycamSettings(OrientationSettings):

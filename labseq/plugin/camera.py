@@ -1,0 +1,27 @@
+"""What camera drivers share: a base class, settings, series of exposures, cooling, a simulated sensor."""
+
+from __future__ import annotations
+
+from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle
+from labseq.drivers.camera import check_step, nearest
+from labseq.drivers.settings import (
+    CameraSettings,
+    CoolingSettings,
+    IndustrialCameraSettings,
+    OrientationSettings,
+)
+
+__all__ = [
+    "CameraDriver",
+    "CameraSettings",
+    "Cooling",
+    "CoolingSettings",
+    "ExposureResult",
+    "IndustrialCameraSettings",
+    "OrientationSettings",
+    "Series",
+    "SimulatedSensor",
+    "check_step",
+    "nearest",
+    "settle",
+]

@@ -1,0 +1,36 @@
+"""Calls of C from compiled code, clocks and signals without Python, priority of threads."""
+
+from __future__ import annotations
+
+from labseq.kernel import c_address, n_cores
+from labseq.native import (
+    N_SIGNAL,
+    WakeSignal,
+    call_c,
+    carray,
+    new_timer,
+    now_ns,
+    pointer,
+    set_signal,
+    sleep_ns,
+    swap,
+    wait_signal,
+)
+from labseq.realtime import raise_priority
+
+__all__ = [
+    "N_SIGNAL",
+    "WakeSignal",
+    "c_address",
+    "call_c",
+    "carray",
+    "n_cores",
+    "new_timer",
+    "now_ns",
+    "pointer",
+    "raise_priority",
+    "set_signal",
+    "sleep_ns",
+    "swap",
+    "wait_signal",
+]

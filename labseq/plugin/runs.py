@@ -1,0 +1,12 @@
+"""Reading recorded runs."""
+
+from __future__ import annotations
+
+from labseq.data import Run, open_run
+from labseq.errors import RecordingError
+
+__all__ = [
+    "RecordingError",
+    "Run",
+    "open_run",
+]
