@@ -583,7 +583,7 @@ def ceiling_of(run: Run, statistics: Statistics) -> Points | None:
     losses = AtomLosses.of(run.record.get("devices") or {})
     if losses is None:
         return None
-    images = run.shots[0].summary.images
+    images = run.shots[0].row.images
     exposures = [s for s, cycle in zip(images.exposure_s, images.cycle, strict=True) if cycle >= 0]
     label = "ceiling: losses in the light and with time"
     label += "" if losses.false_negative is None else ", missed atoms"

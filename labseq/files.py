@@ -264,7 +264,21 @@ class NewLines:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._at = 0
+        self._at, self._inode = 0, 0
+
+    def placed(self) -> Generator[tuple[int, dict[str, Any] | None]]:
+        """The lines since the last call: where each begins in the file, and its values; None if damaged.
+
+        Raises:
+            RecordingError: The file cannot be read.
+        """
+        if not self._path.exists():
+            return
+        self._inode = self._path.stat().st_ino
+        for line in lines_in(self._path, self._at):
+            if line.endswith(b"\n"):  # else it is still being written
+                start, self._at = self._at, self._at + len(line)
+                yield start, parse_object(line)
 
     def read(self) -> list[dict[str, Any]]:
         """The lines since the last call, without damaged ones.
@@ -272,12 +286,16 @@ class NewLines:
         Raises:
             RecordingError: The file cannot be read.
         """
-        rows: list[dict[str, Any]] = []
-        for line in lines_in(self._path, self._at) if self._path.exists() else ():
-            if line.endswith(b"\n"):
-                self._at += len(line)
-                rows += [row] if (row := parse_object(line)) is not None else []
-        return rows
+        return [values for _, values in self.placed() if values is not None]
+
+    def is_replaced(self) -> bool:
+        """Whether the file is no longer the one that was read, or has become shorter than what was read."""
+        if not self._at:
+            return False
+        if not self._path.exists():
+            return True
+        about = self._path.stat()
+        return about.st_ino != self._inode or about.st_size < self._at
 
 
 PROFILES: Final = "hardware_profiles"

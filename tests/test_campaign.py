@@ -89,7 +89,7 @@ def test_a_campaign_that_is_stopped_goes_on_and_its_results_are_combined(file: P
         if (run.changes["planner.degree_of_parallelism"], run.changes["profile.simulation.loading"])
         == ("4", "60 %")
     ]
-    assert point["n_batches"].values.tolist() == [shot.row["n_batches"] for shot in expected.shots]
+    assert point["n_batches"].values.tolist() == [shot.row.n_batches for shot in expected.shots]
     assert float(point["filling"]) == expected.quantity("filling").over(expected.shots).value
     assert len(campaign_picture(folder).rows) == 2
     file.write_text(FILE.replace("seed: 3", "seed: 4"), encoding="utf-8")

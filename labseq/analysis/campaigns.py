@@ -15,6 +15,7 @@ from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_r
 from labseq.console.output import say
 from labseq.console.text import plural
 from labseq.data import Run, Shot
+from labseq.data.columns import quantities_in
 from labseq.data.points import ScanPoint
 from labseq.data.quantities import Quantity, description_of
 from labseq.data.tables import check_installed
@@ -106,8 +107,8 @@ def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
             for end, value in zip(("", "_low", "_high"), (one.value, *one.interval), strict=True):
                 means[name + end][point] = value
         for name, values in of_shots.items():
-            known = [shot.row.get(name) for shot in shots[point]]
-            values[point][: len(known)] = [math.nan if value is None else value for value in known]
+            known = [quantities_in(shot.row).get(name, math.nan) for shot in shots[point]]
+            values[point][: len(known)] = known
     dims, of_shot = (*names, REPEAT), slice(None)
     if n_repeats == 1:
         dims, of_shot = names, 0

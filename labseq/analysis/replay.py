@@ -408,7 +408,7 @@ def _point_of(shot: Shot, assembly: Assembly, point_of_shot: Sequence[int]) -> P
     """The settings that a recorded shot was taken with."""
     if assembly.search is None:
         return assembly.at(point_of_shot[shot.index])
-    return assembly.search.at(assembly.search.values_in(shot.row))
+    return assembly.search.at(assembly.search.values_in(shot.row.parameters))
 
 
 def assembly_of(run: Run) -> Assembly:

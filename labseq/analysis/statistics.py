@@ -16,7 +16,7 @@ from labseq.errors import RecordingError
 from labseq.model import Occupancy, TargetPattern, follow_atoms
 from labseq.model.estimate import Estimate, Rate, as_mapping, mean
 from labseq.plain import to_plain
-from labseq.recording.run_file import ShotSummary
+from labseq.recording.index import IndexRow
 
 Counts = NDArray[np.int64]
 
@@ -61,8 +61,6 @@ class Statistics:
 
     Attributes:
         n_shots: Number of shots.
-        unreadable: Indices of shots without cycles in the index, whose file cannot be read:
-            they only count in ``defect_free``, ``seen`` and ``filling``.
         defect_free: Judged shots that met the target. A shot is judged on its last ``image``
             step, if it does not rearrange after that.
         seen: Shots in which some image after a rearrangement is defect-free.
@@ -76,7 +74,6 @@ class Statistics:
     """
 
     n_shots: int
-    unreadable: tuple[int, ...]
     defect_free: Rate
     seen: Rate
     filling: Estimate
@@ -94,39 +91,21 @@ class Statistics:
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
     """Compute the statistics of shots from the index, or from their files if needed; no frames are read."""
-    all_shots = list(shots)
-    read: list[tuple[Shot, ShotSummary]] = []
-    unreadable: list[Shot] = []
-    for shot in all_shots:
-        try:
-            read.append((shot, shot.summary))
-        except RecordingError:
-            unreadable.append(shot)
-    judged = [(shot, of) for shot, of in read if _has_filling(shot) and of.is_judged]
-    rated = [shot for shot, _ in judged] + [shot for shot in unreadable if _has_filling(shot)]
-    summaries = [summary for _, summary in read]
-    with_truth = [of for of in summaries if "n_defects_true" in of.simulation and len(of.images)]
+    rows = [shot.row for shot in shots]
+    judged = [row for row in rows if not math.isnan(row.filling_fraction) and row.ends_with_image_step]
+    with_truth = [row for row in rows if "n_defects_true" in row.simulation and len(row.images)]
     return Statistics(
-        n_shots=len(all_shots),
-        unreadable=tuple(shot.index for shot in unreadable),
-        defect_free=Rate(sum(shot.success for shot in rated), len(rated)),
-        seen=Rate(sum(map(_is_seen, all_shots)), len(all_shots)),
-        filling=mean([shot.filling_fraction for shot in rated]),
-        cycles=_cycles(summaries, target),
-        defects=_histogram([of.images.n_defects[-1] for _, of in judged if len(of.images)]),
-        too_short=Rate(sum(of.cycles.n_batches_played != of.cycles.n_batches for of in summaries), len(read)),
-        losses=_losses(summaries),
-        defects_true=mean([of.simulation["n_defects_true"] for of in with_truth]),
-        defects_seen=mean([of.images.n_defects[-1] for of in with_truth]),
+        n_shots=len(rows),
+        defect_free=Rate(sum(bool(row.success) for row in judged), len(judged)),
+        seen=Rate(sum(row.was_defect_free for row in rows), len(rows)),
+        filling=mean([row.filling_fraction for row in judged]),
+        cycles=_cycles(rows, target),
+        defects=_histogram([row.images.n_defects[-1] for row in judged if len(row.images)]),
+        too_short=Rate(sum(row.cycles.n_batches_played != row.cycles.n_batches for row in rows), len(rows)),
+        losses=_losses(rows),
+        defects_true=mean([row.simulation["n_defects_true"] for row in with_truth]),
+        defects_seen=mean([row.images.n_defects[-1] for row in with_truth]),
     )
-
-
-def _has_filling(shot: Shot) -> bool:
-    return not math.isnan(shot.filling_fraction)
-
-
-def _is_seen(shot: Shot) -> bool:
-    return shot.success or shot.seen_defect_free_cycle >= 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +120,9 @@ class _ShotCycle:
     period_s: float
 
 
-def _made(summary: ShotSummary) -> list[_ShotCycle]:
+def _made(row: IndexRow) -> list[_ShotCycle]:
     """The cycles of a shot that end with an image."""
-    images, cycles = summary.images, summary.cycles
+    images, cycles = row.images, row.cycles
     ends = [i for i, cycle in enumerate(images.cycle) if cycle >= 0]
     return [
         _ShotCycle(
@@ -158,8 +137,8 @@ def _made(summary: ShotSummary) -> list[_ShotCycle]:
     ]
 
 
-def _cycles(summaries: Sequence[ShotSummary], target: TargetPattern) -> tuple[CycleStatistics, ...]:
-    per_shot = list(map(_made, summaries))
+def _cycles(rows: Sequence[IndexRow], target: TargetPattern) -> tuple[CycleStatistics, ...]:
+    per_shot = list(map(_made, rows))
     seen = [list(accumulate((one.is_met for one in made), max)) for made in per_shot]
     n_most = max(map(len, per_shot), default=0)
     return tuple(
@@ -193,10 +172,10 @@ def _histogram(numbers: Sequence[int]) -> tuple[int, ...]:
     return tuple(np.bincount(np.array(numbers, np.int64)).tolist())
 
 
-def _losses(summaries: Sequence[ShotSummary]) -> dict[str, Estimate]:
-    causes = dict.fromkeys(name for of in summaries for name in of.simulation if name.startswith(LOST))
+def _losses(rows: Sequence[IndexRow]) -> dict[str, Estimate]:
+    causes = dict.fromkeys(name for row in rows for name in row.simulation if name.startswith(LOST))
     return {
-        name.removeprefix(LOST): mean([of.simulation[name] for of in summaries if name in of.simulation])
+        name.removeprefix(LOST): mean([row.simulation[name] for row in rows if name in row.simulation])
         for name in causes
     }
 
@@ -265,7 +244,7 @@ class Survival:
         Raises:
             RecordingError: The file cannot be read.
         """
-        occupancies, cycles, images = shot.occupancies, iter(shot.cycles), shot.summary.images
+        occupancies, cycles, images = shot.occupancies, iter(shot.cycles), shot.row.images
         loaded_s = [timing.t_start_s for timing in shot.timing if timing.step in loads]
         if len(images) != len(occupancies):
             raise RecordingError(

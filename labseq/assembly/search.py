@@ -70,9 +70,9 @@ class Search:
         except ConfigError as error:
             raise alone.explained(error) from None
 
-    def values_in(self, row: Mapping[str, Any]) -> dict[str, float]:
-        """The values that a shot was taken with, from its line of the index: address -> value, SI."""
-        return {one.address: row["parameters"][one.address] for one in self.ranges}
+    def values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
+        """The values of the point among the parameters of a shot: address -> value, SI."""
+        return {one.address: parameters[one.address] for one in self.ranges}
 
     def written(self, values: Mapping[str, Any]) -> dict[str, str]:
         """The values of a point as text in the units of the sequence: address -> text."""

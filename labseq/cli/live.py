@@ -23,8 +23,9 @@ from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
 from labseq.console.text import clock_time, count_of, plural
 from labseq.data.points import SCANNER, ChosenPoints
-from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming
+from labseq.model import ImageRecord, RunRecord, StageTiming
 from labseq.model.estimate import Estimate, jeffreys, mean
+from labseq.recording.index import IndexRow
 from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25
@@ -406,18 +407,18 @@ class ScanTally:
         """The scanned settings, as text."""
         return ", ".join(scanned_names(self._scan))
 
-    def add(self, shot: ShotRecord) -> None:
+    def add(self, row: IndexRow) -> None:
         """Count a shot, unless it was not judged or its point is unknown."""
-        number = self._number(shot)
-        if number is not None and not math.isnan(shot.filling_fraction):
+        number = self._number(row)
+        if number is not None and not math.isnan(row.filling_fraction):
             point = self._points.setdefault(number, PointTally())
-            point += PointTally(1, int(shot.success), shot.filling_fraction)
+            point += PointTally(1, int(bool(row.success)), row.filling_fraction)
 
-    def _number(self, shot: ShotRecord) -> int | None:
+    def _number(self, row: IndexRow) -> int | None:
         try:
             if self._chosen is not None:
-                return self._chosen.number(shot.parameters)
-            return self._scan["point_of_shot"][shot.shot_index] if shot.shot_index >= 0 else None
+                return self._chosen.number(row.parameters)
+            return self._scan["point_of_shot"][row.shot] if row.shot >= 0 else None
         except (KeyError, IndexError):  # `labseq watch` on a damaged index
             return None
 
@@ -437,7 +438,7 @@ class Tally:
 
     Attributes:
         record: The run, from "run_starting" on.
-        n_before: Number of shots that were complete when the run was resumed.
+        n_before: Number of shots that were complete before the first event.
         n_done: Number of shots completed since then.
         n_defect_free: Number of them that met the target.
         n_seen: Number of them that met it in at least one image.
@@ -495,11 +496,12 @@ class Tally:
                 if math.isnan(self._first_shot_s):
                     self._first_shot_s = self._now()
             case "shot_finished":
-                self._count(values["shot"])
+                self._count(values["row"])
             case "shot_repeated":
                 self.n_repeated += 1
             case "run_starting":
-                self.record, self.n_before = values["record"], values.get("n_before", 0)
+                self.record = values["record"]
+                self.n_before = values.get("n_before", 0) - self.n_done  # `watch` has counted them itself
                 self.status = ""
                 if self.scan is None and values["record"].scan:  # the points of a resumed run are kept
                     self.scan = ScanTally(values["record"].scan)
@@ -510,13 +512,13 @@ class Tally:
             case _:
                 pass
 
-    def _count(self, shot: ShotRecord) -> None:
-        if shot.status != "complete":
+    def _count(self, row: IndexRow) -> None:
+        if not row.counts:
             return
         self.n_done += 1
-        self.n_defect_free += shot.success
-        self.n_seen += shot.success or shot.seen_defect_free_cycle >= 0
+        self.n_defect_free += bool(row.success)
+        self.n_seen += row.was_defect_free
         if self.scan is not None:
-            self.scan.add(shot)
-        if not math.isnan(shot.filling_fraction):
-            self._fillings.append(shot.filling_fraction)
+            self.scan.add(row)
+        if not math.isnan(row.filling_fraction):
+            self._fillings.append(row.filling_fraction)

@@ -9,10 +9,10 @@ from typing import Any, Final
 from labseq.console.output import as_line, say
 from labseq.console.text import columns, plural, size_text
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import read_lines
 from labseq.messages import visible
 from labseq.recording import data_root
-from labseq.recording.folders import INDEX_FILE, runs_in
+from labseq.recording.folders import runs_in
+from labseq.recording.index import read_index
 from labseq.recording.run_file import read_run, read_state
 
 _HEADER: Final = ("run", "started", "profile", "shots", "status", "hardware", "seed", "size")
@@ -51,7 +51,7 @@ def _about(folder: Path) -> dict[str, Any]:
     about: dict[str, Any] = {"run": _id(folder), "run_dir": str(folder)}
     try:
         record, (status, error) = read_run(folder), read_state(folder)
-        rows = [row for row in read_lines(folder / INDEX_FILE)[0] if type(row.get("bytes")) is int]
+        rows = read_index(folder)[0]
     except (RecordingError, OSError) as failure:
         keys = ("t_start_utc", "sequence", "profile", "shots", "n_shots", "simulated", "seed", "bytes")
         return about | dict.fromkeys(keys) | {"status": "damaged", "error": str(failure)}
@@ -61,13 +61,13 @@ def _about(folder: Path) -> dict[str, Any]:
         "t_start_utc": record.get("t_start_utc"),
         "sequence": record["name"],
         "profile": profile.get("name") if isinstance(profile, dict) else None,
-        "shots": len({row.get("shot") for row in rows if row.get("counts") is True}),
+        "shots": len({row.shot for row in rows if row.counts}),
         "n_shots": record["n_shots"],
         "status": status,
         "error": error,
         "simulated": record["simulated"],
         "seed": record["seed"],
-        "bytes": sum(row["bytes"] for row in rows),
+        "bytes": sum(row.bytes for row in rows),
     }
 
 

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli.summary import MAX_ROWS, json_summary, summary_lines
@@ -20,7 +20,6 @@ from labseq.console.text import columns, percent, settings_text
 from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
-from labseq.model.records import STEP
 from labseq.units import format_quantity
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
     values: dict[str, Any] = {"run_dir": str(run.path), "status": run.status}
     if wanted.shots:
         values["shot_list"] = [
-            {"index": shot.index, **{name: shot.row.get(name) for name in SHOT_KEYS}}
+            {"index": shot.index, **{name: getattr(shot.row, name) for name in SHOT_KEYS}}
             for shot in _all_attempts(run)
         ]
     if wanted.timing:
@@ -113,25 +112,16 @@ def _shot_row(shot: Shot, run: Run, *, details: bool) -> tuple[str, ...]:
     row = shot.row
     result = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, run.target.n_atoms)
     if shot.status != "complete":
-        result = f"attempt {shot.attempt} {shot.status}: {clean(str(row.get('error', '')))}"
+        result = f"attempt {shot.attempt} {shot.status}: {clean(row.error)}"
     counts = ("n_cycles", "n_batches", "n_atom_moves") if details else ("n_cycles", "n_atom_moves")
-    time_s = shot_time_s(shot)
     return (
         str(shot.index),
         *(scanned_values(run.scan, shot.index, shot.parameters) if details else ()),
         result,
         percent(shot.filling_fraction),
-        *(str(row.get(name, "-")) for name in counts),
-        format_quantity(time_s, "time") if time_s else "-",
+        *(str(getattr(row, name)) for name in counts),
+        _time(row.duration_s),
     )
-
-
-def shot_time_s(shot: Shot) -> float:
-    """Duration of the steps of a shot, in seconds; 0 if its line of the index is damaged."""
-    found = shot.row.get("stage_s")
-    stages = cast("Mapping[str, object]", found) if isinstance(found, dict) else {}
-    steps_s = [s for name, s in stages.items() if name.startswith(STEP)]
-    return math.fsum(s for s in steps_s if isinstance(s, float | int))
 
 
 def scan_table(run: Run, request: ScanRequest) -> list[str]:

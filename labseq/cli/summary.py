@@ -20,10 +20,10 @@ from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_o
 from labseq.console.text import columns, count_of, plural, quoted
 from labseq.data import Run
 from labseq.data.best import best_point
+from labseq.data.follower import Follower
 from labseq.messages import clean
 from labseq.model.estimate import mean
 from labseq.plain import to_plain
-from labseq.recording.run_file import RunTime
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
 
@@ -76,7 +76,7 @@ def _best_rows(run: Run) -> list[tuple[str, str]]:
 
 def _atom_rows(run: Run) -> list[tuple[str, str]]:
     """The atoms on the first and the last image of the shots of a run without a target."""
-    counts = [shot.summary.images.n_atoms for shot in run.shots if len(shot.summary.images)]
+    counts = [shot.row.images.n_atoms for shot in run.shots if len(shot.row.images)]
     first, last = (mean([of_shot[i] for of_shot in counts]) for i in (0, -1))
     return [
         ("target", "none"),
@@ -144,10 +144,6 @@ def statistics_rows(statistics: Statistics) -> list[tuple[str, str]]:
         rows.append(("lost in a shot", ", ".join(causes) or "no atoms"))
     if not math.isnan(one.defects_true.value):
         rows.append(("true defects", f"{one.defects_true} in a shot, {one.defects_seen} on its last image"))
-    if one.unreadable:
-        are = "is" if len(one.unreadable) == 1 else "are"
-        damaged = f"{plural(len(one.unreadable), 'shot')} cannot be read and {are} left out"
-        rows.append(("warning", f"{damaged} of cycles and defects: {_numbers(one.unreadable)}"))
     return rows
 
 
@@ -191,15 +187,8 @@ def _numbers(shots: Sequence[int]) -> str:
     return ", ".join(str(shot) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
 
 
-_ENDS: Final = frozenset({"shot_finished", "shot_repeated"})
-"""Events at the end of an attempt at a shot."""
-
-
 def _wall_time(run: Run) -> str:
     """Time until the end of the last shot; of a resumed run, of all its parts together."""
-    time, until_s = RunTime(), math.nan
-    for line in run.events:
-        time.advance(line.get("t_s"))
-        if line.get("event") in _ENDS and time.total_s:  # 0 only in a damaged log
-            until_s = time.total_s
-    return "-" if math.isnan(until_s) else f"{format_quantity(until_s, 'time')} on the computer's clock"
+    ends = {"shot_finished", "shot_repeated"}
+    until_s = max((event.t_s for event in Follower(run.path).events() if event.name in ends), default=0.0)
+    return "-" if not until_s else f"{format_quantity(until_s, 'time')} on the computer's clock"

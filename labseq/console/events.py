@@ -10,7 +10,8 @@ from typing import Any, Final, TextIO
 from labseq.console.output import compiling_text, say
 from labseq.console.text import percent, plural
 from labseq.messages import clean
-from labseq.model import RunRecord, ShotRecord
+from labseq.model import RunRecord
+from labseq.recording.index import IndexRow
 from labseq.units import format_quantity, written
 
 LASTING: Final = frozenset(
@@ -71,10 +72,10 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "run_starting":
             return run_text(values["record"], values["run_dir"], values.get("n_before", 0))
         case "shot_finished":
-            return shot_text(values["shot"], run)
+            return shot_text(values["row"], run)
         case "shot_repeated":
-            shot: ShotRecord = values["shot"]
-            return f"shot {shot.shot_index}: attempt {shot.attempt} failed, trying again: {shot.error}"
+            row: IndexRow = values["row"]
+            return f"shot {row.shot}: attempt {row.attempt} failed, trying again: {row.error}"
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
             return f"warning: {values['device']} could not be {task}: {values['error']}"
@@ -121,22 +122,22 @@ def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
     return f"{run_dir}: {plural(run.n_shots, 'shot')}{before}, seed {run.seed}, profile {profile}{simulated}"
 
 
-def shot_text(shot: ShotRecord, run: RunRecord | None) -> str:
+def shot_text(row: IndexRow, run: RunRecord | None) -> str:
     """A line about a shot that is over."""
-    name = f"shot {shot.shot_index}"
-    if run is not None and (at := point_of_shot(run.scan, shot.shot_index, shot.parameters)):
+    name = f"shot {row.shot}"
+    if run is not None and (at := point_of_shot(run.scan, row.shot, row.parameters)):
         name += f"  {at}"
-    if shot.status != "complete":
-        return f"{name}  {shot.status}" + (f": {shot.error}" if shot.status == "failed" else "")
+    if row.status != "complete":
+        return f"{name}  {row.status}" + (f": {row.error}" if row.status == "failed" else "")
     n_atoms = run.target.n_atoms if run is not None else 0
-    ended = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, n_atoms)
-    parts = [name, ended]
-    if not math.isnan(shot.filling_fraction):
-        parts.append(f"filling {percent(shot.filling_fraction)}")
-    if shot.n_missing_atoms:
-        parts.append(f"{plural(shot.n_missing_atoms, 'atom')} short after loading")
-    duration_s = max((timing.t_start_s + timing.duration_s for timing in shot.timing), default=0.0)
-    return "  ".join([*parts, format_quantity(duration_s, "time")])
+    parts = [name, outcome(bool(row.success), row.seen_defect_free_cycle, row.filling_fraction, n_atoms)]
+    if not math.isnan(row.filling_fraction):
+        parts.append(f"filling {percent(row.filling_fraction)}")
+    if row.n_missing_atoms:
+        parts.append(f"{plural(row.n_missing_atoms, 'atom')} short after loading")
+    if not math.isnan(row.duration_s):
+        parts.append(format_quantity(row.duration_s, "time"))
+    return "  ".join(parts)
 
 
 def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> str:

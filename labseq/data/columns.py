@@ -5,37 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.data.shot import Shot
-from labseq.model.records import STEP
 from labseq.plain import dumps, plain_text
 from labseq.recording import schema
+from labseq.recording.index import SIMULATION, IndexRow
 from labseq.recording.results import result_columns
-from labseq.recording.run_file import SIMULATION
 from labseq.recording.schema import unit_of
 
 if TYPE_CHECKING:
     from labseq.data.reader import Run
 
-_Row: TypeAlias = Mapping[str, Any]
-
-_DERIVED: Final[Mapping[str, tuple[str, Callable[[_Row], Any]]]] = {
-    "n_loaded": ("atoms on the first image", lambda row: _of_image(row, "n_atoms", 0)),
-    "n_atoms": ("atoms on the last image", lambda row: _of_image(row, "n_atoms", -1)),
-    "n_defects": ("empty target sites on the last image", lambda row: _of_image(row, "n_defects", -1)),
+_DERIVED: Final[Mapping[str, tuple[str, Callable[[IndexRow], Any]]]] = {
+    "n_loaded": ("atoms on the first image", lambda row: _first(row.images.n_atoms)),
+    "n_atoms": ("atoms on the last image", lambda row: _first(row.images.n_atoms[-1:])),
+    "n_defects": ("empty target sites on the last image", lambda row: _first(row.images.n_defects[-1:])),
     "n_surplus": (
         "atoms on the last image on sites that must be empty",
-        lambda row: _of_image(row, "n_surplus", -1),
+        lambda row: _first(row.images.n_surplus[-1:]),
     ),
-    "duration_s": (
-        "sum of the steps on the session's clock",
-        lambda row: _duration_s(row.get("stage_s", {})),
-    ),
-    "file": ("the shot's file, from the run's folder", lambda row: row.get("file")),
+    "duration_s": ("sum of the steps on the session's clock", lambda row: row.duration_s),
+    "file": ("the shot's file, from the run's folder", lambda row: row.file),
 }
 """Columns that are computed from a line of the index: description, function."""
 
@@ -52,16 +46,15 @@ FRACTIONS: Final = frozenset({"success", "filling_fraction"})
 """Those of them that are shown in per cent."""
 
 
-def _readings(row: _Row) -> dict[str, Any]:
-    simulated = {f"{SIMULATION}{name}": value for name, value in row.get("simulation", {}).items()}
-    return {**row.get("readings", {}), **simulated}
+def _readings(row: IndexRow) -> dict[str, Any]:
+    return {**row.readings, **{f"{SIMULATION}{name}": value for name, value in row.simulation.items()}}
 
 
-_GROUPS: Final[Mapping[str, Callable[[_Row], Mapping[str, Any]]]] = {
-    "": lambda row: row["parameters"],
-    "stage.": lambda row: {f"{name}_s": seconds for name, seconds in row.get("stage_s", {}).items()},
+_GROUPS: Final[Mapping[str, Callable[[IndexRow], Mapping[str, Any]]]] = {
+    "": lambda row: row.parameters,
+    "stage.": lambda row: {f"{name}_s": seconds for name, seconds in row.stage_s.items()},
     "reading.": _readings,
-    "calibration.": lambda row: row["calibrations"],
+    "calibration.": lambda row: row.calibrations,
 }
 """Prefix of the columns that differ from run to run -> their values in a line of the index."""
 GROUPS: Final = {
@@ -123,7 +116,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
             about = _description(prefix, name, scanned=name in scanned)
             columns.append(make_column(full_name, [group.get(name) for group in groups], units, about))
     for name, values in analysed.items():
-        of_rows = [values.get(row["shot"]) if row["counts"] else None for row in rows]
+        of_rows = [values.get(row.shot) if row.counts else None for row in rows]
         columns.append(make_column(name, of_rows, unit_of(name), RESULT))
     return columns
 
@@ -136,11 +129,8 @@ def _description(prefix: str, name: str, *, scanned: bool) -> str:
     return f"{'scanned' if scanned else 'set for the run'}, SI"
 
 
-def quantities_in(row: Mapping[str, Any]) -> dict[str, float]:
+def quantities_in(row: IndexRow) -> dict[str, float]:
     """The quantities (numerical results) of a shot, from its line in the index.
-
-    Args:
-        row: The shot's line in the index.
 
     Returns:
         Name -> value, as :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction",
@@ -156,20 +146,14 @@ def quantities_in(row: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _fixed(row: _Row) -> dict[str, Any]:
+def _fixed(row: IndexRow) -> dict[str, Any]:
     """The values of the columns that every run has."""
-    found = {field.name: row.get(field.name) for field in _FIELDS}
-    return found | {name: value(row) for name, (_, value) in _DERIVED.items()}
+    values = {field.name: getattr(row, field.name) for field in _FIELDS}
+    return values | {name: value(row) for name, (_, value) in _DERIVED.items()}
 
 
-def _of_image(row: _Row, name: str, image: int) -> Any:
-    values = row.get("images", {}).get(name)
-    return values[image] if values else None
-
-
-def _duration_s(stage_s: Mapping[str, float | None]) -> float | None:
-    steps = [seconds for name, seconds in stage_s.items() if name.startswith(STEP) and seconds is not None]
-    return math.fsum(steps) if steps else None
+def _first(values: Sequence[int]) -> int | None:
+    return values[0] if len(values) else None
 
 
 def _column_name(prefix: str, name: str) -> str:

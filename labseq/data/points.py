@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from labseq.errors import RecordingError
 from labseq.plain import dumps
 from labseq.recording.folders import RUN_FILE
+from labseq.recording.index import IndexRow
 from labseq.units import written
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class ChosenPoints:
         return number
 
 
-def completed(scan: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def completed(scan: Mapping[str, Any], rows: Iterable[IndexRow]) -> dict[str, Any]:
     """The record of an adaptive scan, completed with its points so that it reads like any other scan's.
 
     Args:
@@ -75,8 +76,8 @@ def completed(scan: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> dic
     """
     chosen = ChosenPoints(scan)
     of_shot: dict[int, int] = {}
-    for row in sorted(rows, key=lambda row: (row["shot"], row["attempt"])):
-        of_shot[row["shot"]] = chosen.number(row["parameters"])
+    for row in sorted(rows, key=lambda row: (row.shot, row.attempt)):
+        of_shot[row.shot] = chosen.number(row.parameters)
     point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
     return {**scan, "points": chosen.points, "written": chosen.written, "point_of_shot": point_of_shot}
 

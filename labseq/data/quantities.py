@@ -101,7 +101,7 @@ def _defects(shot: Shot, target: TargetPattern, name: str) -> tuple[int, int] | 
     if name:
         image = _image(shot, name, -1)
         return image and (target.n_defects(image.occupancy), target.n_surplus(image.occupancy))
-    images = shot.summary.images
+    images = shot.row.images
     return (images.n_defects[-1], images.n_surplus[-1]) if len(images) else None
 
 

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Any
 from labseq.data.points import SCANNER, completed, reporting_damage
 from labseq.data.shot import Shot, caching_loader
 from labseq.errors import RecordingError
-from labseq.files import NewLines, read_lines
+from labseq.files import read_lines
 from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
 from labseq.plain import to_plain
 from labseq.recording import folders
+from labseq.recording.index import read_index
 from labseq.recording.results import rows_of
-from labseq.recording.run_file import is_index_row, is_skip_row, read_run, read_state, target_of
+from labseq.recording.run_file import is_skip_row, read_run, read_state, target_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,19 +46,18 @@ def open_run(path: str | Path) -> Run:
     folder = folders.find_run(path)
     record = read_run(folder)
     status, error = read_state(folder)
-    rows, damaged = read_lines(folder / folders.INDEX_FILE)
-    usable = [row for row in rows if is_index_row(row)]
+    rows, n_damaged = read_index(folder)
     load = caching_loader()
     # of a shot that was written twice, the last line counts
-    counted = {row["shot"]: row for row in usable if row["counts"]}
+    counted = {row.shot: row for row in rows if row.counts}
     return Run(
         path=folder,
         record=record,
         status=status,
         error=error,
-        shots=tuple(Shot(folder / row["file"], row, load) for _, row in sorted(counted.items())),
-        attempts=tuple(Shot(folder / row["file"], row, load) for row in usable if not row["counts"]),
-        n_damaged_lines=len(damaged) + len(rows) - len(usable),
+        shots=tuple(Shot(folder, counted[shot], load) for shot in sorted(counted)),
+        attempts=tuple(Shot(folder, row, load) for row in rows if not row.counts),
+        n_damaged_lines=n_damaged,
         skipped=_skipped(folder, record["n_shots"]),
     )
 
@@ -244,20 +244,3 @@ class Run:
         from labseq.data.tables import dataset_of
 
         return dataset_of(self, occupancies=occupancies)
-
-
-class Follower:
-    """Follows the index of a run in progress: returns each shot that counts once."""
-
-    def __init__(self, run_dir: Path) -> None:
-        self._run_dir = run_dir
-        self._lines = NewLines(run_dir / folders.INDEX_FILE)
-
-    def new(self) -> list[Shot]:
-        """The shots that were added since the last call.
-
-        Raises:
-            RecordingError: The index cannot be read.
-        """
-        rows = [row for row in self._lines.read() if is_index_row(row) and row["counts"]]
-        return [Shot(self._run_dir / row["file"], row) for row in rows]

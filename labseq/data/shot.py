@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,7 @@ from labseq.errors import RecordingError
 from labseq.files import open_ordinary
 from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.model.records import ShotStatus
-from labseq.recording.run_file import ShotSummary, summary_of
+from labseq.recording.index import IndexRow
 
 if TYPE_CHECKING:
     from labseq.recording.shot_file import ShotContent
@@ -42,47 +41,51 @@ class Shot:
     Every property from ``occupancies`` on raises ``RecordingError`` if the file is missing or damaged.
 
     Attributes:
-        file: The shot's HDF5 file.
-        row: Its line in the index.
+        run_dir: The run's folder.
+        row: The shot as the index lists it.
     """
 
-    file: Path
-    row: dict[str, Any]
+    run_dir: Path
+    row: IndexRow
     _load: Callable[[Path], ShotContent] = load_content
 
     def __repr__(self) -> str:
         return f"<Shot {self.index}: {self.status}, {self.file}>"
 
     @property
+    def file(self) -> Path:
+        """The shot's HDF5 file."""
+        return self.run_dir / self.row.file
+
+    @property
     def index(self) -> int:
         """Index in the run, from 0."""
-        return int(self.row["shot"])
+        return self.row.shot
 
     @property
     def attempt(self) -> int:
         """Number of the attempt, from 0."""
-        return int(self.row["attempt"])
+        return self.row.attempt
 
     @property
     def status(self) -> ShotStatus:
         """One of "complete", "interrupted" and "failed"."""
-        return self.row["status"]
+        return self.row.status
 
     @property
     def success(self) -> bool:
         """Whether the last ``image`` step met the target."""
-        return bool(self.row["success"])
+        return bool(self.row.success)
 
     @property
     def filling_fraction(self) -> float:
         """Filling of the target on the last ``image`` step; nan without one."""
-        value = self.row["filling_fraction"]
-        return math.nan if value is None else float(value)
+        return self.row.filling_fraction
 
     @property
     def seen_defect_free_cycle(self) -> int:
         """Index of the first cycle whose image met the target; -1 if none."""
-        return int(self.row["seen_defect_free_cycle"])
+        return self.row.seen_defect_free_cycle
 
     @property
     def occupancies(self) -> NDArray[np.bool_]:
@@ -90,11 +93,6 @@ class Shot:
         from labseq.recording.shot_file import read_occupancies  # alone: a seventh of the time of all
 
         return read_occupancies(self.file)[1].astype(np.bool_)
-
-    @property
-    def summary(self) -> ShotSummary:
-        """Summary of its images and cycles, from the index."""
-        return summary_of(self.row)
 
     @property
     def signals(self) -> NDArray[np.float64]:
@@ -151,12 +149,12 @@ class Shot:
     @property
     def parameters(self) -> dict[str, Any]:
         """Settings of this shot that differ from the files: address -> value; scanned ones in SI."""
-        return dict(self.row["parameters"])
+        return dict(self.row.parameters)
 
     @property
     def calibrations(self) -> dict[str, str]:
         """The calibrations in use: kind -> id."""
-        return dict(self.row["calibrations"])
+        return dict(self.row.calibrations)
 
     @property
     def readings(self) -> dict[str, Any]:
@@ -212,7 +210,7 @@ class Shot:
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise RecordingError(self.file, f"cannot be read: {error.strerror}", "check the disk") from error
-        if sha256 != self.row.get("sha256"):
+        if sha256 != self.row.sha256:
             raise RecordingError(self.file, "has changed since it was written", "restore it from a backup")
 
     @property

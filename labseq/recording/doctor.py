@@ -29,14 +29,12 @@ from labseq.files import (
 from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Lock, Process
 from labseq.recording import folders
+from labseq.recording.index import SHOT_FILE, IndexRow, index_row, row_of
 from labseq.recording.markers import Marker, markers
 from labseq.recording.run_file import (
-    SHOT_FILE,
     STATUSES,
     OtherFormatError,
     encode_state,
-    index_row,
-    is_index_row,
     is_skip_row,
     read_run,
     read_state_file,
@@ -301,17 +299,19 @@ class _Check:
     def _check_shots(self, folder: Path, run_id: str) -> None:
         """Compare the index with the files of the shots."""
         index = _LineFile(self.folder / folders.INDEX_FILE)
-        of_file, wrong = dict[str, list[int]](), list[int]()
-        for number, row in index.rows.items():
-            if is_index_row(row) and _is_name(row):
-                of_file.setdefault(row["file"], []).append(number)
-            else:
-                wrong.append(number)
-        index.remove(wrong, "a line of the index is not a shot's")
-        whole = {file for file, same in of_file.items() if self._check_file(file, same, index)}
+        rows, of_file = dict[int, IndexRow](), dict[str, list[int]]()
+        for number, values in index.rows.items():
+            row = row_of(values)
+            if row is not None and _is_name(row):
+                rows[number] = row
+                of_file.setdefault(row.file, []).append(number)
+        index.remove([*index.rows.keys() - rows.keys()], "a line of the index is not a shot's")
+        whole = {
+            file for file, same in of_file.items() if self._check_file({n: rows[n] for n in same}, index)
+        }
         self.n_whole += len(whole)
         known = sorted(number for file in whole for number in of_file[file])
-        file_of = {row["shot"]: row["file"] for row in map(index.rows.__getitem__, known) if row["counts"]}
+        file_of = {rows[number].shot: rows[number].file for number in known if rows[number].counts}
         for name in sorted(names_in(folder), key=lambda name: (len(name), name), reverse=True):
             if SHOT_FILE.fullmatch(file := f"{folder.name}/{name}") and file not in of_file:
                 self._check_stray(folder / name, run_id, file_of, index)
@@ -329,17 +329,22 @@ class _Check:
         row = self._row_of_stray(path, run_id)
         if row is None:
             return
-        if row["counts"] and (later := file_of.setdefault(row["shot"], row["file"])) != row["file"]:
-            what = f"an earlier take of shot {row['shot']}, taken again as {Path(later).name}"
+        if row.counts and (later := file_of.setdefault(row.shot, row.file)) != row.file:
+            what = f"an earlier take of shot {row.shot}, taken again as {Path(later).name}"
             self._quarantine(what, path)
             return
         index.added.append(dumps(row).encode())
         index.problems.append(("no line in the index", path, "line added: the file is intact"))
         self.n_whole += 1
 
-    def _check_file(self, file: str, numbers: list[int], index: _LineFile) -> bool:
-        """Whether the file of a shot exists unchanged; further lines of the index for it are removed."""
-        path = self.folder / file
+    def _check_file(self, rows: dict[int, IndexRow], index: _LineFile) -> bool:
+        """Whether the file of a shot exists unchanged; further lines of the index for it are removed.
+
+        Args:
+            rows: The lines for the file, by their number.
+        """
+        numbers, last = [*rows], [*rows.values()][-1]
+        path = self.folder / last.file
         try:
             n_bytes, sha256 = _size_and_hash(path)
         except FileNotFoundError:
@@ -350,11 +355,11 @@ class _Check:
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return False
-        good = [number for number in numbers if index.rows[number]["sha256"] == sha256]
+        good = [number for number, row in rows.items() if row.sha256 == sha256]
         if not good:
             what = "the checksum does not hold: a byte has changed since it was written"
-            if n_bytes < (expected := index.rows[numbers[-1]]["bytes"]):
-                what = f"the shot's file is cut off: {n_bytes} of {expected} bytes"
+            if n_bytes < last.bytes:
+                what = f"the shot's file is cut off: {n_bytes} of {last.bytes} bytes"
             remedy = f"{_TO_QUARANTINE}, with its line"
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
                 index.remove(numbers)
@@ -363,7 +368,7 @@ class _Check:
         index.remove(second, f"a second line for {path.name}")
         return True
 
-    def _row_of_stray(self, path: Path, run_id: str) -> dict[str, Any] | None:
+    def _row_of_stray(self, path: Path, run_id: str) -> IndexRow | None:
         """The line for a file that has none, if the file is a whole shot of this run."""
         from labseq.recording.shot_file import (  # h5py takes 0.1 s to import
             damage_reported,
@@ -391,7 +396,7 @@ class _Check:
         if content.run_id != run_id:
             self._quarantine(f"a shot of another run, {content.run_id}", path)
             return None
-        if not is_index_row(row) or not _is_name(row):
+        if not _is_name(row):
             self._quarantine("a shot under a name that is not its own", path)
             return None
         return row
@@ -431,12 +436,11 @@ def _size_and_hash(path: Path) -> tuple[int, str]:
         return os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _is_name(row: dict[str, Any]) -> bool:
+def _is_name(row: IndexRow) -> bool:
     """Whether the file in a line of the index has the name of its shot."""
-    match = SHOT_FILE.fullmatch(row["file"])
+    match = SHOT_FILE.fullmatch(row.file)
     take = int(match[3] or 1) if match else 1
-    name = folders.shot_file_name(row["shot"], row["attempt"], counts=row["counts"], take=take)
-    return row["file"] == name
+    return row.file == folders.shot_file_name(row.shot, row.attempt, counts=row.counts, take=take)
 
 
 def _move_away(what: str, path: Path, folder: Path) -> None:

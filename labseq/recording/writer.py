@@ -23,7 +23,8 @@ from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, now_utc
 from labseq.recording import folders
-from labseq.recording.run_file import encode_run, encode_state, encode_text, index_row, read_run
+from labseq.recording.index import IndexRow, index_row
+from labseq.recording.run_file import encode_run, encode_state, encode_text, read_run
 
 if TYPE_CHECKING:
     from labseq.recording.shot_file import ShotEncoder
@@ -49,7 +50,6 @@ class RunWriter:
         run_dir: The run's folder.
         run: The run's record, of which each shot has a copy.
         n_written: Shots written that count; failed attempts do not count.
-        last_row: The line in the index of the attempt that was written last; empty before the first.
         is_given_up: Whether the disk did not answer, so that nothing more is written.
     """
 
@@ -58,7 +58,7 @@ class RunWriter:
         self._guard = Guard(stop, reuses_threads=True)
         self.is_given_up = False
         self.n_written = 0
-        self.last_row: Mapping[str, Any] = {}
+        self._last_row: IndexRow | None = None
         self.run = run
         self._encoder = self._make_encoder()
         self._index = LineLog(run_dir / folders.INDEX_FILE)
@@ -131,6 +131,12 @@ class RunWriter:
         write_file(run_dir / folders.STATE_FILE, encode_state("running"))
         return writer
 
+    @property
+    def last_row(self) -> IndexRow:
+        """The attempt that was written last, as the index lists it; there must be one."""
+        assert self._last_row is not None
+        return self._last_row
+
     def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
         """Add the descriptions of the devices; called before the first shot, when they are open.
 
@@ -158,34 +164,32 @@ class RunWriter:
 
         return ShotEncoder(self.run, run_id_of(self.run_dir))
 
-    def write_shot(self, shot: ShotRecord) -> Path:
+    def write_shot(self, shot: ShotRecord) -> IndexRow:
         """Write an attempt at a shot; it counts if it is complete.
 
         Returns:
-            The shot's file; it and its line in the index are on the disk.
+            The attempt as the index lists it; its file and its line are on the disk.
 
         Raises:
             RecordingError: The disk is full, or the record contradicts itself.
                 The shots written before are intact, and this one may be written again.
         """
         data = self._encoder.encode(shot)
-        row = index_row(shot, self.run.target, file="", sha256="", n_bytes=data.nbytes)
-        file = self._free_name(row["shot"], row["attempt"], counts=row["counts"])
+        file = self._free_name(shot.shot_index, shot.attempt, counts=shot.status == "complete")
+        row = index_row(shot, self.run.target, file=file, sha256="", n_bytes=data.nbytes)
         sha256 = SimpleQueue[str]()
-        written = self._on_disk(self._write_shot, {**row, "file": file}, data, sha256)
+        written = self._on_disk(self._write_shot, row, data, sha256)
         sha256.put(hashlib.sha256(data).hexdigest())  # while the disk writes
-        self.last_row = written()
-        self.n_written += row["counts"]
-        return self.run_dir / file
+        self._last_row = row = written()
+        self.n_written += row.counts
+        return row
 
-    def _write_shot(
-        self, row: Mapping[str, Any], data: memoryview, sha256: SimpleQueue[str]
-    ) -> Mapping[str, Any]:
+    def _write_shot(self, row: IndexRow, data: memoryview, sha256: SimpleQueue[str]) -> IndexRow:
         """Write the file of an attempt, then its line in the index; returns that."""
-        path = self.run_dir / row["file"]
+        path = self.run_dir / row.file
         with self._guard.step(f"{path.name} ", ANSWER_S, "disk"):
             write_file(path, data)
-        row = {**row, "sha256": sha256.get()}
+        row = replace(row, sha256=sha256.get())
         with self._guard.step(f"{folders.INDEX_FILE} ", ANSWER_S, "disk"):
             self._index.append(row, sync=True)
         return row

@@ -373,10 +373,10 @@ class Sequencer:
         self._close_record(record, "complete" if failure is None else "failed", failure)
         self._states.to(State.WRITING)
         start_s = time.perf_counter()
-        self._sink.write_shot(record)
+        row = self._sink.write_shot(record)
         host_s = time.perf_counter() - start_s
         event = "shot_repeated" if then == "repeat_shot" else "shot_finished"
-        self._emit(event, {"shot": record, "write_s": host_s})
+        self._emit(event, {"shot": record, "row": row, "write_s": host_s})
         self._states.to(State.IDLE)
         self._check_writing_time(shot.stages, host_s)
         return then, record.error
@@ -448,11 +448,12 @@ class Sequencer:
             self._leaders(record).failed(error)
         self._close_record(record, status, error)
         try:
-            self._sink.write_shot(record)
+            row = self._sink.write_shot(record)
         except Exception as failure:  # noqa: BLE001 - the first error is the one to report
             text = f"the interrupted shot could not be written: {error_text(failure)}"
             self._emit("warning", {"text": text})
-        self._emit("shot_finished", {"shot": record})
+        else:
+            self._emit("shot_finished", {"shot": record, "row": row})
 
     def _leaders(self, record: ShotRecord) -> LeaderAnswers:
         return LeaderAnswers(self.lab, self.guard, record, self._emit)

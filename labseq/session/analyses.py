@@ -25,7 +25,7 @@ from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
 from labseq.assembly.recorded import context_of, plugins_of, resolved_of
 from labseq.config.validation import validate_values
 from labseq.data import Run, open_run
-from labseq.data.reader import Follower
+from labseq.data.follower import Follower
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import format_error
 from labseq.plain import now_utc
@@ -260,10 +260,10 @@ def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Recor
     follower = Follower(run_dir)
     while True:
         over = end.came  # before the index is read, so that it contains every shot written before the end
-        for shot in follower.new():
+        for shot in follower.shots():
             if end.time_is_up:
                 return
-            if shot.index not in before:
+            if shot.row.counts and shot.index not in before:
                 yield shot
         if over:
             return

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from labseq.data.quantities import make_quantity
 from labseq.data.shot import Shot, caching_loader
 from labseq.errors import CheckFailedError
 from labseq.model import TargetPattern
+from labseq.recording.index import IndexRow
 from labseq.recording.results import PREFIX
 from labseq.session.analysis_processes import AnalysisProcesses
 
@@ -26,7 +26,7 @@ class Checks:
 
     Args:
         run_dir: The run's folder.
-        rows: The index's lines of earlier shots of a resumed run, in order.
+        rows: The rows of earlier shots of a resumed run, in order.
         target: The target of the run.
         analyses: The analyses whose results are checked.
         warn: Receives the messages of checks that only warn.
@@ -39,7 +39,7 @@ class Checks:
         self,
         checks: Sequence[CheckSettings],
         run_dir: Path,
-        rows: Iterable[Mapping[str, Any]],
+        rows: Iterable[IndexRow],
         target: TargetPattern,
         analyses: AnalysisProcesses,
         warn: Callable[[str], None],
@@ -57,13 +57,13 @@ class Checks:
         for row in rows:
             self._unseen.clear()  # the warning was given then
             skipping = [message for check, message in self._look(row) if check.then == "skip_point"]
-            self.left_open = row["shot"], skipping[0] if skipping else ""  # earlier skips are recorded
+            self.left_open = row.shot, skipping[0] if skipping else ""  # earlier skips are recorded
 
-    def after(self, row: Mapping[str, Any]) -> str:
+    def after(self, row: IndexRow) -> str:
         """Check a shot that was taken.
 
         Args:
-            row: Its line in the index.
+            row: The shot as the index lists it.
 
         Returns:
             Why to skip the rest of its point, or "".
@@ -78,19 +78,19 @@ class Checks:
             if check.then == "skip_point":
                 skipped = skipped or message
             else:
-                self._warn(f"shot {row['shot']}: {message}")
+                self._warn(f"shot {row.shot}: {message}")
         return skipped
 
-    def _look(self, row: Mapping[str, Any]) -> list[tuple[CheckSettings, str]]:
+    def _look(self, row: IndexRow) -> list[tuple[CheckSettings, str]]:
         """The checks that fail after a shot, each with a message."""
         broken: list[tuple[CheckSettings, str]] = []
-        shot = Shot(self._run_dir / row["file"], dict(row), self._load)
+        shot = Shot(self._run_dir, row, self._load)
         for check, quantity, values in self._checks:
             self._analyses.await_shots(quantity.name, [shot.index])
             value = quantity.of_shot(shot)
             if math.isnan(value) and check.value in self._unseen:  # its name may be misspelt
                 self._unseen.discard(check.value)
-                self._warn(missing_quantity(row["shot"], check.value, "to check", quantities_in(row)))
+                self._warn(missing_quantity(row.shot, check.value, "to check", quantities_in(row)))
             values.append(value)
             if message := _failure(check, values):
                 broken.append((check, message))

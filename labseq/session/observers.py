@@ -15,6 +15,8 @@ from labseq.roles import RunObserver
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
 """Events that are not logged: the shot files hold them, or the writer logs them itself."""
+_UNLOGGED: Final = frozenset({"record", "row"})
+"""Values that run.json and the index hold."""
 _HOOKS: Final = {  # event -> observer hook of plugins, and the event's values that are its arguments
     "run_started": ("labseq_run_started", {"run": "record"}),
     "shot_finished": ("labseq_shot_finished", {"shot": "shot"}),
@@ -87,7 +89,7 @@ class Observers:
             if timing.over_budget:
                 self._log("over_budget", **_timing(timing))
             return
-        self._log(name, **{key: _plain(value) for key, value in values.items() if key != "record"})
+        self._log(name, **{key: _plain(value) for key, value in values.items() if key not in _UNLOGGED})
 
 
 def _timing(timing: StageTiming) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from labseq.plain import dumps, now_utc
 from labseq.processes import Lock, knows_no_locks
 from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
+from labseq.recording.index import IndexRow
 from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
 from labseq.session.provenance import run_record
 from labseq.text_files import decode, read_bytes
@@ -112,8 +113,8 @@ class ResumableRun:
         return cls(run, done, tuple(changes), warnings, lock)
 
     @property
-    def rows(self) -> list[Mapping[str, Any]]:
-        """The lines of the index of the shots that are on disk, in order."""
+    def rows(self) -> list[IndexRow]:
+        """The shots that are on disk, in order."""
         return [shot.row for shot in self.run.shots if shot.index in self.done]
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
@@ -20,7 +19,7 @@ from labseq.data.quantities import make_quantity
 from labseq.data.shot import caching_loader
 from labseq.errors import DeviceError
 from labseq.model import VisitedPoint
-from labseq.plain import dumps
+from labseq.recording.index import IndexRow
 from labseq.recording.results import PREFIX
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ class History:
         point_of_shot: Number of the point of each shot of the run.
         to_take: Shots still to take, in order.
         shots: Number of a point -> index of a shot -> the shots taken there that count; of an adaptive scan.
-        given_up: Number of a point -> line of the index of a shot that was given up there; likewise.
+        given_up: Number of a point -> a shot that was given up there; likewise.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class History:
         self.point_of_shot = assembly.point_of_shot(seed)
         self.to_take = [shot for shot in range(len(self.point_of_shot)) if shot not in done]
         self.shots = defaultdict[int, dict[int, Shot]](dict)
-        self.given_up: dict[int, Mapping[str, Any]] = {}
+        self.given_up: dict[int, IndexRow] = {}
         self._is_scan, self._is_search = assembly.scanned is not None, assembly.search is not None
         self._load = caching_loader()
         if run is not None and self._is_search:
@@ -62,15 +61,14 @@ class History:
         """Number of the point of the next shot; None if no shot is left."""
         return self.point_of_shot[self.to_take[0]] if self.to_take else None
 
-    def add(self, run_dir: Path, row: Mapping[str, Any]) -> None:
-        """Add the next shot, which was taken or given up: its line of the index."""
-        self.to_take.remove(row["shot"])
+    def add(self, run_dir: Path, row: IndexRow) -> None:
+        """Add the next shot, which was taken or given up."""
+        self.to_take.remove(row.shot)
         if not self._is_search:  # nothing depends on the lines; those of a long run would fill the memory
             return
-        number = self.point_of_shot[row["shot"]]
-        if row["counts"]:
-            # as it will be read when the run is resumed, so that the scanner then chooses the same points
-            self.shots[number][row["shot"]] = Shot(run_dir / row["file"], json.loads(dumps(row)), self._load)
+        number = self.point_of_shot[row.shot]
+        if row.counts:
+            self.shots[number][row.shot] = Shot(run_dir, row, self._load)
         else:
             self.given_up[number] = row
 
@@ -225,7 +223,7 @@ class SearchedPoints:
         """The values of a point; None if no shot was attempted there."""
         rows = [shot.row for shot in history.shots[number].values()]
         row = rows[0] if rows else history.given_up.get(number)
-        return None if row is None else self._search.values_in(row)
+        return None if row is None else self._search.values_in(row.parameters)
 
     def _warn_if_missing(self, shot: Shot | None) -> None:
         """Warn once if a shot does not have the quantity: its name may be misspelt."""

@@ -20,7 +20,6 @@ from labseq.analysis.timing import StageTotals
 from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
-from labseq.recording.run_file import read_state
 from labseq.web.endpoint import Endpoint, describe, in_thread
 from labseq.web.history import finite
 from labseq.web.live import MAX_VIEWERS, Live
@@ -119,7 +118,7 @@ class Api:
     def run(self, request: Request) -> Any:
         """A run: its head, figures, trend, losses, what was changed, and its files."""
         run = self._opened(request)
-        record, (status, error) = run.record, read_state(run.folder)
+        record, (status, error) = run.record, run.follower.state()
         run.history.update()
         columns = run.history.columns()
         changes: dict[str, Any] = record.get("overrides") or {}
@@ -196,7 +195,7 @@ class Api:
         line = self._line(run, request)
         record = run.record
         values = shot_values(run.shot(line), str(record.get("record_frames")))
-        status, error = read_state(run.folder)
+        status, error = run.follower.state()
         return {"run": head_of(run, record, status, error), "shot": values}
 
     async def frame(self, request: Request) -> Response:

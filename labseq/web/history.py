@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from array import array
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
 from threading import Lock
@@ -14,29 +14,28 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.analysis.statistics import LOST
+from labseq.data.follower import Follower
 from labseq.errors import RecordingError
-from labseq.files import lines_in, open_ordinary
+from labseq.files import lines_in
 from labseq.model.estimate import Estimate, Rate, mean
-from labseq.model.records import STEP
 from labseq.plain import parse_object
 from labseq.recording.folders import INDEX_FILE
-from labseq.recording.run_file import is_index_row
+from labseq.recording.index import IndexRow, row_of
 
 _BIN: Final = 5
 """Minimum number of shots of a point of a trend, once there are enough."""
-_NUMBERS: Final = ("success", "filling", "seen", "n_cycles", "n_batches", "n_atom_moves", "duration_s", "t_s")
-_LINE: Final = re.compile(
-    rb'\{"shot": (\d{1,15}), "attempt": (\d{1,9}), "status": "(\w+)", "error": "(?:[^"\\]|\\.)*+", '
-    rb'"t_start_utc": "([^"]{,40})", "t_end_utc": "[^"]{,40}", "success": (true|false|null), '
-    rb'"filling_fraction": (null|[-+.\deE]{1,30}), "seen_defect_free_cycle": (-?\d{1,9}), "n_images": \d+, '
-    rb'"n_cycles": (\d{1,9}), "n_batches": (\d{1,9}), "n_atom_moves": (\d{1,15}), '
-    rb'(?:"\w{1,40}": [-+.\w]{1,30}, )*?"counts": (true|false), .*\}\n',
-    re.DOTALL,
-)
-"""A line as `labseq.recording` writes it, up to "counts"; matching takes a tenth of the time of JSON."""
-_STEP: Final = re.compile(rb'"' + STEP.encode() + rb'\w{1,80}": ([.\deE+-]{1,30})')
-_LOST: Final = re.compile(rb'"lost\.(\w{1,40})": ([.\deE+-]{1,30})')
-_TRUTH: Final = {b"true": 1.0, b"false": 0.0, b"null": math.nan}
+_NUMBERS: Final[Mapping[str, Callable[[IndexRow], float]]] = {
+    "success": lambda row: math.nan if row.success is None else row.success,
+    "filling": lambda row: row.filling_fraction,
+    "seen": lambda row: row.seen_defect_free_cycle,
+    "n_cycles": lambda row: row.n_cycles,
+    "n_batches": lambda row: row.n_batches,
+    "n_atom_moves": lambda row: row.n_atom_moves,
+    "duration_s": lambda row: row.duration_s,
+    "t_s": lambda row: _seconds(row.t_start_utc),
+}
+"""Column -> its number in a row of the index."""
 
 
 class RunHistory:
@@ -46,15 +45,13 @@ class RunHistory:
 
     Args:
         run_dir: The run's folder.
+        follower: Reads what is added to the index.
     """
 
-    def __init__(self, run_dir: Path) -> None:
+    def __init__(self, run_dir: Path, follower: Follower) -> None:
         self._path = run_dir / INDEX_FILE
+        self._follower = follower
         self._lock = Lock()
-        self._clear()
-
-    def _clear(self) -> None:
-        self._read_to = self._inode = 0
         self._shot, self._attempt, self._start = array("q"), array("q"), array("q")
         self._numbers = {name: array("d") for name in _NUMBERS}
         self._counts = array("b")
@@ -62,89 +59,34 @@ class RunHistory:
         self._line_of: dict[int, int] = {}
         self.n_damaged = 0
 
-    def update(self) -> bool:
-        """Read the lines that were added; all of them again if the file was replaced or shortened.
-
-        Returns:
-            Whether anything has changed.
+    def update(self) -> None:
+        """Read the lines that were added.
 
         Raises:
             RecordingError: The file cannot be read.
         """
         with self._lock:
-            try:
-                about = self._path.stat()
-            except OSError:
-                has_lines = bool(self._shot)
-                self._clear()
-                return has_lines
-            is_other = about.st_ino != self._inode or about.st_size < self._read_to
-            if is_other:
-                self._clear()
-                self._inode = about.st_ino
-            if about.st_size == self._read_to:
-                return is_other
-            at = before = self._read_to
-            for line in lines_in(self._path, at):
-                if line.endswith(b"\n"):
-                    self._add(line, at)
-                    at += len(line)
-            self._read_to = at
-            return is_other or at > before
+            for start, row in self._follower.lines():
+                if row is None:
+                    self.n_damaged += 1
+                else:
+                    self._add(row, start)
 
-    def _add(self, line: bytes, at: int) -> None:
-        found = _LINE.fullmatch(line)
-        if found is None:
-            self._add_parsed(line, at)
-            return
-        shot, attempt, _, t_start, success, filling, *counts, counted = found.groups()
-        steps_s = math.fsum(map(float, _STEP.findall(line)))
-        judged = math.nan if filling == b"null" else float(filling)
-        numbers = (_TRUTH[success], judged, *map(float, counts), steps_s, _seconds(t_start.decode()))
-        lost = {name.decode(): float(value) for name, value in _LOST.findall(line)}
-        self._append((int(shot), int(attempt), at), numbers, lost, is_counted=counted == b"true")
-
-    def _add_parsed(self, line: bytes, at: int) -> None:
-        """Add a line that another version of labseq wrote; or count it as damaged."""
-        row = parse_object(line)
-        if row is None or not is_index_row(row):
-            self.n_damaged += 1
-            return
-        filling, success = row["filling_fraction"], row["success"]
-        numbers = (
-            math.nan if success is None else float(success),
-            math.nan if filling is None else float(filling),
-            *(float(row.get(name) or 0) for name in ("seen_defect_free_cycle", *_NUMBERS[3:6])),
-            math.fsum(s or 0.0 for name, s in row["stage_s"].items() if name.startswith(STEP)),
-            _seconds(str(row.get("t_start_utc"))),
-        )
-        lost = {
-            name.removeprefix("lost."): float(value)
-            for name, value in row["simulation"].items()
-            if name.startswith("lost.")
-        }
-        self._append((row["shot"], row["attempt"], at), numbers, lost, is_counted=row["counts"])
-
-    def _append(
-        self,
-        place: tuple[int, int, int],
-        numbers: tuple[float, ...],
-        lost: dict[str, float],
-        *,
-        is_counted: bool,
-    ) -> None:
-        shot, attempt, at = place
+    def _add(self, row: IndexRow, start: int) -> None:
         n = len(self._shot)
-        if is_counted:  # the last line counts if a shot was written twice
-            if (older := self._line_of.get(shot)) is not None:
+        if row.counts:  # the last line counts if a shot was written twice
+            if (older := self._line_of.get(row.shot)) is not None:
                 self._counts[older] = 0
-            self._line_of[shot] = n
-        self._counts.append(is_counted)
-        self._shot.append(shot)
-        self._attempt.append(attempt)
-        self._start.append(at)
-        for column, number in zip(self._numbers.values(), numbers, strict=True):
-            column.append(number)
+            self._line_of[row.shot] = n
+        self._counts.append(row.counts)
+        self._shot.append(row.shot)
+        self._attempt.append(row.attempt)
+        self._start.append(start)
+        for name, number_of in _NUMBERS.items():
+            self._numbers[name].append(number_of(row))
+        lost = {
+            name.removeprefix(LOST): value for name, value in row.simulation.items() if name.startswith(LOST)
+        }
         for name in lost.keys() - self._lost.keys():
             self._lost[name] = array("d", [math.nan]) * n
         for name, column in self._lost.items():
@@ -159,21 +101,17 @@ class RunHistory:
         """Number of shots that count."""
         return len(self._line_of)
 
-    def row(self, line: int) -> dict[str, Any]:
-        """A line of the index, read from the file.
+    def row(self, line: int) -> IndexRow:
+        """A row of the index, read from the file.
 
         Raises:
             RecordingError: It cannot be read.
         """
         with self._lock:
             start = self._start[line]
-        try:
-            with open_ordinary(self._path) as file:
-                file.seek(start)
-                row = parse_object(file.readline(1 << 24))
-        except OSError as error:
-            raise RecordingError(self._path, f"cannot be read: {error.strerror}", "check the disk") from error
-        if row is None or not is_index_row(row):
+        values = parse_object(next(lines_in(self._path, start), b""))
+        row = None if values is None else row_of(values)
+        if row is None:
             raise RecordingError(self._path, "has a damaged line", "`labseq doctor` reports them")
         return row
 

@@ -8,21 +8,22 @@ import time
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any, Final, cast
 
 from labseq.data import Run, Shot
-from labseq.data.shot import caching_loader
+from labseq.data.follower import Event, Follower
 from labseq.errors import RecordingError
-from labseq.files import NewLines, read_file, write_file
+from labseq.files import read_file, write_file
 from labseq.messages import visible
 from labseq.model import TargetPattern
 from labseq.plain import dumps, now_utc, parse_object
-from labseq.recording.folders import EVENTS_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
-from labseq.recording.run_file import RunTime, read_run, read_state, target_of
-from labseq.web.history import RunHistory, finite, judged_values
+from labseq.recording.folders import INDEX_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
+from labseq.recording.run_file import read_run, read_state, target_of
+from labseq.web.history import RunHistory, judged_values
 
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""
@@ -64,14 +65,12 @@ class OpenRun:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.id = f"{folder.parent.name}/{folder.name}"
-        self.history = RunHistory(folder)
+        self.follower = Follower(folder)
+        self.history = RunHistory(folder, self.follower)
         self.lock = Lock()
-        self._load = caching_loader()
         self._record: dict[str, Any] = {}
         self._record_stamp: object = None
-        self._event_lines = NewLines(folder / EVENTS_FILE)
-        self._time = RunTime()
-        self.events: list[dict[str, Any]] = []
+        self.events: list[Event] = []
         self.scan_events: list[dict[str, Any]] = []
         self.first_shot_s = self.last_event_s = math.nan
         self.shots_before = 0
@@ -99,29 +98,28 @@ class OpenRun:
         """
         return target_of(self.folder / RUN_FILE, self.record)
 
-    def read_events(self) -> bool:
-        """Read what was added to the event log; whether there was anything.
+    def read_events(self) -> None:
+        """Read what was added to the event log.
 
         Raises:
             RecordingError: It cannot be read.
         """
-        lines = self._event_lines.read()
-        for line in lines:
-            with suppress(KeyError, TypeError, ValueError, AttributeError):  # a damaged line
-                self._add_event(str(line["event"]), line["values"], line)
-        return bool(lines)
+        for event in self.follower.events():
+            with suppress(TypeError, ValueError):  # a damaged line
+                self._add_event(event)
 
-    def _add_event(self, name: str, values: Mapping[str, Any], line: Mapping[str, Any]) -> None:
-        self._time.advance(line.get("t_s"))
-        self.last_event_s = self._time.total_s
-        if name == "run_starting":
-            self.shots_before, self.first_shot_s = int(values.get("n_before") or 0), math.nan
-        elif name == "shot_started" and math.isnan(self.first_shot_s):
-            self.first_shot_s = self._time.total_s
-        elif name == "scan_point":
-            self.scan_events.append(dict(values))
-        if name in _NOTED and not (name in ("safe_state", "closed") and values.get("ok") is True):
-            self.events.append({"t_utc": text_of(line.get("t_utc", ""), 40), "event": name, "values": values})
+    def _add_event(self, event: Event) -> None:
+        self.last_event_s = event.t_s
+        if event.name == "run_starting":
+            self.shots_before, self.first_shot_s = int(event.values.get("n_before") or 0), math.nan
+        elif event.name == "shot_started" and math.isnan(self.first_shot_s):
+            self.first_shot_s = event.t_s
+        elif event.name == "scan_point":
+            self.scan_events.append(dict(event.values))
+        if event.name in _NOTED and not (
+            event.name in ("safe_state", "closed") and event.values.get("ok") is True
+        ):
+            self.events.append(event)
             del self.events[:-_MAX_EVENTS]
 
     def with_rows(self, lines: Iterable[int]) -> list[Shot]:
@@ -138,12 +136,14 @@ class OpenRun:
         Raises:
             RecordingError: The line cannot be read.
         """
-        row = self.history.row(line)
-        return Shot(self.folder / row["file"], row, self._load)
+        return self.follower.shot(self.history.row(line))
 
     def outline(self) -> Run:
         """The run with no more of its shots than how they were judged, however many there are."""
-        columns = self.history.columns()
+        status, error = self.follower.state()
+        if not len(self.history):
+            return Run(self.folder, self.record, status, error, (), ())
+        columns, some_row = self.history.columns(), self.history.row(0)
         numbers = zip(
             columns.shot[columns.counted].tolist(),
             columns.of_shots("filling").tolist(),
@@ -151,11 +151,10 @@ class OpenRun:
             strict=True,
         )
         rows = (
-            {"shot": shot, "filling_fraction": finite(filling), "success": success == 1.0}
+            replace(some_row, shot=shot, filling_fraction=filling, success=success == 1.0)
             for shot, filling, success in numbers
         )
-        status, error = read_state(self.folder)
-        shots = tuple(Shot(self.folder, row) for row in rows)
+        shots = tuple(map(self.follower.shot, rows))
         return Run(self.folder, self.record, status, error, shots, ())
 
 
@@ -225,7 +224,9 @@ class Catalogue:
 
     def _opened(self, folder: Path) -> OpenRun:
         with self._lock:
-            run = self._open.pop(str(folder), None) or OpenRun(folder)
+            run = self._open.pop(str(folder), None)
+            if run is None or run.follower.is_replaced():
+                run = OpenRun(folder)
             self._open[str(folder)] = run
             while len(self._open) > _MAX_OPEN:
                 self._open.popitem(last=False)
@@ -233,12 +234,13 @@ class Catalogue:
 
     def summary(self, folder: Path) -> dict[str, Any]:
         """A run in a line of the list; it is only read again if one of its files has changed."""
-        names = (RUN_FILE, STATE_FILE, "index.jsonl", NOTES_FILE)
+        names = (RUN_FILE, STATE_FILE, INDEX_FILE, NOTES_FILE)
         stamp = [_stamp(folder / name) for name in names]
         known = self._summaries.get(folder)
         if known is not None and known[0] == stamp and known[1]["status"] != "running":
             return known[1]
-        values = _summary(self._open.get(str(folder)) or OpenRun(folder))
+        run = self._open.get(str(folder))
+        values = _summary(OpenRun(folder) if run is None or run.follower.is_replaced() else run)
         self._summaries[folder] = (stamp, values)
         return values
 

@@ -6,6 +6,7 @@ import io
 import itertools
 import math
 import zlib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -45,10 +46,10 @@ def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
         "shot": shot.index,
         "attempt": shot.attempt,
         "status": shot.status,
-        "error": text_of(shot.row.get("error") or ""),
-        "t_start_utc": text_of(shot.row.get("t_start_utc") or "", 40),
+        "error": text_of(shot.row.error),
+        "t_start_utc": text_of(shot.row.t_start_utc, 40),
         "filling": finite(shot.filling_fraction),
-        "success": shot.row["success"],
+        "success": shot.row.success,
         "seen_defect_free_cycle": shot.seen_defect_free_cycle,
         "images": [_image(image, target, has_frame=i in kept) for i, image in enumerate(images)],
         "cycles": [_cycle(cycle) for cycle in shot.cycles],
@@ -66,15 +67,15 @@ def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
             for one in shot.timing
         ],
         "sites_px": None if shot.sites_px is None else np.round(shot.sites_px, 1).tolist(),
-        "readings": readings_of(shot.row.get("readings") or {}),
-        "parameters": readings_of(shot.row.get("parameters") or {}),
-        "calibrations": readings_of(shot.row.get("calibrations") or {}),
-        "file": text_of(shot.row["file"], 200),
-        "bytes": shot.row["bytes"],
+        "readings": readings_of(shot.row.readings),
+        "parameters": readings_of(shot.row.parameters),
+        "calibrations": readings_of(shot.row.calibrations),
+        "file": text_of(shot.row.file, 200),
+        "bytes": shot.row.bytes,
     }
 
 
-def readings_of(values: dict[str, Any]) -> dict[str, Any]:
+def readings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """Single values by name, texts of limited length."""
     plain: dict[str, Any] = to_plain(values)
     return {
@@ -124,7 +125,7 @@ def frame_png(shot: Shot, image: int, width: int) -> tuple[bytes, int]:
     Raises:
         RecordingError: The file is damaged, or has no such frame.
     """
-    return _cached_png(shot.file, str(shot.row["sha256"]), image, min(width, MAX_SIDE))
+    return _cached_png(shot.file, shot.row.sha256, image, min(width, MAX_SIDE))
 
 
 @lru_cache(maxsize=8)

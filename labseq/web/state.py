@@ -19,14 +19,14 @@ from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, percent, plural, size_text
 from labseq.data import Shot, open_run
+from labseq.data.follower import Event
 from labseq.data.points import SCANNER, ScanPoint
 from labseq.errors import LabseqError, RecordingError
 from labseq.model import StageTiming
 from labseq.model.estimate import Rate, mean
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
-from labseq.recording.folders import STOP_FILE
-from labseq.recording.run_file import read_state
+from labseq.recording.folders import INDEX_FILE, STOP_FILE
 from labseq.web.history import Columns, finite, judged_values
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
 from labseq.web.shots import rows_of, shot_values
@@ -86,7 +86,7 @@ class RunState:
             RecordingError: run.json is damaged, or a file cannot be read.
         """
         with self.run.lock:
-            record, (status, error) = self.run.record, read_state(self.run.folder)
+            record, (status, error) = self.run.record, self.run.follower.state()
             self.run.history.update()
             self.run.read_events()
             columns = self.run.history.columns()
@@ -121,9 +121,6 @@ class RunState:
         if lines == self._n_opened or is_too_soon:
             return
         self._opened_s, self._shot_error = time.monotonic(), ""
-        if lines < self._n_opened:  # the index was replaced
-            self._stages.clear()
-            self._last, self._n_opened = None, 0
         for line in range(max(self._n_opened, lines - _OPENED[self._n_opened > 0]), lines):
             try:
                 shot = self.run.shot(line)
@@ -282,7 +279,7 @@ def _run_alarms(run: OpenRun, status: str, error: str, columns: Columns) -> list
         text = ""
         with suppress(RecordingError):
             row = run.history.row(last)
-            text = f"the last: shot {row['shot']}, {row['status']}: {text_of(row['error'], 300)}"
+            text = f"the last: shot {row.shot}, {row.status}: {text_of(row.error, 300)}"
         found.append(alarm("warning", f"{plural(n_failed, 'attempt')} at a shot failed", text))
     if run.history.n_damaged:
         text = "they are left out here; `labseq doctor` repairs what can be repaired"
@@ -297,7 +294,7 @@ def _run_alarms(run: OpenRun, status: str, error: str, columns: Columns) -> list
 def _silent_s(run: OpenRun, columns: Columns) -> float:
     """Time without a new shot, if it is much longer than one takes; else 0."""
     try:
-        silent_s = time.time() - (run.folder / "index.jsonl").stat().st_mtime
+        silent_s = time.time() - (run.folder / INDEX_FILE).stat().st_mtime
     except OSError:
         return 0.0
     t_s = columns.of_shots("t_s")[-20:]
@@ -330,9 +327,9 @@ def disk_alarms(folder: Path, free_share: float) -> list[dict[str, str]]:
     return [alarm("warning" if disk.free else "error", "The disk is nearly full", free)]
 
 
-def log_line(event: Mapping[str, Any]) -> dict[str, str]:
+def log_line(event: Event) -> dict[str, str]:
     """An event of the log as a line of text."""
-    name, values = event["event"], event["values"]
+    name, values = event.name, event.values
     text = ""
     with suppress(KeyError, TypeError, ValueError, AttributeError):  # an event of another version of labseq
         if name == "shot_repeated":
@@ -344,7 +341,7 @@ def log_line(event: Mapping[str, Any]) -> dict[str, str]:
             text = "run resumed" if values.get("n_before") else "run started"
         else:
             text = event_text(name, values, None)
-    return {"t_utc": event["t_utc"], "event": text_of(name, 60), "text": text_of(text or name, 400)}
+    return {"t_utc": text_of(event.t_utc, 40), "event": text_of(name, 60), "text": text_of(text or name, 400)}
 
 
 def scan_values(run: OpenRun) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from urllib.request import urlopen
@@ -25,6 +26,7 @@ import numpy as np
 import psutil
 
 from labseq.data import Run, open_run
+from labseq.plain import dumps
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE, PROFILE = ROOT / "sequences" / "compact_225.yaml", ROOT / "hardware_profiles" / "virtual.yaml"
@@ -163,7 +165,7 @@ def feedback_ms(run: Run) -> tuple[list[float], list[float]]:
     """From each frame to its first move, on this computer's clock: with pages open, and without."""
     found: tuple[list[float], list[float]] = ([], [])
     for shot in run.shots[3:]:
-        began = datetime.fromisoformat(shot.row["t_start_utc"]).timestamp()
+        began = datetime.fromisoformat(shot.row.t_start_utc).timestamp()
         is_open = any(first <= began <= last for first, last in OPEN)
         cycles: dict[int, float] = {}
         for one in shot.timing:
@@ -208,7 +210,7 @@ def long_run(source: Run, root: Path, n_shots: int) -> str:
     """A run of so many shots without their files."""
     many_runs(source, root, 1)
     folder = next(root.glob("*/*"))
-    lines = [json.dumps({**source.shots[i % len(source.shots)].row, "shot": i}) for i in range(n_shots)]
+    lines = [dumps(replace(source.shots[i % len(source.shots)].row, shot=i)) for i in range(n_shots)]
     (folder / "index.jsonl").write_text("\n".join(lines) + "\n")
     return f"{folder.parent.name}/{folder.name}"
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming, TargetPattern
+from labseq.recording.index import IndexRow, index_row
 
 Event = tuple[str, Mapping[str, Any]]
 Call = Callable[..., tuple[int, str, str]]
@@ -77,6 +78,12 @@ def make_shot(
     return shot
 
 
+def make_row(index: int = 0, **changes: Any) -> IndexRow:
+    """A shot as the index lists it."""
+    file = "shots/shot_000000.h5"
+    return index_row(make_shot(index, **changes), make_target(), file=file, sha256="", n_bytes=0)
+
+
 @dataclass
 class Script:
     """The events of a run of ``n_shots`` with ``n_cycles`` cycles each."""
@@ -111,10 +118,17 @@ class Script:
             for stage in ("expose", "detect"):
                 yield "stage", {"timing": StageTiming(stage, 2, cycle, 0.6, 45e-3, 1.2e-3)}
             yield "image", {"image": make_image(occupancy, cycle), "filling_fraction": 1.0}
-        yield "shot_finished", {"shot": make_shot(index)}
+        yield "shot_finished", {"row": make_row(index)}
 
 
 @pytest.fixture
 def fake() -> SimpleNamespace:
-    """Makers of records and events: run, target, image, shot, script."""
-    return SimpleNamespace(run=make_run, target=make_target, image=make_image, shot=make_shot, script=Script)
+    """Makers of records and events: run, target, image, shot, row, script."""
+    return SimpleNamespace(
+        run=make_run,
+        target=make_target,
+        image=make_image,
+        shot=make_shot,
+        row=make_row,
+        script=Script,
+    )

@@ -30,11 +30,11 @@ def test_a_run_in_lines(fake: Any) -> None:
 
 
 def test_what_goes_wrong_is_reported(fake: Any) -> None:
-    failed = fake.shot(status="failed", error="TransientError: no light", attempt=1)
+    failed = fake.row(status="failed", error="TransientError: no light", attempt=1)
     events = [
         ("warning", {"text": "the laser is warm"}),
-        ("shot_repeated", {"shot": failed}),
-        ("shot_finished", {"shot": failed}),
+        ("shot_repeated", {"row": failed}),
+        ("shot_finished", {"row": failed}),
         ("safe_state", {"device": "camera", "ok": True, "error": ""}),
         ("safe_state", {"device": "camera", "ok": False, "error": "camera: mute"}),
         ("closed", {"device": "shutter", "ok": False, "error": "shutter: jammed"}),
@@ -63,13 +63,13 @@ def test_what_goes_wrong_is_reported(fake: Any) -> None:
     ],
 )
 def test_a_shot_as_text(fake: Any, changes: Any, words: str) -> None:
-    text = event_text("shot_finished", {"shot": fake.shot(2, **changes)}, fake.run())
+    text = event_text("shot_finished", {"row": fake.row(2, **changes)}, fake.run())
     assert text == f"shot 2  {words}  1.9 s"
 
 
 def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
-    shot = fake.shot(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
-    assert event_text("shot_finished", {"shot": shot}, fake.run()) == "shot 0  interrupted"
+    row = fake.row(0, status="interrupted", error="StopRequested: stopped by Ctrl-C")
+    assert event_text("shot_finished", {"row": row}, fake.run()) == "shot 0  interrupted"
     scan = {"addresses": ["a.b", "c.d"], "written": [["5 ms", "7"]], "point_of_shot": [0]}
-    text = event_text("shot_finished", {"shot": shot}, replace(fake.run(), scan=scan))
+    text = event_text("shot_finished", {"row": row}, replace(fake.run(), scan=scan))
     assert text == "shot 0  b 5 ms, d 7  interrupted"

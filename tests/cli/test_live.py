@@ -12,7 +12,9 @@ from rich.console import Console
 from labseq.cli.live import REDRAW_S, LiveView, Picture, ScanTally, Tally, draw_scan, observer_for
 from labseq.console.arrays import ASCII, UNICODE
 from labseq.console.events import LogLines
-from labseq.model import ShotRecord, StageTiming
+from labseq.model import StageTiming
+
+from .conftest import make_row
 
 
 @pytest.fixture(autouse=True)
@@ -105,7 +107,7 @@ def test_with_real_hardware_it_is_drawn_between_shots_only(fake: Any) -> None:
     image = {"image": fake.image(run.target.fill, 1), "filling_fraction": 1.0}
     assert terminal.drawings("image", image) == 0
     assert terminal.drawings("state", {"state": "making safe"}) == 0
-    assert terminal.drawings("shot_finished", {"shot": fake.shot()}) == 1
+    assert terminal.drawings("shot_finished", {"row": fake.row()}) == 1
 
 
 def test_warnings_stay_on_the_screen(fake: Any) -> None:
@@ -259,7 +261,7 @@ def scan(values: list[Any], *, repeats: int = 1) -> dict[str, Any]:
 def scan_tally(values: list[Any], shots: list[tuple[int, bool, float]]) -> ScanTally:
     tally = ScanTally(scan(values))
     for index, success, filling in shots:
-        tally.add(ShotRecord(index, 0, 1, "", success=success, filling_fraction=filling))
+        tally.add(make_row(index, success=success, filling=filling))
     return tally
 
 

@@ -21,6 +21,8 @@ from labseq.recording import RunWriter
 
 NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction": None}
 
+ENDED = {"event": "shot_finished", "values": {}}
+
 
 class FakeSession:
     """Records its arguments; takes the given shots, then raises the given error, if any."""
@@ -51,13 +53,12 @@ class FakeSession:
         self.run_dir = writer.run_dir
         observer.event("run_starting", {"record": self.record, "run_dir": str(self.run_dir)})
         for shot in self.shots:
-            writer.write_shot(shot)
-            observer.event("shot_finished", {"shot": shot})
+            observer.event("shot_finished", {"row": writer.write_shot(shot)})
         stopped = isinstance(self.error, StopRequested)
         writer.finish(
             "complete" if self.error is None else "stopped" if stopped else "failed", str(self.error or "")
         )
-        lines = [{"t_s": 1.0 + shot.shot_index, "event": "shot_finished"} for shot in self.shots]
+        lines = [{"t_s": 1.0 + shot.shot_index, **ENDED} for shot in self.shots]
         with (self.run_dir / "events.jsonl").open("a", encoding="utf-8") as events:
             events.writelines(f"{json.dumps(line)}\n" for line in lines)
         if self.error is not None:
@@ -245,7 +246,7 @@ def test_a_clock_that_is_set_changes_no_duration(perform: Any) -> None:
     session, *_ = perform(as_json=False)
     assert session.run_dir is not None
     times_s = [(10.0, "2026-11-20"), (70.0, "2026-11-19"), (5.0, "2027-01-01")]  # resumed before the last
-    lines = [{"t_utc": f"{day}T10:00:00+00:00", "t_s": t, "event": "shot_finished"} for t, day in times_s]
+    lines = [{"t_utc": f"{day}T10:00:00+00:00", "t_s": t, **ENDED} for t, day in times_s]
     text = "".join(f"{json.dumps(line)}\n" for line in lines)
     (session.run_dir / "events.jsonl").write_text(text, encoding="utf-8")
     assert "wall time         75 s on the computer's clock" in summary_lines(open_run(session.run_dir))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +28,6 @@ CYCLE = CycleStatistics(
 )
 STATISTICS = Statistics(
     n_shots=20,
-    unreadable=(),
     defect_free=Rate(7, 20),
     seen=Rate(18, 20),
     filling=Estimate(0.993, 0.001),
@@ -77,17 +75,6 @@ def test_the_truth_of_a_simulation_is_reported() -> None:
     assert printed["lost in a shot"] == "vacuum 3.9(6), hand over 3.5(5)"
     assert printed["true defects"] == "1.9(3) in a shot, 1.3(2) on its last image"
     assert lines(losses={"vacuum": Estimate(0.0, 0.0)})["lost in a shot"] == "no atoms"
-
-
-@pytest.mark.parametrize(
-    ("unreadable", "printed"),
-    [
-        ((3,), r"1 shot .*: 3"),
-        (tuple(range(7)), r"7 shots .*: 0, 1, 2, 3, 4, \.\.\."),
-    ],
-)
-def test_shots_that_cannot_be_read_are_named(unreadable: tuple[int, ...], printed: str) -> None:
-    assert re.fullmatch(printed, lines(unreadable=unreadable)["warning"])
 
 
 def test_each_cycle_has_a_row() -> None:

@@ -29,14 +29,14 @@ def test_a_run_is_summed_up(fake: Any) -> None:
 
 def test_only_complete_shots_count(fake: Any) -> None:
     tally = Tally(lambda: 0.0)
-    shots = [
-        fake.shot(0, success=False, seen=0, filling=0.99),
-        fake.shot(1, status="interrupted"),
-        fake.shot(2, status="failed"),
-        fake.shot(3, success=False, seen=-1, filling=math.nan),
+    rows = [
+        fake.row(0, success=False, seen=0, filling=0.99),
+        fake.row(1, status="interrupted"),
+        fake.row(2, status="failed"),
+        fake.row(3, success=False, seen=-1, filling=math.nan),
     ]
-    for shot in shots:
-        tally.add("shot_finished", {"shot": shot})
+    for row in rows:
+        tally.add("shot_finished", {"row": row})
     assert (tally.n_done, tally.n_defect_free, tally.n_seen) == (2, 0, 1)
     assert tally.filling.value == 0.99
     assert math.isnan(tally.filling.error)
@@ -58,5 +58,5 @@ def test_time_left_follows_the_pace_so_far(fake: Any) -> None:
     assert math.isnan(tally.time_left_s)
     for i in range(2):
         now += 3.0
-        tally.add("shot_finished", {"shot": fake.shot(i)})
+        tally.add("shot_finished", {"row": fake.row(i)})
     assert tally.time_left_s == pytest.approx(24.0)

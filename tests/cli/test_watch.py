@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from labseq.cli.live import Tally
-from labseq.cli.watch import POLL_S, EventReader, NewLines, watch_run
+from labseq.cli.watch import WatchedRun, watch_run
 from labseq.data import open_run
 from labseq.recording import RunWriter
 
 
-class WatchedRun:
+class WrittenRun:
     """A run that is written while it is watched."""
 
     def __init__(self, root: Path, fake: Any, n_shots: int = 3) -> None:
@@ -39,7 +39,7 @@ class WatchedRun:
         left = list(meanwhile)
 
         def wait(duration_s: float) -> None:
-            assert duration_s == POLL_S
+            assert duration_s > 0
             left.pop(0)()
 
         watch_run(self.writer.run_dir, self.out, wait)
@@ -48,11 +48,11 @@ class WatchedRun:
 
 
 @pytest.fixture
-def watched(tmp_path: Path, fake: Any) -> WatchedRun:
-    return WatchedRun(tmp_path, fake)
+def watched(tmp_path: Path, fake: Any) -> WrittenRun:
+    return WrittenRun(tmp_path, fake)
 
 
-def test_a_run_is_watched_to_its_end(watched: WatchedRun) -> None:
+def test_a_run_is_watched_to_its_end(watched: WrittenRun) -> None:
     watched.take(0)
     lines = watched.watch(
         lambda: watched.take(1, status="failed", error="TransientError: no light"),
@@ -69,13 +69,13 @@ def test_a_run_is_watched_to_its_end(watched: WatchedRun) -> None:
     assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
 
 
-def test_a_finished_run_is_shown_at_once(watched: WatchedRun) -> None:
+def test_a_finished_run_is_shown_at_once(watched: WrittenRun) -> None:
     watched.take(0)
     watched.writer.finish("complete")
     assert "status            complete" in watched.watch()
 
 
-def test_ctrl_c_leaves_the_run_alone(watched: WatchedRun) -> None:
+def test_ctrl_c_leaves_the_run_alone(watched: WrittenRun) -> None:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
@@ -84,24 +84,24 @@ def test_ctrl_c_leaves_the_run_alone(watched: WatchedRun) -> None:
     assert open_run(watched.writer.run_dir).status == "running"
 
 
-def test_the_view_learns_what_the_runs_own_view_does(watched: WatchedRun) -> None:
+def test_the_view_learns_what_the_runs_own_view_does(watched: WrittenRun) -> None:
     """Its times are those of the run, in all its parts, whatever day it is."""
     watched.take(0)
     times_s, path = iter([0.0, 70.0, 5.0]), watched.writer.run_dir / "events.jsonl"  # resumed before the last
     lines = [json.loads(line) | {"t_s": next(times_s)} for line in path.read_text("utf-8").splitlines()]
     path.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
     clock_s = iter([500.0, 500.0, 507.0])
-    reader = EventReader(open_run(watched.writer.run_dir), lambda: next(clock_s))
+    reader = WatchedRun(watched.writer.run_dir, lambda: next(clock_s))
     tally = Tally(reader.now)
-    for name, values in reader.read():
+    for name, values in reader.events():
         tally.add(name, values)
     assert (tally.n_done, tally.n_defect_free, tally.n_seen, tally.n_shots) == (1, 1, 1, 3)
     assert (reader.now(), reader.now()) == (75.0, 82.0)  # of the last event, and 7 s later
-    assert not reader.is_over()
-    assert [*reader.read()] == []
+    assert not reader.follower.is_over
+    assert [*reader.events()] == []
 
 
-def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: WatchedRun) -> None:
+def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: WrittenRun) -> None:
     path = watched.writer.run_dir / "events.jsonl"
     watched.take(0)
     odd: list[Any] = [
@@ -114,14 +114,3 @@ def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: Watc
         "x\n" + "".join(f"{json.dumps(line)}\n" for line in odd) + path.read_text("utf-8"), "utf-8"
     )
     assert any(line.startswith("shot 0  ") for line in watched.watch())
-
-
-def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:
-    tail = NewLines(tmp_path / "log")
-    assert tail.read() == []
-    (tmp_path / "log").write_text('{"a": 1}\n{"a"')
-    assert tail.read() == [{"a": 1}]
-    with (tmp_path / "log").open("a") as file:
-        file.write(": 2}\n[]\n")
-    assert tail.read() == [{"a": 2}]
-    assert tail.read() == []

@@ -12,7 +12,7 @@ import labseq
 from labseq.analysis.scanned import ScanRequest
 from labseq.cli.live import Picture, Tally, draw_scan
 from labseq.cli.show import Tables, show_run
-from labseq.cli.watch import EventReader
+from labseq.cli.watch import WatchedRun
 from labseq.console.arrays import UNICODE
 from labseq.console.events import LogLines, event_text
 from labseq.data.points import scan_points
@@ -92,9 +92,9 @@ def test_the_run_ends_with_the_best_point_and_a_suggested_one(
 def test_a_view_in_another_process_learns_the_points_and_the_best(
     printed: tuple[labseq.Run, list[str]],
 ) -> None:
-    reader = EventReader(printed[0])
-    tally, lines = Tally(reader.now), list[str]()
-    for name, values in reader.read():
+    watched = WatchedRun(printed[0].path)
+    tally, lines = Tally(watched.now), list[str]()
+    for name, values in watched.events():
         tally.add(name, values)
         lines.append(event_text(name, values, tally.record))
     assert [line for line in lines if line.startswith("point ")] == [

@@ -26,7 +26,6 @@ from labseq.plans.plan_file import parse_plan
 from labseq.queue.queue import Entry, Queue
 from labseq.queue.running import list_entries
 from labseq.recording.doctor import examine
-from labseq.recording.run_file import summary_of
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies
 from labseq.testing.fakes import fake_calibration
 from tests.config.mutations import PIECES
@@ -183,7 +182,7 @@ def _read_run(run_dir: Path, *, repair: bool = False) -> None:
         repr(run),
     )
     for shot in (*run.shots, *run.attempts):
-        _ = (shot.summary, summary_of(shot.row), shot.parameters, shot.calibrations, repr(shot))
+        _ = (shot.parameters, shot.calibrations, repr(shot))
     run.to_dataframe(attempts=True)
 
 

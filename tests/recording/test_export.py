@@ -192,7 +192,7 @@ def test_an_archive_keeps_what_differs_after_a_resume(tmp_path: Path) -> None:
 
 def test_damaged_shots_are_left_out_of_an_archive_and_told(tmp_path: Path) -> None:
     writer = RunWriter.create(tmp_path, make_run())
-    paths = [writer.write_shot(make_shot(index)) for index in range(3)]
+    paths = [writer.run_dir / writer.write_shot(make_shot(index)).file for index in range(3)]
     writer.write_shot(make_shot(3, status="failed"))
     paths[0].unlink()
     text = make_run().sequence_text.encode()

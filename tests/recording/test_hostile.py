@@ -18,7 +18,7 @@ import pytest
 from labseq.data import open_run
 from labseq.data.columns import columns_of
 from labseq.data.export import export_run
-from labseq.data.reader import Follower
+from labseq.data.follower import Follower
 from labseq.errors import RecordingError
 from labseq.recording.doctor import examine
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies
@@ -242,7 +242,7 @@ def test_pipes_and_devices_are_refused_without_waiting(
         run = open_run(run_dir)
         for shot in run.shots:
             _ = shot.occupancies
-        _ = run.events, columns_of(run), Follower(run_dir).new()
+        _ = run.events, columns_of(run), Follower(run_dir).shots()
     except RecordingError as error:
         assert str(run_dir) in str(error)
         what = "run.json is gone" if name == "run.json" else "this is not an ordinary file"

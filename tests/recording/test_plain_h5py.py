@@ -110,7 +110,8 @@ def test_a_sequence_without_a_target_is_run_shown_and_drawn(tmp_path: Path) -> N
     path.write_text(f"labseq: 1\nname: release\nseed: 3\nshots: 2\nshot: {steps}\n", "utf-8")
     with labseq.Session.open(path, output=tmp_path) as session:
         run = session.run()
-    assert [(shot.row["success"], shot.row["filling_fraction"]) for shot in run.shots] == [(None, None)] * 2
+    assert [shot.row.success for shot in run.shots] == [None] * 2
+    assert all(math.isnan(shot.row.filling_fraction) for shot in run.shots)
     assert [math.isnan(shot.filling_fraction) for shot in run.shots] == [True, True]
     assert all("not judged" not in line and "defect" not in line for line in summary_lines(run))
     assert any("on the first image" in line for line in summary_lines(run))

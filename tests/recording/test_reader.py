@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 
 from labseq.data import open_run
-from labseq.data.reader import Follower
 from labseq.errors import RecordingError
 from labseq.recording import RunWriter
-from labseq.recording.folders import INDEX_FILE
 
 from .records import make_run, make_shot, write
 
@@ -229,30 +227,3 @@ def test_only_shots_of_the_run_are_skipped(tmp_path: Path) -> None:
     with (writer.run_dir / "skipped.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"shots": [0, 3], "why": ""}\n{"shots": [true], "why": ""}\n{"shots": 1}\n{"sho')
     assert open_run(writer.run_dir).skipped == {2: "no light"}
-
-
-def test_every_shot_that_counts_comes_once(tmp_path):
-    writer = RunWriter.create(tmp_path, make_run())
-    follower = Follower(writer.run_dir)
-    assert list(follower.new()) == []
-    writer.write_shot(make_shot(shot_index=0))
-    writer.write_shot(make_shot(shot_index=1, status="failed"))
-    assert [shot.index for shot in follower.new()] == [0]
-    writer.write_shot(make_shot(shot_index=1, attempt=1))
-    writer.write_shot(make_shot(shot_index=2))
-    (one, two) = follower.new()
-    assert (one.index, one.attempt, two.index) == (1, 1, 2)
-    assert len(two.occupancies) == len(make_shot().images)
-    assert list(follower.new()) == []
-
-
-def test_half_a_line_is_not_looked_at_before_it_is_whole(tmp_path):
-    writer = RunWriter.create(tmp_path, make_run())
-    writer.write_shot(make_shot(shot_index=0))
-    index = writer.run_dir / INDEX_FILE
-    whole = index.read_bytes()
-    follower = Follower(writer.run_dir)
-    index.write_bytes(whole[:40])
-    assert list(follower.new()) == []
-    index.write_bytes(whole)
-    assert [shot.index for shot in follower.new()] == [0]

@@ -6,7 +6,6 @@ import json
 import math
 import statistics as by_hand
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,9 @@ import pytest
 
 from labseq.analysis.statistics import statistics_of
 from labseq.data import Run, open_run
-from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
 from labseq.model.estimate import Rate
 from labseq.recording import RunWriter
-from labseq.recording.run_file import summarise, summary_of
 
 from .records import make_run, make_shot
 
@@ -139,31 +136,3 @@ def test_the_truth_of_a_simulation_is_told_where_it_is_known(of_defects: Any, re
     assert {cause: loss.value for cause, loss in found.losses.items()} == {"vacuum": 2.0, "imaging": 0.0}
     assert found.losses["vacuum"].error == 1.0
     assert (found.defects_true.value, found.defects_seen.value) == (2.0, 1.5)
-
-
-def test_a_shot_with_a_damaged_line_is_left_out_and_named(of_defects: Any, recorded: Any) -> None:
-    run = recorded(*(of_defects(i, (1, 0), last=0) for i in range(3)))
-    run.shots[1].row["images"] = {"cycle": [0, 1]}
-    found = statistics_of(run.shots, run.target)
-    assert found.unreadable == (1,)
-    assert found.cycles[0].n_shots == 2
-    assert found.defect_free == Rate(3, 3)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"images": None},
-        {"cycles": {"n_batches": [1], "n_batches_played": [], "n_atom_moves": []}},
-        {"cycles": {"n_batches": ["1"], "n_batches_played": [1], "n_atom_moves": [1]}},
-    ],
-)
-def test_a_damaged_summary_is_an_error(of_defects: Any, recorded: Any, damage: dict[str, Any]) -> None:
-    (shot,) = recorded(of_defects(0, (1, 0))).shots
-    with pytest.raises(RecordingError, match=r"damaged line for shot 0; 'labseq doctor'"):
-        summary_of({**shot.row, **damage})
-
-
-def test_a_summary_survives_the_index(of_defects: Any) -> None:
-    summary = summarise(of_defects(0, (2, None, 0), last=1, lost__vacuum=3), make_run().target)
-    assert summary_of(json.loads(json.dumps(asdict(summary)))) == summary

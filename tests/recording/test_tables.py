@@ -96,8 +96,7 @@ def test_what_is_not_known_is_nan(tmp_path: Path) -> None:
 
 
 def test_texts_that_have_no_utf8_are_escaped(tmp_path: Path) -> None:
-    run = write(tmp_path, make_shot(0))
-    run.shots[0].row["parameters"] = {"a \ud800": "\ud800"}
+    run = write(tmp_path, make_shot(0, parameters={"a \ud800": "\ud800"}))
     assert run.to_dataframe()["a_\\ud800"].tolist() == ["\\ud800"]
 
 

@@ -131,7 +131,7 @@ def table(run: labseq.Run) -> list[Any]:
             shot.parameters,
             shot.success,
             shot.filling_fraction,
-            shot.row["n_atom_moves"],
+            shot.row.n_atom_moves,
             shot.occupancies.tobytes(),
             shot.frames.tobytes(),
             [plan.moves.tobytes() for plan in shot.plans],

@@ -16,9 +16,10 @@ import labseq
 from labseq.analysis.timing import writing_s
 from labseq.cli.live import Tally
 from labseq.cli.summary import summary_lines
-from labseq.cli.watch import EventReader
+from labseq.cli.watch import WatchedRun
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
+from labseq.plain import to_plain
 from labseq.session import provenance as recording_of
 from labseq.testing.fakes import RecordingObserver
 
@@ -108,7 +109,8 @@ DAY_S, YEAR_S = 86400, 31536000
 def recorded(run: labseq.Run) -> list[Any]:
     """All that the index and the files of shots hold, apart from time stamps and measured durations."""
     stamped = {"t_start_utc", "t_end_utc", "sha256", "bytes", "stage_s"}
-    rows = [{name: row[name] for name in row.keys() - stamped} for row in (shot.row for shot in run.shots)]
+    plain: list[dict[str, Any]] = [to_plain(shot.row) for shot in run.shots]
+    rows = [{name: row[name] for name in row.keys() - stamped} for row in plain]
     return [*table(run), *rows]
 
 
@@ -129,7 +131,7 @@ def test_a_clock_that_is_set_changes_nothing_but_time_stamps(
     run_dir = interrupted(write(tmp_path), "shot_started", 4, kind=SettingClock)
     ahead_s[0] = before_s
     run = resumed(run_dir)
-    starts = [datetime.fromisoformat(shot.row["t_start_utc"]).timestamp() for shot in run.shots]
+    starts = [datetime.fromisoformat(shot.row.t_start_utc).timestamp() for shot in run.shots]
     assert [round((t_s - starts[0]) / DAY_S) for t_s in starts] == [
         round(s / DAY_S) for s in (0, 0, during_s, *[before_s] * 3)
     ]
@@ -142,11 +144,12 @@ def test_a_clock_that_is_set_changes_nothing_but_time_stamps(
     assert shown == expected
     (wall_time,) = (line for line in summary_lines(run) if line.startswith("wall time "))
     assert re.fullmatch(r"wall time +[\d.]+ m?s on the computer's clock", wall_time)
-    reader = EventReader(run)
-    tally = Tally(reader.now)
-    for name, values in reader.read():
+    watched = WatchedRun(run.path)
+    tally = Tally(watched.now)
+    for name, values in watched.events():
         tally.add(name, values)
-    assert 0 <= reader.now() < DAY_S / 2
+    assert (tally.n_before, tally.n_done) == (0, len(run.shots))
+    assert 0 <= watched.now() < DAY_S / 2
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,7 @@ def table(run, names=NAMES):
     """What the shots of a run contain, apart from times."""
     return [
         (
-            [shot.row[name] for name in names],
+            [getattr(shot.row, name) for name in names],
             shot.occupancies.tobytes(),
             [plan.moves.tobytes() for plan in shot.plans],
         )

@@ -17,11 +17,13 @@ from numpy.testing import assert_allclose
 from labseq.analysis.statistics import statistics_of
 from labseq.calibration_store import encode_entry
 from labseq.data import open_run
+from labseq.data.follower import Follower
+from labseq.files import write_file
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.model.estimate import mean
 from labseq.plain import now
-from labseq.recording.run_file import is_index_row
 from labseq.web.history import RunHistory
+from labseq.web.runs import Catalogue
 from tests.pictures.pixels import decoded
 from tests.recording import damages
 
@@ -34,17 +36,14 @@ def answers(client: Any, path: str) -> Any:
     return answer.json()
 
 
-def test_columns_are_the_index_as_the_library_reads_it(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(RunHistory, "_add_parsed")  # ten times slower: for lines of other versions only
-    history, run = RunHistory(run_dir), open_run(run_dir)
-    assert history.update()
-    assert not history.update()
+def test_columns_are_the_index_as_the_library_reads_it(run_dir: Path) -> None:
+    history, run = RunHistory(run_dir, Follower(run_dir)), open_run(run_dir)
+    for _ in range(2):  # nothing is read twice
+        history.update()
     columns = history.columns()
     rows = [shot.row for shot in run.shots]
-    assert columns.of_shots("filling").tolist() == [row["filling_fraction"] for row in rows]
-    assert columns.of_shots("n_atom_moves").tolist() == [row["n_atom_moves"] for row in rows]
+    assert columns.of_shots("filling").tolist() == [row.filling_fraction for row in rows]
+    assert columns.of_shots("n_atom_moves").tolist() == [row.n_atom_moves for row in rows]
     assert columns.shot[columns.counted].tolist() == [shot.index for shot in run.shots]
     assert len(columns.shot) == len(run.shots) + len(run.attempts)
     assert columns.filling == mean([shot.filling_fraction for shot in run.shots])
@@ -52,25 +51,21 @@ def test_columns_are_the_index_as_the_library_reads_it(
     assert history.row(history.line_of(3) or 0) == run.shots[3].row
 
 
-def test_lines_of_other_versions_give_the_same_columns_and_damaged_ones_are_counted(run_dir: Path) -> None:
-    """The quick pattern and JSON agree, line by line, also when a line comes in two parts."""
-    path = run_dir / "index.jsonl"
-    before = RunHistory(run_dir)
-    before.update()
+def test_damaged_lines_are_counted_and_an_index_that_was_replaced_is_read_again(run_dir: Path) -> None:
+    path, runs = run_dir / "index.jsonl", Catalogue(run_dir.parents[1])
     lines = path.read_bytes().splitlines(keepends=True)
-    rows = [dict(reversed(json.loads(line).items())) for line in lines]
-    assert all(map(is_index_row, rows))
-    other = [json.dumps(row).encode() + b"\n" for row in rows]
-    path.write_bytes(b"".join(other[:-1]) + b"{damaged\n" + other[-1][:50])
-    after = RunHistory(run_dir)
-    after.update()
-    assert len(after) == len(lines) - 1
+    path.write_bytes(b"".join(lines[:-1]) + b"{damaged\n" + lines[-1][:50])
+    before = runs.open(run_dir.parent.name, run_dir.name)
+    before.history.update()
+    assert (len(before.history), before.history.n_damaged) == (len(lines) - 1, 1)
     with path.open("ab") as file:
-        file.write(other[-1][50:])
-    assert after.update()
-    assert after.n_damaged == 1
-    for name, column in before.columns().numbers.items():
-        np.testing.assert_array_equal(column, after.columns().numbers[name])
+        file.write(lines[-1][50:])
+    before.history.update()
+    assert len(before.history) == len(lines)
+    write_file(path, b"".join(lines))
+    after = runs.open(run_dir.parent.name, run_dir.name)
+    after.history.update()
+    assert (len(after.history), after.history.n_damaged) == (len(lines), 0)
 
 
 def test_state_of_the_newest_run(client: Any, run_dir: Path) -> None:
@@ -81,7 +76,7 @@ def test_state_of_the_newest_run(client: Any, run_dir: Path) -> None:
     assert state["figures"]["filling"] == pytest.approx(run.filling_fraction)
     assert state["figures"]["defect_free"] == pytest.approx(run.defect_free)
     last = run.shots[-1]
-    assert [image["n_atoms"] for image in state["shot"]["images"]] == list(last.summary.images.n_atoms)
+    assert [image["n_atoms"] for image in state["shot"]["images"]] == list(last.row.images.n_atoms)
     assert [len(cycle["batches"]) for cycle in state["shot"]["cycles"]] == [p.n_batches for p in last.plans]
     assert any("attempt" in alarm["title"] for alarm in state["alarms"])
 
