@@ -227,7 +227,7 @@ class _Kernel:
     def _compile(self, kind: str, cache: bool) -> None:
         # only what Python calls can take Python's objects: that takes a fifth of the time for compiling
         options = self._options | {"cache": cache, "no_cpython_wrapper": kind == "kernels"}
-        dispatcher = self._dispatchers[kind] = _numba().njit(**options)(self.function)
+        dispatcher = self._dispatchers[kind] = _numba().njit(**options)(self._function(cache))
         try:
             for signature in self.signatures:
                 dispatcher.compile(signature)  # which may need the dispatcher, for calls of itself
@@ -249,7 +249,21 @@ class _Kernel:
 
     def _compile_for_c(self, cache: bool) -> None:
         options = {key: value for key, value in self._options.items() if key != "nogil"}
-        self._c: Any = _numba().cfunc(self.signatures[0], cache=cache, **options)(self.function)
+        self._c: Any = _numba().cfunc(self.signatures[0], cache=cache, **options)(self._function(cache))
+
+    def _function(self, cache: bool) -> FunctionType:
+        """The function; for the cache as if it stood alone in a file of the kernel's folder.
+
+        numba looks at the file of a function and at its line, and would compile it again in another copy
+        of labseq, or after another function in its file was edited.
+        """
+        function = self.function
+        if not cache:
+            return function
+        code = function.__code__.replace(co_filename=str(self.folder / "kernel.py"), co_firstlineno=1)
+        return FunctionType(
+            code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+        )
 
     def _cached(self, kind: str, compile_it: Callable[[bool], None]) -> None:
         """Compile with numba's cache in the kernel's folder."""
@@ -261,14 +275,18 @@ class _Kernel:
             folder.mkdir(parents=True, exist_ok=True)
             os.utime(folder.parent)
             _delete_unused(folder.parents[1])
-            can_write = Path(self.function.__code__.co_filename).is_file()  # numba looks at its date
+            (folder.parent / "kernel.py").touch()  # numba wants to read it
+            can_write = True
         settings.CACHE_DIR = str(folder)
         try:
             compile_it(can_write)
         except Exception:  # noqa: BLE001 - a crash may have truncated any file; other errors come again
             shutil.rmtree(folder, ignore_errors=True)
             _announce_compiling(self)
-            compile_it(can_write)
+            try:
+                compile_it(can_write)
+            except Exception:  # noqa: BLE001 - it comes again, and names the line in the author's file
+                compile_it(False)
         finally:
             settings.CACHE_DIR = before
         _PENDING.pop(self, None)

@@ -56,18 +56,21 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile all kernels before the whole suite begins: its processes would each compile the same ones."""
+    """Compile what the cache lacks before several processes begin: each would compile the same kernels."""
     config = session.config
-    if hasattr(config, "workerinput") or config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses"):
         return
     names = [
         ".".join(path.relative_to(base).with_suffix("").parts)
         for base, folder in ((REPOSITORY, "labseq"), (REPOSITORY / "plugins", "."))
         for path in (base / folder).rglob("*kernels*.py")
     ]
-    code = (
-        f"import importlib, labseq.kernel as k; [*map(importlib.import_module, {names!r})]; k.load_kernels()"
-    )
+    code = f"""
+import importlib, labseq.kernel as k
+[*map(importlib.import_module, {names!r})]
+if not all(one.is_cached() for one in k._PENDING if not one.is_helper):
+    k.load_kernels()
+"""
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

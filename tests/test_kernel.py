@@ -249,8 +249,9 @@ def test_processes_fill_the_cache(package: Package, monkeypatch: pytest.MonkeyPa
         load_kernels(lambda: polled.append(None))
     assert (top.top(0), len(announced)) == (102, 1)
     assert compiled_modules(package.load) == []
-    package.write("top", TOP.format(package=package.name).replace("MIDDLE(x)", "MIDDLE(y)"))
-    with pytest.raises(labseq.PluginLoadError, match=r"'top' cannot be compiled: TypingError(.|\n)*'y'"):
+    package.write("top", TOP.format(package=package.name).replace("+ OFFSET", "+ x.y"))
+    message = r"'top' cannot be compiled: TypingError(.|\n)*'y'(.|\n)*top\.py\", line 10:"
+    with pytest.raises(labseq.PluginLoadError, match=message):
         package.load()
 
 
@@ -269,16 +270,26 @@ def test_a_cache_that_cannot_be_written_does_no_harm(
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path / "file" / "cache"))
     assert package.result() == 102
-    assert not list(package.folder.rglob("top-*"))
+    assert not list(package.folder.rglob("*top-*"))
 
 
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 @pytest.mark.parametrize("size", [0, 7, 1000])
 def test_files_truncated_by_a_crash_are_replaced(package: Package, cache: Path, size: int, kind: str) -> None:
     package.load()
-    for file in cache.rglob(f"top.top-*.{kind}"):
+    for file in cache.rglob(f"kernel.top-*.{kind}"):
         file.write_bytes(file.read_bytes()[:size])
     assert compiled_modules(package.load) == ["top"]
+    assert compiled_modules(package.load) == []
+    assert package.result() == 102
+
+
+def test_another_copy_of_a_package_finds_its_kernels_compiled(package: Package, tmp_path: Path) -> None:
+    assert compiled_modules(package.load) == ["top", "middle", "leaf"]
+    (tmp_path / "elsewhere").mkdir()
+    package.folder = package.folder.rename(tmp_path / "elsewhere" / package.name)
+    sys.path[0] = str(tmp_path / "elsewhere")
+    package.write("leaf", "# a comment\nUNUSED = 3\n" + textwrap.dedent(LEAF.format(step=1)))
     assert compiled_modules(package.load) == []
     assert package.result() == 102
 
