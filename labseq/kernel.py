@@ -310,7 +310,7 @@ class _Kernel:
         return getattr(sys.modules.get(self.module), "__dict__", None) is self.function.__globals__
 
     def is_cached(self) -> bool:
-        return any(self.folder.glob(f"{'c' if self.for_c else self._kind}/*/*.nbi"))
+        return any(self.folder.glob(f"{'c' if self.for_c else self._kind}/*/kernel.*.nbi"))
 
     @cached_property
     def named(self) -> dict[str, Any]:
