@@ -56,9 +56,14 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile what the cache lacks before several processes begin: each would compile the same kernels."""
+    """Compile what the cache lacks before several processes begin: each would compile the same kernels.
+
+    Tests that are named by their files may need few kernels.
+    """
     config = session.config
     if hasattr(config, "workerinput") or not config.getoption("numprocesses"):
+        return
+    if not any(Path(argument).is_dir() for argument in config.args):
         return
     names = [
         ".".join(path.relative_to(base).with_suffix("").parts)

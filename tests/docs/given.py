@@ -6,11 +6,11 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from filelock import FileLock
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
@@ -39,11 +39,14 @@ SHOTS: Final = {
 
 
 class Store:
-    """Runs that pages speak of, each taken once and copied to the place at which a page looks for it."""
+    """Runs that pages speak of, each taken once and copied to the place at which a page looks for it.
+
+    Several processes may share its folder.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.taken = cache(self._taken)
+        folder.mkdir(exist_ok=True)
 
     def give(self, text: str, to: Path) -> None:
         """Put a run at each folder of a run that stands in a text."""
@@ -52,7 +55,15 @@ class Store:
             if not there.exists() and name in (*SHOTS, "calibrate-sites"):
                 shutil.copytree(self.taken(name), there)
 
-    def _taken(self, name: str) -> Path:
+    def taken(self, name: str) -> Path:
+        """The folder of a run."""
+        with FileLock(self.folder / f"{name}.lock"):
+            if not (self.folder / name).exists():
+                self._take(name)
+        (run,) = (self.folder / name).glob(f"*/*_{name}")
+        return run
+
+    def _take(self, name: str) -> None:
         data = self.folder / name
         if name == "calibrate-sites":
             copy_repository(data)
@@ -61,14 +72,15 @@ class Store:
                 ["calibrate", "sites", "-p", profile, "--shots", "8", "--seed", "1", "--output", str(data)]
             )
             assert code == 0, errors
-            (run,) = data.glob("*/*_calibrate-sites")
-            return run
+            return
         file, shots = SHOTS[name]
-        sequence = self.folder / file if file == "look.yaml" else ROOT / file
+        sequence = ROOT / file
+        if file == "look.yaml":
+            sequence = self.folder / file
+            save_files(LOOK, self.folder)
         every = ["record_frames=all"]
-        save_files(LOOK, self.folder)
         with api.Session.open(sequence, shots=shots, seed=1, output=data, overrides=every) as session:
-            return session.run().path
+            session.run()
 
 
 def save_files(page: Path, to: Path) -> None:

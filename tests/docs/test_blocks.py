@@ -17,7 +17,9 @@ from .running import Reader
 
 @pytest.fixture(scope="session")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return Store(tmp_path_factory.mktemp("runs"))
+    """One for all processes of the tests."""
+    base = tmp_path_factory.getbasetemp()
+    return Store((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "runs")
 
 
 @pytest.fixture(autouse=True)
