@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,25 +19,24 @@ pytestmark = pytest.mark.system
 SEQUENCE = Path(__file__).resolve().parents[2] / "sequences" / "compact_225.yaml"
 
 
-def labseq_command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "labseq", *map(str, arguments)]
-
-
-def test_run_then_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = labseq_command("run", SEQUENCE, "--json", "--shots", "2", "--seed", "1")
-    done = subprocess.run(command, capture_output=True, encoding="utf-8", cwd=tmp_path, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("\n") == 1
-    answer = json.loads(done.stdout)
+def test_run_then_show(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    call: Callable[..., tuple[int, str, str]],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = call("run", str(SEQUENCE), "--json", "--shots", "2", "--seed", "1")
+    assert (code, out.count("\n")) == (0, 1), err
+    answer = json.loads(out)
     run_dir = tmp_path / answer["run_dir"]
     assert (answer["shots"], answer["status"]) == (2, "complete")
     assert 0.9 < answer["filling_fraction"] <= 1.0
     assert answer["defect_free"] in {0.0, 0.5, 1.0}
     assert run_dir.parents[1] == tmp_path / "data"
     assert len(list((run_dir / "shots").glob("*.h5"))) == 2
-    with pytest.raises(SystemExit, match=r"^0$"):
-        main(["show", str(run_dir)])
-    assert "shots             2 of 2" in capsys.readouterr().out
+    code, out, err = call("show", str(run_dir))
+    assert code == 0, err
+    assert "shots             2 of 2" in out
 
 
 def test_without_a_terminal_there_are_plain_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,9 +80,13 @@ def test_a_wrong_sequence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals between processes")
 def test_a_run_that_is_stopped(tmp_path: Path) -> None:
-    command = labseq_command("run", SEQUENCE, "--shots", "100000", "--json", "--seed", "1")
+    arguments = ["run", str(SEQUENCE), "--shots", "100000", "--json", "--seed", "1"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+        [sys.executable, "-m", "labseq", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
     ) as child:
         assert child.stderr is not None
         while not child.stderr.readline().startswith("shot 0  "):
