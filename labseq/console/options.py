@@ -29,9 +29,10 @@ def new_kinds(incomplete: str) -> list[str]:
         >>> new_kinds("st")
         ['static_tweezers', 'step']
     """
-    from labseq.roles import ROLES
-
-    return [kind for kind in (*_FILES, *ROLES) if kind.startswith(incomplete)]
+    # the names of the templates and not the table of roles, which imports numpy
+    templates = Path(__file__).parents[1] / "scaffold" / "templates"
+    roles = sorted(path.stem for path in templates.glob("*.txt") if path.stem != "pyproject")
+    return [kind for kind in (*_FILES, *roles) if kind.startswith(incomplete)]
 
 
 def file_kinds(incomplete: str) -> list[str]:

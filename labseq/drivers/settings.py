@@ -121,8 +121,8 @@ class CameraSettings(OrientationSettings):
             return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
         return _unbinnable(height, width, self.binning)
 
-    def simulated_world(self, context: Context) -> Simulation:
-        """The simulation whose frames a simulated camera takes.
+    def simulated_world(self, context: Context) -> tuple[Simulation, tuple[int, int]]:
+        """The simulation whose frames a simulated camera takes, and (height, width) of its sensor.
 
         Raises:
             ConfigError: There is none, it does not describe its sensor, or the region is beyond it.
@@ -133,7 +133,7 @@ class CameraSettings(OrientationSettings):
             raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
         if setting_error := self.sensor_conflict(world.sensor_shape):
             raise ConfigError(setting_error)
-        return world
+        return world, world.sensor_shape
 
     @model_validator(mode="after")
     def _cycle_time_is_of_external_start(self) -> Self:

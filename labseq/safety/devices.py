@@ -17,7 +17,6 @@ from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
-from labseq.messages import format_error
 from labseq.recording import find_dead_run
 from labseq.roles import Hardware, Simulation, in_opening_order, overrides
 from labseq.safety.locks import lock_devices
@@ -200,22 +199,20 @@ def _examined(
         return replace(found, latency_s=statistics.median(readings_s))
     except LabseqError as failure:
         return replace(found, failure=failure)
-    except Exception as failure:  # noqa: BLE001 - of the driver's class
-        return replace(found, failure=DeviceError(name, format_error(failure)))
 
 
 def _versions_read(guard: Guard, found: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
     """Read the versions of a device; that this fails says nothing about whether the device works."""
+
+    def versions() -> dict[str, tuple[str, str]]:
+        return {name: (str(here), str(tried)) for name, (here, tried) in device.versions().items()}
+
     try:
-        given = dict(guard.call(found.name, timeout_s, device.versions))
-        versions = {str(what): (str(here), str(tried)) for what, (here, tried) in given.items()}
-        return replace(found, versions=versions)
+        return replace(found, versions=guard.call(found.name, timeout_s, versions))
     except StopRequested:
         raise
     except LabseqError as failure:
         return replace(found, unversioned=failure)
-    except Exception as failure:  # noqa: BLE001 - of the driver's class
-        return replace(found, unversioned=DeviceError(found.name, f"versions(): {format_error(failure)}"))
 
 
 def _reading_s(guard: Guard, name: str, device: Hardware | Simulation, timeout_s: float) -> float:

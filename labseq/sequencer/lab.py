@@ -25,7 +25,6 @@ from labseq.roles import (
     Clock,
     Detector,
     Device,
-    Emergency,
     Hardware,
     Lines,
     MobileTweezers,
@@ -255,13 +254,9 @@ def open_device(
         LabseqError: It cannot be opened, or ``emergency()`` fails.
     """
     guard.call_despite_stop(name, timeout_s, device.open)
-
-    def emergency() -> Emergency | None:
-        found = device.emergency()
-        return None if found is None else Emergency(found.script, dict(found.arguments))
-
-    if (found := guard.call_despite_stop(name, timeout_s, emergency)) is not None:
-        watchdog.add(name, order, found.script, found.arguments)
+    emergency = guard.call_despite_stop(name, timeout_s, device.emergency)
+    if emergency is not None:
+        watchdog.add(name, order, emergency.script, dict(emergency.arguments))
 
 
 def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:

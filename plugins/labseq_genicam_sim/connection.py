@@ -33,8 +33,8 @@ class SimulatedConnection(CameraConnection):
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:
         super().__init__(settings, context)
-        self._world = settings.simulated_world(context)
-        self.sensor_shape = self._world.sensor_shape
+        self._world, self._shape = settings.simulated_world(context)
+        self.sensor_shape = self._shape
         self.min_exposure_s = 1e-6 * EXPOSURE_US[0]
         self.packet_size = settings.packet_size or PACKET_SIZE
         self._clock = context.clock
@@ -48,7 +48,7 @@ class SimulatedConnection(CameraConnection):
         self._sensor = SimulatedSensor(self._world, context.clock)
         self._fake = FakeCamera(
             self._expose,
-            sensor_shape=self._world.sensor_shape,
+            sensor_shape=self._shape,
             faults=Faults(**settings.faults.model_dump()),
         )
         self._acquisition: Acquisition | None = None
@@ -167,7 +167,7 @@ class SimulatedConnection(CameraConnection):
     def _check(self, exposure: Exposure) -> None:
         """Raise if the camera is not set to what the simulation shows."""
         binning, (y, x) = self._mode.binning, (self._mode.region or (0, 0))[:2]
-        height, width = self._mode.frame_shape(self._world.sensor_shape)
+        height, width = self._mode.frame_shape(self._shape)
         wanted = (y // binning, x // binning, height, width, (binning, binning), (0, 0))
         came = (
             exposure.y,

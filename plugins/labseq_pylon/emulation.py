@@ -47,8 +47,7 @@ class EmulatedCamera(CameraConnection):
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
         super().__init__(settings, context)
-        self._world = settings.simulated_world(context)
-        self._shape: tuple[int, int] = self._world.sensor_shape
+        self._world, self._shape = settings.simulated_world(context)
         self.sensor_shape = self._shape
         self.ready_s = MAX_WAIT_S
         self._sensor = SimulatedSensor(self._world, context.clock)

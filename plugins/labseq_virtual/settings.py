@@ -11,7 +11,6 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-import labseq
 from labseq.plugin import (
     Angle,
     Duration,
@@ -22,6 +21,7 @@ from labseq.plugin import (
     Settings,
     Temperature,
     Voltage,
+    camera,
     format_quantity,
 )
 from labseq.plugin.camera import CoolingSettings
@@ -479,7 +479,7 @@ class CameraFaults(Settings):
     late_by: Duration = Field(default=2.0, description="delay of a late frame")
 
 
-class CameraSettings(labseq.plugin.camera.CameraSettings):
+class CameraSettings(camera.CameraSettings):
     """The virtual camera; what it sees is set in the simulation."""
 
     readout: Duration = Field(

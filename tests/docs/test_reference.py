@@ -13,13 +13,12 @@ from pydantic import BaseModel, create_model
 from pydantic.fields import FieldInfo
 
 import labseq
-import labseq.plugin.simulation
-import labseq.plugin.system
 from labseq import errors, plugin, roles, testing
 from labseq.config.profile import MotionSettings, ProfileSpec, load_profile
 from labseq.config.sequence import SequenceSpec, StepPolicySettings, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
+from labseq.plugin import simulation, system
 from labseq.registry import Registry
 from labseq.roles import ROLES
 from labseq.scaffold import reference
@@ -29,7 +28,7 @@ from labseq.settings import Choice, PatternChoice, models_at, settings_at, setti
 from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
-IN_PLUGIN = {*plugin.__all__, *plugin.simulation.__all__, *plugin.system.__all__}
+IN_PLUGIN = {*plugin.__all__, *simulation.__all__, *system.__all__}
 SCRIPT: Any = load_script("make_reference")
 TEXTS: dict[Path, str] = {path: path.read_text("utf-8") for path in SCRIPT.pages()}
 PARTS = {part for text in TEXTS.values() for part, _ in SCRIPT.PART.findall(text)}

@@ -119,7 +119,9 @@ class TakesAnyTrigger(RecordingCamera):
 
 
 class SaysItExposesByItself(RecordingCamera):
-    facts = CameraFacts(triggers=("software", "internal"))
+    @property
+    def facts(self) -> CameraFacts:
+        return CameraFacts(triggers=("software", "internal"))
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
         super().arm(n_frames, exposure_s, "software" if trigger == "internal" else trigger)
