@@ -275,7 +275,10 @@ class _Kernel:
             folder.mkdir(parents=True, exist_ok=True)
             os.utime(folder.parent)
             _delete_unused(folder.parents[1])
-            (folder.parent / "kernel.py").touch()  # numba wants to read it
+            with suppress(
+                FileExistsError
+            ):  # numba reads it, and older ones compile again if its date changes
+                (folder.parent / "kernel.py").touch(exist_ok=False)
             can_write = True
         settings.CACHE_DIR = str(folder)
         try:
