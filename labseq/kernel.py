@@ -275,9 +275,7 @@ class _Kernel:
             folder.mkdir(parents=True, exist_ok=True)
             os.utime(folder.parent)
             _delete_unused(folder.parents[1])
-            with suppress(
-                FileExistsError
-            ):  # numba reads it, and older ones compile again if its date changes
+            with suppress(FileExistsError):  # numba before 0.63 knows it by its date
                 (folder.parent / "kernel.py").touch(exist_ok=False)
             can_write = True
         settings.CACHE_DIR = str(folder)
