@@ -125,7 +125,7 @@ class Scan:
                     axes.append(_placed_in_profile(axis, document) if axis.of_profile else axis)
             groups.append(tuple(axes))
         found.raise_any()
-        _refuse_twice(groups, in_profile=True)
+        _refuse_twice(groups)
         return replace(self, groups=tuple(groups))
 
     def at_first_point(self, document: Document, *, profile: bool) -> Document:
@@ -383,9 +383,9 @@ def _check_together(group: Sequence[Axis]) -> None:
         seen.add(position)
 
 
-def _refuse_twice(groups: Sequence[Group], *, in_profile: bool | None = None) -> None:
-    """Raise for two addresses of which one contains the other."""
-    axes = [axis for group in groups for axis in group if in_profile in (None, axis.of_profile)]
+def _refuse_twice(groups: Sequence[Group]) -> None:
+    """Raise for two addresses, both with their location, of which one contains the other."""
+    axes = [axis for group in groups for axis in group]
     for i, axis in enumerate(axes):
         for other in axes[:i]:
             n = min(len(axis.loc), len(other.loc))

@@ -6,6 +6,7 @@ import json
 import math
 import shlex
 import time
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -99,6 +100,12 @@ class _PointCheck:
     def longest_exposure_s(self) -> float:
         """The longest exposure of a shot, in seconds; 0 without images."""
         return max((bar.exposure_s for _, bars in self.timeline for bar in bars), default=0.0)
+
+    @property
+    def shot_s(self) -> tuple[float, float]:
+        """Minimum and maximum duration of a shot, in seconds."""
+        bars = [bar for _, own in self.timeline for bar in own]
+        return sum(bar.min_duration_s for bar in bars), sum(bar.duration_s for bar in bars)
 
     def _add(self, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
         self.checks.found.add(self.point.document.error(loc, what, expected, hint))
@@ -334,8 +341,8 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
     try:
         first = checks.of(assembly.first_point)
         numbers: dict[_PointCheck, set[int]] = {first: {0}}
-        for known in run.points.known(run.history):
-            numbers.setdefault(checks.of(known.settings), set()).add(known.number)
+        for number, point in run.points.known(run.history).items():
+            numbers.setdefault(checks.of(point), set()).add(number)
         # the first points first, in whatever order the shots take them
         numbers = dict(sorted(numbers.items(), key=lambda item: min(item[1])))
         asks = (
@@ -372,14 +379,15 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
 
 def _run_s(checks: _Checks) -> tuple[float, float]:
     """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
-    run, least_s, most_s = checks.run, list[float](), list[float]()
-    for _, point, n in run.points.known(run.history):
-        bars = [bar for _, bars in checks.of(point).timeline for bar in bars]
-        least_s.append(n * sum(bar.min_duration_s for bar in bars))
-        most_s.append(n * sum(bar.duration_s for bar in bars))
+    run = checks.run
+    points, point_of_shot = run.points.known(run.history), run.history.point_of_shot
+    shot_s = {number: checks.of(point).shot_s for number, point in points.items()}
     if run.assembly.search is not None:
-        return min(least_s), max(most_s)
-    return sum(least_s), sum(most_s)
+        n_shots = len(point_of_shot)
+        least_s, most_s = zip(*shot_s.values(), strict=True)
+        return n_shots * min(least_s), n_shots * max(most_s)
+    of_shots = [(n, *shot_s[number]) for number, n in Counter(point_of_shot).items()]
+    return sum(n * least_s for n, least_s, _ in of_shots), sum(n * most_s for n, _, most_s in of_shots)
 
 
 def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -> list[Problem]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from labseq.assembly.points import Point
 from labseq.assembly.policies import missing_quantity
@@ -37,6 +37,7 @@ class History:
     Attributes:
         point_of_shot: Number of the point of each shot of the run.
         to_take: Shots still to take, in order.
+        last: The shot added last; None before the first one of this process.
         shots: Number of a point -> index of a shot -> the shots taken there that count; of an adaptive scan.
         given_up: Number of a point -> a shot that was given up there; likewise.
     """
@@ -46,6 +47,7 @@ class History:
     ) -> None:
         self.point_of_shot = assembly.point_of_shot(seed)
         self.to_take = [shot for shot in range(len(self.point_of_shot)) if shot not in done]
+        self.last: int | None = None
         self.shots = defaultdict[int, dict[int, Shot]](dict)
         self.given_up: dict[int, IndexRow] = {}
         self._is_scan, self._is_search = assembly.scanned is not None, assembly.search is not None
@@ -63,6 +65,7 @@ class History:
 
     def add(self, run_dir: Path, row: IndexRow) -> None:
         """Add the next shot, which was taken or given up."""
+        self.last = row.shot
         self.to_take.remove(row.shot)
         if not self._is_search:  # nothing depends on the lines; those of a long run would fill the memory
             return
@@ -84,27 +87,8 @@ class History:
         return [*is_there] if self._is_scan else []
 
 
-class KnownPoint(NamedTuple):
-    """A point of a run that is known before its first shot.
-
-    Attributes:
-        number: Its number in the scan; of an adaptive scan, any number above 0.
-        settings: The settings of its shots.
-        n_shots: Shots of the run there; of an adaptive scan, as if all shots were taken there.
-    """
-
-    number: int
-    settings: Point
-    n_shots: int
-
-
 class Points(Protocol):
     """Says where the shots of a run are taken."""
-
-    @property
-    def name(self) -> str:
-        """What chooses the points, for the run's events."""
-        ...
 
     def next(self, history: History) -> Point | None:
         """The point of the next shot, the same object for following shots of a point; None to end the run.
@@ -115,35 +99,24 @@ class Points(Protocol):
         """
         ...
 
-    def result(self, history: History, shot: int) -> Mapping[str, Any]:
-        """The result of the point of a shot just taken, for the run's events; empty if there is none yet."""
-        ...
-
-    def known(self, history: History) -> list[KnownPoint]:
-        """The points that can be checked before the run."""
+    def known(self, history: History) -> Mapping[int, Point]:
+        """The points that can be checked before the run: number -> point."""
         ...
 
 
 class ListedPoints:
     """Points that are known in advance; without a scan, the settings of the files."""
 
-    name = "the scan"
-
     def __init__(self, assembly: Assembly) -> None:
         self._at = cache(assembly.at)  # the same object for the same point, so that nothing is built again
 
     def next(self, history: History) -> Point | None:
-        """The point of the next shot."""
+        """The point of the next shot; None after the last one."""
         return None if history.next_number is None else self._at(history.next_number)
 
-    def result(self, history: History, shot: int) -> Mapping[str, Any]:  # noqa: ARG002
-        """Nothing: no quantity is optimised."""
-        return {}
-
-    def known(self, history: History) -> list[KnownPoint]:
+    def known(self, history: History) -> Mapping[int, Point]:
         """The points of the run."""
-        counts = Counter(history.point_of_shot)
-        return [KnownPoint(point, self._at(point), n) for point, n in counts.items()]
+        return {number: self._at(number) for number in dict.fromkeys(history.point_of_shot)}
 
 
 class SearchedPoints:
@@ -153,45 +126,54 @@ class SearchedPoints:
     shot that is repeated is taken at its old point.
 
     Args:
-        run: The run; its stop flag ends a wait for the scanner.
+        run: The run; receives the result of each point.
         search: The scanner, and its ranges.
     """
 
     def __init__(self, run: PreparedRun, search: Search) -> None:
-        self.name = search.name
         self._run = run
         self._search = search
         self._scanner = search.make_scanner(run.seed)
         choice, results = search.scan.choice, run.analyses.values
         self._quantity = make_quantity(choice.quantity, run.assembly.target, results)
         self._sign = 1.0 if choice.minimise is None else -1.0
-        self._current: tuple[int, Point | None] = -1, None
+        self._current: tuple[int | None, Point | None] = -1, None
         self._visited: list[VisitedPoint] = []
         self._has_warned = self._quantity.name.startswith(PREFIX)  # the analyses warn of missing results
 
     def next(self, history: History) -> Point | None:
         """The point of the next shot; the scanner is asked when all shots of the one before are there."""
-        number = history.next_number
-        if number is None:
-            return None
+        number, last = history.next_number, history.last
+        if last is not None:
+            self._warn_if_missing(history.shots[history.point_of_shot[last]].get(last))
         if self._current[0] != number:
+            if last is not None:
+                self._report(history, history.point_of_shot[last])
             values = self._values(history, number) or self._choose(history, number)
             self._current = number, None if values is None else self._search.at(values)
         return self._current[1]
 
-    def _choose(self, history: History, number: int) -> dict[str, float] | None:
+    def known(self, history: History) -> Mapping[int, Point]:
+        """The point of the first shot to take, and the corners of the ranges; numbered from 1."""
+        corners, first = self._search.corners, self.next(history)
+        points = [corners.at(n) for n in range(math.prod(corners.scan.shape))]
+        return dict(enumerate(points if first is None else [first, *points], start=1))
+
+    def _choose(self, history: History, number: int | None) -> dict[str, float] | None:
+        """Ask the scanner; None if it has finished, or if no shot is left."""
+        if number is None:
+            return None
         visited = [one for one in self._first(history, number) if one.values]
         values = self._search.choose(self._scanner, visited, self._run.stop_flag)
         if values is None and number == 0:
-            raise DeviceError(self.name, "next_point() gave no point at all; expected a first one")
+            raise DeviceError(self._search.name, "next_point() gave no point at all; expected a first one")
+        if values is None and history.last is not None:
+            ended = {"scanner": self._search.name, "n_shots": history.to_take[0]}
+            self._run.observers.event("scan_ended", ended)
         return values
 
-    def result(self, history: History, shot: int) -> Mapping[str, Any]:
-        """The score of a point whose shots have all been taken, and the best one so far, JSON-ready."""
-        number = history.point_of_shot[shot]
-        self._warn_if_missing(history.shots[number].get(shot))
-        if history.later_at_its_point(shot):
-            return {}
+    def _report(self, history: History, number: int) -> None:
+        """Report the score of a point whose shots have all been taken, and the best one so far."""
         visited = self._first(history, number + 1)
         scores: dict[tuple[float, ...], tuple[int, list[float]]] = {}
         for place, one in enumerate(visited):  # a point that is visited again has the mean score
@@ -204,23 +186,14 @@ class SearchedPoints:
 
         means = [(sum(own) / len(own), -first) for first, own in scores.values()]
         mean, first = max(means, default=(math.nan, 0))
-        return {
-            "figure": self._quantity.name,
-            **plain(number, visited[number].score),
-            "best": plain(-first, mean) if means else None,
-        }
+        best = plain(-first, mean) if means else None
+        about = {"figure": self._quantity.name, **plain(number, visited[number].score), "best": best}
+        self._run.observers.event("scan_point", about)
 
-    def known(self, history: History) -> list[KnownPoint]:
-        """The point of the first shot to take, and the corners of the ranges."""
-        corners = self._search.corners
-        first = self.next(history)
-        points = [corners.at(n) for n in range(math.prod(corners.scan.shape))]
-        points = points if first is None else [first, *points]
-        n_shots = len(history.point_of_shot)
-        return [KnownPoint(n, point, n_shots) for n, point in enumerate(points, start=1)]
-
-    def _values(self, history: History, number: int) -> dict[str, float] | None:
+    def _values(self, history: History, number: int | None) -> dict[str, float] | None:
         """The values of a point; None if no shot was attempted there."""
+        if number is None:
+            return None
         rows = [shot.row for shot in history.shots[number].values()]
         row = rows[0] if rows else history.given_up.get(number)
         return None if row is None else self._search.values_in(row.parameters)

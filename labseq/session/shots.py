@@ -65,23 +65,21 @@ class Shots:
             self._skip(history.later_at_its_point(last), why)
         while (point := points.next(history)) is not None:
             check_stop_file(self._writer.run_dir)
-            self._take(history.to_take[0], point, checks)
-        if history.to_take:
-            self._emit("scan_ended", scanner=points.name, n_shots=history.to_take[0])
+            shot = history.to_take[0]
+            self._move_to(point)
+            failure = self.sequencer.take(shot)
+            self._run.analyses.look()
+            history.add(self._writer.run_dir, self._writer.last_row)
+            if why := failure or checks.after(self._writer.last_row):
+                self._skip([*([shot] if failure else []), *history.later_at_its_point(shot)], why)
 
-    def _take(self, shot: int, point: Point, checks: Checks) -> None:
-        points, history, writer = self._run.points, self._run.history, self._writer
-        if point is not self._point:
-            lab, reopened = rebuild_lab(self.sequencer.lab, self._point, point, self._run.seed)
-            self.sequencer.change(lab, point.steps, self._parameters(point), reopened)
-            self._point = point
-        failure = self.sequencer.take(shot)
-        self._run.analyses.look()
-        history.add(writer.run_dir, writer.last_row)
-        if why := failure or checks.after(writer.last_row):
-            self._skip([*([shot] if failure else []), *history.later_at_its_point(shot)], why)
-        if result := points.result(history, shot):
-            self._emit("scan_point", **result)
+    def _move_to(self, point: Point) -> None:
+        """Change what differs between the present point and the next."""
+        if point is self._point:
+            return
+        lab, reopened = rebuild_lab(self.sequencer.lab, self._point, point, self._run.seed)
+        self.sequencer.change(lab, point.steps, self._parameters(point), reopened)
+        self._point = point
 
     def _parameters(self, point: Point) -> dict[str, Any]:
         """The settings at a point that differ from the files: address -> value."""
@@ -95,7 +93,4 @@ class Shots:
         self._run.history.skip(shots)
         which = f"shot {shots[0]} is" if len(shots) == 1 else f"{len(shots)} shots are"
         self._run.warn(f"{which} skipped: {why}")
-        self._emit("shots_skipped", shots=[*shots], why=why)
-
-    def _emit(self, event: str, **values: Any) -> None:
-        self._run.observers.event(event, values)
+        self._run.observers.event("shots_skipped", {"shots": [*shots], "why": why})
