@@ -80,10 +80,6 @@ class Settings(BaseModel):
         """
         return None
 
-    def keeps_to_clock(self) -> bool:
-        """Of a driver: whether it keeps to the session's clock with these settings, which may be virtual."""
-        return False
-
     def warnings(self) -> Iterable[tuple[Loc, str, str]]:
         """Of a driver, for ``labseq check``: what is allowed but probably not intended.
 

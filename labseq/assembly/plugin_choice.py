@@ -56,8 +56,6 @@ class ChosenPlugin:
     def virtual_time(self) -> bool:
         """Whether the plugin needs no real time: always, or with its present settings."""
         simulated = self.entry.simulated
-        if self.settings is not None and self.settings.keeps_to_clock():
-            return True
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
         update = {key: value for key, value in simulated.items() if key != "trigger" or not self.by_line}

@@ -127,9 +127,6 @@ class RandomStream:
     Args:
         seed: The run's seed.
         name: Name of the consumer; "" is the simulation.
-
-    Attributes:
-        place: Index of the shot and its attempt; None before the first shot.
     """
 
     def __init__(self, seed: int, name: str = "") -> None:
@@ -137,7 +134,6 @@ class RandomStream:
         self.name = name
         self._key = (zlib.crc32(name.encode()),) if name else ()
         self._shot = self.machine()
-        self.place: tuple[int, int] | None = None
 
     def machine(self) -> np.random.Generator:
         """A new generator for everything that stays the same from shot to shot."""
@@ -145,7 +141,6 @@ class RandomStream:
 
     def begin_shot(self, shot_index: int, attempt: int) -> None:
         """Start the numbers of a shot; the sequencer calls it."""
-        self.place = shot_index, attempt
         key = (shot_index, attempt, *self._key)
         self._shot = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
 

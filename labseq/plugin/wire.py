@@ -5,7 +5,6 @@ from __future__ import annotations
 from labseq.wire import (
     BEAT_S,
     LOST_S,
-    PATIENT_S,
     PROTOCOL,
     MessageError,
     client_socket,
@@ -25,7 +24,6 @@ from labseq.wire import (
 __all__ = [
     "BEAT_S",
     "LOST_S",
-    "PATIENT_S",
     "PROTOCOL",
     "MessageError",
     "client_socket",

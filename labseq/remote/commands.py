@@ -10,7 +10,7 @@ from labseq.console.options import Overrides, Plugins, ProfileArgument
 SERVE_EXAMPLES = """\b
 Examples:
   labseq serve-devices camera_pc --bind tcp://0.0.0.0:5760
-  labseq serve-devices bench --plain --bind tcp://127.0.0.1:5760
+  labseq serve-devices practice --plain --bind tcp://127.0.0.1:5760
 """
 KEYS_EXAMPLES = """\b
 Examples:

@@ -30,20 +30,18 @@ from labseq.errors import (
     one_of,
 )
 from labseq.guard import StopFlag, stop_on_signals
-from labseq.kernel import load_kernels
 from labseq.messages import clean, format_error
 from labseq.plain import now
 from labseq.recording import clear_active
-from labseq.remote.served import CLOSED, LOOK_S, Run, ServedDevice, Session
-from labseq.remote.simulation import ServedSimulation
-from labseq.roles import NeedsWarmUp
+from labseq.remote.drivers import DeviceEntry
+from labseq.remote.served import LOOK_S, ServedDevice, why_ended
+from labseq.remote.sessions import CLOSED, Session
 from labseq.safety.devices import check_each_device
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import construct_hardware
-from labseq.sequencer.clock import RealClock, VirtualClock
+from labseq.sequencer.clock import RealClock
 from labseq.wire import (
     LOST_S,
-    PATIENT_S,
     PROTOCOL,
     Connections,
     MessageError,
@@ -124,39 +122,41 @@ def serving(
     keys = None if how.plain else find_keys(keys_root(), how.key)
     whole = resolve_profile(profile, overrides=profile_overrides(overrides))
     hardware = replace(whole, chosen=_served(whole, how.devices))
-    simulation = next(
-        filter(_is_remote, [one for one in whole.chosen.values() if one.entry.kind == "simulation"]), None
-    )
+    simulation = None
+    if any(one.virtual_time for one in hardware.chosen.values()):
+        simulation = whole.chosen.get("simulation")
     with ExitStack() as stack:
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
         report(f"tests {', '.join(hardware.chosen)}")
         _test(hardware, simulation, report)
         with suppress(RecordingError):  # all are safe now
             clear_active(hardware.key, hardware.identities)
-        if "simulation" in how.devices:
-            _warm_simulation(hardware)
-        server = Server(hardware, simulation, host, port, keys, report)
+        server = Server(_entries(hardware, simulation), host, port, keys, report)
         stack.callback(server.end)
         server.start()
         yield server
 
 
-def _is_remote(chosen: ChosenPlugin) -> bool:
-    return chosen.entry.name == "remote"
-
-
 def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> dict[str, ChosenPlugin]:
     """The devices that are served: those named, else the real ones, else all."""
-    able = {name: one for name, one in hardware.chosen.items() if one.entry.role.has_twin}
+    able = {name: one for name, one in hardware.chosen.items() if one.entry.role.is_hardware}
     for name in names:
         if name not in able:
             expected = one_of([*able])
             raise ConfigError(Problem(f"the profile has no device '{clean(name)}'", expected=expected))
-    if remote := [name for name in names if _is_remote(able[name])]:
-        raise ConfigError(f"'{remote[0]}' is itself on another computer; serve it there")
-    here = {name: one for name, one in able.items() if not _is_remote(one)}
+        if able[name].entry.name == "remote":
+            raise ConfigError(f"'{name}' is itself on another computer; serve it there")
+    here = {name: one for name, one in able.items() if one.entry.name != "remote"}
     real = [name for name, one in here.items() if not one.virtual_time]
     return {name: here[name] for name in names or real or here}
+
+
+def _entries(hardware: ResolvedProfile, simulation: ChosenPlugin | None) -> list[DeviceEntry]:
+    entries: list[DeviceEntry] = []
+    for name, chosen in hardware.chosen.items():
+        identities = tuple(one for one, role in hardware.identities.items() if role == name)
+        entries.append(DeviceEntry(name, chosen, simulation if chosen.virtual_time else None, identities))
+    return entries
 
 
 def _test(
@@ -165,44 +165,25 @@ def _test(
     """Raise the first failure of a device, after all were tried."""
     if simulation is not None:
         hardware = replace(hardware, chosen={**hardware.chosen, "simulation": simulation})
-    is_virtual = hardware.virtual_time
-    clock = VirtualClock(StopFlag()) if is_virtual else RealClock(StopFlag())
-    made, refused = construct_hardware(hardware, clock)
+    stop = StopFlag()
+    made, refused = construct_hardware(hardware, RealClock(stop))
     made_simulation = made.pop("simulation", None)
-    virtual = [name for name in refused if hardware.chosen[name].virtual_time]
-    if made_simulation is None and hardware.profile.simulation is not None and virtual:
-        what = f"'{virtual[0]}' is simulated, and acts on the simulation, which is not served here"
-        hint = "add --device simulation, or name its server: `simulation: {use: remote, address: ...}`"
-        raise ConfigError(Problem(what, hint=hint))
     failures: list[LabseqError] = [*refused.values()]
-    if made_simulation is not None or not is_virtual:
-        for found in check_each_device(
-            made.items(), timeouts_of(hardware.profile), StopFlag(), made_simulation, report
-        ):
-            if found.name == "simulation" and found.failure is not None:
-                raise found.failure  # the others act on it
-            failures += [one for one in (found.failure, found.unsafe, found.unclosed) if one is not None]
+    for device in check_each_device(
+        made.items(), timeouts_of(hardware.profile), stop, made_simulation, report
+    ):
+        failures += [one for one in (device.failure, device.unsafe, device.unclosed) if one is not None]
     for failure in failures[1:]:
         report(f"error: {failure}")
     if failures:
         raise failures[0]
 
 
-def _warm_simulation(hardware: ResolvedProfile) -> None:
-    """Compile its kernels before devices of other servers, which it would keep waiting, act on it."""
-    only = replace(hardware, chosen={"simulation": hardware.chosen["simulation"]})
-    made, _ = construct_hardware(only, VirtualClock(StopFlag()))
-    if isinstance(made.get("simulation"), NeedsWarmUp):
-        made["simulation"].warm()
-    load_kernels()
-
-
 class Server:
     """The devices and their control.
 
     Args:
-        hardware: The profile, with the devices that are served.
-        simulation: The plugin of the simulation at another server that they act on, or None.
+        entries: The devices that are served.
         host: Address to listen on.
         port: The control's port; the devices have the next ones.
         keys: Keys of this computer; None without keys.
@@ -211,8 +192,7 @@ class Server:
 
     def __init__(
         self,
-        hardware: ResolvedProfile,
-        simulation: ChosenPlugin | None,
+        entries: Sequence[DeviceEntry],
         host: str,
         port: int,
         keys: Any,
@@ -225,7 +205,6 @@ class Server:
         self._known: Mapping[bytes, str] = known_keys(keys_root()) if keys is not None else {}
         self._zmq = zmq.Context()
         self._auth: Any = None
-        self._runs: dict[bytes, Run] = {}
         self._ended = threading.Event()
         self._failure: BaseException | None = None
         self._key_failure = ""
@@ -233,12 +212,9 @@ class Server:
         self.devices: dict[str, ServedDevice] = {}
         try:
             self._control = server_socket(self._zmq, host, port, keys)
-            for number, (name, chosen) in enumerate(hardware.chosen.items(), 1):
+            for number, entry in enumerate(entries, 1):
                 socket = server_socket(self._zmq, host, port + number, keys)
-                served = ServedSimulation if chosen.entry.kind == "simulation" else ServedDevice
-                own = [identity for identity, role in hardware.identities.items() if role == name]
-                device = served(name, chosen, socket, self.is_known, self._report, simulation, own)
-                self.devices[name] = device
+                self.devices[entry.name] = ServedDevice(entry, socket, self.is_known, self._report)
         except ConfigError:
             self._zmq.destroy(linger=0)
             raise
@@ -344,57 +320,53 @@ class Server:
 
     def _look(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
         """End the sessions of clients that are gone, or no longer known."""
-        live: set[int] = set()
+        stood_still_s = passed_s if passed_s > LOST_S / 2 else 0.0  # this computer, not the client
         for device in self.devices.values():
             for session in list(device.sessions.values()):
-                live.add(id(session.run))
-                if passed_s > LOST_S / 2:  # this computer stood still, not the client
-                    session.beat_s += passed_s
-                lost_s = PATIENT_S if device.kind == "simulation" else LOST_S
+                session.beat_s += stood_still_s
                 if session.connection in ended:
                     device.end_session(session, "its process has ended")
-                elif now_s - session.beat_s > lost_s:
-                    device.end_session(session, f"no sign of life for {lost_s:g} s")
+                elif now_s - session.beat_s > LOST_S:
+                    device.end_session(session, f"no sign of life for {LOST_S:g} s")
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
             device.rescue_stuck()
-        self._runs = {key: run for key, run in self._runs.items() if id(run) in live}
 
     def _answer(self, frames: list[Any]) -> list[Any]:
-        import zmq
-
-        peer = str(frames[-1].get("User-Id")) if self._keys is not None else ""
         number = 0
         try:
             message = unpack([frame.buffer for frame in frames[1:]])
-            number, what = message["n"], message["op"]
-            if type(number) is not int:
+            if type(message["n"]) is not int:
                 raise MessageError("it has no number")
-            if not self.is_known(peer):
-                raise DeviceError("server", "the key was withdrawn")
-            if what == "hello":
-                connection = self._connections.named(frames[-1].get(zmq.SRCFD))
-                return pack({"n": number, "value": self._hello(message, peer, connection)})
-            act = {"beat": self._beat, "bye": self._bye, "abort": self._abort}
-            if what == "status":
-                return pack({"n": number, "value": self._status()})
-            if what not in act:
-                raise MessageError("it asks for something unknown")
-            return pack({"n": number, "value": act[what](message, peer)})
+            number = message["n"]
+            return pack({"n": number, "value": self._value(message, frames[-1])})
         except DeviceError as error:
             return pack({"n": number, "error": report_error(error)})
         except (MessageError, KeyError, TypeError, AttributeError) as error:
             failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
-            return pack({"n": number if type(number) is int else 0, "error": report_error(failure)})
+            return pack({"n": number, "error": report_error(failure)})
+
+    def _value(self, message: Mapping[str, Any], frame: Any) -> Any:
+        """Do what a message asks for; its frame names the client's key and connection."""
+        import zmq
+
+        peer = str(frame.get("User-Id")) if self._keys is not None else ""
+        if not self.is_known(peer):
+            raise DeviceError("server", "the key was withdrawn")
+        if message["op"] == "hello":
+            return self._hello(message, peer, self._connections.named(frame.get(zmq.SRCFD)))
+        if message["op"] == "status":
+            return self._status()
+        ask = {"beat": self._beat, "bye": self._bye, "abort": self._abort}.get(message["op"])
+        if ask is None:
+            raise MessageError("it asks for something unknown")
+        return ask(message, *self._of(message, peer))
 
     def _hello(self, message: Mapping[str, Any], peer: str, connection: tuple[int, int]) -> dict[str, Any]:
-        about = {"protocol": PROTOCOL, "labseq": labseq.__version__, "host": platform.node()}
         if message["protocol"] != PROTOCOL:
-            theirs = (
-                f"labseq {clean(str(message['labseq']))} speaks protocol {clean(str(message['protocol']))}"
-            )
-            text = f"{theirs}, and labseq {labseq.__version__} of the server speaks {PROTOCOL}; update one"
-            raise DeviceError("server", text)
+            theirs = f"{clean(str(message['labseq']))} speaks protocol {clean(str(message['protocol']))}"
+            ours = f"labseq {labseq.__version__} of the server speaks {PROTOCOL}"
+            raise DeviceError("server", f"labseq {theirs}, and {ours}; update one")
         device = self.devices.get(str(message["device"]))
         if device is None:
             text = f"there is no device '{clean(str(message['device']))}'; expected {one_of([*self.devices])}"
@@ -405,15 +377,23 @@ class Server:
             raise DeviceError("server", text)
         if sum(len(one.sessions) for one in self.devices.values()) >= MAX_SESSIONS:
             raise DeviceError("server", f"it has {MAX_SESSIONS} connections already")
-        if not isinstance(message["run"], bytes) or len(message["run"]) != 16:
-            raise MessageError("it names no run")
         name = self._known.get(peer.encode(), "this computer")
-        run = self._runs.setdefault(message["run"], Run(message["run"]))
-        session = Session(peer, f"{name} ({clean(str(message['who']))})", run, connection)
+        session = Session(peer, f"{name} ({clean(str(message['who']))})", connection)
         device.sessions[session.token] = session
-        return {**about, "session": session.token, "port": self._ports[device.name]}
+        return {
+            "protocol": PROTOCOL,
+            "labseq": labseq.__version__,
+            "host": platform.node(),
+            "session": session.token,
+            "port": self._ports[device.name],
+        }
 
     def _of(self, message: Mapping[str, Any], peer: str) -> tuple[ServedDevice, Session]:
+        """The device and the session that a message names.
+
+        Raises:
+            DeviceError: The session has ended.
+        """
         token = message["session"]
         for device in self.devices.values():
             session = device.sessions.get(token)
@@ -421,34 +401,31 @@ class Server:
                 if session.ended:
                     raise DeviceError(device.name, session.ended)
                 return device, session
-        ended = [one.ended[token] for one in self.devices.values() if token in one.ended]
-        raise DeviceError(
-            "server", (ended or ["the connection has ended, or the server was started again"])[0]
-        )
+        ended = {key: why for one in self.devices.values() for key, why in one.ended.items()}
+        raise DeviceError("server", why_ended(ended, token))
 
-    def _beat(self, message: Mapping[str, Any], peer: str) -> dict[str, Any]:
-        device, session = self._of(message, peer)
+    def _beat(self, _message: Mapping[str, Any], device: ServedDevice, session: Session) -> dict[str, Any]:
         session.beat_s = time.monotonic()
-        running = session.is_running or device.is_busy
+        running = session.began_s is not None or device.is_busy
         return {"number": session.number, "running": running, "rescue": session.rescue}
 
-    def _bye(self, message: Mapping[str, Any], peer: str) -> None:
-        device, session = self._of(message, peer)
+    def _bye(self, _message: Mapping[str, Any], device: ServedDevice, session: Session) -> None:
         device.end_session(session, CLOSED)
 
-    def _abort(self, message: Mapping[str, Any], peer: str) -> None:
-        device, session = self._of(message, peer)
+    def _abort(self, message: Mapping[str, Any], _device: ServedDevice, session: Session) -> None:
         if session.number == message["number"]:
-            device.abort(session)
+            session.abort_call()
 
     def _status(self) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
         for device in self.devices.values():
             owner = device.owner
-            call = owner.call if owner is not None and owner.is_running else ""
-            since_s = time.monotonic() - owner.running_s if owner is not None and call else 0.0
-            who = "" if owner is None else owner.who
-            rows.append({"device": device.name, "owner": who, "call": call, "for_s": since_s})
+            row = {"device": device.name, "owner": "", "call": "", "for_s": 0.0}
+            if owner is not None:
+                row["owner"] = owner.who
+                if (began_s := owner.began_s) is not None:
+                    row |= {"call": owner.call, "for_s": time.monotonic() - began_s}
+            rows.append(row)
         return rows
 
 

@@ -179,16 +179,3 @@ class ReceivesOutput(Protocol):
             source: Its outputs.
         """
         ...
-
-
-class JoinsRun(Protocol):
-    """A simulation at another server of devices, which a server joins for simulated devices of its own."""
-
-    def join(self, run: bytes, catch_up: Callable[[float | None, tuple[int, int] | None], object]) -> None:
-        """Use the simulation that the run has there, instead of constructing one.
-
-        Args:
-            run: Names the run.
-            catch_up: Called with time and (shot, attempt) of the simulation before it calls a device here.
-        """
-        ...

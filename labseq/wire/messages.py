@@ -45,20 +45,15 @@ TYPES: Final[Mapping[str, type]] = {
         model.AxisTones,
         model.CalibrationEntry,
         model.CameraFacts,
-        model.DepthRamp,
         model.Frame,
         model.LineProgram,
         model.LineSpec,
         model.LinesFacts,
         model.LossSpec,
         model.MotionSpec,
-        model.RfSamples,
         model.RfSpec,
-        model.RfTones,
-        model.SensorMode,
         model.SiteGrid,
         model.ToneProgram,
-        model.TweezerAmplitudes,
         model.TweezersFacts,
         errors.Problem,
     )
@@ -103,7 +98,7 @@ def pack(value: Any) -> list[Part]:
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MessageError(f"it cannot be sent: {format_error(error)}") from error
     parts: list[Part] = [header, bytes(small), *arrays] if small or arrays else [header]
-    if len(header) > MAX_HEADER or len(small) > MAX_PART or len(parts) > MAX_PARTS:
+    if len(header) > MAX_HEADER or len(parts) > MAX_PARTS or max(map(len, parts)) > MAX_PART:
         raise MessageError(f"it is too large to be sent: at most {MAX_PARTS} parts of {MAX_PART >> 20} MB")
     return parts
 
@@ -111,9 +106,8 @@ def pack(value: Any) -> list[Part]:
 def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> list[Any]:
     """Where an array is, its dtype and its shape.
 
-    The place is an index among the parts, to which it is appended. Small arrays share the first of them, as
-    a part costs more than copying: their place is [where they begin]. That of an array beyond MAX_PART is
-    [the first of its parts, how many it has].
+    The place is [index of its part, where it begins there]. Small arrays share the first part after the
+    header, because a part costs more than copying.
     """
     dtype = array.dtype
     if not dtype.isnative or sys.byteorder == "big":
@@ -121,13 +115,11 @@ def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> lis
     if array.dtype is not dtype or not array.flags.c_contiguous:
         array = np.ascontiguousarray(array, dtype).reshape(array.shape)
     if array.nbytes <= SMALL:
-        place: Any = [len(small)]
+        place = [1, len(small)]
         small.extend(array.tobytes() + bytes(ALIGNMENT - array.nbytes % ALIGNMENT))  # never nothing
     else:
-        place, data = len(arrays) + 2, array.reshape(-1).view(np.uint8).data
-        arrays += [data[begin : begin + MAX_PART] for begin in range(0, array.nbytes, MAX_PART)]
-        if array.nbytes > MAX_PART:
-            place = [place, len(arrays) + 2 - place]
+        place = [len(arrays) + 2, 0]
+        arrays.append(array.reshape(-1).view(np.uint8).data)
     if dtype.names is None:
         return [place, _dtype_text(dtype), array.shape, {}]
     columns = [[name, _dtype_text(dtype[name])] for name in dtype.names]
@@ -220,27 +212,21 @@ def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
         raise MessageError("an array has a wrong shape")
     wanted = math.prod(cast("list[int]", shape)) * kind.itemsize
     data = _data(parts, place, wanted)
-    n_bytes = sum(one.nbytes for one in data)
-    if n_bytes != wanted:
-        raise MessageError(f"an array of shape {tuple(shape)} has {n_bytes} bytes; expected {wanted}")
-    whole = data[0] if len(data) == 1 else np.concatenate([np.frombuffer(one, np.uint8) for one in data])
-    array = np.frombuffer(whole, kind).reshape(shape) if wanted else np.empty(shape, kind)
+    if data.nbytes != wanted:
+        raise MessageError(f"an array of shape {tuple(shape)} has {data.nbytes} bytes; expected {wanted}")
+    array = np.frombuffer(data, kind).reshape(shape) if wanted else np.empty(shape, kind)
     if not array.flags.aligned:  # kernels are compiled for aligned arrays
         array = array.copy()
     array.flags.writeable = False
     return array
 
 
-def _data(parts: Sequence[Part], place: Any, wanted: int) -> list[memoryview]:
+def _data(parts: Sequence[Part], place: Any, n_bytes: int) -> memoryview:
     """The bytes of an array, from their place as :func:`_described` gives it."""
-    numbers = cast("list[Any]", place if isinstance(place, list) else [place, 1])
-    if not 1 <= len(numbers) <= 2 or any(type(one) is not int or one < 0 for one in numbers):
+    part, begin = place
+    if type(part) is not int or type(begin) is not int or not 1 <= part < len(parts) or begin < 0:
         raise MessageError("an array is missing")
-    first, n = numbers if len(numbers) == 2 else (1, 1)
-    if not (1 <= first < len(parts) and 1 <= n <= len(parts) - first):
-        raise MessageError("an array is missing")
-    data = [memoryview(one) for one in parts[first : first + n]]
-    return data if len(numbers) == 2 else [data[0][numbers[0] : numbers[0] + wanted]]
+    return memoryview(parts[part])[begin : begin + n_bytes]
 
 
 def _known_dtype(text: Any) -> np.dtype[Any]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from labseq.wire.keys import Keys
 
-PROTOCOL: Final = 1
+PROTOCOL: Final = 2
 """Version of the messages; both computers need the same."""
 BEAT_S: Final = 0.15
 """Interval of the heartbeats of a connection."""
@@ -27,8 +27,6 @@ HANDSHAKE_S: Final = 2.0
 """How long a connection may take to show its key."""
 MAX_CONNECTIONS: Final = 128
 """Connections at a port, beyond which it does not listen until some have ended."""
-PATIENT_S: Final = 5.0
-"""The same for a simulation, which has no outputs that could stay on."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]@]+):(\d{1,5})")
 

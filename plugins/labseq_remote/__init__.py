@@ -7,9 +7,8 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer a driver named ``remote`` for each role, and for the simulation that served simulators act on."""
+    """Offer a driver named ``remote`` for each role."""
     module, settings = "labseq_remote.drivers", "labseq_remote.settings"
-    simulation = "labseq_remote.simulation:RemoteSimulation"
     for kind, factory in (
         (registry.camera, "RemoteCamera"),
         (registry.static_tweezers, "RemoteStaticTweezers"),
@@ -18,4 +17,3 @@ def labseq_register(registry: Registry) -> None:
         (registry.lines, "RemoteLines"),
     ):
         kind("remote", f"{module}:{factory}", f"{settings}:RemoteSettings")
-    registry.simulation("remote", simulation, f"{settings}:RemoteSimulationSettings")

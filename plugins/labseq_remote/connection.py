@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import platform
-import secrets
 import threading
 import time
 import weakref
@@ -35,31 +34,16 @@ class Run:
     """What the connections of a run have in common.
 
     Attributes:
-        key: Names the run at the servers, where its devices share one simulation.
         lost: Connections that are lost and not closed yet; calls over the others are aborted.
-        was_lost: Whether one was lost: its simulation need not be closed with patience.
+        was_lost: Whether one was lost: then the ends of the others are not waited for.
     """
 
-    key: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     lost: set[Connection] = field(default_factory=set["Connection"])
     was_lost: bool = False
 
 
 _runs: weakref.WeakKeyDictionary[Clock, Run] = weakref.WeakKeyDictionary()
 """The session's clock -> its run."""
-
-
-@dataclass(frozen=True, slots=True)
-class Joins:
-    """The simulation of a run that has been begun by another process, or by another connection.
-
-    Attributes:
-        run: Names the run.
-        seen_by: Name of the camera, not that of the atoms, whose view of it is wanted; "" for it itself.
-    """
-
-    run: bytes
-    seen_by: str = ""
 
 
 class Connection:
@@ -69,28 +53,23 @@ class Connection:
         settings: Where the device is.
         context: The driver's context, which the server constructs its driver with.
         kind: Kind of the device, "camera".
-        joins: The simulation to use; None to have a new one, or a device.
 
     Raises:
         DeviceError: The server does not answer, refuses, or has another version.
         ConfigError: Keys are missing, or the served driver refuses its settings.
     """
 
-    def __init__(
-        self, settings: RemoteSettings, context: Context, kind: str, joins: Joins | None = None
-    ) -> None:
+    def __init__(self, settings: RemoteSettings, context: Context, kind: str) -> None:
         wire.require_packages()
         self.address = settings.address
         self._name = context.name or kind
         self._clock = context.clock
-        self._random = context.random
-        self._joins = joins
-        self._run = run_of(context.clock)
+        self._run = _runs.setdefault(context.clock, Run())
         self._calling = threading.Lock()
         self._controlling = threading.Lock()
         self._number = self._question = self._given_up = 0
         self._lost = ""
-        self._lost_s = wire.PATIENT_S if kind == "simulation" else wire.LOST_S
+        self._lost_s = wire.LOST_S
         self._is_abandoned = False
         self._ended = threading.Event()
         self._heard_s = time.monotonic()
@@ -137,8 +116,6 @@ class Connection:
                 "call": name,
                 "args": list(args),
                 "named": named,
-                "now": self._clock.now() if self._clock.virtual else None,
-                "shot": self._random.place if self._joins is None else None,
             }
             try:
                 parts = wire.pack(message)
@@ -169,11 +146,6 @@ class Connection:
         self.call("safe_state", stoppable=False)
 
     @property
-    def is_run_lost(self) -> bool:
-        """Whether this connection, or another one of the run, is or was lost."""
-        return self._run.was_lost
-
-    @property
     def is_hanging(self) -> bool:
         """Whether the server is still carrying out a call, which others would have to wait for."""
         if self._calling.locked():
@@ -187,7 +159,7 @@ class Connection:
         """End the connection; the server makes the device safe if that was not done."""
         if not self._ended.is_set():
             with suppress(LabseqError):
-                self.ask("bye", BYE_S if self.is_run_lost else self._lost_s)
+                self.ask("bye", BYE_S if self._run.was_lost else self._lost_s)
             self._ended.set()
             self._run.lost.discard(self)
             if self._calling.acquire(timeout=2 * POLL_S):
@@ -237,10 +209,8 @@ class Connection:
     def _hello(self, settings: RemoteSettings, kind: str) -> dict[str, Any]:
         """Begin the session; if that fails, the events of the socket say why."""
         self._control.connect(wire.endpoint(settings.host, settings.port))
-        run = self._run.key if self._joins is None else self._joins.run
-        me = {"protocol": wire.PROTOCOL, "labseq": version("labseq"), "run": run}
+        me = {"protocol": wire.PROTOCOL, "labseq": version("labseq")}
         who = f"{platform.node()}, process {os.getpid()}"
-        who = who if self._joins is None else f"'{self._name}' at {who}"
         about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
             raise self.failure("it is not a server of this version of labseq")
@@ -254,9 +224,6 @@ class Connection:
             "motion": context.motion,
             "lines": list(context.lines),
             "calibrations": dict(context.calibrations),
-            "seed": context.random.seed,
-            "virtual": bool(context.clock.virtual),
-            "joins": None if self._joins is None else self._joins.seen_by,
         }
 
     def _await(self, name: str, parts: list[Any], stoppable: bool) -> dict[str, Any]:
@@ -308,9 +275,7 @@ class Connection:
         return is_late and not self._beat["running"] and not self._calls.poll(0)
 
     def _result(self, reply: dict[str, Any]) -> Any:
-        """The value of a reply, on the session's clock; its waits pass here, too."""
-        for duration_s in reply.get("waits", ()):
-            self._clock.sleep(float(duration_s))
+        """The value of a reply; the time of a frame is on the session's clock."""
         if "error" in reply:
             error = wire.error_of(reply["error"], self._name, self.address)
             if isinstance(error, StopRequested):
@@ -318,7 +283,7 @@ class Connection:
             raise error
         self.state |= reply.get("state", {})
         value = reply["value"]
-        if isinstance(value, Frame) and not self._clock.virtual:
+        if isinstance(value, Frame):
             t_start_s = value.t_start_s + self._clock.now() - float(reply["now"])
             value = replace(value, t_start_s=t_start_s)
         return value
@@ -359,11 +324,6 @@ def _read(parts: Any) -> dict[str, Any]:
     except wire.MessageError:
         return {}
     return message if isinstance(message, dict) else {}
-
-
-def run_of(clock: Clock) -> Run:
-    """The run of a session's clock."""
-    return _runs.setdefault(clock, Run())
 
 
 def _keys(settings: RemoteSettings) -> tuple[Any, bytes | None]:

@@ -25,7 +25,6 @@ from labseq.plugin import (
 )
 from labseq_remote.link import Link, called, called_if_able, known
 from labseq_remote.settings import RemoteSettings
-from labseq_remote.simulation import RemoteSimulation
 
 # pyright: reportIncompatibleMethodOverride=false
 # (pyright does not know the properties that `known` makes)
@@ -60,13 +59,7 @@ class RemoteHardware(Hardware):
     _kind: ClassVar[str]
 
     def __init__(self, settings: RemoteSettings, context: Context) -> None:
-        simulation = context.simulation
-        first = simulation.connect if isinstance(simulation, RemoteSimulation) else None
-        self.link = Link(settings, context, self._kind, first)
-
-    def call(self, name: str, *args: Any, **named: Any) -> Any:
-        """Call a method of the open device."""
-        return self.link.call(name, *args, **named)
+        self.link = Link(settings, context, self._kind)
 
     def open(self) -> None:
         """Connect, and open the device for this client alone.

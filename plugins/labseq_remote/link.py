@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
 from typing import Any, Protocol
 
 from labseq.plugin import Context, DeviceError
-from labseq_remote.connection import Connection, Joins
+from labseq_remote.connection import Connection
 from labseq_remote.settings import RemoteSettings
 
 
@@ -18,26 +17,14 @@ class Link:
         settings: Where the device is.
         context: The driver's context.
         kind: Kind of the device.
-        first: Connects the simulation, which must be there before the devices that act on it.
-
-    Attributes:
-        joins: The simulation to use, if it is one of a run that has begun.
     """
 
-    def __init__(
-        self,
-        settings: RemoteSettings,
-        context: Context,
-        kind: str,
-        first: Callable[[], object] | None = None,
-    ) -> None:
+    def __init__(self, settings: RemoteSettings, context: Context, kind: str) -> None:
         self.settings = settings
         self.name = context.name or kind
         self.is_open = False
         self._context = context
         self._kind = kind
-        self._first = first
-        self.joins: Joins | None = None
         self._connection: Connection | None = None
         self._state: dict[str, Any] = {}
         self._about: dict[str, Any] = {}
@@ -49,17 +36,11 @@ class Link:
             DeviceError: The server does not answer, or refuses.
         """
         if self._connection is None:
-            if self._first is not None:
-                self._first()
-            self._connection = made = self.another(self.joins)
-            weakref.finalize(self, made.abandon)
-            self._about = made.about
-            made.state = self._state = {**self._state, **made.state}
+            self._connection = connection = Connection(self.settings, self._context, self._kind)
+            weakref.finalize(self, connection.abandon)
+            self._about = connection.about
+            connection.state = self._state = {**self._state, **connection.state}
         return self._connection
-
-    def another(self, joins: Joins | None) -> Connection:
-        """A connection beside that one."""
-        return Connection(self.settings, self._context, self._kind, joins)
 
     def call(self, name: str, *args: Any, **named: Any) -> Any:
         """Call a method of the open device.
@@ -67,7 +48,7 @@ class Link:
         Raises:
             DeviceError: It is not open, or the connection is lost.
         """
-        if not self.is_open and self.joins is None:
+        if not self.is_open:
             raise DeviceError(self.name, f"it is not open (at {self.settings.address})")
         return self.connect().call(name, *args, **named)
 
@@ -111,8 +92,7 @@ class Link:
         self.is_open = False
         connection = self.connect()
         try:
-            # what hangs, and a simulation whose devices are lost, is closed by the server
-            if not connection.is_hanging and not (self._kind == "simulation" and connection.is_run_lost):
+            if not connection.is_hanging:  # else the server closes the device
                 connection.call("close", stoppable=False)
         finally:
             self.end()
@@ -137,20 +117,16 @@ class Link:
 
 
 class Linked(Protocol):
-    """A driver or simulation whose methods are those of another computer."""
+    """A driver whose methods are carried out on another computer."""
 
     link: Link
-
-    def call(self, name: str, *args: Any, **named: Any) -> Any:
-        """Call a method there."""
-        ...
 
 
 def called(name: str) -> Any:
     """A method that is carried out at the server; its meaning is that of the role."""
 
     def method(driver: Linked, /, *args: Any, **named: Any) -> Any:
-        return driver.call(name, *args, **named)
+        return driver.link.call(name, *args, **named)
 
     method.__name__ = name
     return method

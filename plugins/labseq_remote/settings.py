@@ -27,10 +27,6 @@ class RemoteSettings(Settings):
         description="address of the server, as `labseq serve-devices` prints it: tcp://HOST:PORT"
     )
     device: Text = Field(description="role or name of the device in the profile of its computer")
-    simulated: bool = Field(
-        default=False,
-        description="whether the served device is simulated there and keeps to the clock of this run",
-    )
     key: Text | None = Field(
         default=None, description="which of this computer's keys; by default the only one"
     )
@@ -56,14 +52,3 @@ class RemoteSettings(Settings):
     def identities(self) -> Sequence[str]:
         """The device at its address."""
         return (f"{self.device} at {self.address}",)
-
-    def keeps_to_clock(self) -> bool:
-        """Whether it is simulated."""
-        return self.simulated
-
-
-class RemoteSimulationSettings(RemoteSettings):
-    """The server of the simulation that simulated devices act on; they must be served by the same one."""
-
-    device: Text = Field(default="simulation", description="its name in the profile of its computer")
-    simulated: bool = Field(default=True, description="whether it keeps to the clock of this run: it does")

@@ -12,7 +12,7 @@ import pytest
 from labseq_remote.settings import RemoteSettings
 
 import labseq.remote.server
-from labseq import wire
+from labseq.plugin import wire
 from labseq.remote.server import Server, Serving, serving
 
 PROFILE = """\
@@ -61,7 +61,7 @@ class Served:
 
     def settings(self, device: str, *, port: int = 0, **others: Any) -> RemoteSettings:
         """For a client."""
-        about = {"address": f"tcp://127.0.0.1:{port or self.port}", "device": device, "simulated": True}
+        about = {"address": f"tcp://127.0.0.1:{port or self.port}", "device": device}
         return RemoteSettings.model_validate({**about, **others})
 
 

@@ -11,11 +11,9 @@ from typing import Any
 
 import zmq
 
-from labseq import wire
-from labseq.plugin import MotionSpec, SiteGrid
-from labseq.remote.served import METHODS
+from labseq.plugin import MotionSpec, SiteGrid, wire
+from labseq.remote.drivers import METHODS
 from labseq.remote.server import Server
-from labseq.remote.simulation import METHODS as SIMULATION
 
 LAST = 1 << 40
 """Number of the message that is sent last; its reply shows that all before were read."""
@@ -71,7 +69,6 @@ def _begin(control: Any, name: str, kind: str) -> bytes:
         "op": "hello",
         "protocol": wire.PROTOCOL,
         "labseq": "x",
-        "run": bytes(16),
         "who": "fuzz",
     }
     control.send_multipart(wire.pack({**hello, "device": name, "kind": kind}))
@@ -83,18 +80,16 @@ def _begin(control: Any, name: str, kind: str) -> bytes:
 
 
 def _call(name: str, args: list[Any]) -> dict[str, Any]:
-    return {"call": name, "args": args, "named": {}, "now": 0.0, "shot": (0, 0)}
+    return {"call": name, "args": args, "named": {}}
 
 
 def _message(random_: random.Random, kind: str, token: bytes, number: int) -> dict[str, Any]:
     if kind == "control":
         what = random_.choice(["hello", "beat", "abort", "status", "nonsense"])
-        about = {"protocol": 1, "labseq": "x", "run": bytes(16), "device": "camera", "kind": "camera"}
+        about = {"protocol": 1, "labseq": "x", "device": "camera", "kind": "camera"}
         return {"n": number, "op": what, "session": token, "number": 1, **about}
     attach = {"name": kind, "grid": SiteGrid(6, 7), "motion": MotionSpec(), "lines": [], "calibrations": {}}
-    attach |= {"seed": 1, "virtual": True, "joins": random_.choice([None, "", "other"])}
-    names = sorted(SIMULATION | {"next"} if kind == "simulation" else METHODS[kind])
-    name = random_.choice(["attach", "open", "close", *names])
+    name = random_.choice(["attach", "open", "close", *sorted(METHODS[kind])])
     values = [0, -1.5, "x", b"y", None, [1], {"a": 1}, "camera", "mobile_tweezers", SiteGrid(6, 7)]
     args = [attach] if name == "attach" else random_.choices(values, k=random_.randrange(4))
     session = token if random_.random() < 0.8 else bytes(16)

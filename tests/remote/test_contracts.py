@@ -17,16 +17,15 @@ from labseq_remote.drivers import (
     RemoteMobileTweezers,
     RemoteStaticTweezers,
 )
-from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
-from labseq_remote.simulation import RemoteSimulation
+from labseq_remote.settings import RemoteSettings
 
-from labseq.plugin import Context, SiteGrid
+import labseq.remote.drivers
+from labseq.plugin import Clock, Context, SiteGrid
 from labseq.testing import (
     CameraContract,
     DeviceContract,
     LinesContract,
     MobileTweezersContract,
-    SimulationContract,
     StaticTweezersContract,
 )
 from labseq.testing.fakes import FakeClock
@@ -34,6 +33,7 @@ from tests.remote.conftest import Served
 from tests.remote.proxy import PROXY, Proxy
 
 _port = 0
+_clock: Clock = FakeClock()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -41,24 +41,27 @@ def _rough_network(server: Served) -> Generator[None]:
     global _port
     _port = server.port
     proxy = Proxy(server, is_rough=True)
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(labseq.remote.drivers, "RealClock", lambda _: _clock)
+        yield
     proxy.end()
 
 
 def settings(device: str) -> RemoteSettings:
-    about = {"address": f"tcp://{PROXY}:{_port}", "device": device, "simulated": True}
+    about = {"address": f"tcp://{PROXY}:{_port}", "device": device}
     return RemoteSettings.model_validate(about)
 
 
-def with_simulation(context: Context) -> Context:
-    settings = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{_port}")
-    context = replace(context, grid=SiteGrid(6, 7))
-    return replace(context, simulation=RemoteSimulation(settings, replace(context, name="simulation")))
+def shared(context: Context) -> Context:
+    """A context whose virtual clock the served driver has, too; that of a lab keeps real time."""
+    global _clock
+    _clock = context.clock
+    return replace(context, grid=SiteGrid(6, 7))
 
 
 class TestRemoteCamera(CameraContract):
     def context(self) -> Context:
-        return with_simulation(super().context())
+        return shared(super().context())
 
     @pytest.fixture
     def factory(self) -> Callable[[Context], RemoteCamera]:
@@ -67,7 +70,7 @@ class TestRemoteCamera(CameraContract):
 
 class TestRemoteStaticTweezers(StaticTweezersContract):
     def context(self) -> Context:
-        return with_simulation(super().context())
+        return shared(super().context())
 
     @pytest.fixture
     def factory(self) -> Callable[[Context], RemoteStaticTweezers]:
@@ -77,14 +80,14 @@ class TestRemoteStaticTweezers(StaticTweezersContract):
 @pytest.fixture(scope="module")
 def _warm() -> None:
     """Compile the kernels; with an empty cache the first call would come late."""
-    context = with_simulation(Context("mobile_tweezers", clock=FakeClock()))
+    context = shared(Context("mobile_tweezers", clock=FakeClock()))
     RemoteMobileTweezers(settings("mobile_tweezers"), context).warm()
 
 
 @pytest.mark.usefixtures("_warm")
 class TestRemoteMobileTweezers(MobileTweezersContract):
     def context(self) -> Context:
-        return with_simulation(super().context())
+        return shared(super().context())
 
     @pytest.fixture
     def factory(self) -> Callable[[Context], RemoteMobileTweezers]:
@@ -95,6 +98,9 @@ class TestRemoteDevice(DeviceContract):
     commands: ClassVar = {"open": {}, "set": {"power": 0.5}}
     values: ClassVar = ("state", "power")
 
+    def context(self) -> Context:
+        return shared(super().context())
+
     @pytest.fixture
     def factory(self) -> Callable[[Context], RemoteDevice]:
         return lambda context: RemoteDevice(settings("instrument"), context)
@@ -102,15 +108,8 @@ class TestRemoteDevice(DeviceContract):
 
 class TestRemoteLines(LinesContract):
     def context(self) -> Context:
-        return with_simulation(super().context())
+        return shared(super().context())
 
     @pytest.fixture
     def factory(self) -> Callable[[Context], RemoteLines]:
         return lambda context: RemoteLines(settings("lines"), context)
-
-
-class TestRemoteSimulation(SimulationContract):
-    @pytest.fixture
-    def factory(self) -> Callable[[Context], RemoteSimulation]:
-        there = RemoteSimulationSettings(address=f"tcp://{PROXY}:{_port}")
-        return lambda context: RemoteSimulation(there, context)

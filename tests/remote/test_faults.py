@@ -23,22 +23,29 @@ from labseq_remote.drivers import (
     RemoteMobileTweezers,
     RemoteStaticTweezers,
 )
-from labseq_remote.settings import RemoteSettings, RemoteSimulationSettings
-from labseq_remote.simulation import RemoteSimulation
+from labseq_remote.settings import RemoteSettings
 from labseq_virtual.devices import VirtualDevice
 
-import labseq.remote.served
 import labseq.remote.server
+import labseq.remote.sessions
 from labseq import wire
 from labseq.guard import StopFlag
-from labseq.plugin import ConfigError, Context, DeviceError, LimitError, SiteGrid, StopRequested
+from labseq.plugin import (
+    ConfigError,
+    Context,
+    DeviceError,
+    LimitError,
+    LineSpec,
+    SiteGrid,
+    StopRequested,
+    wire as wire_of_plugins,
+)
 from labseq.remote.server import Serving, serving
 from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock
 from labseq.wire import messages
 from tests.remote.conftest import PROFILE, Served, free_port, served
 from tests.remote.proxy import PROXY, Proxy
-from tests.remote.test_contracts import with_simulation
 
 ROLES: dict[str, Any] = {
     "mobile_tweezers": RemoteMobileTweezers,
@@ -88,27 +95,16 @@ def instrument(server: Served, host: str = "127.0.0.1", **settings: Any) -> Gene
 
 
 @contextmanager
-def camera(server: Served, host: str = "127.0.0.1") -> Generator[RemoteCamera]:
+def camera(server: Served, host: str = "127.0.0.1", stop: StopFlag | None = None) -> Generator[RemoteCamera]:
     """An open camera."""
-    context = with_simulation(Context("camera", clock=FakeClock()))
-    assert context.simulation is not None
-    context.simulation.open()
-    context.simulation.begin_shot()
-    device = RemoteCamera(server.settings("camera", address=f"tcp://{host}:{server.port}"), context)
+    settings = server.settings("camera", address=f"tcp://{host}:{server.port}")
+    device = RemoteCamera(settings, Context("camera", SiteGrid(6, 7), clock=RealClock(stop or StopFlag())))
     device.open()
     try:
         yield device
     finally:
         with suppress(DeviceError):
             device.close()
-        context.simulation.close()
-
-
-@pytest.fixture(autouse=True)
-def _port(server: Served) -> None:
-    from tests.remote import test_contracts
-
-    test_contracts._port = server.port
 
 
 def test_a_call_that_arrives_twice_is_carried_out_once(server: Served, faulty: Proxy) -> None:
@@ -167,14 +163,12 @@ def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
 
 
 def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    context = with_simulation(Context("", clock=FakeClock()))
+    context = Context("", SiteGrid(6, 7), clock=FakeClock())
     address = f"tcp://{PROXY}:{server.port}"
     devices = {
         name: role(server.settings(name, address=address), replace(context, name=name))
         for name, role in ROLES.items()
     }
-    assert context.simulation is not None
-    context.simulation.open()
     for device in devices.values():
         device.open()
     devices["static_tweezers"].start()
@@ -191,7 +185,6 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
         with suppress(DeviceError):
             device.close()
     monkeypatch.undo()
-    context.simulation.close()
     with instrument(server) as again:
         again.command("open")
 
@@ -199,7 +192,7 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
 def test_a_lost_reply_ends_the_connection(server: Served, faulty: Proxy) -> None:
     with instrument(server, PROXY) as device:
         device.link.connect()._lost_s = 0.5
-        faulty.reply_fault = lambda message: [] if b"waits" in message[0] else [message]
+        faulty.reply_fault = lambda message: [] if b"state" in message[0] else [message]
         with pytest.raises(DeviceError, match="no reply"):
             device.command("open")
 
@@ -244,7 +237,7 @@ def test_a_device_is_made_safe_beside_a_call_that_hangs(
 def test_a_call_that_was_given_up_delays_neither_the_safe_state_nor_the_end(
     server: Served, monkeypatch: pytest.MonkeyPatch, grace_s: float
 ) -> None:
-    monkeypatch.setattr(labseq.remote.served, "GRACE_S", grace_s)
+    monkeypatch.setattr(labseq.remote.sessions, "GRACE_S", grace_s)
     released, entered = threading.Event(), threading.Semaphore(0)
     inside, together = 0, 0
 
@@ -261,7 +254,7 @@ def test_a_call_that_was_given_up_delays_neither_the_safe_state_nor_the_end(
     monkeypatch.setattr(VirtualDevice, "close", make_safe)
     stop = StopFlag()
     context = Context("laser", SiteGrid(6, 7), clock=RealClock(stop))
-    device = RemoteDevice(server.settings("instrument", simulated=False), context)
+    device = RemoteDevice(server.settings("instrument"), context)
     device.open()
     threading.Timer(0.05, stop.request).start()
     begun_s = time.monotonic()
@@ -290,33 +283,19 @@ def test_the_next_connection_is_not_taken_for_one_that_has_ended(server: Served)
             device.command("open")
 
 
-def test_a_server_that_has_ended_is_not_waited_for_again(tmp_path: Path) -> None:
-    with served(tmp_path) as one:
-        context = Context("simulation", SiteGrid(6, 7), clock=FakeClock())
-        settings = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{one.port}")
-        simulation = RemoteSimulation(settings, context)
-        simulation.open()
-        connection = simulation.link.connect()
+def test_a_server_that_has_ended_is_not_waited_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wire_of_plugins, "LOST_S", 30.0)
+    with served(tmp_path, devices=("instrument",)) as one:
+        device = RemoteDevice(one.settings("instrument"), Context("laser", clock=FakeClock()))
+        device.open()
+        connection = device.link.connect()
     until(lambda: bool(connection.lost))
     begun_s = time.monotonic()
     with pytest.raises(DeviceError, match="the server has ended"):
         connection.ask("beat")
-    assert time.monotonic() < begun_s + 1.0  # a simulation may be silent for 5 s
-
-
-def test_a_simulation_ends_after_the_devices_that_act_on_it(server: Served) -> None:
-    context = Context("simulation", SiteGrid(6, 7), clock=FakeClock())
-    settings = RemoteSimulationSettings(address=f"tcp://127.0.0.1:{server.port}")
-    simulation, of_a_device = (RemoteSimulation(settings, context) for _ in range(2))
-    simulation.open()
-    simulation.begin_shot()
-    run, sessions = connection.run_of(context.clock).key, server.server.devices["simulation"].sessions
-    of_a_device.join(run, lambda *_: None)
-    of_a_device.connect()
-    simulation.close()  # while another server still makes a simulated device safe
-    of_a_device.load(0.0, 0.1)
-    of_a_device.close()
-    until(lambda: run not in {one.run.key for one in tuple(sessions.values())})
+    assert time.monotonic() < begun_s + 10.0
 
 
 def test_errors_keep_their_class_and_values(server: Served) -> None:
@@ -339,9 +318,9 @@ def test_a_wrong_name_is_refused(server: Served, settings: dict[str, str], match
 
 
 def test_another_version_is_named(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wire, "PROTOCOL", 99)
+    monkeypatch.setattr(wire_of_plugins, "PROTOCOL", 99)
     with (
-        pytest.raises(DeviceError, match=r"speaks protocol 99, and labseq .* of the server speaks 1"),
+        pytest.raises(DeviceError, match=r"speaks protocol 99, and labseq .* of the server speaks 2"),
         instrument(server),
     ):
         pass
@@ -454,7 +433,7 @@ def test_shapes_are_checked_before_arrays_are_made() -> None:
 
     def message(index: int, dtype: object, shape: object) -> list[bytes]:
         packb: Any = msgpack.packb
-        return [packb(msgpack.ExtType(1, packb([index, dtype, shape, {}]))), bytes(16)]
+        return [packb(msgpack.ExtType(1, packb([[index, 0], dtype, shape, {}]))), bytes(16)]
 
     assert np.array_equal(wire.unpack(message(1, "<f8", [2])), np.zeros(2))
     (empty,) = wire.unpack(wire.pack([np.zeros((0, 3))]))
@@ -473,52 +452,50 @@ def test_shapes_are_checked_before_arrays_are_made() -> None:
             wire.unpack(message(*wrong))
 
 
-def test_an_array_beyond_the_limit_of_a_part_is_divided(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_too_large_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(messages, "MAX_PART", 1 << 15)
-    samples = np.arange(100_001, dtype=np.int16)
-    parts = wire.pack([samples, samples[:10], samples[:9000]])
-    assert max(len(part) for part in parts) <= 1 << 15
-    for sent, came in zip([samples, samples[:10], samples[:9000]], wire.unpack(parts), strict=True):
-        assert np.array_equal(sent, came)
-    with pytest.raises(wire.MessageError, match="expected 200002"):
-        wire.unpack([*parts[:2], parts[8], *parts[3:]])  # a part was replaced by a shorter one
-    monkeypatch.setattr(messages, "MAX_PARTS", 4)
-    with pytest.raises(wire.MessageError, match="at most 4 parts"):
-        wire.pack(samples)
+    assert len(wire.pack(np.zeros(1 << 12))) == 3
+    with pytest.raises(wire.MessageError, match="too large to be sent"):
+        wire.pack(np.zeros((1 << 12) + 1))
 
 
-def real_camera(server: Served, stop: StopFlag) -> RemoteCamera:
-    """A served camera in real time, with the simulation that it needs."""
-    context = Context("camera", SiteGrid(6, 7), clock=RealClock(stop))
-    about: dict[str, Any] = {"address": f"tcp://127.0.0.1:{server.port}", "simulated": False}
-    simulation = RemoteSimulation(RemoteSimulationSettings(**about), context)
-    camera = RemoteCamera(RemoteSettings(device="camera", **about), replace(context, simulation=simulation))
-    simulation.open()
-    simulation.begin_shot()
-    camera.open()
-    return camera
-
-
-def test_times_of_frames_are_on_the_clock_of_the_client(server: Served) -> None:
-    camera = real_camera(server, StopFlag())
-    camera.arm(1, 0.01, "software")
-    before_s = time.monotonic()
-    camera.trigger()
-    frame = camera.read(2.0)
-    assert before_s <= frame.t_start_s <= time.monotonic() - 0.01
-    camera.close()
+def test_times_of_frames_are_on_the_clock_of_the_client(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with camera(server) as device:
+        clock = device.link.connect()._clock
+        monkeypatch.setattr(clock, "now", lambda: time.monotonic() + 1000.0)  # not that of the server
+        device.arm(1, 0.01, "software")
+        before_s = clock.now()
+        device.trigger()
+        assert before_s <= device.read(2.0).t_start_s <= clock.now() - 0.01
 
 
 def test_a_stop_request_aborts_the_call_at_the_server(server: Served) -> None:
     stop = StopFlag()
-    camera = real_camera(server, stop)
-    camera.arm(1, 0.01, "software")
-    threading.Timer(0.1, stop.request).start()
-    with pytest.raises(StopRequested):
-        camera.read(600.0)  # nothing triggers it
-    with stop.held():
-        camera.safe_state()
-        camera.close()
+    with camera(server, stop=stop) as device:
+        device.arm(1, 0.01, "software")
+        threading.Timer(0.1, stop.request).start()
+        with pytest.raises(StopRequested):
+            device.read(600.0)  # nothing triggers it
+        with stop.held():
+            device.safe_state()
+            device.close()
+
+
+def test_a_simulated_device_refuses_a_line_that_nothing_can_switch_there(server: Served) -> None:
+    line = LineSpec("trigger", 0, frozenset({"image"}), triggers="camera")
+    context = Context("camera", SiteGrid(6, 7), clock=RealClock(StopFlag()), lines=(line,))
+    with pytest.raises(ConfigError, match=r"'camera' is simulated at its server.*--dry-run"):
+        RemoteCamera(server.settings("camera"), context).open()
+
+
+def test_a_client_cannot_replace_the_driver_of_an_open_device(server: Served) -> None:
+    with instrument(server) as device:
+        connection = device.link.connect()
+        with pytest.raises(DeviceError, match="has a driver already"):
+            connection.call("attach", connection._about(Context("laser")))
+        device.command("open")
 
 
 BROKEN = """

@@ -1,116 +1,68 @@
-"""Runs with remote devices: the same data as with devices of this computer."""
+"""Runs with remote devices."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 
-import pytest
-
 import labseq
-import labseq.remote.server
-from labseq import wire
 from tests.remote.conftest import served
-from tests.session.small_runs import table
 
-GRID = "{rows: 6, cols: 6, spacing: 4.49 um, row_frequency: TONES, column_frequency: TONES}".replace(
-    "TONES", "{centre: 100 MHz, step: 1.6 MHz}"
-)
-CHANNELS = """
-    mot: {channel: 3, on: [load]}
-    imaging: {channel: 4, on: [image]}
-    trigger: {channel: 5, on: [image], pulse: 0.2 ms, triggers: camera}
-    awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, triggers: mobile_tweezers}"""
-MOTION = "rf: {full_scale: 200 mV, max_peak: 200 mV, amplifier_gain: 38}"
-PROFILE = f"""\
+DEVICES = ("camera", "static_tweezers", "mobile_tweezers", "lines", "instrument")
+PROFILE = """\
 labseq: 1
 name: lab
-grid: {GRID}
-camera: CAMERA
-static_tweezers: STATIC
-mobile_tweezers: {{MOBILE, {MOTION}}}
-devices: {{trap_camera: {{role: camera, TRAP}}}}
-lines:
-  LINES
-  channels: {CHANNELS}
-detector: {{use: threshold}}
-simulation: SIMULATION
+grid: {{rows: 4, cols: 4, spacing: 4.49 um}}
+camera: {camera}
+static_tweezers: {static_tweezers}
+mobile_tweezers: {mobile_tweezers}
+lines: {{{lines}, channels: {{cooling: {{channel: 2, on: [load]}}}}}}
+devices: {{instrument: {instrument}}}
+detector:
+  use: threshold
+  frame: [80, 96]
+  centre_px: [39.5, 47.5]
+  pixel_size: 0.35 um
+  region: 5
+  threshold: 1630
+simulation: {{use: virtual, image: {{frame: [80, 96], centre_px: [39.5, 47.5]}}}}
 """
-HERE = {
-    "CAMERA": "{use: virtual}",
-    "STATIC": "{use: virtual}",
-    "MOBILE": "use: spcm, card: simulated, mode: replay, sample_rate: 624 MHz",
-    "TRAP": "use: virtual",
-    "LINES": "{use: ttl, port: simulated, simulated_by: python}",
-    "SIMULATION": "{use: virtual, lights: {loading: [mot], imaging: [imaging]}}",
-}
-DEVICES = {
-    "CAMERA": "camera",
-    "STATIC": "static_tweezers",
-    "MOBILE": "mobile_tweezers",
-    "TRAP": "trap_camera",
-    "LINES": "lines",
-}
 SEQUENCE = """
 labseq: 1
 name: small
 profile: ./lab.yaml
-target: {pattern: compact, rows: 3, cols: 3}
-planner: {use: psca}
+target: {pattern: compact, rows: 2, cols: 2}
 shots: 2
 shot:
-  - load: {duration: 500 ms}
-  - image: {exposure: 45 ms}
-  - rearrange: {cycles: 2, window: 60 ms, exposure: 45 ms}
-  - image: {exposure: 45 ms}
+  - load: {duration: LOAD}
+  - image: {exposure: 5 ms}
 """
 
 
-def filled(texts: dict[str, str]) -> str:
-    profile = PROFILE
-    for key, text in texts.items():
-        inside = key in ("MOBILE", "TRAP", "LINES")
-        if key == "LINES":
-            text = text.strip("{}").replace(", ", "\n  ")
-        profile = profile.replace(key, text.strip("{}") if inside else text)
-    return profile
+def write_client(folder: Path, at: Mapping[str, str], load: str = "1 ms") -> Path:
+    """A sequence all of whose devices are at servers; ``at`` has the address of each."""
+    remote = {name: f"use: remote, {at[name]}, device: {name}" for name in DEVICES}
+    texts = {name: text if name == "lines" else f"{{{text}}}" for name, text in remote.items()}
+    (folder / "lab.yaml").write_text(PROFILE.format(**texts), encoding="utf-8")
+    path = folder / "small.yaml"
+    path.write_text(SEQUENCE.replace("LOAD", load), encoding="utf-8")
+    return path
 
 
-def run(folder: Path, profile: str) -> labseq.Run:
-    folder.mkdir()
-    (folder / "lab.yaml").write_text(profile, encoding="utf-8")
-    (folder / "small.yaml").write_text(SEQUENCE, encoding="utf-8")
-    with labseq.Session.open(folder / "small.yaml", seed=5, output=folder / "runs") as session:
-        return session.run()
-
-
-@pytest.fixture(autouse=True)
-def _never_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four servers and a run share this process, which may stand still for long."""
-    for module in (wire, labseq.remote.server):
-        monkeypatch.setattr(module, "LOST_S", 60.0)
-
-
-def test_devices_of_several_servers_share_a_simulation(tmp_path: Path) -> None:
-    with served(tmp_path, filled(HERE), devices=("simulation",)) as first:
-        there = {"SIMULATION": f"{{use: remote, address: 'tcp://127.0.0.1:{first.port}'}}"}
-        split = filled({**HERE, **there})
-        with (
-            served(tmp_path, split, devices=("camera", "lines", "trap_camera")) as second,
-            served(tmp_path, split, devices=("static_tweezers", "mobile_tweezers")) as third,
-        ):
-            for key, name in DEVICES.items():
-                port = (third if "tweezers" in name else second).port
-                about = f"use: remote, address: 'tcp://127.0.0.1:{port}', device: {name}, simulated: true"
-                there[key] = f"{{{about}}}"
-            apart = run(tmp_path / "apart", filled(there))
-    together = run(tmp_path / "together", filled(HERE))
-    assert table(apart) == table(together)
+def test_a_run_uses_the_devices_of_a_server_and_records_where_they_are(tmp_path: Path) -> None:
+    with served(tmp_path) as server:
+        sequence = write_client(tmp_path, dict.fromkeys(DEVICES, f"address: 'tcp://127.0.0.1:{server.port}'"))
+        with labseq.Session.open(sequence, output=tmp_path / "runs") as session:
+            run = session.run()
+        assert all(device.owner is None for device in server.server.devices.values())
+    assert len(run.shots) == 2
+    record = json.loads((run.path / "run.json").read_text("utf-8"))
+    for name in DEVICES:
+        assert record["devices"][name]["remote"]["address"] == f"tcp://127.0.0.1:{server.port}"
 
 
 def test_a_dry_run_makes_no_connection(tmp_path: Path) -> None:
-    about = "use: remote, address: 'tcp://127.0.0.1:1', device:"
-    texts = {key: f"{{{about} {name}, simulated: true}}" for key, name in DEVICES.items()}
-    (tmp_path / "lab.yaml").write_text(filled({**texts, "SIMULATION": f"{{{about} simulation}}"}), "utf-8")
-    (tmp_path / "small.yaml").write_text(SEQUENCE, "utf-8")
-    with labseq.Session.open(tmp_path / "small.yaml", output=tmp_path / "runs", dry_run="full") as session:
+    sequence = write_client(tmp_path, dict.fromkeys(DEVICES, "address: 'tcp://127.0.0.1:1'"))
+    with labseq.Session.open(sequence, output=tmp_path / "runs", dry_run="full") as session:
         assert len(session.run().shots) == 2

@@ -1,0 +1,253 @@
+"""The driver that a server constructs for a client, and what the client may call.
+
+Each client has an object of the driver of its own. Several may be constructed at a time; one of them is open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
+
+from labseq.assembly.lab import construct
+from labseq.assembly.plugin_choice import ChosenPlugin
+from labseq.errors import ConfigError, DeviceError, LabseqError, Problem
+from labseq.files import devices_root
+from labseq.guard import Guard, StopFlag
+from labseq.kernel import load_kernels
+from labseq.messages import format_error
+from labseq.recording import clear_active, mark_active
+from labseq.roles import ROLES, Context, overrides
+from labseq.sequencer.clock import RealClock
+from labseq.sequencer.lab import attempt
+from labseq.watchdog import Watchdog
+
+_COMMON: Final = frozenset(
+    {"safe_state", "describe", "versions", "warm", "settle", "self_test", "poll", "check_interlocks"}
+)
+METHODS: Final[Mapping[str, frozenset[str]]] = {
+    "camera": _COMMON | {"arm", "disarm", "trigger", "read"},
+    "static_tweezers": _COMMON | {"load", "start", "ramp", "release", "leave_on"},
+    "mobile_tweezers": _COMMON | {"check_program", "prepare", "play", "wait", "prepare_beginning", "append"},
+    "device": _COMMON | {"command", "read", "check_command"},
+    "lines": _COMMON | {"check_program", "idle", "compile", "arm", "fire", "wait"},
+}
+"""Kind of device -> what clients may call, beside ``open`` and ``close``."""
+LOOKS: Final = frozenset({"describe", "versions"})
+"""What a client that has not opened the device gets from the driver of the one that has."""
+_WITHOUT_OPENING: Final = LOOKS | {"safe_state", "warm", "check_program", "check_command"}
+
+_OF_HARDWARE: Final = ("settling_timeout_s", "idle_output")
+_LIVE: Final = ("start_delay_s", "beginning_s")
+_PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
+    "camera": (*_OF_HARDWARE, "facts"),
+    "static_tweezers": (*_OF_HARDWARE, "facts"),
+    "mobile_tweezers": (*_OF_HARDWARE, "waits_for_trigger", *_LIVE),
+    "device": _OF_HARDWARE,
+    "lines": (*_OF_HARDWARE, "lines_facts"),
+}
+"""Kind of device -> properties that the client gets after ``attach`` and ``open``."""
+_CHANGES_LIVE: Final = frozenset({"prepare", "prepare_beginning", "append", "play"})
+
+RESCUE_S: Final = 5.0
+"""Longest time for a safe state beside a call that hangs; then the watchdog switches the device off."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEntry:
+    """A device of the profile that is served.
+
+    Attributes:
+        name: Its role, or its name in the profile.
+        chosen: Its plugin.
+        simulation: The plugin of the simulation that it acts on, if it is simulated.
+        identities: What identifies the hardware, for its marker; none if it is simulated.
+    """
+
+    name: str
+    chosen: ChosenPlugin
+    simulation: ChosenPlugin | None = None
+    identities: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """Kind of the device, "camera"."""
+        return self.chosen.entry.kind
+
+    @property
+    def key(self) -> str:
+        """Stands for the profile in the device's marker."""
+        return f"labseq serve-devices {self.name}"
+
+
+class ClientDriver:
+    """A client's own object of the driver of a served device, with its watchdog.
+
+    All methods are called in the thread of the device, except for :meth:`make_safe_beside`.
+
+    Attributes:
+        device: The driver.
+        clock: Its time.
+        is_open: Whether the client has opened the device and may act with it.
+        is_safe: Whether nothing was called since a safe state that succeeded.
+
+    Args:
+        entry: The device.
+        about: The client's context: name, grid, motion, lines and calibrations.
+        abort: Ends waits of the driver.
+        report: Receives what happens, for the operator.
+
+    Raises:
+        ConfigError: The driver refuses its settings, or a simulated device would need the client's lines.
+    """
+
+    def __init__(
+        self, entry: DeviceEntry, about: Mapping[str, Any], abort: StopFlag, report: Callable[[str], object]
+    ) -> None:
+        self.clock = RealClock(abort)
+        self.is_open = self.is_safe = False
+        self._entry = entry
+        self._abort = abort
+        self._report = report
+        self._watchdog: Watchdog | None = None
+        name, lines = about["name"], tuple(about["lines"])
+        if entry.chosen.virtual_time and name in [line.triggers for line in lines]:
+            what = f"'{entry.name}' is simulated at its server, where no line can trigger it"
+            raise ConfigError(Problem(what, hint="'--dry-run' simulates all devices in one place"))
+        context = Context(
+            name,
+            about["grid"],
+            about["motion"],
+            self.clock,
+            calibrations=about["calibrations"],
+            lines=lines,
+        )
+        chosen = {name: entry.chosen}
+        if entry.simulation is not None:
+            chosen["simulation"] = entry.simulation
+        made, _ = construct(chosen, context, seed=0)
+        self.device = made[name]
+        self._simulation = made.get("simulation")
+
+    def abilities(self) -> list[str]:
+        """The methods that the driver has itself; the client need not ask for the others."""
+        base = ROLES[self._entry.kind].base
+        return [name for name in METHODS[self._entry.kind] if overrides(self.device, getattr(base, name))]
+
+    def open(self, lost: Callable[[str], object]) -> None:
+        """Open the device.
+
+        Args:
+            lost: Called, from another thread, when the watchdog is lost.
+        """
+        self.is_open, self.is_safe = True, False
+        self._mark()
+        with self._abort.held():
+            if self._simulation is not None:
+                self._simulation.open()
+                self._simulation.begin_shot()
+            self.device.open()
+        emergency = self.device.emergency()
+        if emergency is not None and self._watchdog is None:
+            self._watchdog = Watchdog("labseq serve-devices", lost=lost, may_end=True)
+            self._watchdog.add(self._entry.name, 0, emergency.script, dict(emergency.arguments))
+            for note in self._watchdog.notes():
+                self._report(f"{self._entry.name}: {note}")
+
+    def call(self, name: str, args: list[Any], named: dict[str, Any]) -> Any:
+        """Call a method of the driver.
+
+        Raises:
+            DeviceError: A client may not call it, or has to open the device first.
+        """
+        if name not in METHODS[self._entry.kind]:
+            raise DeviceError(self._entry.name, f"a client cannot call {name[:40]!r}")
+        if not self.is_open and name not in _WITHOUT_OPENING:
+            raise DeviceError(self._entry.name, "this connection has not opened it")
+        if name == "warm":
+            self.device.warm()
+            return load_kernels()
+        if name == "safe_state":
+            return self._make_safe() if self.is_open else None
+        self.is_safe = self.is_safe and name in _WITHOUT_OPENING
+        value = getattr(self.device, name)(*args, **named)
+        if name == "leave_on" and value:
+            self.is_safe = True  # it must not be switched off
+            self._give_up()
+        return dict(value) if isinstance(value, Mapping) else value
+
+    def state_after(self, name: str) -> dict[str, Any]:
+        """Values of the properties that a call may have changed."""
+        is_mobile = self._entry.kind == "mobile_tweezers"
+        if name in ("attach", "open"):
+            names = _PROPERTIES[self._entry.kind]
+        elif is_mobile and name in _CHANGES_LIVE:
+            names = _LIVE
+        else:
+            return {}
+        state = {name: getattr(self.device, name) for name in names}
+        if is_mobile:
+            state["timings"] = dict(self.device.timings())
+        return state
+
+    def make_safe_beside(self) -> str:
+        """Make the device safe while a call hangs in its thread; returns why that failed, or ""."""
+        guard = Guard(self._abort)
+        with self._abort.held():
+            failure = attempt(guard, self._entry.name, RESCUE_S, self.device.safe_state)
+        guard.end()
+        if failure is not None and self._watchdog is not None:
+            self._watchdog.end()  # it switches off what it was not asked to forget
+        return "" if failure is None else str(failure)
+
+    def close(self) -> list[str]:
+        """Make the device safe, unless it is, and close it; returns what failed."""
+        failures: list[str] = []
+
+        def attempt_each(method: Callable[[], object], what: str) -> None:
+            try:
+                method()
+            except BaseException as error:  # noqa: BLE001 - of the driver's class
+                failures.append(f"{what} failed: {format_error(error)}")
+
+        with self._abort.held():
+            if self.is_open and not self.is_safe:
+                attempt_each(self._make_safe, "safe_state()")
+            attempt_each(self.device.close, "close()")
+            if self._simulation is not None:
+                attempt_each(self._simulation.close, "close() of its simulation")
+        if self.is_open and not self.is_safe:
+            acts = "its watchdog switches it off" if self._watchdog else "nothing else can switch it off"
+            failures.append(f"it is NOT SAFE: {acts}")
+        self._give_up()
+        return failures
+
+    def _make_safe(self) -> None:
+        self.is_safe = False
+        with self._abort.held():
+            self.device.safe_state()
+        if self._simulation is not None:
+            self._simulation.begin_shot()  # an exposure that was ended keeps the next one from beginning
+        self.is_safe = True
+
+    def _give_up(self) -> None:
+        """Let others use the device. A watchdog that is not told to forget it switches it off."""
+        self.is_open = False
+        if self._watchdog is not None:
+            if self.is_safe:
+                self._watchdog.forget([self._entry.name])
+            self._watchdog.end()
+            self._watchdog = None
+        if self.is_safe and self._entry.identities:
+            with suppress(LabseqError):
+                clear_active(self._entry.key, self._entry.identities)
+
+    def _mark(self) -> None:
+        """Leave a marker until the device is safe, as a run does: `labseq safe` and `devices` see it."""
+        if not self._entry.identities:
+            return
+        try:
+            mark_active(self._entry.key, self._entry.identities, devices_root() / self._entry.key)
+        except LabseqError as error:
+            self._report(f"{self._entry.name}: {error}")

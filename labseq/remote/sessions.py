@@ -1,0 +1,103 @@
+"""A client's session with a served device, and the call that is carried out for it."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from labseq.guard import StopFlag
+from labseq.remote.drivers import ClientDriver
+
+GRACE_S: Final = 0.3
+"""How long a call may take to end after it was aborted, before the device is made safe beside it."""
+
+CLOSED: Final = "closed"
+"""Why a session is over that the client has ended."""
+
+
+class Abort(StopFlag):
+    """The request to end the call in progress; the next call begins without it."""
+
+    def clear(self) -> None:
+        """Take the request back."""
+        self._event.clear()
+
+
+@dataclass(eq=False)
+class Session:
+    """A client's connection to a device. The control's thread sees and aborts its calls.
+
+    Attributes:
+        peer: The client's public key; "" without keys.
+        who: What the client calls itself, for other users.
+        connection: The connection that its signs of life come from; see :class:`labseq.wire.Connections`.
+        token: Names the session in each message.
+        beat_s: When it last gave a sign of life.
+        ended: Why it is over; "" while it is not.
+        driver: Its own object of the driver; None before the client has sent its context.
+        number: Number of the last call.
+        call: Name of the last call.
+        reply: The parts of the last reply, in case the message comes twice.
+        began_s: When the call in progress began; None while none is.
+        rescue: Outcome of a safe state beside that call: "" if there was none, "under way", "safe", or why
+            it failed.
+    """
+
+    peer: str
+    who: str
+    connection: tuple[int, int]
+    token: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    beat_s: float = field(default_factory=time.monotonic)
+    ended: str = ""
+    driver: ClientDriver | None = None
+    number: int = 0
+    call: str = ""
+    reply: list[Any] = field(default_factory=list[Any])
+    began_s: float | None = None
+    rescue: str = ""
+    abort: Abort = field(default_factory=Abort)
+    _aborted_s: float | None = None
+    _is_rescued: threading.Event = field(default_factory=threading.Event)
+    _deciding: threading.Lock = field(default_factory=threading.Lock)
+
+    def begin_call(self, number: int, call: str) -> None:
+        """Note that a call is carried out from now on."""
+        self.number, self.call, self.reply = number, call, []
+        self.abort.clear()
+        self._aborted_s, self.rescue, self.began_s = None, "", time.monotonic()
+
+    def end_call(self) -> None:
+        """Note that it has ended; waits for the end of a safe state beside it.
+
+        A driver need not bear further calls while ``safe_state()`` is carried out.
+        """
+        with self._deciding:
+            self.began_s = None
+            is_under_way = self.rescue == "under way"
+        if is_under_way:
+            self._is_rescued.wait()
+
+    def abort_call(self) -> None:
+        """Ask the call in progress to end."""
+        if self.began_s is not None:
+            self._aborted_s = self._aborted_s or time.monotonic()
+            self.abort.request()
+
+    def rescue_if_stuck(self, report: Callable[[str], object]) -> None:
+        """Make the device safe in another thread if a call does not end after it was aborted."""
+        with self._deciding:
+            is_stuck = self._aborted_s is not None and time.monotonic() > self._aborted_s + GRACE_S
+            if self.began_s is None or not is_stuck or self.rescue or self.driver is None:
+                return
+            self.rescue = "under way"
+            self._is_rescued.clear()
+        threading.Thread(target=self._rescue, args=[self.driver, report], daemon=True).start()
+
+    def _rescue(self, driver: ClientDriver, report: Callable[[str], object]) -> None:
+        self.rescue = driver.make_safe_beside() or "safe"
+        report(f"{self.call}() does not return; made safe beside it: {self.rescue}")
+        self._is_rescued.set()
