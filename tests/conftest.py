@@ -34,7 +34,7 @@ LONGEST = ("tests/web/test_browser.py", "tests/docs/test_blocks.py")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add ``--quick``, for running tests while editing."""
-    parser.addoption("--quick", action="store_true", help="nothing outlives a power cut; less is looked up")
+    parser.addoption("--quick", action="store_true", help="nothing outlives a power cut; checks plan less")
 
 
 def pytest_configure() -> None:
@@ -85,27 +85,36 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    if session.config.getoption("--quick"):
-        _be_quick()
-
-
-def _be_quick() -> None:
-    """Leave out what costs time and is rarely the subject of the tests that one runs while editing.
-
-    Files need not outlive a power cut; what is installed, the state of this repository and the command line
-    stay the same; checks plan for fewer loadings.
-    """
-    from labseq.session import check, provenance
-
     patch = pytest.MonkeyPatch()
-    patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
-    patch.setattr(os, "fsync", os.fstat)
+    _look_up_once(patch)
+    if session.config.getoption("--quick"):
+        _be_quick(patch)
+
+
+def _look_up_once(patch: pytest.MonkeyPatch) -> None:
+    """What is installed, the state of this repository and the command line are the same for all tests.
+
+    A process of labseq looks each up once; the tests are thousands of such processes in one.
+    """
+    from labseq.session import provenance
+
     entry_points, read_text = importlib.metadata.entry_points, importlib.metadata.PathDistribution.read_text
     installed = cache(lambda _path, **which: entry_points(**which))
     patch.setattr(importlib.metadata, "entry_points", lambda **which: installed(tuple(sys.path), **which))
     patch.setattr(importlib.metadata.PathDistribution, "read_text", cache(read_text))
     patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
     patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"], {}))
+
+
+def _be_quick(patch: pytest.MonkeyPatch) -> None:
+    """Leave out what is rarely the subject of the tests that one runs while editing.
+
+    Files need not outlive a power cut; checks plan for fewer loadings.
+    """
+    from labseq.session import check
+
+    patch.setattr(check, "N_LOADINGS", check.N_LOADINGS // 20)
+    patch.setattr(os, "fsync", os.fstat)
 
 
 def _git_here_once(
