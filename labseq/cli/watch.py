@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -62,7 +63,7 @@ class WatchedRun:
         self.follower = Follower(run_dir)
         self._record = read_record(run_dir)
         self._clock = clock
-        self._rows: dict[tuple[int, int], IndexRow] = {}
+        self._rows = defaultdict[tuple[int, int, str], list[IndexRow]](list)
         self._time_s, self._read_s = 0.0, math.nan
 
     def now(self) -> float:
@@ -81,7 +82,8 @@ class WatchedRun:
             return
         self._read_s = math.nan
         # after the events: a shot is in the index before its event is in the log
-        self._rows |= {(row.shot, row.attempt): row for _, row in self.follower.lines() if row is not None}
+        for shot in self.follower.shots():
+            self._rows[shot.index, shot.attempt, shot.status].append(shot.row)
         rows = [self._row_of(event) for event in events]
         # reading a shot's file takes 10 ms: of a run that is joined late, only the last ones are opened
         to_open = {id(row) for row in list(filter(None, rows))[-20:]}
@@ -100,8 +102,9 @@ class WatchedRun:
             return None
         try:
             shot = event.values["shot"]
-            return self._rows.pop((shot["shot_index"], shot["attempt"]), None)
-        except (KeyError, TypeError):
+            # an attempt that was interrupted is made again, under the same number, when the run is resumed
+            return self._rows[shot["shot_index"], shot["attempt"], shot["status"]].pop(0)
+        except (KeyError, TypeError, IndexError):
             return None
 
 

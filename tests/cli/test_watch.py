@@ -32,7 +32,7 @@ class WrittenRun:
         self.writer.write_shot(shot)
         names = ("shot_index", "attempt", "status", "error", "success", "filling_fraction")
         printed = {name: getattr(shot, name) for name in names}
-        self.writer.event("shot_finished" if shot.status == "complete" else "shot_repeated", shot=printed)
+        self.writer.event("shot_repeated" if shot.status == "failed" else "shot_finished", shot=printed)
 
     def watch(self, *meanwhile: Callable[[], None]) -> list[str]:
         """Watch the run; between the looks at it, do these things."""
@@ -67,6 +67,16 @@ def test_a_run_is_watched_to_its_end(watched: WrittenRun) -> None:
         "shot 1  defect-free after 2 cycles  filling 100.0 %  1.9 s",
     ]
     assert "shots             2 of 3, 1 attempt kept that did not complete" in lines
+
+
+def test_an_attempt_that_is_made_again_after_an_interruption_has_a_line_of_its_own(
+    watched: WrittenRun,
+) -> None:
+    watched.take(0, status="interrupted")
+    watched.take(0)
+    watched.writer.finish("complete")
+    lines = [line for line in watched.watch() if line.startswith("shot 0")]
+    assert [line.split()[2] for line in lines] == ["interrupted", "defect-free"]
 
 
 def test_a_finished_run_is_shown_at_once(watched: WrittenRun) -> None:
