@@ -137,7 +137,7 @@ def test_a_rehearsed_loss_of_frames_repeats_shots(tmp_path):
     done = run(tmp_path, write(tmp_path), shots=4, seed=2, **options)
     assert [s.index for s in done.shots] == [0, 1, 2, 3]
     assert done.attempts
-    assert all("TransientError" in attempt.row["error"] for attempt in done.attempts)
+    assert all("TransientError" in attempt.row.error for attempt in done.attempts)
 
 
 def test_an_unwritable_place_is_named_before_anything_opens(tmp_path):
