@@ -78,6 +78,9 @@ class Simulation(ABC):
         """(height, width) in pixels of the sensor, also before ``open()``; None if it describes none."""
         return None
 
+    def warm(self) -> None:
+        """Import every kernel that a shot needs, before ``open()``; labseq then compiles or loads them."""
+
     def warnings(self) -> Sequence[str]:
         """What ``labseq check`` and a run warn of, such as settings beyond the range of the model."""
         return ()

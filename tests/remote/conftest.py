@@ -12,7 +12,6 @@ import pytest
 from labseq_remote.settings import RemoteSettings
 
 import labseq.remote.server
-from labseq.plugin import wire
 from labseq.remote.server import Server, Serving, serving
 
 PROFILE = """\
@@ -90,7 +89,7 @@ def _patient() -> Generator[None]:
     connected, because tests do not collect garbage.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wire, "LOST_S", 2.0)
+        patch.setattr("labseq.plugin.wire.LOST_S", 2.0)
         patch.setattr(labseq.remote.server, "LOST_S", 2.0)
         patch.setattr(labseq.remote.server, "MAX_SESSIONS", 10_000)
         yield
