@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,8 +24,6 @@ from typing import (
     get_origin,
 )
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -34,7 +32,7 @@ from pydantic import (
     Field,
     PrivateAttr,
     ValidationInfo,
-    field_validator,
+    create_model,
     model_validator,
 )
 from pydantic.fields import FieldInfo
@@ -42,7 +40,6 @@ from pydantic_core import PydanticCustomError
 
 from labseq.errors import Loc
 from labseq.messages import clean, shown
-from labseq.model.grid import centred_comb
 from labseq.text_files import beside
 from labseq.units import expected, parse_any, parse_quantity, unit_names
 
@@ -69,7 +66,12 @@ class Settings(BaseModel):
     """
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=False, defer_build=True
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        validate_default=False,
+        defer_build=True,
+        serialize_by_alias=True,
     )
 
     def identities(self) -> Sequence[str] | None:
@@ -90,6 +92,33 @@ class Settings(BaseModel):
 
 class NoSettings(Settings):
     """The settings of a plugin that takes none."""
+
+
+_SI_UNIT: Final = re.compile(r"(?<!_per)_(m_s|s|m|k|hz|v|w|db)$")
+
+
+def key_without_unit(name: str) -> str:
+    """The key in a file for an attribute in SI: in a file the unit stands beside the value.
+
+    Example:
+        >>> key_without_unit("speed_m_s"), key_without_unit("distance_per_m")
+        ('speed', 'distance_per_m')
+    """
+    return _SI_UNIT.sub("", name)
+
+
+IN_SI: Final = ConfigDict(
+    extra="forbid",
+    allow_inf_nan=False,
+    defer_build=True,
+    serialize_by_alias=True,
+    alias_generator=key_without_unit,
+    validate_by_name=True,
+)
+"""Configuration of a domain type that is also a mapping of settings, as a dataclass of pydantic.
+
+Python constructs it with its attributes, whose names have their units; a file has :func:`key_without_unit`.
+"""
 
 
 def setting_error(
@@ -155,6 +184,10 @@ def _quantity(dimension: str) -> BeforeValidator:
     return BeforeValidator(Quantity(dimension))
 
 
+SettingsType: TypeAlias = type[Any]
+"""A type with settings, see :func:`has_settings`."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
     """One key of a settings model: what messages, reference pages, units and addresses need to know of it.
@@ -178,7 +211,7 @@ class Setting:
     is_required: bool
     description: str
     dimension: str
-    models: tuple[type[BaseModel], ...]
+    models: tuple[SettingsType, ...]
     is_by_name: bool
 
     @property
@@ -188,9 +221,9 @@ class Setting:
 
 
 @cache
-def settings_of(model: type[BaseModel] | None) -> tuple[Setting, ...]:
+def settings_of(model: SettingsType | None) -> tuple[Setting, ...]:
     """The settings of a model, in the order of its declaration; none for a plugin that takes none."""
-    return tuple(_setting(name, field) for name, field in (model.model_fields if model else {}).items())
+    return tuple(_setting(name, field) for name, field in getattr(model, "__pydantic_fields__", {}).items())
 
 
 def _setting(name: str, field: FieldInfo) -> Setting:
@@ -205,7 +238,7 @@ def _setting(name: str, field: FieldInfo) -> Setting:
         is_required=field.is_required(),
         description=field.description or "",
         dimension=dimensions.pop() if len(dimensions) == 1 else "",
-        models=tuple(dict.fromkeys(filter(_is_model, parts))),
+        models=tuple(dict.fromkeys(filter(has_settings, parts))),
         is_by_name=any(get_origin(part) is dict for part in parts),
     )
 
@@ -223,17 +256,18 @@ def dimension_read_by(part: Any) -> str:
     return function.dimension if isinstance(function, Quantity) else ""
 
 
-def _is_model(part: Any) -> TypeGuard[type[BaseModel]]:
-    return isinstance(part, type) and issubclass(part, BaseModel)
+def has_settings(kind: Any) -> TypeGuard[SettingsType]:
+    """Whether a type is a mapping of settings: a model, or a domain type with the configuration IN_SI."""
+    return isinstance(kind, type) and hasattr(kind, "__pydantic_fields__")
 
 
-def settings_at(model: type[BaseModel] | None, loc: Loc) -> Sequence[Setting]:
+def settings_at(model: SettingsType | None, loc: Loc) -> Sequence[Setting]:
     """The setting at a location below a model: several in a union, none at the top.
 
     Indices, and names that the user chooses, count as the list or mapping that they are in.
     """
     found: Sequence[Setting] = ()
-    models: Sequence[type[BaseModel] | None] = [model]
+    models: Sequence[SettingsType | None] = [model]
     for step in loc:
         named = [one for inner in models for one in settings_of(inner) if one.key == step]
         if named:
@@ -241,13 +275,13 @@ def settings_at(model: type[BaseModel] | None, loc: Loc) -> Sequence[Setting]:
     return found
 
 
-def models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+def models_at(model: SettingsType, loc: Loc) -> list[SettingsType]:
     """The settings models of a location below a model: several in a union."""
     settings = settings_at(model, loc)
     return [inner for one in settings for inner in one.models] if settings else [model]
 
 
-def si_unit_at(model: type[BaseModel] | None, loc: Loc) -> str:
+def si_unit_at(model: SettingsType | None, loc: Loc) -> str:
     """SI unit of the setting at a location in a settings model; "" for one that has or is none.
 
     Example:
@@ -347,6 +381,17 @@ class PatternChoice(Choice):
 _C = TypeVar("_C", bound=Choice)
 
 
+def with_settings_of(spec: SettingsType) -> Callable[[type[_C]], type[_C]]:
+    """Let the mapping that names a plugin hold the settings of a domain type too."""
+
+    def extend(choice: type[_C]) -> type[_C]:
+        fields: Any = {name: (field.annotation, field) for name, field in spec.__pydantic_fields__.items()}
+        name, module = choice.__name__, choice.__module__
+        return create_model(name, __base__=choice, __module__=module, __doc__=choice.__doc__, **fields)
+
+    return extend
+
+
 def _placed_by_field(choice: _C, info: ValidationInfo) -> _C:
     return choice.placed(info.field_name or "")
 
@@ -410,34 +455,3 @@ Variables: TypeAlias = Annotated[
     dict[str, Annotated[int | float, BeforeValidator(si_of)]], AfterValidator(_named_well), empty_is({})
 ]
 """Name -> value, SI."""
-
-
-class FrequencyComb(Settings):
-    """Tones of the rows or columns of the grid: equally spaced, or a table from a calibration."""
-
-    centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
-    step: Frequency = Field(
-        default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
-    )
-    table: tuple[Annotated[Frequency, Field(gt=0)], ...] = Field(
-        default=(), description="calibrated frequency of each row or column, in place of centre and step"
-    )
-
-    @field_validator("step")
-    @classmethod
-    def _tones_differ(cls, step: float) -> float:
-        if step == 0:
-            raise ValueError("a step of 0 puts all tones at one frequency; expected another value")
-        return step
-
-    @field_validator("table")
-    @classmethod
-    def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
-        steps_hz = np.diff(table)
-        if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
-            raise ValueError("the tones neither rise nor fall all along; expected the sites' in order")
-        return table
-
-    def tones(self, n_sites: int) -> NDArray[np.float64]:
-        """Frequency of the tone of each of ``n_sites`` rows or columns, in Hz."""
-        return np.array(self.table) if self.table else centred_comb(n_sites, self.centre, self.step)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq import motion
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
 from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.wiring import wrong_wiring
-from labseq.config.profile import MotionSettings, ProfileSpec
+from labseq.config.profile import ProfileSpec
 from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
@@ -180,7 +180,10 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
 def _reopened(lab: Lab, before: ResolvedProfile, after: ResolvedProfile) -> frozenset[str]:
     names = {name for name, _ in lab.hardware()} | ({"simulation"} if lab.simulation is not None else set())
     changed = {name for name in names if _differs(before, after, name)}
-    moved = _changed_motion(before.profile.mobile_tweezers, after.profile.mobile_tweezers)
+    old, new = before.profile.motion, after.profile.motion
+    moved = {
+        field.name for field in fields(MotionSpec) if getattr(old, field.name) != getattr(new, field.name)
+    }
     if lab.simulation is not None:
         return frozenset(names if changed or moved else ())
     if moved & DRIVERS_MOTION:
@@ -191,10 +194,6 @@ def _reopened(lab: Lab, before: ResolvedProfile, after: ResolvedProfile) -> froz
 def _differs(before: ResolvedProfile, after: ResolvedProfile, name: str) -> bool:
     old, new = before.chosen[name], after.chosen[name]
     return (old.entry, old.settings) != (new.entry, new.settings)
-
-
-def _changed_motion(before: MotionSettings, after: MotionSettings) -> set[str]:
-    return {key for key in MotionSettings.model_fields if getattr(before, key) != getattr(after, key)}
 
 
 def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:

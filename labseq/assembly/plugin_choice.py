@@ -227,7 +227,7 @@ def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
     if settings is None:
         return {}
     what = f"the settings of {entry.kind} '{entry.name}'"
-    return call_plugin(entry.owner, what, lambda: settings.model_dump(mode="json", by_alias=True))
+    return call_plugin(entry.owner, what, lambda: settings.model_dump(mode="json"))
 
 
 def changed_settings(settings: Settings | None) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class ResolvedProfile:
         motion, mobile = self.profile.motion, self.profile.mobile_tweezers
         driver = self.chosen.get("mobile_tweezers")  # None if it has an error, and others are made safe
         typical_s = getattr(driver and driver.settings, "overhead_per_cycle_s", None)
-        if typical_s is not None and "overhead_per_cycle" not in mobile.model_fields_set:
+        if typical_s is not None and "overhead_per_cycle_s" not in mobile.model_fields_set:
             motion = replace(motion, overhead_per_cycle_s=typical_s)
         return with_calibrations(motion, self.calibrations)
 
@@ -161,7 +161,7 @@ def _takes_time(host: PluginHost, step: str) -> bool:
 def check_dead_time(document: Document, spec: ProfileSpec, found: ProblemCollector) -> None:
     """Find a dead time before each batch of tweezers that are not virtual: they would play it as silence."""
     mobile = spec.mobile_tweezers
-    if mobile.overhead_per_batch and not mobile.use.startswith(VIRTUAL_TWIN):
+    if mobile.motion.overhead_per_batch_s and not mobile.use.startswith(VIRTUAL_TWIN):
         what = f"a dead time before each batch is set for '{clean(mobile.use)}', which would play silence"
         expected = "none: batches follow each other, and only `use: virtual` models a setup that cannot do so"
         found.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.calibration_store import read_entry
 from labseq.config.document import StoredText
-from labseq.config.profile import MOTION_KEYS, GridSettings, MotionSettings
+from labseq.config.profile import GridSettings
 from labseq.config.validation import validate_values
 from labseq.data.reader import Run
 from labseq.errors import RecordingError
@@ -20,6 +20,7 @@ from labseq.plugins import PluginHost
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
+from labseq.settings import settings_of
 from labseq.text_files import beside
 
 
@@ -131,10 +132,11 @@ def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
         ConfigError: The recorded profile is invalid.
     """
     tweezers = machine.get("mobile_tweezers", {})
-    motion = {key: tweezers[key] for key in MOTION_KEYS if key in tweezers}
+    keys = [setting.key for setting in settings_of(MotionSpec)]
+    motion = {key: tweezers[key] for key in keys if key in tweezers}
     return Machine(
         validate_values(GridSettings, machine.get("grid", {}), called).model(),
-        validate_values(MotionSettings, motion, called).spec(),
+        validate_values(MotionSpec, motion, called),
     )
 
 

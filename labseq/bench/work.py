@@ -18,7 +18,6 @@ from labseq.assembly.plugin_choice import ChosenPlugin, construct_target, dump, 
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.config.addresses import Override
 from labseq.config.document import Document
-from labseq.config.profile import MotionSettings
 from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
@@ -96,7 +95,7 @@ def _motion(condition: Condition) -> MotionSpec:
         for key, value in condition.motion
     ]
     document = Document.of_options(overrides, _MOTION_ADDRESS)
-    motion = document.validate(MotionSettings, ("motion",), called=_MOTION_ADDRESS).spec()
+    motion = document.validate(MotionSpec, ("motion",), called=_MOTION_ADDRESS)
     n = condition.degree_of_parallelism
     limit, what = min(
         (motion.max_tweezers, "the most tweezers that can be on at once"),

@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
-from pydantic import BaseModel
-
 from labseq.config.addresses import Override, find
 from labseq.config.expressions import Expressions, evaluate
 from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector, collecting
 from labseq.messages import clean, shown, visible
-from labseq.settings import FORMAT
+from labseq.settings import FORMAT, SettingsType
 from labseq.text_files import beside, decode, is_folder, read_bytes
 
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M")
 
 FileKind = Literal["sequence", "hardware profile"]
 _KINDS: Final[Mapping[FileKind, str]] = {"sequence": "shot", "hardware profile": "grid"}
@@ -313,7 +311,7 @@ def load_checked(
         return repaired, spec
 
 
-def _without_wrong_values(document: Document, model: type[BaseModel], fallbacks: FallbackValues) -> Document:
+def _without_wrong_values(document: Document, model: SettingsType, fallbacks: FallbackValues) -> Document:
     """A copy whose invalid values are replaced by fallbacks, or removed if there is no fallback."""
     root, seen, replaced = document.root, set[Loc](), set[Loc]()
     for _ in range(_MAX_PASSES):  # validators of a whole list run once all its items are right

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import fields
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, cast
 
 from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
@@ -15,9 +16,9 @@ from labseq.config.document import Document, FallbackValues, StoredText, check_k
 from labseq.config.find import find_profile
 from labseq.errors import ProblemCollector
 from labseq.messages import clean
-from labseq.model import CALIBRATION_KINDS, LossSpec, MotionSpec, RfSpec, SiteGrid
+from labseq.model import CALIBRATION_KINDS, FrequencyComb, MotionSpec, SiteGrid
 from labseq.model.lines import LineSpec
-from labseq.model.motion import PhaseChoice, SpeedProfile
+from labseq.model.motion import Sites
 from labseq.settings import (
     FORMAT,
     Choice,
@@ -25,21 +26,16 @@ from labseq.settings import (
     FilePath,
     Folders,
     FormatVersion,
-    Fraction,
-    Frequency,
-    FrequencyComb,
     Length,
     Name,
     PositiveDuration,
-    Power,
     Settings,
-    Speed,
     Text,
     Variables,
-    Voltage,
     empty_is,
     placed_by_field,
     setting_error,
+    with_settings_of,
 )
 from labseq.units import format_quantity
 
@@ -314,222 +310,14 @@ class LinesChoice(Choice):
         return tuple(sorted(specs, key=lambda spec: spec.channel))
 
 
-_RF: Final = RfSpec()
-
-
-def _rises(band: tuple[float, float]) -> tuple[float, float]:
-    low, high = band
-    if not 0 <= low < high:
-        from_, to = (format_quantity(hz, "frequency") for hz in band)
-        raise ValueError(f"the band goes from {from_} to {to}; expected [lowest, highest], both above 0 Hz")
-    return band
-
-
-Band: TypeAlias = Annotated[tuple[Frequency, Frequency], AfterValidator(_rises)]
-Amplitudes: TypeAlias = tuple[Annotated[Fraction, Field(gt=0)], ...]
-
-
-class RfSettings(Settings):
-    """The RF drive of the mobile tweezers' AODs, and its limits."""
-
-    row_band: Band = Field(
-        default=_RF.row_band_hz, description="[lowest, highest] frequency of the row axis' AOD"
-    )
-    column_band: Band = Field(
-        default=_RF.column_band_hz, description="[lowest, highest] frequency of the column axis' AOD"
-    )
-    min_spacing: Annotated[Frequency, Field(ge=0)] = Field(
-        default=_RF.min_spacing_hz, description="smallest distance of two tones of an axis"
-    )
-    row_amplitudes: Amplitudes = Field(
-        default=_RF.row_amplitudes,
-        description="amplitude of each row's tone, as a fraction of full scale; none: all equal, such that "
-        "`max_row_tones` reach full scale together",
-    )
-    column_amplitudes: Amplitudes = Field(
-        default=_RF.column_amplitudes,
-        description="amplitude of each column's tone, as a fraction of full scale; none: all equal, such "
-        "that `max_column_tones` reach full scale together",
-    )
-    phases: PhaseChoice = Field(
-        default=_RF.phases,
-        description="phases of the tones at pick-up: random, but always the same for a site, or chosen for "
-        "each batch so that the tones' sum has a low crest",
-    )
-    phase_seed: int = Field(default=_RF.phase_seed, ge=0, description="seed of the random phases")
-    full_scale: Annotated[Voltage, Field(gt=0)] = Field(
-        default=_RF.full_scale_v, description="peak voltage of the output at full scale, across 50 Ohm"
-    )
-    max_peak: Annotated[Voltage, Field(gt=0)] = Field(
-        default=_RF.max_peak_v, description="largest peak voltage that the amplifiers tolerate"
-    )
-    amplifier_gain: float = Field(
-        default=_RF.amplifier_gain_db, description="power gain between the output and each AOD, in dB"
-    )
-    max_mean_power: Annotated[Power, Field(gt=0)] = Field(
-        default=_RF.max_mean_power_w, description="largest mean RF power at each AOD"
-    )
-    snap_within: Annotated[Length, Field(ge=0)] = Field(
-        default=_RF.snap_within_m,
-        description="distance in the atom plane within which calibrated tones are moved to an equally "
-        "spaced comb; 0: none is moved",
-    )
-
-    def spec(self) -> RfSpec:
-        """Convert the settings to the core's type."""
-        return RfSpec(
-            row_band_hz=self.row_band,
-            column_band_hz=self.column_band,
-            min_spacing_hz=self.min_spacing,
-            row_amplitudes=self.row_amplitudes,
-            column_amplitudes=self.column_amplitudes,
-            phases=self.phases,
-            phase_seed=self.phase_seed,
-            full_scale_v=self.full_scale,
-            max_peak_v=self.max_peak,
-            amplifier_gain_db=self.amplifier_gain,
-            max_mean_power_w=self.max_mean_power,
-            snap_within_m=self.snap_within,
-        )
-
-
-_LOSSES: Final = LossSpec()
-
-
-class LossSettings(Settings):
-    """How probably atoms are lost, to compare plans by what survives; nothing is lost because of it."""
-
-    move: Annotated[Fraction, Field(lt=1)] = Field(
-        default=_LOSSES.move, description="loss of an atom that is picked up, moved and dropped off"
-    )
-    tone: Annotated[Fraction, Field(lt=1)] = Field(
-        default=_LOSSES.tone, description="added to it for each tone on beyond one per axis"
-    )
-    distance_per_m: Annotated[float, Field(ge=0)] = Field(
-        default=_LOSSES.distance_per_m, description="added to it per metre of the way"
-    )
-    landing: Annotated[Fraction, Field(lt=1)] = Field(
-        default=_LOSSES.landing,
-        description="loss of an atom that stands where a tweezer without an atom is ramped down",
-    )
-    passing: Annotated[Fraction, Field(lt=1)] = Field(
-        default=_LOSSES.passing,
-        description="loss of an atom that a tweezer passes at 1.944 um, as in a straight lane of the paper's "
-        "lattice; a factor e less for each further 0.15 um; the tweezer's own atom is then lost too",
-    )
-    spread: Annotated[float, Field(ge=0, le=5)] = Field(
-        default=_LOSSES.spread,
-        description="spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor "
-        "with mean 1",
-    )
-    image: Annotated[Fraction, Field(lt=1)] = Field(
-        default=_LOSSES.image, description="loss of an atom by one image, beyond that of the moves"
-    )
-    lifetime: PositiveDuration = Field(
-        default=_LOSSES.lifetime_s, description="lifetime of an atom in a static tweezer"
-    )
-
-    def spec(self) -> LossSpec:
-        """Convert the settings to the core's type."""
-        values = self.model_dump()
-        return LossSpec(lifetime_s=values.pop("lifetime"), **values)
-
-
-_MOTION: Final = MotionSpec()
-
-Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
-"""A number of sites, tweezers or tones."""
-
-
-class MotionSettings(Settings):
-    """How the mobile tweezers move, for every driver."""
-
-    pick_up: Duration = Field(
-        default=_MOTION.pick_up_s, description="duration of the pick-up ramp, linear in depth"
-    )
-    drop_off: Duration = Field(
-        default=_MOTION.drop_off_s, description="duration of the drop-off ramp, linear in depth"
-    )
-    speed: Speed = Field(default=_MOTION.speed_m_s, description="transport speed")
-    speed_profile: SpeedProfile = Field(
-        default=_MOTION.speed_profile,
-        description="course of the speed during a transport; `speed` is the mean on the longest way of a "
-        "batch, and with a course other than constant all atoms of a batch start and arrive together",
-    )
-    overhead_per_batch: Duration = Field(
-        default=_MOTION.overhead_per_batch_s,
-        description="time that passes before each batch, tweezers off; only of `use: virtual`, as a model of "
-        "another setup",
-    )
-    overhead_per_cycle: Duration = Field(
-        default=_MOTION.overhead_per_cycle_s,
-        description="time that passes before the first batch of a cycle; left out: what is typical of the "
-        "driver and its mode, if it says so; a calibration of the kind `timing` takes precedence",
-    )
-    max_tweezers: Sites = Field(
-        default=_MOTION.max_tweezers, description="largest number of mobile tweezers on at once"
-    )
-    max_row_tones: Sites = Field(
-        default=_MOTION.max_row_tones, description="largest number of tones on the row axis at once"
-    )
-    max_column_tones: Sites = Field(
-        default=_MOTION.max_column_tones, description="largest number of tones on the column axis at once"
-    )
-    eject_slots: int = Field(
-        default=_MOTION.eject_slots,
-        ge=0,
-        le=100,
-        description="how many sites beyond the grid the tones reach, on each side",
-    )
-    clearance: Annotated[Length, Field(gt=0, le=1e-3)] = Field(
-        default=_MOTION.clearance_m,
-        description="least distance of a moving tweezer from atoms that stand, and of neighbouring lines of "
-        "tweezers, where rows and columns move at once",
-    )
-    path_depth: Annotated[Fraction, Field(gt=0)] = Field(
-        default=_MOTION.path_depth,
-        description="depth of the tweezers where rows and columns move at once, as a fraction of the full "
-        "depth: shallower ones take fewer of the atoms that they pass",
-    )
-    empty_tweezers_may_land: bool = Field(
-        default=_MOTION.empty_tweezers_may_land,
-        description="whether a tweezer without an atom may end on a site that holds one, where rows and "
-        "columns move at once",
-    )
-    rf: Annotated[RfSettings, empty_is({})] = Field(
-        default=RfSettings(), description="the RF drive of the AODs, and its limits"
-    )
-    losses: Annotated[LossSettings, empty_is({})] = Field(
-        default=LossSettings(), description="losses of atoms that plans are compared by"
-    )
-
-    def spec(self) -> MotionSpec:
-        """Convert the settings to the core's type."""
-        return MotionSpec(
-            pick_up_s=self.pick_up,
-            drop_off_s=self.drop_off,
-            speed_m_s=self.speed,
-            speed_profile=self.speed_profile,
-            overhead_per_batch_s=self.overhead_per_batch,
-            overhead_per_cycle_s=self.overhead_per_cycle,
-            max_tweezers=self.max_tweezers,
-            max_row_tones=self.max_row_tones,
-            max_column_tones=self.max_column_tones,
-            eject_slots=self.eject_slots,
-            clearance_m=self.clearance,
-            path_depth=self.path_depth,
-            empty_tweezers_may_land=self.empty_tweezers_may_land,
-            rf=self.rf.spec(),
-            losses=self.losses.spec(),
-        )
-
-
-MOTION_KEYS: Final = tuple(MotionSettings.model_fields)
-"""Keys of ``mobile_tweezers`` that belong to the core, not to the plugin."""
-
-
-class MobileTweezersChoice(MotionSettings, Choice):
+@with_settings_of(MotionSpec)
+class MobileTweezersChoice(Choice):
     """The plugin of the mobile tweezers, and how they move."""
+
+    @property
+    def motion(self) -> MotionSpec:
+        """How they move."""
+        return MotionSpec(**{field.name: getattr(self, field.name) for field in fields(MotionSpec)})
 
 
 class TimeoutSettings(Settings):
@@ -660,7 +448,7 @@ class ProfileSpec(Settings):
     @property
     def motion(self) -> MotionSpec:
         """How the mobile tweezers move."""
-        return self.mobile_tweezers.spec()
+        return self.mobile_tweezers.motion
 
     @property
     def line_specs(self) -> tuple[LineSpec, ...]:

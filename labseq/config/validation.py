@@ -7,19 +7,29 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 from pathlib import Path, PurePath
 from typing import Any, Final, TypeVar, cast, overload
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from labseq.config.yaml_nodes import Mark, Node, comma_hint, resolve
 from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, closest, did_you_mean, format_error, listing, shown
-from labseq.settings import FOLDER, NEEDS_UNITS, NoSettings, Setting, models_at, settings_at, settings_of
+from labseq.settings import (
+    FOLDER,
+    NEEDS_UNITS,
+    NoSettings,
+    Setting,
+    SettingsType,
+    models_at,
+    settings_at,
+    settings_of,
+)
 from labseq.units import expected as expected_quantity, with_units
 
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M")
 
 MAX_HINTS: Final = 50
 """Number of unknown keys of a mapping that are compared with the known ones, which takes time. A file with
@@ -61,7 +71,7 @@ class ValidationContext:
     folder: Path = Path()
     needs_units: bool = False
 
-    def known_keys(self, model: type[BaseModel], loc: Loc) -> list[str]:
+    def known_keys(self, model: SettingsType, loc: Loc) -> list[str]:
         """The keys of the mapping at a location."""
         keys = keys_of(models_at(model, loc))
         own = keys if loc else [*(key for key in keys if key not in self.drop), *self.other_keys]
@@ -88,6 +98,7 @@ def validate(model: type[M], node: Node, context: ValidationContext) -> M:
     result = check(model, node, context)
     if not isinstance(result, list):
         return result
+    placed: list[tuple[Mark, Problem]]
     placed = [(node.mark_at(found.loc, found.key), found.problem) for found in result]
     placed.sort(key=lambda pair: pair[0].order)
     raise ConfigError([mark.problem(p.what, p.expected, p.hint) for mark, p in placed])
@@ -109,14 +120,20 @@ def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Fi
         return [Finding((), Problem(f"these settings make the plugin's check fail: {reason}"))]
 
 
+@cache
+def _adapter(model: type[M]) -> TypeAdapter[M]:
+    return TypeAdapter(model)
+
+
 def _validated(model: type[M], text: str, context: Mapping[str, Any]) -> M:
     """Validate JSON, because there strict means: no number out of a text, but a tuple out of a list."""
+    adapter = _adapter(model)
     try:
-        return model.model_validate_json(text, strict=True, context=context)
+        return adapter.validate_json(text, strict=True, context=context, by_alias=True, by_name=False)
     except ValidationError as error:
         # Behind a validator of the model's own, strict wants a tuple from the start.
         if all(_is_list_for_tuple(one) for one in error.errors(include_url=False)):
-            return model.model_validate_json(text, context=context)
+            return adapter.validate_json(text, context=context, by_alias=True, by_name=False)
         raise
 
 
@@ -157,7 +174,7 @@ class _Placed:
 
 
 def _findings(
-    error: ValidationError, model: type[BaseModel], top: Node, context: ValidationContext
+    error: ValidationError, model: SettingsType, top: Node, context: ValidationContext
 ) -> list[Finding]:
     raised = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
     errors = [_place(one, top) for one in raised if not (_is_list_for_tuple(one) or _is_long_enough(one))]
@@ -173,11 +190,11 @@ def _findings(
         else:
             chosen += _best_branch(union)
     missing = {one.loc for one in chosen if one.kind == "missing"}
-    unknown = [one for one in chosen if one.kind == "extra_forbidden"][:MAX_HINTS]
+    unknown = [one for one in chosen if one.kind in _UNKNOWN][:MAX_HINTS]
     meant = {one.loc: closest(str(one.loc[-1]), context.known_keys(model, one.loc[:-1])) for one in unknown}
     misspelt = {(*loc[:-1], key) for loc, key in meant.items()}
     for one in chosen:
-        if one.kind == "extra_forbidden":
+        if one.kind in _UNKNOWN:
             findings.append(_unknown_key(one.loc, meant.get(one.loc, ""), model, top, context))
         elif one.kind != "missing":
             findings.append(_wrong_value(one, top, context))
@@ -242,9 +259,7 @@ def _wrong_value(one: _Placed, top: Node, context: ValidationContext) -> Finding
     return Finding(loc, problem, bool(details.get("key")))
 
 
-def _unknown_key(
-    loc: Loc, meant: str, model: type[BaseModel], top: Node, context: ValidationContext
-) -> Finding:
+def _unknown_key(loc: Loc, meant: str, model: SettingsType, top: Node, context: ValidationContext) -> Finding:
     key, node = clean(str(loc[-1])), top.at(loc)
     comma = comma_hint(key, node.value) if node is not None else ""
     known, owner = context.known_keys(model, loc[:-1]), context.mapping(loc[:-1])
@@ -256,7 +271,7 @@ def _unknown_key(
     return Finding(loc, Problem(what, expected=listing(known), hint=comma or hint), key=True)
 
 
-def _missing_key(loc: Loc, model: type[BaseModel], top: Node, context: ValidationContext) -> Finding:
+def _missing_key(loc: Loc, model: SettingsType, top: Node, context: ValidationContext) -> Finding:
     parent, key, around = top.at(loc[:-1]), str(loc[-1]), loc[:-1]
     about = _description(settings_at(model, loc))
     where = f" from {context.mapping(around)}" if context.name or around else ""
@@ -274,7 +289,7 @@ def _missing_item(loc: Loc, index: int, top: Node, context: ValidationContext) -
     return Finding(loc, Problem(what, expected=f"at least {index + 1}"))
 
 
-def keys_of(models: list[type[BaseModel]]) -> list[str]:
+def keys_of(models: list[SettingsType]) -> list[str]:
     """The keys of the models, in order."""
     return list(dict.fromkeys(setting.key for model in models for setting in settings_of(model)))
 
@@ -288,6 +303,8 @@ def _description(settings: Sequence[Setting]) -> str:
     return ""
 
 
+_UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
+"""pydantic's errors for an unknown key of a model and of a dataclass."""
 _MAPPING: Final = "a mapping (key: value)"
 _LIST: Final = "a list ([a, b], or lines that begin with '- ')"
 _TYPES: Final[Mapping[str, str]] = {

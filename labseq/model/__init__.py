@@ -8,7 +8,7 @@ from labseq.model.calibration import (
     same_grid,
 )
 from labseq.model.camera import CameraFacts, Flip, Frame, Orientation, SensorMode
-from labseq.model.grid import Occupancy, SiteGrid, TargetPattern, as_occupancy, read_only
+from labseq.model.grid import FrequencyComb, Occupancy, SiteGrid, TargetPattern, as_occupancy, read_only
 from labseq.model.lines import LineProgram, LinesFacts, LineSpec
 from labseq.model.motion import LossSpec, MotionSpec, RfSamples, RfSpan, RfSpec, RfTones
 from labseq.model.plan import Batch, Plan, PlanReport, TonePaths
@@ -50,6 +50,7 @@ __all__ = [
     "DepthRamp",
     "Flip",
     "Frame",
+    "FrequencyComb",
     "FrequencyCourse",
     "ImageRecord",
     "LineProgram",

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, Self, TypeAlias
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+from pydantic import Field, field_validator
+
+from labseq.settings import Frequency, Settings
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -95,6 +98,37 @@ def centred_comb(n_sites: int, centre_hz: float = 100e6, step_hz: float = 1.6e6)
     """
     sites = np.arange(n_sites, dtype=np.float64)
     return centre_hz + step_hz * (sites - (n_sites - 1) / 2)
+
+
+class FrequencyComb(Settings):
+    """Tones of the rows or columns of the grid: equally spaced, or a table from a calibration."""
+
+    centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
+    step: Frequency = Field(
+        default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
+    )
+    table: tuple[Annotated[Frequency, Field(gt=0)], ...] = Field(
+        default=(), description="calibrated frequency of each row or column, in place of centre and step"
+    )
+
+    @field_validator("step")
+    @classmethod
+    def _tones_differ(cls, step: float) -> float:
+        if step == 0:
+            raise ValueError("a step of 0 puts all tones at one frequency; expected another value")
+        return step
+
+    @field_validator("table")
+    @classmethod
+    def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
+        steps_hz = np.diff(table)
+        if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
+            raise ValueError("the tones neither rise nor fall all along; expected the sites' in order")
+        return table
+
+    def tones(self, n_sites: int) -> NDArray[np.float64]:
+        """Frequency of the tone of each of ``n_sites`` rows or columns, in Hz."""
+        return np.array(self.table) if self.table else centred_comb(n_sites, self.centre, self.step)
 
 
 def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+from pydantic.dataclasses import dataclass as settings
 
 from labseq.model.grid import read_only
+from labseq.settings import (
+    IN_SI,
+    Duration,
+    Fraction,
+    Frequency,
+    Length,
+    PositiveDuration,
+    Power,
+    Speed,
+    Voltage,
+    empty_is,
+)
+from labseq.units import format_quantity
 
 SpeedProfile = Literal["constant", "minimum_jerk", "constant_jerk"]
 PhaseChoice = Literal["random", "low_crest"]
@@ -18,59 +32,77 @@ LOAD_OHM = 50.0
 """Load of an output in ohms; full scale is the voltage across it."""
 
 
-@dataclass(frozen=True, slots=True)
+def _rises(band: tuple[float, float]) -> tuple[float, float]:
+    low, high = band
+    if not 0 <= low < high:
+        from_, to = (format_quantity(hz, "frequency") for hz in band)
+        raise ValueError(f"the band goes from {from_} to {to}; expected [lowest, highest], both above 0 Hz")
+    return band
+
+
+Band: TypeAlias = Annotated[tuple[Frequency, Frequency], AfterValidator(_rises)]
+Amplitudes: TypeAlias = tuple[Annotated[Fraction, Field(gt=0)], ...]
+
+
+@settings(frozen=True, slots=True, config=IN_SI)
 class RfSpec:
-    """The RF chain of the two AODs of the mobile tweezers: bands, amplitudes, phases, limits.
+    """The RF drive of the mobile tweezers' AODs, and its limits.
 
     Random phases and amplitudes preassigned per tone are the paper's ("RF
     intermodulation"). All numbers are ours, because the paper is silent. Amplifiers of this kind
     die above 2 V at their input.
-
-    Attributes:
-        row_band_hz: Lowest and highest frequency of the row axis' AOD.
-        column_band_hz: The same for the columns.
-        min_spacing_hz: Least distance of two tones of an axis.
-        row_amplitudes: Amplitude of each row's tone as a fraction of full scale;
-            empty: all equal, such that the most tones of the axis reach full scale together.
-        column_amplitudes: The same for each column.
-        phases: "random": preassigned to each tone; "low_crest": chosen for each batch
-            by Schroeder's rule, for a low crest factor.
-        phase_seed: Seed of the preassigned phases.
-        full_scale_v: Peak voltage of a sum of amplitudes of 1, across 50 Ohm.
-        max_peak_v: Greatest peak voltage that the amplifiers bear.
-        amplifier_gain_db: Power gain between the output and each AOD, in dB.
-        max_mean_power_w: Greatest mean RF power at each AOD.
-        snap_within_m: How far, in the atom plane, a calibrated tone may be from an
-            equally spaced comb to be played on the comb; 0: none is moved.
     """
 
-    row_band_hz: tuple[float, float] = (82e6, 118e6)
-    column_band_hz: tuple[float, float] = (82e6, 118e6)
-    min_spacing_hz: float = 0.5e6
-    row_amplitudes: tuple[float, ...] = ()
-    column_amplitudes: tuple[float, ...] = ()
-    phases: PhaseChoice = "random"
-    phase_seed: int = 20220711
-    full_scale_v: float = 1.6
-    max_peak_v: float = 2.0
-    amplifier_gain_db: float = 20.0
-    max_mean_power_w: float = 3.0
-    snap_within_m: float = 20e-9
-
-    def __post_init__(self) -> None:
-        for name in ("row_band_hz", "column_band_hz", "row_amplitudes", "column_amplitudes"):
-            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
-        for low, high in (self.row_band_hz, self.column_band_hz):
-            if not 0 <= low < high:
-                raise ValueError(f"a band goes from {low} to {high} Hz; expected 0 <= lowest < highest")
-        if any(not 0 < a <= 1 for a in (*self.row_amplitudes, *self.column_amplitudes)):
-            raise ValueError("an amplitude is a fraction of full scale, above 0 and at most 1")
-        if any(not value > 0 for value in (self.full_scale_v, self.max_peak_v, self.max_mean_power_w)):
-            raise ValueError("voltages and powers must be above 0")
-        if any(not value >= 0 for value in (self.min_spacing_hz, self.snap_within_m, self.phase_seed)):
-            raise ValueError("minimum spacing, snapping distance and seed cannot be negative")
-        if not math.isfinite(self.amplifier_gain_db):
-            raise ValueError(f"the amplifier's gain is {self.amplifier_gain_db} dB; expected a number")
+    row_band_hz: Annotated[Band, Field(description="[lowest, highest] frequency of the row axis' AOD")] = (
+        82e6,
+        118e6,
+    )
+    column_band_hz: Annotated[
+        Band, Field(description="[lowest, highest] frequency of the column axis' AOD")
+    ] = (82e6, 118e6)
+    min_spacing_hz: Annotated[
+        Frequency, Field(ge=0, description="smallest distance of two tones of an axis")
+    ] = 0.5e6
+    row_amplitudes: Annotated[
+        Amplitudes,
+        Field(
+            description="amplitude of each row's tone, as a fraction of full scale; none: all equal, such "
+            "that `max_row_tones` reach full scale together"
+        ),
+    ] = ()
+    column_amplitudes: Annotated[
+        Amplitudes,
+        Field(
+            description="amplitude of each column's tone, as a fraction of full scale; none: all equal, such "
+            "that `max_column_tones` reach full scale together"
+        ),
+    ] = ()
+    phases: Annotated[
+        PhaseChoice,
+        Field(
+            description="phases of the tones at pick-up: random, but always the same for a site, or chosen "
+            "for each batch so that the tones' sum has a low crest"  # by Schroeder's rule
+        ),
+    ] = "random"
+    phase_seed: Annotated[int, Field(ge=0, description="seed of the random phases")] = 20220711
+    full_scale_v: Annotated[
+        Voltage, Field(gt=0, description="peak voltage of the output at full scale, across 50 Ohm")
+    ] = 1.6
+    max_peak_v: Annotated[
+        Voltage, Field(gt=0, description="largest peak voltage that the amplifiers tolerate")
+    ] = 2.0
+    amplifier_gain_db: Annotated[
+        float, Field(description="power gain between the output and each AOD, in dB")
+    ] = 20.0
+    max_mean_power_w: Annotated[Power, Field(gt=0, description="largest mean RF power at each AOD")] = 3.0
+    snap_within_m: Annotated[
+        Length,
+        Field(
+            ge=0,
+            description="distance in the atom plane within which calibrated tones are moved to an equally "
+            "spaced comb; 0: none is moved",
+        ),
+    ] = 20e-9
 
     @property
     def full_scale_power_w(self) -> float:
@@ -78,109 +110,132 @@ class RfSpec:
         return self.full_scale_v**2 / (2 * LOAD_OHM) * 10 ** (self.amplifier_gain_db / 10)
 
 
-@dataclass(frozen=True, slots=True)
+Loss: TypeAlias = Annotated[Fraction, Field(lt=1)]
+
+
+@settings(frozen=True, slots=True, config=IN_SI)
 class LossSpec:
-    """How probably atoms are lost, to predict what a plan does to an array.
+    """How probably atoms are lost, to compare plans by what survives; nothing is lost because of it."""
 
-    Attributes:
-        move: Loss of an atom that is picked up, moved and dropped off: about the paper's filling after one
-            cycle (derived).
-        tone: Added to it for each tone on beyond one per axis.
-        distance_per_m: Added to it per metre of the way.
-        landing: Loss of an atom that stands where a tweezer without an atom is ramped down (ours: at the
-            paper's depths 99.6 % or more in the simulation, however slowly the tweezer comes).
-        passing: Loss of an atom that a tweezer passes at 1.944 um, as in a straight lane of the paper's
-            lattice, and a factor e less for each further 0.15 um; the tweezer's own atom is then lost
-            too (ours: simulated for the paper's depths and waists at 15 uK).
-        spread: Spread of these losses from shot to shot: s.d. of the logarithm of a log-normal factor with
-            mean 1, common to all atoms.
-        image: Loss of an atom by one image (the paper's, 0.45 %), beyond that of the moves.
-        lifetime_s: Lifetime of an atom in a static tweezer (paper).
-    """
+    # About the paper's filling after one cycle (derived).
+    move: Annotated[Loss, Field(description="loss of an atom that is picked up, moved and dropped off")] = (
+        0.0188
+    )
+    tone: Annotated[Loss, Field(description="added to it for each tone on beyond one per axis")] = 0.0
+    distance_per_m: Annotated[float, Field(ge=0, description="added to it per metre of the way")] = 0.0
+    # Ours: at the paper's depths 99.6 % or more in the simulation, however slowly the tweezer comes.
+    landing: Annotated[
+        Loss,
+        Field(description="loss of an atom that stands where a tweezer without an atom is ramped down"),
+    ] = 0.99
+    # Ours: simulated for the paper's depths and waists at 15 uK.
+    passing: Annotated[
+        Loss,
+        Field(
+            description="loss of an atom that a tweezer passes at 1.944 um, as in a straight lane of the "
+            "paper's lattice; a factor e less for each further 0.15 um; the tweezer's own atom is then lost "
+            "too"
+        ),
+    ] = 0.0027
+    spread: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=5,
+            description="spread of these losses from shot to shot: s.d. of the logarithm of a log-normal "
+            "factor with mean 1",
+        ),
+    ] = 0.5
+    # The paper's, 0.45 %.
+    image: Annotated[Loss, Field(description="loss of an atom by one image, beyond that of the moves")] = (
+        0.0045
+    )
+    # The paper's.
+    lifetime_s: Annotated[PositiveDuration, Field(description="lifetime of an atom in a static tweezer")] = (
+        33.0
+    )
 
-    move: float = 0.0188
-    tone: float = 0.0
-    distance_per_m: float = 0.0
-    landing: float = 0.99
-    passing: float = 0.0027
-    spread: float = 0.5
-    image: float = 0.0045
-    lifetime_s: float = 33.0
 
-    def __post_init__(self) -> None:
-        if any(not 0 <= loss < 1 for loss in (self.move, self.tone, self.landing, self.passing, self.image)):
-            raise ValueError("a loss is a probability from 0 to below 1")
-        if not (0 <= self.distance_per_m < math.inf and 0 <= self.spread < math.inf):
-            raise ValueError("the loss per metre and the spread of losses cannot be negative")
-        if not self.lifetime_s > 0:
-            raise ValueError(f"the lifetime is {self.lifetime_s} s; expected more than 0")
+Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+"""A number of sites, tweezers or tones."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings(frozen=True, slots=True, config=IN_SI)
 class MotionSpec:
-    """Ramps, speed, overheads and limits of the mobile tweezers.
+    """How the mobile tweezers move, for every driver: ramps, speed, overheads and limits.
 
     Ramps and speed are the paper's ("Experimental Setup"). The overhead of a cycle is ours:
     the paper's cycle time of x1.8 over ten cycles leaves about 13 ms per later cycle
-    beside the exposure.
-
-    Attributes:
-        pick_up_s: Pick-up ramp, in seconds.
-        drop_off_s: Drop-off ramp, in seconds.
-        speed_m_s: Transport speed, in m/s; its mean over the longest way of a batch.
-        speed_profile: Course of the speed during a transport. At "constant" speed all
-            atoms of a batch are equally fast, and those with a shorter way arrive earlier.
-            With "minimum_jerk" and "constant_jerk" they start and arrive together.
-        overhead_per_batch_s: Time that passes before each batch, tweezers off. Outputs that play
-            samples need none; the virtual tweezers model with it a setup that does.
-        overhead_per_cycle_s: Time that passes before the first batch of a cycle
-            (planning, rendering, upload); not spent on an empty plan.
-        max_tweezers: Most mobile tweezers on at once, whatever the planner's
-            degree of parallelism.
-        max_row_tones: Most tones on the row axis at once.
-        max_column_tones: Most tones on the column axis at once.
-        eject_slots: Sites beyond the grid that the AOD band reaches, each side.
-        clearance_m: Least distance of a tweezer from standing atoms, and of neighbouring lines of
-            tweezers from one another, in batches with paths of tones (ours). Half-way between two rows
-            of the paper's lattice it is 1.944 um; how many atoms are lost there depends on their
-            temperature.
-        path_depth: Depth of the tweezers in batches with paths of tones, as a fraction of the full
-            depth: shallower ones take fewer of the atoms that they pass.
-        empty_tweezers_may_land: Whether a tweezer without an atom may end on a site that holds one.
-        rf: What drives the AODs.
-        losses: How probably atoms are lost.
+    beside the exposure; it is not spent on an empty plan.
     """
 
-    pick_up_s: float = 60e-6
-    drop_off_s: float = 60e-6
-    speed_m_s: float = 0.130
-    speed_profile: SpeedProfile = "constant"
-    overhead_per_batch_s: float = 0.0
-    overhead_per_cycle_s: float = 13e-3
-    max_tweezers: int = 20
-    max_row_tones: int = 20
-    max_column_tones: int = 20
-    eject_slots: int = 1
-    clearance_m: float = 1.9e-6
-    path_depth: float = 1.0
-    empty_tweezers_may_land: bool = False
-    rf: RfSpec = field(default_factory=RfSpec)
-    losses: LossSpec = field(default_factory=LossSpec)
-
-    def __post_init__(self) -> None:
-        if not self.speed_m_s > 0:
-            raise ValueError(f"the transport speed is {self.speed_m_s} m/s; expected more than 0")
-        times = (self.pick_up_s, self.drop_off_s, self.overhead_per_batch_s, self.overhead_per_cycle_s)
-        if any(not t >= 0 for t in times):
-            raise ValueError("ramps and overheads cannot be negative")
-        if min(self.max_tweezers, self.max_row_tones, self.max_column_tones) < 1:
-            raise ValueError("at least one tweezer and one tone per axis are needed")
-        if self.eject_slots < 0:
-            raise ValueError("eject_slots cannot be negative")
-        if not 0 < self.clearance_m < math.inf:
-            raise ValueError(f"the clearance is {self.clearance_m} m; expected more than 0")
-        if not 0 < self.path_depth <= 1:
-            raise ValueError(f"path_depth is {self.path_depth}; expected a fraction, more than 0")
+    pick_up_s: Annotated[Duration, Field(description="duration of the pick-up ramp, linear in depth")] = 60e-6
+    drop_off_s: Annotated[Duration, Field(description="duration of the drop-off ramp, linear in depth")] = (
+        60e-6
+    )
+    speed_m_s: Annotated[Speed, Field(description="transport speed")] = 0.130
+    speed_profile: Annotated[
+        SpeedProfile,
+        Field(
+            description="course of the speed during a transport; `speed` is the mean on the longest way of a "
+            "batch, and with a course other than constant all atoms of a batch start and arrive together"
+        ),
+    ] = "constant"
+    overhead_per_batch_s: Annotated[
+        Duration,
+        Field(
+            description="time that passes before each batch, tweezers off; only of `use: virtual`, as a "
+            "model of another setup"
+        ),
+    ] = 0.0
+    overhead_per_cycle_s: Annotated[
+        Duration,
+        Field(
+            description="time that passes before the first batch of a cycle; left out: what is typical of "
+            "the driver and its mode, if it says so; a calibration of the kind `timing` takes precedence"
+        ),
+    ] = 13e-3
+    max_tweezers: Annotated[Sites, Field(description="largest number of mobile tweezers on at once")] = 20
+    max_row_tones: Annotated[Sites, Field(description="largest number of tones on the row axis at once")] = 20
+    max_column_tones: Annotated[
+        Sites, Field(description="largest number of tones on the column axis at once")
+    ] = 20
+    eject_slots: Annotated[
+        int,
+        Field(ge=0, le=100, description="how many sites beyond the grid the tones reach, on each side"),
+    ] = 1
+    # Half-way between two rows of the paper's lattice it is 1.944 um; how many atoms are lost there depends
+    # on their temperature (ours).
+    clearance_m: Annotated[
+        Length,
+        Field(
+            gt=0,
+            le=1e-3,
+            description="least distance of a moving tweezer from atoms that stand, and of neighbouring lines "
+            "of tweezers, where rows and columns move at once",
+        ),
+    ] = 1.9e-6
+    path_depth: Annotated[
+        Fraction,
+        Field(
+            gt=0,
+            description="depth of the tweezers where rows and columns move at once, as a fraction of the "
+            "full depth: shallower ones take fewer of the atoms that they pass",
+        ),
+    ] = 1.0
+    empty_tweezers_may_land: Annotated[
+        bool,
+        Field(
+            description="whether a tweezer without an atom may end on a site that holds one, where rows and "
+            "columns move at once"
+        ),
+    ] = False
+    rf: Annotated[RfSpec, empty_is({}), Field(description="the RF drive of the AODs, and its limits")] = (
+        RfSpec()
+    )
+    losses: Annotated[
+        LossSpec, empty_is({}), Field(description="losses of atoms that plans are compared by")
+    ] = LossSpec()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

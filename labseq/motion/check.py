@@ -139,8 +139,7 @@ def check_plan(
     Raises:
         InvalidPlanError: The plan breaks a rule; it says which, where and how. Or plan,
             target, grid or motion is something else.
-        LimitError: The degree of parallelism is not a whole number or below 1, or the speed
-            profile does not exist.
+        LimitError: The degree of parallelism is not a whole number, or below 1.
 
     Example:
         >>> target = TargetPattern(fill=[[False, True]], clear=[[True, False]])

@@ -9,7 +9,7 @@ from typing import Final, NoReturn, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.errors import LimitError, PlanError, one_of
+from labseq.errors import LimitError, PlanError
 from labseq.model import AxisTones, MotionSpec, Plan, PlanReport, RfSpec, SiteGrid, ToneProgram
 from labseq.model.motion import SpeedProfile
 from labseq.motion.axes import AXES, AxisIndex, Drive, drive
@@ -35,15 +35,10 @@ def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     With a course of the speed other than constant, that of the mean over the longest
     way of a batch, so that a batch takes the same time whatever the course.
 
-    Raises:
-        LimitError: The speed profile does not exist.
-
     Example:
         >>> round(site_time_s(SiteGrid(), MotionSpec()), 9)
         3.4538e-05
     """
-    if motion.speed_profile not in SPEED_PROFILES:
-        raise LimitError("the speed profile", f"'{motion.speed_profile}'", one_of(SPEED_PROFILES))
     return grid.spacing_m / motion.speed_m_s
 
 
@@ -139,8 +134,7 @@ def tone_program(
     Raises:
         PlanError: The plan does not fit onto the grid, or has fewer batches than asked for.
         LimitError: Tones break a limit of AOD or amplifier (band, number, spacing, sum of
-            amplitudes, peak voltage, mean power), the amplitudes are not one per site, or the
-            speed profile does not exist.
+            amplitudes, peak voltage, mean power), or the amplitudes are not one per site.
     """
     from labseq.motion.tone_kernels import N_FIELDS, NOT_ON_GRID, PHASE, build_axis, room_for
 

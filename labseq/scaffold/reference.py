@@ -18,8 +18,6 @@ from itertools import groupby
 from signal import SIGINT, SIGTERM
 from typing import Any, Final, TypeAlias
 
-from pydantic import BaseModel
-
 from labseq import builtin, errors, hookspecs, roles
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.profile import ProfileSpec
@@ -33,7 +31,7 @@ from labseq.messages import clean, closest
 from labseq.registry import Entry, Registry
 from labseq.roles import EVENTS, ROLES
 from labseq.scaffold.words import default_of, docstring, summary, value_of
-from labseq.settings import Choice, Setting, models_at, settings_of
+from labseq.settings import Choice, Setting, SettingsType, has_settings, models_at, settings_of
 from labseq.units import EXAMPLES, UNITS, unit_names
 
 
@@ -147,11 +145,11 @@ def _unmarked(text: str) -> str:
 
 # Settings: files, and what plugins offer
 
-FILES: Final[Mapping[str, type[BaseModel]]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
+FILES: Final[Mapping[str, SettingsType]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
 """Kind of file -> its model."""
 _CHOSEN: Final = {"target": "pattern", "devices": "device", "shot": "step", "scan": "scanner"}
 """Key that names plugins -> their kind, if that is not the key itself."""
-_ADDED_BY_LOADER: Final[Mapping[tuple[type[BaseModel] | None, str], str]] = {
+_ADDED_BY_LOADER: Final[Mapping[tuple[SettingsType | None, str], str]] = {
     (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`",
     (SequenceSpec, "shots"): "required without `scan`",
 }
@@ -160,7 +158,7 @@ _KEY_HEADER: Final = ("key", "value", "default", "meaning")
 _NO_SETTINGS: Final = "It takes no settings."
 
 
-def settings(model: type[BaseModel] | None, *, top: bool = False) -> Block:
+def settings(model: SettingsType | None, *, top: bool = False) -> Block:
     """A row per key; the keys of a mapping follow it as ``mapping.key``.
 
     Args:
@@ -171,8 +169,8 @@ def settings(model: type[BaseModel] | None, *, top: bool = False) -> Block:
 
 
 def _keys_of(
-    model: type[BaseModel] | None, *, top: bool = False, prefix: str = ""
-) -> Iterator[tuple[str, type[BaseModel] | None, Setting]]:
+    model: SettingsType | None, *, top: bool = False, prefix: str = ""
+) -> Iterator[tuple[str, SettingsType | None, Setting]]:
     """Every key of a model with those of the mappings in it, whose key it is, and its description."""
     for setting in settings_of(model):
         key = prefix + setting.key
@@ -182,13 +180,13 @@ def _keys_of(
             yield from _keys_of(inner, prefix=f"{key}.NAME." if setting.is_by_name else f"{key}.")
 
 
-def _inner_model(setting: Setting) -> type[BaseModel] | None:
+def _inner_model(setting: Setting) -> SettingsType | None:
     """The model of a mapping, unless it is a plugin's choice, whose settings are its own."""
     return next((one for one in setting.models if not issubclass(one, Choice)), None)
 
 
-def _row(key: str, owner: type[BaseModel] | None, setting: Setting) -> tuple[str, ...]:
-    is_mapping = isinstance(setting.default, BaseModel)
+def _row(key: str, owner: SettingsType | None, setting: Setting) -> tuple[str, ...]:
+    is_mapping = has_settings(type(setting.default))
     default = "as below" if is_mapping else _ADDED_BY_LOADER.get((owner, key)) or default_of(setting)
     return f"`{key}`", value_of(setting), default, setting.description
 
@@ -480,7 +478,7 @@ def _row_topics(name: str, blocks: Iterable[Block]) -> Iterator[tuple[str, Topic
                 yield " ".join(filter(None, words)), topic
 
 
-def _key_topics(names: tuple[str, ...], model: type[BaseModel] | None) -> dict[str, Topic]:
+def _key_topics(names: tuple[str, ...], model: SettingsType | None) -> dict[str, Topic]:
     return {
         " ".join((*names, *key.replace(".NAME", "").split("."))): Topic(
             setting.description, partial(_key_blocks, key, owner, setting)
@@ -490,7 +488,7 @@ def _key_topics(names: tuple[str, ...], model: type[BaseModel] | None) -> dict[s
 
 
 def _key_blocks(
-    key: str, owner: type[BaseModel] | None, setting: Setting, further: Iterable[Block] = ()
+    key: str, owner: SettingsType | None, setting: Setting, further: Iterable[Block] = ()
 ) -> list[Block]:
     """The row of a key, those of the mapping that it holds, and what else there is."""
     inner = _inner_model(setting)
@@ -515,7 +513,7 @@ def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
     return found | _key_topics((kind, "shot", "policy"), StepPolicySettings if kind == "sequence" else None)
 
 
-def _choice_blocks(models: Sequence[type[BaseModel]], entries: Sequence[Entry]) -> list[Block]:
+def _choice_blocks(models: Sequence[SettingsType], entries: Sequence[Entry]) -> list[Block]:
     """The keys beside the name of a plugin, and the plugins."""
     own = [settings(model) for model in models if issubclass(model, Choice)]
     return [*own, "The plugins, with settings of their own:", *_offered(entries)]

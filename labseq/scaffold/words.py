@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
-from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError
-from labseq.settings import Choice, Setting, dimension_read_by
+from labseq.settings import Choice, Setting, dimension_read_by, has_settings
 from labseq.units import EXAMPLES, format_quantity, parse_quantity
 
 _NOUNS: Final[dict[Any, str]] = {
@@ -88,7 +87,7 @@ def _noun(annotation: Any) -> Words:
         return _list(f"{len(inner)} ", _words(inner[0], ()))
     if isinstance(annotation, type) and issubclass(annotation, Choice):
         return Words(f"mapping with `{annotation.key}`")
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if has_settings(annotation):
         return Words("mapping")
     return Words(_NOUNS.get(annotation) or annotation.__name__.removesuffix("Spec").lower())
 

@@ -160,9 +160,6 @@ class ScannedPlan:
 
         Returns:
             Seconds.
-
-        Raises:
-            LimitError: The speed profile does not exist.
         """
         n_stops = int(self.lines_passed.sum())
         wait_s = max(motion.pick_up_s, motion.drop_off_s)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +12,18 @@ import pytest
 
 from labseq.config.document import Document
 from labseq.config.profile import (
-    MOTION_KEYS,
     BudgetSettings,
     CalibrationSettings,
     ChannelSettings,
     GridSettings,
     LinesChoice,
-    LossSettings,
-    MotionSettings,
     ProfileSpec,
-    RfSettings,
     TimeoutSettings,
     load_profile,
 )
 from labseq.errors import ConfigError
-from labseq.model import CALIBRATION_KINDS, LossSpec, MotionSpec, RfSpec, SiteGrid
-from labseq.settings import Settings
+from labseq.model import CALIBRATION_KINDS, MotionSpec, SiteGrid
+from labseq.settings import Settings, settings_of
 from tests.config.wrong_files import wrong_files
 
 DATA = Path(__file__).parent / "data"
@@ -81,13 +76,14 @@ def test_motion_keys_and_the_plugin_s_share_a_mapping(loaded: tuple[Document, Pr
         band_centre: str = ""
 
     document, spec = loaded
-    loc, drop = spec.mobile_tweezers.loc, {"use", *MOTION_KEYS}
-    assert document.validate(Plugin, loc, drop=drop, other_keys=MOTION_KEYS).band_centre == "100 MHz"
+    loc, drop = spec.mobile_tweezers.loc, spec.mobile_tweezers.core_keys
+    other_keys = [setting.key for setting in settings_of(MotionSpec)]
+    assert document.validate(Plugin, loc, drop=drop, other_keys=other_keys).band_centre == "100 MHz"
     wrong = document.override("mobile_tweezers.sped", "1", "--set")
     with pytest.raises(
         ConfigError, match=r"^--set: 'sped' is not a .* one of band_centre, pick_up,.* 'speed'\?$"
     ):
-        wrong.validate(Plugin, loc, drop=drop, other_keys=MOTION_KEYS)
+        wrong.validate(Plugin, loc, drop=drop, other_keys=other_keys)
 
 
 def test_what_may_be_left_out() -> None:
@@ -107,45 +103,10 @@ def test_default_budgets_are_those_of_a_computer_that_keeps_up() -> None:
     assert all(1e-3 <= budget_s <= 0.1 for budget_s in BudgetSettings().model_dump().values())
 
 
-def test_defaults_are_those_of_the_core() -> None:
-    assert MotionSettings().spec() == MotionSpec()
-    assert RfSettings().spec() == RfSpec()
-    assert LossSettings().spec() == LossSpec()
+def test_the_grid_of_the_paper_is_the_default() -> None:
     grid, paper = GridSettings(rows=20, cols=20, spacing=4.49e-6).model(), SiteGrid()
     np.testing.assert_array_equal(grid.positions_m, paper.positions_m)
     np.testing.assert_array_equal(grid.row_frequency_hz, paper.row_frequency_hz)
-
-
-CHANGES: dict[str, Any] = {
-    "speed_profile": "minimum_jerk",
-    "clearance": "1.5 um",
-    "path_depth": "50 %",
-    "empty_tweezers_may_land": True,
-    "rf": {"phases": "low_crest"},
-    "losses": {"move": 0.5},
-    "row_band": ["90 MHz", "110 MHz"],
-    "column_band": ["90 MHz", "110 MHz"],
-    "row_amplitudes": ["5 %", 0.1],
-    "column_amplitudes": ["5 %", 0.1],
-    "phases": "low_crest",
-    "snap_within": "5 nm",
-    **dict.fromkeys(("move", "tone", "landing", "passing", "image", "spread"), 0.25),
-}
-
-
-@pytest.mark.parametrize(
-    ("model", "key"),
-    [
-        *((MotionSettings, key) for key in MOTION_KEYS),
-        *((RfSettings, key) for key in RfSettings.model_fields),
-        *((LossSettings, key) for key in LossSettings.model_fields),
-    ],
-)
-def test_every_key_changes_its_own_field_of_the_core(model: Any, key: str) -> None:
-    default, changed = model().spec(), model.model_validate({key: CHANGES.get(key, 7)}).spec()
-    names = [field.name for field in dataclasses.fields(default)]
-    (different,) = [name for name in names if getattr(changed, name) != getattr(default, name)]
-    assert different in {key, *(f"{key}_{unit}" for unit in ("s", "m", "m_s", "hz", "v", "db", "w"))}
 
 
 def with_option(address: str, value: str) -> ProfileSpec:

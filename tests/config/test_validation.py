@@ -94,7 +94,7 @@ def test_right_settings() -> None:
         "either": [1],
         "window": (0.06, 0.1),
         "pet": {"kind": "dog", "tricks": ["sit"]},
-        "other": 9,
+        "else": 9,
     }
 
 

@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 
 import labseq
 from labseq import errors, plugin, roles, testing
-from labseq.config.profile import MotionSettings, ProfileSpec, load_profile
+from labseq.config.profile import ProfileSpec, load_profile
 from labseq.config.sequence import SequenceSpec, StepPolicySettings, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
@@ -68,9 +68,7 @@ SUBJECTS: dict[str, type[BaseModel] | None] = {
     **{f"{entry.kind} {entry.name}": entry.settings_model for entry in SCRIPT.registry().entries()},
 }
 FILES: dict[str, type[BaseModel]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
-MODELS = sorted(
-    {m for m in [*SUBJECTS.values(), *FILES.values(), MotionSettings, Choice, PatternChoice] if m}, key=str
-)
+MODELS = sorted({m for m in [*SUBJECTS.values(), *FILES.values(), Choice, PatternChoice] if m}, key=str)
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)

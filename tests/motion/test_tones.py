@@ -312,8 +312,6 @@ def test_what_takes_no_time_is_left_out() -> None:
 def test_what_cannot_be_played() -> None:
     with pytest.raises(LimitError, match=r"column tones in batch 1 is 2; .* 1"):
         program_of(batch((0, 0, 0, 1)), batch((0, 1, 0, 2), (0, 3, 0, 4)), max_column_tones=1)
-    with pytest.raises(LimitError, match=r"'jerky'.*'constant', "):
-        program_of(batch((0, 0, 0, 1)), speed_profile="jerky")
     for move in ((4, 0, 4, 1), (0, 6, 0, 5), (-1, 0, -1, 1)):
         with pytest.raises(PlanError, match="4 x 6 sites"):
             program_of(batch(move))

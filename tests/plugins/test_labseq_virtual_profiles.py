@@ -17,10 +17,11 @@ from labseq_virtual.settings import (
     StaticTweezersSettings,
 )
 
-from labseq.config.profile import MOTION_KEYS, load_profile
+from labseq.config.profile import MobileTweezersChoice, load_profile
 from labseq.detection.threshold import ThresholdSettings
 from labseq.plugin import MotionSpec, Settings, SiteGrid
 from labseq.plugin.motion import RfSpec
+from labseq.settings import settings_of
 
 MODELS: Mapping[str, type[Settings]] = {
     "camera": CameraSettings,
@@ -44,7 +45,8 @@ def test_the_virtual_profile_states_the_defaults() -> None:
     document, profile = load_profile("virtual", beside=Path())
     assert all(choice.use == "virtual" for role, choice in profile.choices.items() if role != "detector")
     for role, model in MODELS.items():
-        read = document.validate(model, (role,), drop={"use", *MOTION_KEYS})
+        core_keys = {one.key for one in settings_of(MobileTweezersChoice)}
+        read = document.validate(model, (role,), drop=core_keys)
         stated, default = flat(read.model_dump()), flat(model().model_dump())
         if role == "simulation":  # the profile says what the machine is; by default it is what the grid says
             for axis in ("row_tones", "column_tones"):

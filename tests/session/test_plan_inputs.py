@@ -136,10 +136,9 @@ def test_a_shot_brings_its_target_and_its_machine() -> None:
 
 
 def inputs_motion(**changes: Any) -> dict[str, Any]:
-    from labseq.config.profile import MOTION_KEYS, MotionSettings
+    from labseq.config.profile import MobileTweezersChoice
 
-    values = MotionSettings().model_dump(mode="json", include=set(MOTION_KEYS))
-    return values | changes
+    return MobileTweezersChoice(use="virtual").model_dump(mode="json", exclude={"use"}) | changes
 
 
 @pytest.mark.parametrize("machine", [{}, {"grid": {"rows": 0, "cols": 5}}])
