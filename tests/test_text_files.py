@@ -67,7 +67,7 @@ def test_path_is_kept_as_given() -> None:
     path = Path("sub") / ".." / "f.yaml"
     Path("sub").mkdir()
     Path("f.yaml").write_text("a: [", encoding="utf-8")
-    assert message_of(path).startswith(f"{path}:1:4: the '[' that opens here is never closed")
+    assert message_of(path).startswith(f"{path}:1:4: the '[' that opens here is not closed")
     Path("f.yaml").write_text("a: b", encoding="utf-8")
     assert Document.read(path).path == path
 

@@ -397,38 +397,13 @@ def _check_characters(text: str, source: str, is_option: bool) -> None:
     raise Mark(source, *place).error(what, expected, hint)
 
 
-_QUOTE_IT: Final = "put text with special characters in quotes"
-
-
-_MISALIGNED: Final = "the indentation of this line fits no line above"
-
-
-_CLOSER: Final = {"[": "]", "{": "}"}
-
-
-_RULES: Final = (
-    ("found character (.+) that cannot start any token", "a value cannot begin with {0}", "", _QUOTE_IT),
-    (
-        "found unknown escape character (.+)",
-        "a backslash and {0} mean nothing in double quotes",
-        "",
-        r"use single quotes, or write '\\' for a backslash",
-    ),
-    ("expected the node content", "a value is missing here", "", ""),
-    (
-        "but found another document",
-        "a second document begins here",
-        "one document in a file",
-        "remove '---'",
-    ),
-)
-"""PyYAML's problem -> what, expected and hint of the message; ``{0}`` is the first group."""
+_QUOTE_IT: Final = "put text with special characters in single quotes"
 
 
 def explain_syntax_error(
     error: MarkedYAMLError, text: str, last: Event | None, opened: YamlMark | None
 ) -> Problem:
-    """Explain a syntax error, with its place.
+    """Explain a syntax error, with its place: common mistakes in our own words, the others in PyYAML's.
 
     Args:
         last: The event before the error.
@@ -437,38 +412,33 @@ def explain_syntax_error(
     Returns:
         The problem, with line and column but without a source.
     """
-    problem, context = error.problem or "", error.context or ""
+    problem = error.problem or ""
     at = cast("YamlMark", error.problem_mark or error.context_mark)
     since = error.context_mark or at
     if text[at.index : at.index + 1] == "\t":
-        if text[at.index - at.column : at.index].strip():
-            return _at(at, "there is a tab here", "a space")
-        return _at(at, "a tab is used for indentation", "spaces")
+        return _at(at, "there is a tab here", "spaces")
     if "expected ':'" in problem:
-        line = re.split(r"[\r\n]", text[since.index :], maxsplit=1)[0]
-        has_colon = ":" in line.partition(" #")[0]
-        what = "there is no space after the ':' of this line" if has_colon else "this line has no ':'"
-        return _at(since, what, "'key: value'")
+        return _missing_colon(text, since)
     if problem.startswith("mapping values"):
         return _stray_colon(text, at)
-    if opened and problem.endswith("'<stream end>'"):
-        bracket = text[opened.index]
-        what = f"the '{bracket}' that opens here is never closed"
-        return _at(opened, what, f"',' or '{_CLOSER[bracket]}'")
-    if flow := re.match(r"expected ',' or '(.)', but got", problem):
-        return _wrong_in_brackets(flow[1], since, at)
-    if block := re.match(r"expected <block end>, but found '(.+)'", problem):
-        return _late_quote(last, at) or _out_of_place(block[1], context, text, since, at)
-    if "quoted scalar" in context and "unexpected" in problem:
+    if opened and (problem.startswith("expected ',' or") or problem.endswith("'<stream end>'")):
+        return _wrong_in_brackets(text, opened, at)
+    if problem.startswith("expected <block end>"):
+        return _late_quote(last, at) or _out_of_place(text, since, at)
+    if "quoted scalar" in (error.context or "") and "unexpected" in problem:
         return _at(since, "the quotation mark that opens here is never closed")
-    for pattern, what, expected, hint in _RULES:
-        if match := re.search(pattern, problem):
-            return _at(at, what.format(*map(clean, match.groups())), expected, hint)
-    return _at(at, f"this is not valid YAML: {clean(problem)}", "", _QUOTE_IT)
+    return _at(at, f"this is not valid YAML: {clean(problem.removeprefix('but '))}", "", _QUOTE_IT)
 
 
 def _at(mark: YamlMark, what: str, expected: str = "", hint: str = "") -> Problem:
     return Problem(what, "", mark.line + 1, mark.column + 1, expected, hint)
+
+
+def _missing_colon(text: str, since: YamlMark) -> Problem:
+    line = re.split(r"[\r\n]", text[since.index :], maxsplit=1)[0]
+    has_colon = ":" in line.partition(" #")[0]
+    what = "there is no space after the ':' of this line" if has_colon else "this line has no ':'"
+    return _at(since, what, "'key: value'")
 
 
 def _stray_colon(text: str, at: YamlMark) -> Problem:
@@ -492,14 +462,15 @@ def _line_above(text: str, at: YamlMark) -> tuple[int, int]:
     return 0, 0
 
 
-def _wrong_in_brackets(closer: str, since: YamlMark, at: YamlMark) -> Problem:
+def _wrong_in_brackets(text: str, opened: YamlMark, at: YamlMark) -> Problem:
     """Explain an error in a list or mapping in brackets, on its first line or a later one."""
-    pair = "[...]" if closer == "]" else "{...}"
-    if at.line == since.line:
-        what = f"the {pair} that opens in column {since.column + 1} goes wrong here"
-        return _at(at, what, f"',' or '{closer}'")
-    what = f"the '{pair[0]}' that opens here is not closed by line {at.line + 1}"
-    return _at(since, what, f"',' or '{closer}'")
+    bracket = text[opened.index]
+    closer = "]" if bracket == "[" else "}"
+    expected = f"',' or '{closer}'"
+    if at.line == opened.line and at.index < len(text):
+        what = f"the {bracket}...{closer} that opens in column {opened.column + 1} goes wrong here"
+        return _at(at, what, expected)
+    return _at(opened, f"the '{bracket}' that opens here is not closed", expected)
 
 
 def _late_quote(last: Event | None, at: YamlMark) -> Problem | None:
@@ -513,20 +484,17 @@ def _late_quote(last: Event | None, at: YamlMark) -> Problem | None:
     return _at(start, what, "a quotation mark at the end of the text")
 
 
-def _out_of_place(found: str, context: str, text: str, since: YamlMark, at: YamlMark) -> Problem:
-    """Explain a line whose indentation matches neither the current block nor one around it."""
-    is_item = found in ("-", "<block sequence start>")
-    is_aligned = at.column == since.column
-    if is_item and is_aligned:
-        return _at(at, "a list item ('- ') is among the keys of a mapping", "'key: value'")
-    if is_item:
-        return _at(at, _MISALIGNED, "that of the other items of the list")
-    if is_aligned and "collection" in context:
-        return _at(at, "this line does not continue the list above", "'- '", "check the indentation")
-    if is_aligned and found == ":":
-        return _at(at, "a key is missing before this ':'", "'key: value'")
-    if not is_aligned and found in ("<block mapping start>", "?"):
-        above, line = _line_above(text, at)
-        other = f" or {since.column} as in line {since.line + 1}" if since.column != above else ""
-        return _at(at, _MISALIGNED, f"{above} spaces as in line {line}{other}")
-    return _at(at, "this does not belong here", "the end of the line", _QUOTE_IT)
+def _out_of_place(text: str, since: YamlMark, at: YamlMark) -> Problem:
+    """Explain a line that continues no block above it, or what follows a complete value on its line."""
+    if text[at.index - at.column : at.index].strip():
+        return _at(at, "this does not belong here", "the end of the line", _QUOTE_IT)
+    if at.column == since.column:
+        return _at(
+            at, "this line does not continue the block above", "'- ' in a list, 'key: value' otherwise"
+        )
+    what = "the indentation of this line fits no line above"
+    if text[at.index] == "-":
+        return _at(at, what, "that of the other items of the list")
+    above, line = _line_above(text, at)
+    other = f" or {since.column} as in line {since.line + 1}" if since.column != above else ""
+    return _at(at, what, f"{above} spaces as in line {line}{other}")

@@ -84,7 +84,7 @@ def test_missing_parents_are_made_where_allowed(document: Document) -> None:
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("[1", "o: the '[' that opens here is never closed; expected ',' or ']'"),
+        ("[1", "o: the '[' that opens here is not closed; expected ',' or ']'"),
         ("a: b", "o: this is YAML of several lines; expected one value: 5, '45 ms', [a, b] or {key: value}"),
         ("{a: 1, a: 2}", "o: 'a' is given twice; remove one of them"),
         ("\udcb5", "o: a byte that is not UTF-8; expected plain text; delete it"),

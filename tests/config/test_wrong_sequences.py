@@ -34,15 +34,15 @@ shots: 20 => shots 20
 shots: 20 => shots:20
   5:1: there is no space after the ':' of this line; expected 'key: value'
   - image: { => ⇥- image: {
-  16:1: a tab is used for indentation; expected spaces
+  16:1: there is a tab here; expected spaces
 shots: 20 => shots:⇥20
-  5:7: there is a tab here; expected a space
+  5:7: there is a tab here; expected spaces
 target: {pattern: compact, rows: 15, cols: 15}⏎ => target: {pattern: compact, rows: 15⏎
-  7:9: the '{' that opens here is not closed by line 8; expected ',' or '}'
+  7:9: the '{' that opens here is not closed; expected ',' or '}'
 rows: 15, cols => rows: 15 cols
   7:41: the {...} that opens in column 9 goes wrong here; expected ',' or '}'
 - wait: {duration: 1 ms}⏎  - image:⏎ => - wait: {duration: 1 ms⏎
-  26:11: the '{' that opens here is never closed; expected ',' or '}'
+  26:11: the '{' that opens here is not closed; expected ',' or '}'
 rows: 15, cols: 15 => rows: 15, rows: 15
   7:38: 'rows' is given twice (first in line 7, column 28); remove one of them
 attempts: 2 => shots: 2
@@ -56,17 +56,17 @@ shots: 20 =>   shots: 20
 name: compact-225 => name: 'compact-225
   3:7: the quotation mark that opens here is closed only in line 24; expected a quotation mark at the end of the text
 name: compact-225 => name: 'compact'-225
-  3:16: this does not belong here; expected the end of the line; put text with special characters in quotes
+  3:16: this does not belong here; expected the end of the line; put text with special characters in single quotes
 - image:⏎ => - image: {a: 'b}⏎
   27:16: the quotation mark that opens here is never closed
 name: compact-225 => name: compact: 225
   3:14: a ':' is not allowed here; expected one 'key: value' on a line; put text that holds ': ' in quotes
 name: compact-225 => name: "C:\\data"
-  3:11: a backslash and 'd' mean nothing in double quotes; use single quotes, or write '\\\\' for a backslash
+  3:11: this is not valid YAML: found unknown escape character 'd'; put text with special characters in single quotes
 name: compact-225 => name: @home
-  3:7: a value cannot begin with '@'; put text with special characters in quotes
+  3:7: this is not valid YAML: found character '@' that cannot start any token; put text with special characters in single quotes
 name: compact-225 => name: *best*
-  3:12: this is not valid YAML: expected alphabetic or numeric character, but found '*'; put text with special characters in quotes
+  3:12: this is not valid YAML: expected alphabetic or numeric character, but found '*'; put text with special characters in single quotes
 [plugins, "more plugins"] => &a [*a]
   13:21: '*a' is inside '&a' itself
 name: compact-225 => name: !mine x
@@ -78,11 +78,11 @@ name: compact-225 => <<: {name: x}
 name: compact-225 => 225: compact
   3:1: a key is 225; expected text; write '225' in quotes
 name: compact-225 => : compact
-  3:1: a key is missing before this ':'; expected 'key: value'
+  3:1: this line does not continue the block above; expected '- ' in a list, 'key: value' otherwise
 seed: 7 => - seed: 7
-  6:1: a list item ('- ') is among the keys of a mapping; expected 'key: value'
+  6:1: this line does not continue the block above; expected '- ' in a list, 'key: value' otherwise
 shot:⏎ => ---⏎shot:⏎
-  14:1: a second document begins here; expected one document in a file; remove '---'
+  14:1: this is not valid YAML: found another document; put text with special characters in single quotes
 shots: 20 => shots: 2\x070
   5:9: an invisible character (U+0007, control character); expected plain text; delete it
 shots: 20 => shots: 2\x000
