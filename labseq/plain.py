@@ -21,7 +21,8 @@ def to_plain(value: Any) -> Any:
     """Turn any value into one that JSON can hold; never raises.
 
     nan and infinities become None, numpy scalars and arrays plain numbers and
-    lists, keys text. Anything else becomes its ``repr``.
+    lists, keys text. A dataclass becomes what its ``as_json()`` returns, or a mapping of its
+    fields. Anything else becomes its ``repr``.
 
     Example:
         >>> import numpy as np
@@ -93,6 +94,9 @@ def _plain_container(value: Any, parents: tuple[int, ...]) -> Any:
     if isinstance(value, AbstractSet):
         return [_plain(item, parents) for item in sorted(cast("AbstractSet[Any]", value), key=_repr)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        as_json: Any = getattr(value, "as_json", None)
+        if as_json is not None:
+            return _plain(as_json(), parents)
         return {item.name: _plain(getattr(value, item.name), parents) for item in dataclasses.fields(value)}
     if isinstance(value, date | time_of_day):
         return value.isoformat()

@@ -20,7 +20,7 @@ import pytest
 import labseq
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, construct_target, validate
 from labseq.cli import main
-from labseq.cli.devices import plugins_table as table
+from labseq.cli.devices import Plugins
 from labseq.config.document import Document
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins import LOCAL_PACKAGE, PluginHost, PluginInfo, call_plugin
@@ -151,7 +151,7 @@ def test_a_plugin_that_fails_to_load_is_contained(tmp_path: Path, old: str, new:
     assert len(info.reason) < 1000
     assert info.reason.isprintable()
     assert host.registry.entries() == []
-    assert f"mine: {info.reason}" in table(host)
+    assert f"mine: {info.reason}" in Plugins.of(host).as_text()
     with pytest.raises(PluginLoadError) as caught:
         host.get("planner", "mine")
     assert str(caught.value).startswith("plugin 'mine' failed to load: ")

@@ -384,7 +384,7 @@ class Fit:
             *([] if math.isnan(self.chi2) else [f"reduced chi-square {self.chi2:.2f}"]),
         ]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """The result, JSON-ready, SI."""
         parameters = {
             name: {

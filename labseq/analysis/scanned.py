@@ -11,14 +11,15 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.analysis.fits import Fit, fit_points
-from labseq.console.text import columns, count_of
+from labseq.console.report import aligned
+from labseq.console.text import count_of
 from labseq.data import Run
 from labseq.data.columns import Column, make_column
 from labseq.data.points import ScanPoint, scan_points
 from labseq.data.quantities import Quantity, description_of, find_quantity, select_shots
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
-from labseq.model.estimate import Estimate, Estimated, Rate, as_mapping
+from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of, split_quantity
 
 MIN_FULL: Final = 0.5
@@ -209,7 +210,7 @@ class ScanReport:
     values: tuple[tuple[Quantity, list[Estimated]], ...]
     fits: tuple[Fit, ...] = ()
 
-    def lines(self) -> list[str]:
+    def as_text(self) -> list[str]:
         """A map for each quantity if all pairs of two values were scanned, else a table; then the fits."""
         found = self.found
         if len(found.axes) == 2 and len({*found.places}) == math.prod(len(axis.words) for axis in found.axes):
@@ -234,7 +235,7 @@ class ScanReport:
             )
             for i, (words, point) in enumerate(zip(written, self.found.points, strict=True))
         ]
-        return columns([header, *rows], right=range(len(header)), most=most)
+        return aligned([header, *rows], right=range(len(header)), most=most)
 
     def _map(self, quantity: Quantity, values: Sequence[Estimated]) -> list[str]:
         down, across = self.found.axes
@@ -248,20 +249,20 @@ class ScanReport:
         ]
         header = ("", *across.words)
         title = [title_of(quantity), f"down: {down.address}", f"across: {across.address}"]
-        return [*title, *columns([header, *rows], right=range(len(header)))]
+        return [*title, *aligned([header, *rows], right=range(len(header)))]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """The points and fits, SI: points are counted from 0."""
         points = [
             {
                 "parameters": dict(point.parameters),
                 "shots": len(point.shots),
-                "values": {quantity.name: as_mapping(values[i]) for quantity, values in self.values},
+                "values": {quantity.name: values[i] for quantity, values in self.values},
             }
             for i, point in enumerate(self.found.points)
         ]
         names = [quantity.name for quantity, _ in self.values]
-        fits = {name: fit.as_dict() for name, fit in zip(names, self.fits, strict=False)}
+        fits = dict(zip(names, self.fits, strict=False))
         return {"points": points} | ({"fits": fits} if fits else {})
 
     def columns(self, units: Mapping[str, str]) -> list[Column]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.model import Occupancy, TargetPattern, follow_atoms
-from labseq.model.estimate import Estimate, Rate, as_mapping, mean
-from labseq.plain import to_plain
+from labseq.model.estimate import Estimate, Rate, mean
 from labseq.recording.index import IndexRow
 
 Counts = NDArray[np.int64]
@@ -83,10 +82,6 @@ class Statistics:
     losses: Mapping[str, Estimate]
     defects_true: Estimate
     defects_seen: Estimate
-
-    def as_dict(self) -> dict[str, Any]:
-        """All statistics, JSON-ready: rates and means with their errors; None for unknown values."""
-        return to_plain(as_mapping(self))
 
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,18 +26,17 @@ from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.analysis.shot import save_shot, shot_picture
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document
-from labseq.console.output import as_line, json_writer, report_compiling, say, stdout_to_stderr
+from labseq.console.output import json_writer, report_compiling, say
+from labseq.console.report import Column, aligned, reporting, table
 from labseq.console.runs import chosen_run
-from labseq.console.text import columns, count_of, percent, plural, settings_text
+from labseq.console.text import count_of, percent, plural, settings_text, time_text
 from labseq.data import Run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
-from labseq.model.estimate import as_mapping, mean
+from labseq.model.estimate import mean
 from labseq.pictures.figures import check_place
-from labseq.plain import to_plain
 from labseq.session.analyses import AnalysisOutcome, analyse_missing, analyses_of
 from labseq.session.analysis_processes import USE
-from labseq.units import format_quantity
 
 MAX_REPORTED: Final = 5
 """Maximum number of failures that are printed one by one."""
@@ -54,16 +52,37 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
     """
     run = chosen_run(path)
     write = json_writer(None if output is None else str(output))
-    answer = stdout_to_stderr() if as_json else None
-    found = replay(run, request, announce=report_compiling)
-    values = as_values(found)
-    write(values)
-    if answer is not None:
-        answer(as_line(values))
-    else:
-        say(*report_lines(found))
+    with reporting(as_json=as_json) as show:
+        report = ReplayReport(replay(run, request, announce=report_compiling))
+        write(report)
+        show(report)
+    found = report.replay
     say(*_failure_lines(found), stream=sys.stderr)
     return 1 if found.is_own and not found.is_reproduced else 0
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayReport:
+    """The comparison of a replay with the run: shots and images counted from 0, times in seconds."""
+
+    replay: Replay
+
+    def as_text(self) -> list[str]:
+        """The comparison, in tables."""
+        return report_lines(self.replay)
+
+    def as_json(self) -> dict[str, Any]:
+        """The comparison, and each plan and image."""
+        found = self.replay
+        return {
+            "run_dir": found.run.path,
+            "shots": found.n_shots,
+            "used": found.used,
+            "reproduced": found.is_reproduced if found.is_own else None,
+            "planner": _plan_values(found.plans) if "planner" in found.used else None,
+            "detector": _image_values(found.images) if "detector" in found.used else None,
+            "unreadable": found.unreadable,
+        }
 
 
 def report_lines(found: Replay) -> list[str]:
@@ -97,15 +116,25 @@ def _title(role: str, used: Mapping[str, Any], changed: Mapping[str, Any]) -> st
     return f"{role} {used['use']}" + (f": {settings}" if settings else "")
 
 
+PLANS: Final[Sequence[Column[tuple[str, Mapping[str, Any]]]]] = (
+    Column("", lambda row: row[0]),
+    Column("plans", lambda row: row[1]["n_plans"], right=True),
+    Column("batches", lambda row: row[1]["n_batches"], right=True),
+    Column("atom moves", lambda row: row[1]["n_atom_moves"], right=True),
+    Column("duration", lambda row: time_text(row[1]["duration_s"].value), right=True),
+    Column("planning", lambda row: time_text(row[1]["planning_s"].value), right=True),
+    Column("filling", lambda row: percent(row[1]["filling"].value, 2), right=True),
+    Column("target met", lambda row: count_of(row[1]["n_met"], row[1]["n_plans"]), right=True),
+)
+
+
 def _plan_lines(found: Replay) -> list[str]:
-    header = ("", "plans", "batches", "atom moves", "duration", "planning", "filling", "target met")
-    rows: list[tuple[str, ...]] = []
+    rows: list[tuple[str, Mapping[str, Any]]] = []
     for label, plans in _groups(found.plans):
-        rows.append(_row(f"{label}, recorded", mean_counts([plan.recorded for plan in plans])))
-        rows.append(_row(f"{label}, replayed", mean_counts(_made(plans))))
+        rows.append((f"{label}, recorded", mean_counts([plan.recorded for plan in plans])))
+        rows.append((f"{label}, replayed", mean_counts(_made(plans))))
     n_same, n_failed = sum(plan.same for plan in found.plans), sum(bool(p.failure) for p in found.plans)
-    lines = [_title("planner", found.used["planner"], found.changed["planner"])]
-    lines += columns([header, *rows], right=range(1, len(header)))
+    lines = [_title("planner", found.used["planner"], found.changed["planner"]), *table(rows, PLANS)]
     lines.append("means per plan; filling and target as predicted if no atom is lost")
     lines.append(f"the same as recorded: {count_of(n_same, len(found.plans))}")
     return [*lines, f"INVALID: {count_of(n_failed, len(found.plans))}"] if n_failed else lines
@@ -126,19 +155,6 @@ def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedP
 
 def _made(plans: Sequence[ReplayedPlan]) -> list[PlanCounts]:
     return [plan.replayed for plan in plans if plan.replayed is not None]
-
-
-def _row(label: str, means: Mapping[str, Any]) -> tuple[str, ...]:
-    times = (means[name].value for name in ("duration_s", "planning_s"))
-    return (
-        label,
-        str(means["n_plans"]),
-        str(means["n_batches"]),
-        str(means["n_atom_moves"]),
-        *("-" if math.isnan(time_s) else format_quantity(time_s, "time") for time_s in times),
-        percent(means["filling"].value, 2),
-        count_of(means["n_met"], means["n_plans"]),
-    )
 
 
 def _image_lines(found: Replay) -> list[str]:
@@ -169,7 +185,7 @@ def _image_lines(found: Replay) -> list[str]:
             for name, key in (("recorded", "n_atoms"), ("now", "n_atoms_replayed"), ("truth", "n_atoms_true"))
         )
         rows.append(("on a last image", ", ".join(f"{name} {value}" for name, value in means)))
-    return [*lines, *columns(rows), *_map(images)]
+    return [*lines, *aligned(rows), *_map(images)]
 
 
 def _without(images: ReplayedImages) -> str:
@@ -202,41 +218,27 @@ def _first(failures: Sequence[str], rest: str) -> list[str]:
     return [*failures[:MAX_REPORTED], *([f"and {n_more} {rest}"] if n_more > 0 else [])]
 
 
-def as_values(found: Replay) -> dict[str, Any]:
-    """All results, JSON-ready: shots and images counted from 0, times in seconds, None for unknown."""
-    images = found.images
-    return to_plain(
-        {
-            "run_dir": str(found.run.path),
-            "shots": found.n_shots,
-            "used": found.used,
-            "reproduced": found.is_reproduced if found.is_own else None,
-            "planner": _plan_values(found.plans) if "planner" in found.used else None,
-            "detector": {
-                "n_images": len(images.images),
-                "n_without_frame": images.n_without_frame,
-                "appeared": images.appeared,
-                "vanished": images.vanished,
-                "images": [asdict(image) for image in images.images],
-                "failures": [
-                    {"shot": shot, "image": image, "error": text}
-                    for (shot, image), text in images.failures.items()
-                ],
-            }
-            if "detector" in found.used
-            else None,
-            "unreadable": found.unreadable,
-        }
-    )
-
-
 def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
     return {
-        "recorded": as_mapping(mean_counts([plan.recorded for plan in plans])),
-        "replayed": as_mapping(mean_counts(_made(plans))),
+        "recorded": mean_counts([plan.recorded for plan in plans]),
+        "replayed": mean_counts(_made(plans)),
         "n_same": sum(plan.same for plan in plans),
         "n_invalid": sum(bool(plan.failure) for plan in plans),
-        "plans": [asdict(plan) for plan in plans],
+        "plans": plans,
+    }
+
+
+def _image_values(images: ReplayedImages) -> dict[str, Any]:
+    failures = [
+        {"shot": shot, "image": image, "error": text} for (shot, image), text in images.failures.items()
+    ]
+    return {
+        "n_images": len(images.images),
+        "n_without_frame": images.n_without_frame,
+        "appeared": images.appeared,
+        "vanished": images.vanished,
+        "images": images.images,
+        "failures": failures,
     }
 
 
@@ -260,7 +262,7 @@ def analyse_run(
         _report(done)
         failed = failed or bool(done.failures)
     if request is not None:
-        say(*([""] if wanted else []), *scan_report(run, request).lines())
+        say(*([""] if wanted else []), *scan_report(run, request).as_text())
     return int(failed)
 
 

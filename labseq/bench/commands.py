@@ -126,7 +126,6 @@ def planners(
     """Let planners plan the same random loadings, check every plan, and compare the results."""
     from labseq.bench.comparison import read_comparison
     from labseq.bench.planners import Where, compare
-    from labseq.bench.report import notes, table
     from labseq.cluster import check_workers
     from labseq.console import output
     from labseq.pictures.plans import check_picture
@@ -142,10 +141,10 @@ def planners(
     with progress_of("loadings") as progress:
         where = Where(workers, scheduler, keys)
         report = compare(comparison, where, announce=output.report_compiling, progress=progress)
-    output.say(*table(report), *notes(report))
+    output.say(*report.as_text())
     if report.rows:
         _write_files(report, csv, png, json)
-    write(report.as_dict())
+    write(report)
     _raise_failures(report)
 
 
@@ -211,7 +210,7 @@ def latency(
 
     Shots are taken in a dry run up to the first image; then the atoms are rearranged once, as in a run.
     """
-    from labseq.bench.latency import LatencyRequest, draw_report, measure_latency, report_text
+    from labseq.bench.latency import LatencyRequest, draw_report, measure_latency
     from labseq.console.output import json_writer, report_compiling, say
     from labseq.pictures.figures import check_place
 
@@ -222,12 +221,12 @@ def latency(
     request = LatencyRequest(sequence, profile, tuple(overrides or ()), loadings, seed)
     with progress_of("loadings") as progress:
         report = measure_latency(request, announce=report_compiling, progress=progress)
-    say(*report_text(report))
+    say(*report.as_text())
     say(*(f"warning: {text}" for text in report.warnings), stream=sys.stderr)
     if picture is not None:
         draw_report(report, picture)
         say(f"written: {picture}")
-    write(report.as_dict())
+    write(report)
 
 
 @bench.command(short_help="Measure the speed of rendering.")
@@ -238,10 +237,10 @@ def waveform(
     json: JsonFile = None,
 ) -> None:
     """Measure rendering on this computer: by kind of segment, and for a plan."""
-    from labseq.bench.rendering import bench_waveform, report_text
+    from labseq.bench.rendering import bench_waveform
     from labseq.console.output import json_writer, report_compiling, say
 
     write = json_writer(json)
     report = bench_waveform(repeats, announce=report_compiling)
-    say(*report_text(report))
+    say(*report.as_text())
     write(report)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.builtin.rearrange import checked_plan, n_beginning, play_prepared, prepare, rest_of
-from labseq.console.text import columns, plural
+from labseq.console.report import Column, table
+from labseq.console.text import plural, time_text
 from labseq.errors import ConfigError, Problem
 from labseq.guard import stop_on_signals
 from labseq.model import ShotRecord, TimelineEntry
@@ -63,6 +64,14 @@ class Stage:
         return cls(name, float(np.median(host_s)), float(np.quantile(host_s, 0.99)), modelled)
 
 
+STAGES: Final[Sequence[Column[Stage]]] = (
+    Column("stage", lambda stage: stage.name),
+    Column("median", lambda stage: time_text(stage.median_s or None), right=True),
+    Column("99 %", lambda stage: time_text(stage.p99_s or None), right=True),
+    Column("modelled", lambda stage: time_text(stage.modelled_s or None), right=True),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
     """The times of a profile and a sequence, on this computer.
@@ -109,9 +118,14 @@ class LatencyReport:
         median, p99 = np.quantile(self.light_s, (0.5, 0.99))
         return float(median), float(p99), max(self.light_s)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, JSON-ready, in SI."""
+    def as_json(self) -> dict[str, Any]:
+        """Everything, in SI."""
         return asdict(self) | {"goal_s": GOAL_S, "light_quantiles_s": self.light_quantiles_s}
+
+    def as_text(self) -> list[str]:
+        """A table of the stages, and notes."""
+        stages = (*self.stages, self.total, self.start, self.light)
+        return [*table(stages, STAGES), "", *_notes(self)]
 
 
 N_WARM: Final = 5
@@ -291,13 +305,6 @@ def _report(
     )
 
 
-def report_text(report: LatencyReport) -> list[str]:
-    """The report as a table and notes."""
-    stages = (*report.stages, report.total, report.start, report.light)
-    rows = [(s.name, _time(s.median_s), _time(s.p99_s), _time(s.modelled_s)) for s in stages]
-    return [*columns([("stage", "median", "99 %", "modelled"), *rows], right=(1, 2, 3)), "", *_notes(report)]
-
-
 def draw_report(report: LatencyReport, path: Path) -> None:
     """Draw a histogram of the times from a frame to the light; see :func:`draw_times`."""
     mode = f", mode {report.mode}" if report.mode else ""
@@ -333,10 +340,6 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
         return figure
 
     save_figure(path, draw)
-
-
-def _time(duration_s: float) -> str:
-    return format_quantity(duration_s, "time") if duration_s else "-"
 
 
 def _notes(report: LatencyReport) -> list[str]:

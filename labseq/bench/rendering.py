@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import timeit
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
-from labseq.console.text import columns
+from labseq.console.report import Column, table
 from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
 from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
 from labseq.units import format_quantity
@@ -33,16 +33,52 @@ PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1
 """A typical plan: 225 atoms in 20 x 20 sites, moved seven at a time."""
 
 
-def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lambda _: None) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class RenderedProgram:
+    """The speed of rendering one program.
+
+    Attributes:
+        gigasamples_per_s: Samples of both channels per second, in 1e9.
+        playing_over_rendering: Its playing time over the time of rendering it.
+        goal: What that should be at least.
+    """
+
+    name: str
+    gigasamples_per_s: float
+    playing_over_rendering: float
+    goal: float
+
+
+PROGRAMS: Final[Sequence[Column[RenderedProgram]]] = (
+    Column("two channels", lambda program: program.name),
+    Column("Gsample/s", lambda program: f"{program.gigasamples_per_s:.3g}", right=True),
+    Column("playing/rendering", lambda program: f"{program.playing_over_rendering:.3g}", right=True),
+    Column("goal", lambda program: f">= {program.goal:g}", right=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RenderingReport:
+    """The speed of rendering: one row for each kind of segment, and one for a plan."""
+
+    rows: Sequence[RenderedProgram]
+    sample_rate_hz: float
+    repeats: int
+
+    def as_text(self) -> list[str]:
+        """A table of the measurements, and their extent."""
+        rate = format_quantity(self.sample_rate_hz, "frequency")
+        return [*table(self.rows, PROGRAMS), "", f"{rate}, two threads; the best of {self.repeats}"]
+
+
+def bench_waveform(
+    repeats: int = 5, *, announce: Callable[[float], None] = lambda _: None
+) -> RenderingReport:
     """Measure rendering in two threads into reused buffers; the fastest of several repetitions counts.
 
     Args:
         repeats: Number of repetitions.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
-
-    Returns:
-        JSON-ready: ``rows``, one for each kind of segment and for a plan, with samples of both channels per
-        second, in 1e9, and the goal for the playing time over the rendering time.
     """
     from labseq.kernel import announcing, load_kernels
 
@@ -52,10 +88,10 @@ def bench_waveform(repeats: int = 5, *, announce: Callable[[float], None] = lamb
         warm_rendering()
         load_kernels()
         rows = list(_rows(moves, rate_hz, repeats))
-    return {"rows": rows, "sample_rate_hz": rate_hz, "repeats": repeats}
+    return RenderingReport(rows, rate_hz, repeats)
 
 
-def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[dict[str, Any]]:
+def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[RenderedProgram]:
     grid = moves.grid
     bare = replace(moves.motion, overhead_per_batch_s=0.0)
     plan = tone_program(moves.plan, grid, bare)
@@ -70,12 +106,12 @@ def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[dict[s
     ):
         renderer = Renderer(program, rate_hz)
         taken_s = min(timeit.repeat(partial(render_all, renderer), number=1, repeat=repeats))
-        yield {
-            "name": name,
-            "gigasamples_per_s": N_CHANNELS * renderer.n_samples / taken_s / 1e9,
-            "playing_over_rendering": renderer.n_samples / rate_hz / taken_s,
-            "goal": goal,
-        }
+        yield RenderedProgram(
+            name=name,
+            gigasamples_per_s=N_CHANNELS * renderer.n_samples / taken_s / 1e9,
+            playing_over_rendering=renderer.n_samples / rate_hz / taken_s,
+            goal=goal,
+        )
 
 
 def uniform_program(
@@ -127,20 +163,3 @@ def in_two_threads(render: Callable[[Samples, int], None], n_samples: int) -> No
         later = other.submit(work, half, n_samples)
         work(0, half)
         later.result()
-
-
-def report_text(report: Mapping[str, Any]) -> list[str]:
-    """A table of the measurements, and their extent."""
-    header = ("two channels", "Gsample/s", "playing/rendering", "goal")
-    rows = [
-        (
-            row["name"],
-            f"{row['gigasamples_per_s']:.3g}",
-            f"{row['playing_over_rendering']:.3g}",
-            f">= {row['goal']:g}",
-        )
-        for row in report["rows"]
-    ]
-    rate = format_quantity(report["sample_rate_hz"], "frequency")
-    extent = f"{rate}, two threads; the best of {report['repeats']}"
-    return [*columns([header, *rows], right=(1, 2, 3)), "", extent]

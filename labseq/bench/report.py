@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from labseq.bench.comparison import BARE_MOTION, Comparison, Condition, PlannerEntry
 from labseq.bench.work import Done, Failure, PreparedCondition, loading_seed
-from labseq.console.text import columns, percent, plural
+from labseq.console.report import Column, table
+from labseq.console.text import percent, plural, time_text
 from labseq.errors import LabseqError
-from labseq.model.estimate import Estimate, as_mapping, mean
+from labseq.model.estimate import Estimate, mean
 from labseq.pictures.figures import make_figure, save_figure
 from labseq.plain import to_plain
 from labseq.units import format_quantity
@@ -75,29 +76,24 @@ def _percent(value: Estimate) -> str:
     return percent(value.value, 2)
 
 
-def _time(duration_s: float) -> str:
-    return "-" if math.isnan(duration_s) else format_quantity(duration_s, "time")
-
-
-PRINTED: Final[Sequence[tuple[str, str, Callable[[Any], str]]]] = (
-    ("planner", "label", str),
-    ("DOP", "degree_of_parallelism", str),
-    ("batches", "n_batches", str),
-    ("atoms moved", "n_atoms_moved", str),
-    ("distance/mm", "distance_m", _milli),
-    ("motion/ms", "motion_s", _milli),
-    ("moving/ms", "moving_s", _milli),
-    ("scans", "n_scans", str),
-    ("scans/ms", "scan_s", _milli),
-    ("planning", "planning_s", lambda times: _time(times["median"])),
-    ("99 %", "planning_s", lambda times: _time(times["p99"])),
-    ("filled", "filling_fraction", _percent),
-    ("met", "target_met", _percent),
-    ("/bound", "ratio_to_bound", str),
-    ("atoms lost", "n_lost", str),
-    ("defect-free", "p_defect_free", _percent),
+PLANNERS: Final[Sequence[Column[Row]]] = (
+    Column("planner", lambda row: row["label"]),
+    Column("DOP", lambda row: row["degree_of_parallelism"], right=True),
+    Column("batches", lambda row: row["n_batches"], right=True),
+    Column("atoms moved", lambda row: row["n_atoms_moved"], right=True),
+    Column("distance/mm", lambda row: _milli(row["distance_m"]), right=True),
+    Column("motion/ms", lambda row: _milli(row["motion_s"]), right=True),
+    Column("moving/ms", lambda row: _milli(row["moving_s"]), right=True),
+    Column("scans", lambda row: row["n_scans"], right=True),
+    Column("scans/ms", lambda row: _milli(row["scan_s"]), right=True),
+    Column("planning", lambda row: time_text(row["planning_s"]["median"]), right=True),
+    Column("99 %", lambda row: time_text(row["planning_s"]["p99"]), right=True),
+    Column("filled", lambda row: _percent(row["filling_fraction"]), right=True),
+    Column("met", lambda row: _percent(row["target_met"]), right=True),
+    Column("/bound", lambda row: row["ratio_to_bound"], right=True),
+    Column("atoms lost", lambda row: row["n_lost"], right=True),
+    Column("defect-free", lambda row: _percent(row["p_defect_free"]), right=True),
 )
-"""Heading, value and format of the printed columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,19 +128,23 @@ class Report:
         incomplete = "" if self.ended_by is None else f", incomplete: {self.n_done} of {self.n_wanted}"
         return f"{self.comparison.n_loadings} loadings{incomplete}, seed {self.comparison.seed}"
 
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, JSON-ready."""
+    def as_json(self) -> dict[str, Any]:
+        """Everything."""
         return {
             "complete": self.ended_by is None,
             "seed": self.comparison.seed,
             "n_loadings": self.comparison.n_loadings,
             "duration_s": self.duration_s,
-            "rows": [to_plain(as_mapping(row.values)) for row in self.rows],
+            "rows": [row.values for row in self.rows],
         }
+
+    def as_text(self) -> list[str]:
+        """A table with a row per condition and planner, and notes."""
+        return [*_table(self), *notes(self)]
 
     def as_csv(self) -> str:
         """The rows as CSV, SI, a line per row."""
-        flat = [_flat(row) for row in self.as_dict()["rows"]]
+        flat = [_flat(to_plain(row.values)) for row in self.rows]
         text = io.StringIO()
         writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
         writer.writeheader()
@@ -241,18 +241,15 @@ def summarise(results: NDArray[Any], loadings: NDArray[Any], n_atoms: int) -> di
     }
 
 
-def table(report: Report) -> list[str]:
-    """The printed table of a comparison: a line per condition and planner."""
+def _table(report: Report) -> list[str]:
     if not report.rows:
         return ["no plan was made"]
     hidden: set[str] = set()
     if not any(row.scans for row in report.rows):
-        hidden |= {"n_scans", "scan_s"}
+        hidden |= {"scans", "scans/ms"}
     if all(row["moving_s"] == row["motion_s"] for row in report.rows):
-        hidden.add("moving_s")
-    printed = [column for column in PRINTED if column[1] not in hidden]
-    lines = [[text(row[name]) for _, name, text in printed] for row in report.rows]
-    return columns([[heading for heading, *_ in printed], *lines], range(1, len(printed)))
+        hidden.add("moving/ms")
+    return table(report.rows, [column for column in PLANNERS if column.heading not in hidden])
 
 
 def notes(report: Report) -> list[str]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
 
 import numpy as np
 
-from labseq.calibration_store import DECIDING, figure_of
+from labseq.calibration_store import DECIDING
 from labseq.errors import ConfigError, Problem
-from labseq.model import CalibrationEntry
+from labseq.model import CalibrationEntry, CalibrationKind
 from labseq.plain import now
 from labseq.recording.schema import unit_of
 from labseq.units import format_quantity
@@ -110,7 +110,8 @@ def quantity(value: float | None, name: str) -> str:
     return f"{value:.4g} {unit}".rstrip()
 
 
-def quality_text(entry: CalibrationEntry) -> str:
+def quality_text(kind: CalibrationKind, quality: Mapping[str, float]) -> str:
     """The deciding figure of a calibration as text; "-" if it has none."""
-    deciding, figure = DECIDING[entry.kind], figure_of(entry)
+    deciding = DECIDING[kind]
+    figure = quality.get(deciding.figure, math.nan)
     return "-" if math.isnan(figure) else f"{deciding.label} {quantity(figure, deciding.figure)}"

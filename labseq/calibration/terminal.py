@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
+from pathlib import Path
 from shlex import quote
 from typing import Any, Final, cast
 
@@ -20,14 +21,94 @@ from labseq.calibration_store import Damaged, Store, Stored, grid_text
 from labseq.config.profile import OFF, CalibrationChoices
 from labseq.console.errors import lines_of
 from labseq.console.events import LASTING, LogLines
-from labseq.console.output import as_line, say, stdout_to_stderr
-from labseq.console.text import age_text, columns
+from labseq.console.output import say
+from labseq.console.report import Column, aligned, print_report, reporting, table
+from labseq.console.text import age_text
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationKind
 
 MAX_LISTED: Final = 4
 """Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationRow:
+    """A calibration; of a damaged file only its kind, its id and the error are known."""
+
+    kind: str
+    id: str
+    file: Path
+    in_use: bool
+    error: str | None = None
+    taken_utc: str | None = None
+    age_s: float | None = None
+    quality: Mapping[str, float] = field(default_factory=dict[str, float])
+    grid: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    origin: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    picture: Path | None = None
+
+    @classmethod
+    def of(cls, calibration: Stored | Damaged, used: Mapping[str, str]) -> CalibrationRow:
+        """An entry of a store; ``used`` as :func:`in_use` returns it."""
+        path = calibration.path
+        if isinstance(calibration, Damaged):
+            is_used = used.get(calibration.kind) == path.name
+            return cls(calibration.kind, calibration.id, path, is_used, str(calibration.error))
+        entry = calibration.entry
+        return cls(
+            kind=entry.kind,
+            id=entry.id,
+            file=path,
+            in_use=used.get(entry.kind) == path.name,
+            taken_utc=entry.taken_utc,
+            age_s=age_s(entry),
+            quality=entry.quality,
+            grid=entry.grid,
+            origin=entry.origin,
+            picture=calibration.picture,
+        )
+
+    @property
+    def quality_text(self) -> str:
+        """The deciding figure."""
+        return "damaged" if self.error else quality_text(cast("CalibrationKind", self.kind), self.quality)
+
+
+CALIBRATIONS: Final[Sequence[Column[CalibrationRow]]] = (
+    Column("kind", lambda row: row.kind),
+    Column("id", lambda row: row.id),
+    Column("taken", lambda row: _time_text(row.taken_utc)),
+    Column("age", lambda row: "-" if row.error else age_text(row.age_s)),
+    Column("quality", lambda row: row.quality_text),
+    Column("", lambda row: "in use" if row.in_use else ""),
+    Column("from", lambda row: clean(str(row.origin.get("run") or row.origin.get("command") or "-"))),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationList:
+    """The calibrations of a profile, oldest first.
+
+    Attributes:
+        problems: Why it cannot be said which are in use.
+    """
+
+    folder: Path
+    calibrations: Sequence[CalibrationRow]
+    problems: Sequence[str]
+
+    def as_text(self) -> list[str]:
+        """A row per calibration, and what is damaged."""
+        if not self.calibrations:
+            return [f"there are no calibrations in {self.folder}", *_below(self.problems)]
+        problems = [*self.problems, *(row.error for row in self.calibrations if row.error)]
+        return [*table(self.calibrations, CALIBRATIONS), *_below(problems)]
+
+
+def _below(lines: Sequence[str]) -> list[str]:
+    """Lines below an empty one; nothing if there are none."""
+    return ["", *lines] if lines else []
 
 
 def list_calibrations(profile: str, dry_run: DryRun, *, as_json: bool) -> None:
@@ -37,22 +118,36 @@ def list_calibrations(profile: str, dry_run: DryRun, *, as_json: bool) -> None:
         ConfigError: The profile has an error, or the folder of its calibrations cannot be read.
     """
     store, spec = open_store(profile, dry_run)
-    found, problems = store.entries(), list[str]()
+    problems = list[str]()
     try:
         used = in_use(store, spec.calibrations.use)
     except ConfigError as error:
         used, problems = {}, [str(error)]
-    if as_json:
-        rows = [_values_of(one, used) for one in found]
-        say(as_line({"folder": str(store.folder), "calibrations": rows, "problems": problems}))
-        return
-    if not found:
-        say(f"there are no calibrations in {store.folder}")
-    else:
-        header = ("kind", "id", "taken", "age", "quality", "", "from")
-        say(*columns([header, *(_row(one, used) for one in found)]))
-    problems += [str(one.error) for one in found if isinstance(one, Damaged)]
-    say(*([""] if problems else []), *problems)
+    rows = [CalibrationRow.of(calibration, used) for calibration in store.entries()]
+    print_report(CalibrationList(store.folder, rows, problems), as_json=as_json)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationDetails(CalibrationRow):
+    """A calibration with its values."""
+
+    values: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, Any])
+
+    def as_text(self) -> list[str]:
+        """A line per figure and value; values of many numbers are summed up."""
+        return aligned(
+            [
+                ("calibration", f"{self.kind} {self.id}"),
+                ("taken", f"{_time_text(self.taken_utc)}, {age_text(self.age_s, ' ago')}"),
+                ("in use", "yes" if self.in_use else "no"),
+                ("grid", grid_text(self.grid)),
+                ("file", str(self.file)),
+                ("picture", str(self.picture or "-")),
+                *((f"origin.{name}", _origin_text(value)) for name, value in self.origin.items()),
+                *((f"quality.{name}", quantity(value, name)) for name, value in self.quality.items()),
+                *((name, _summary(name, value)) for name, value in self.values.items()),
+            ]
+        )
 
 
 def show_calibration(wanted: str, profile: str, dry_run: DryRun, *, as_json: bool) -> None:
@@ -62,27 +157,10 @@ def show_calibration(wanted: str, profile: str, dry_run: DryRun, *, as_json: boo
         ConfigError: There is no such calibration, there are several, or it is damaged.
     """
     store, spec = open_store(profile, dry_run)
-    stored, used = store.find(wanted), in_use(store, spec.calibrations.use)
-    if as_json:
-        say(as_line(_values_of(stored, used)))
-        return
-    entry = stored.entry
-    quality = [(name, quantity(value, name)) for name, value in entry.quality.items()]
-    say(
-        *columns(
-            [
-                ("calibration", f"{entry.kind} {entry.id}"),
-                ("taken", f"{_time_text(entry.taken_utc)}, {age_text(age_s(entry), ' ago')}"),
-                ("in use", "yes" if _is_used(stored, used) else "no"),
-                ("grid", grid_text(entry.grid)),
-                ("file", str(stored.path)),
-                ("picture", str(stored.picture or "-")),
-                *((f"origin.{name}", _origin_text(value)) for name, value in entry.origin.items()),
-                *((f"quality.{name}", text) for name, text in quality),
-                *((name, _summary(name, value)) for name, value in entry.values.items()),
-            ]
-        )
-    )
+    stored = store.find(wanted)
+    row = CalibrationRow.of(stored, in_use(store, spec.calibrations.use))
+    shown = {field.name: getattr(row, field.name) for field in fields(row)}
+    print_report(CalibrationDetails(**shown, values=stored.entry.values), as_json=as_json)
 
 
 def use_calibration(choice: str, profile: str, dry_run: DryRun, *, force: bool) -> None:
@@ -114,29 +192,47 @@ def compare_calibrations(before: str, after: str, profile: str, dry_run: DryRun,
     """
     store, _ = open_store(profile, dry_run)
     one, other = store.find(before).entry, store.find(after).entry
-    values, figures = compare(one, other)
-    if as_json:
-        changes = {"values": [*map(asdict, values)], "quality": [*map(asdict, figures)]}
-        say(as_line({"kind": one.kind, "before": one.id, "after": other.id, **changes}))
-        return
-    ends = (f"{entry.id} ({_time_text(entry.taken_utc)})" for entry in (one, other))
-    say(f"{one.kind}: {' to '.join(ends)}", "", *difference_table(values))
-    rows = [(d.name, quantity(d.before, d.name), quantity(d.after, d.name)) for d in figures]
-    say(*(["", *columns([("figure", "before", "after"), *rows])] if rows else []))
+    ends = f"{one.id} ({_time_text(one.taken_utc)}) to {other.id} ({_time_text(other.taken_utc)})"
+    change = Change(one.kind, one.id, other.id, ends, *compare(one, other))
+    print_report(change, as_json=as_json)
 
 
-def difference_table(differences: Sequence[Difference]) -> list[str]:
-    """A row per value: greatest change, root mean square, mean."""
-    rows = [
-        (
-            one.name,
-            quantity(one.greatest, one.name),
-            quantity(one.rms, one.name),
-            ", ".join(quantity(mean, one.name) for mean in one.mean) or "-",
-        )
-        for one in differences
-    ]
-    return columns([("value", "greatest change", "rms", "mean"), *rows])
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What changed from one calibration to another.
+
+    Attributes:
+        before: Id of the earlier one.
+        after: Id of the later one.
+        ends: Both with their times.
+        values: The changes of their values.
+        quality: The changes of their figures of merit.
+    """
+
+    kind: str
+    before: str
+    after: str
+    ends: str
+    values: Sequence[Difference]
+    quality: Sequence[Difference]
+
+    def as_text(self) -> list[str]:
+        """A table of the values, and one of the figures of merit."""
+        figures = _below(table(self.quality, FIGURES) if self.quality else [])
+        return [f"{self.kind}: {self.ends}", "", *table(self.values, DIFFERENCES), *figures]
+
+
+DIFFERENCES: Final[Sequence[Column[Difference]]] = (
+    Column("value", lambda value: value.name),
+    Column("greatest change", lambda value: quantity(value.greatest, value.name)),
+    Column("rms", lambda value: quantity(value.rms, value.name)),
+    Column("mean", lambda value: ", ".join(quantity(mean, value.name) for mean in value.mean) or "-"),
+)
+FIGURES: Final[Sequence[Column[Difference]]] = (
+    Column("figure", lambda figure: figure.name),
+    Column("before", lambda figure: quantity(figure.before, figure.name)),
+    Column("after", lambda figure: quantity(figure.after, figure.name)),
+)
 
 
 def in_use(store: Store, choices: CalibrationChoices) -> dict[str, str]:
@@ -149,40 +245,6 @@ def in_use(store: Store, choices: CalibrationChoices) -> dict[str, str]:
         elif pin is not None:
             used[kind] = store.find(pin, kind).path.name
     return used
-
-
-def _row(one: Stored | Damaged, used: Mapping[str, str]) -> tuple[str, ...]:
-    mark = "in use" if _is_used(one, used) else ""
-    if isinstance(one, Damaged):
-        return (one.kind, one.id, "-", "-", "damaged", mark, "-")
-    entry = one.entry
-    origin = entry.origin.get("run") or entry.origin.get("command") or "-"
-    taken, age = _time_text(entry.taken_utc), age_text(age_s(entry))
-    return (entry.kind, entry.id, taken, age, quality_text(entry), mark, clean(str(origin)))
-
-
-def _values_of(one: Stored | Damaged, used: Mapping[str, str]) -> dict[str, Any]:
-    head = {"file": one.path, "in_use": _is_used(one, used)}
-    if isinstance(one, Damaged):
-        return {"kind": one.kind, "id": one.id, **head, "error": str(one.error)}
-    entry = one.entry
-    return {
-        "kind": entry.kind,
-        "id": entry.id,
-        **head,
-        "taken_utc": entry.taken_utc,
-        "age_s": age_s(entry),
-        "quality": entry.quality,
-        "grid": entry.grid,
-        "origin": entry.origin,
-        "picture": one.picture,
-        "error": None,
-    }
-
-
-def _is_used(one: Stored | Damaged, used: Mapping[str, str]) -> bool:
-    kind = one.kind if isinstance(one, Damaged) else one.entry.kind
-    return used.get(kind) == one.path.name
 
 
 def _kind(name: str, value: str) -> CalibrationKind:
@@ -210,7 +272,9 @@ def _origin_text(value: Any) -> str:
     return clean(str(value))
 
 
-def _time_text(taken_utc: str) -> str:
+def _time_text(taken_utc: str | None) -> str:
+    if taken_utc is None:
+        return "-"
     return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # in one piece
 
 
@@ -226,21 +290,17 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
             only stored.
         LabseqError: The calibration failed.
     """
-    answer = stdout_to_stderr() if as_json else None
-    try:
+
+    def failed(error: BaseException) -> dict[str, Any]:
+        return {"kind": kind, "id": None, "in_use": False, "error": "\n".join(lines_of(error))}
+
+    with reporting(as_json=as_json, failed=failed) as show:
         method = METHODS.get(kind)
         if method is None:
             what, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
             raise ConfigError(Problem(what, expected=listing(METHODS), hint=hint))
         outcome = calibrate(method, request, _Progress())
-    except BaseException as error:
-        if answer is not None:
-            answer(as_line({"kind": kind, "id": None, "in_use": False, "error": "\n".join(lines_of(error))}))
-        raise
-    if answer is None:
-        say(*summary_lines(outcome))
-    else:
-        answer(as_line(_outcome_values(outcome)))
+        show(Calibrated.of(outcome))
     if outcome.refused:
         entry = outcome.stored.entry
         what = f"{entry.kind} {entry.id} is stored but not in use: {outcome.refused}"
@@ -250,37 +310,62 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
         raise ConfigError(Problem(what, hint=hint))
 
 
-def summary_lines(outcome: Outcome) -> list[str]:
-    """The result, the change from the calibration in use, and where it is stored."""
-    entry, picture = outcome.stored.entry, outcome.stored.picture
-    state = "in use from the next run on" if not outcome.refused else "not in use"
-    figures = [(name, quantity(value, name)) for name, value in entry.quality.items()]
-    lines = [f"{entry.kind} {entry.id}: {state}", *outcome.summary_lines]
-    lines += ["", *columns(figures)] if figures else []
-    if outcome.before is not None:
-        lines += [
-            "",
-            f"compared with {outcome.before.id}, which was in use:",
-            *difference_table(outcome.changes),
-        ]
-    lines += ["", f"stored as {outcome.stored.path}", *([f"look at {picture}"] if picture else [])]
-    return [*lines, *(f"warning: {text}" for text in outcome.warnings)]
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """A calibration that was made.
 
+    Attributes:
+        refused: Why it is not in use; None if it is.
+        summary: What was measured.
+        before: Id of the calibration that was in use.
+        changes: The changes from that one.
+    """
 
-def _outcome_values(outcome: Outcome) -> dict[str, Any]:
-    entry = outcome.stored.entry
-    return {
-        "kind": entry.kind,
-        "id": entry.id,
-        "in_use": not outcome.refused,
-        "refused": outcome.refused or None,
-        "quality": entry.quality,
-        "before": None if outcome.before is None else outcome.before.id,
-        "file": outcome.stored.path,
-        "picture": outcome.stored.picture,
-        "run_dir": None if outcome.run is None else outcome.run.path,
-        "warnings": outcome.warnings,
-    }
+    kind: str
+    id: str
+    in_use: bool
+    refused: str | None
+    summary: Sequence[str]
+    quality: Mapping[str, float]
+    before: str | None
+    changes: Sequence[Difference]
+    file: Path
+    picture: Path | None
+    run_dir: Path | None
+    warnings: Sequence[str]
+
+    @classmethod
+    def of(cls, outcome: Outcome) -> Calibrated:
+        """The outcome of a measurement."""
+        entry = outcome.stored.entry
+        return cls(
+            kind=entry.kind,
+            id=entry.id,
+            in_use=not outcome.refused,
+            refused=outcome.refused or None,
+            summary=outcome.summary_lines,
+            quality=entry.quality,
+            before=None if outcome.before is None else outcome.before.id,
+            changes=outcome.changes,
+            file=outcome.stored.path,
+            picture=outcome.stored.picture,
+            run_dir=None if outcome.run is None else outcome.run.path,
+            warnings=outcome.warnings,
+        )
+
+    def as_text(self) -> list[str]:
+        """The result, the change from the calibration in use, and where it is stored."""
+        state = "in use from the next run on" if self.in_use else "not in use"
+        lines = [f"{self.kind} {self.id}: {state}", *self.summary]
+        lines += _below(aligned([(name, quantity(value, name)) for name, value in self.quality.items()]))
+        if self.before is not None:
+            lines += [
+                "",
+                f"compared with {self.before}, which was in use:",
+                *table(self.changes, DIFFERENCES),
+            ]
+        lines += ["", f"stored as {self.file}", *([f"look at {self.picture}"] if self.picture else [])]
+        return [*lines, *(f"warning: {text}" for text in self.warnings)]
 
 
 class _Progress(LogLines):

@@ -69,7 +69,8 @@ def run_file(
     from labseq.campaigns.running import run_at_once, run_in_turn
     from labseq.cluster import ClusterWorkers, check_workers
     from labseq.console.output import say
-    from labseq.console.text import columns, plural
+    from labseq.console.report import aligned
+    from labseq.console.text import plural
     from labseq.workers import ProcessWorkers
 
     check_workers(None if n_workers == 1 else n_workers, scheduler)
@@ -83,7 +84,7 @@ def run_file(
     _, runs = recorded_runs(folder)
     rows: list[tuple[Any, ...]] = [(*wanted.axes, "shots", "filling", "runs")]
     rows += [(*wanted.values(point), *_result(runs[point])) for point in wanted.points()]
-    say("", *columns(rows), f"{plural(sum(map(len, runs.values())), 'run')} in {folder}")
+    say("", *aligned(rows), f"{plural(sum(map(len, runs.values())), 'run')} in {folder}")
 
 
 def _reporter(wanted: Campaign) -> Callable[[PlannedRun, Run], None]:

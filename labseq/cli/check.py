@@ -6,7 +6,7 @@ import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -16,15 +16,18 @@ from labseq.assembly.search import Search
 from labseq.calibration.compare import age_s, quality_text
 from labseq.config.scan import Axis
 from labseq.config.sequence import CheckSettings
-from labseq.console.errors import json_errors, warning_lines
+from labseq.console.errors import warning_lines
 from labseq.console.events import LogLines
-from labseq.console.output import as_line, say, stdout_to_stderr
-from labseq.console.text import age_text, clock_time, columns, encodes, plural, settings_text, size_text
+from labseq.console.output import say
+from labseq.console.report import Facts, aligned, reporting
+from labseq.console.text import age_text, clock_time, encodes, plural, settings_text, size_text
+from labseq.errors import Problem
 from labseq.messages import clean
-from labseq.model import TimelineEntry
+from labseq.model import CalibrationEntry, TimelineEntry
 from labseq.recording import data_root
 from labseq.sequencer.policies import StepPolicy
-from labseq.session.check import CheckReport, Rehearsal, check
+from labseq.session.check import CheckReport, check
+from labseq.session.rehearsal import Rehearsal
 from labseq.session.session import Session
 from labseq.units import format_quantity
 
@@ -49,7 +52,7 @@ def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> li
             by = by.name + accuracy if bar.duration_s else ""
             rows.append((step, label, format_quantity(start_s, "time"), length, by, drawn))
             start_s += bar.duration_s
-    return columns(rows, right=(2, 3))
+    return aligned(rows, right=(2, 3))
 
 
 def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: int) -> str:
@@ -74,7 +77,7 @@ def lines_table(
             for place, mark in enumerate(_bar(start_s, end_s - start_s, total_s, block, width)):
                 drawn[place] = mark if mark != " " else drawn[place]
         rows.append((name, "", str(len(spans)), format_quantity(on_s, "time"), "".join(drawn).rstrip()))
-    return columns(rows, right=(2, 3))
+    return aligned(rows, right=(2, 3))
 
 
 _THEN = {"repeat_shot": "repeats the shot", "skip_point": "skips its point", "stop": "stops the run"}
@@ -117,79 +120,156 @@ def _check(check: CheckSettings) -> str:
     return f"{check.value} of {of} {' and '.join(limits)}; otherwise {then[check.then]}"
 
 
+@dataclass(frozen=True, slots=True)
+class TimelineStep:
+    """A step of a shot, counted from 0, and its bars."""
+
+    step: int
+    name: str
+    bars: Sequence[TimelineEntry]
+
+
+@dataclass(frozen=True, slots=True)
+class FirstCycle:
+    """How long the moves of the first cycle take over random loadings, in seconds."""
+
+    median: float
+    p95: float
+    n_loadings: int
+
+    @classmethod
+    def of(cls, rehearsal: Rehearsal) -> FirstCycle:
+        """The quantiles of a rehearsal."""
+        return cls(rehearsal.quantile_s(0.5), rehearsal.quantile_s(0.95), rehearsal.n_loadings)
+
+
+@dataclass(frozen=True, slots=True)
+class UsedCalibration:
+    """A calibration that the run uses."""
+
+    kind: str
+    id: str
+    taken_utc: str
+    age_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedSequence:
+    """What a sequence does, for a scan at its first point.
+
+    Attributes:
+        about: Name and text of what the run is made of: sequence, profile, planner, ...
+        limits: The same of what limits it: windows, attempts, policies, timeouts.
+        shot_s: Shortest and longest duration of a shot.
+        run_s: The same of the run.
+    """
+
+    about: Facts
+    timeline: Sequence[TimelineStep]
+    shots: int
+    shot_s: tuple[float, float]
+    points: int | None
+    points_are_chosen: bool
+    run_s: tuple[float, float]
+    lines: Mapping[str, Sequence[tuple[float, float]]]
+    idle_outputs: Mapping[str, str]
+    n_images: int
+    shot_bytes: int | None
+    run_bytes: int | None
+    free_bytes: int
+    first_cycle_s: FirstCycle | None
+    calibrations: Sequence[UsedCalibration]
+    limits: Facts
+    warnings: Sequence[Problem]
+    problems: Sequence[Problem] = ()
+
+    @classmethod
+    def of(cls, assembly: Assembly, checked: CheckReport) -> CheckedSequence:
+        """What the check of a sequence found."""
+        return cls(
+            about=_subject(assembly),
+            timeline=[TimelineStep(i, name, bars) for i, (name, bars) in enumerate(checked.timeline)],
+            shots=checked.n_shots,
+            shot_s=(checked.shortest_shot_s, checked.longest_shot_s),
+            points=checked.n_points,
+            points_are_chosen=assembly.search is not None,
+            run_s=checked.run_s,
+            lines=checked.lines,
+            idle_outputs=checked.idle_outputs,
+            n_images=checked.n_images,
+            shot_bytes=checked.shot_bytes,
+            run_bytes=None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
+            free_bytes=_free_bytes(data_root()),
+            first_cycle_s=None if checked.rehearsal is None else FirstCycle.of(checked.rehearsal),
+            calibrations=[
+                UsedCalibration(entry.kind, entry.id, entry.taken_utc, age_s(entry))
+                for entry in assembly.hardware.calibrations.values()
+            ],
+            limits=_limits(assembly),
+            warnings=checked.warnings,
+        )
+
+    def as_text(self) -> list[str]:
+        """What it is made of, timelines of steps and lines, durations and limits."""
+        block = "█" if encodes(sys.stdout.encoding, "█") else "#"
+        timeline = [(step.name, step.bars) for step in self.timeline]
+        text_width = 2 + max(map(len, timeline_table(timeline, block, 0)))
+        room = shutil.get_terminal_size((text_width + BAR_WIDTH, 24)).columns - text_width
+        width = max(0, min(BAR_WIDTH, room))
+        outputs = [("output", "when nothing plays"), *self.idle_outputs.items()] if self.idle_outputs else []
+        parts = (
+            aligned(self.about),
+            timeline_table(timeline, block, width),
+            lines_table(self.lines, self.shot_s[1], block, width),
+            aligned(outputs),
+            aligned(self._totals()),
+            aligned(self.limits),
+        )
+        return [line for lines in parts if lines for line in ("", *lines)][1:]
+
+    def _totals(self) -> list[tuple[str, str]]:
+        shortest, longest = (format_quantity(t, "time") for t in self.shot_s)
+        run = " to ".join(map(clock_time, self.run_s))
+        points = "" if self.points is None else f"{plural(self.points, 'point')}, "
+        points = f"at most {points}" if self.points_are_chosen else points
+        size = "of unknown size" if self.shot_bytes is None else f"{size_text(self.shot_bytes)} each"
+        disk = "unknown" if self.run_bytes is None else f"{size_text(self.run_bytes)} at most"
+        space = f"{disk} on disk, {size_text(self.free_bytes)} free"
+        totals = [
+            ("shot", f"{shortest} to {longest}, {plural(self.n_images, 'image')} at most, {size}"),
+            ("run", f"{points}{plural(self.shots, 'shot')}, {run}, {space}"),
+        ]
+        if self.first_cycle_s is not None:
+            median, p95 = (
+                format_quantity(t, "time") for t in (self.first_cycle_s.median, self.first_cycle_s.p95)
+            )
+            over = f"over {self.first_cycle_s.n_loadings} random loadings"
+            totals.append(("first cycle", f"median {median}, 95th percentile {p95}, {over}"))
+        return totals
+
+
+def _free_bytes(folder: Path) -> int:
+    """Free space of the disk on which a folder is, or will be."""
+    path = folder.absolute()
+    return shutil.disk_usage(next(one for one in (path, *path.parents) if one.exists())).free
+
+
 def check_sequence(
     sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
 ) -> None:
     """Check a sequence, and print its timeline, limits and errors; no device is opened."""
-    answer = stdout_to_stderr() if as_json else None
-    observer = LogLines(sys.stderr)
-    try:
+    with reporting(as_json=as_json) as show:
         session = Session.open(
-            sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=observer
+            sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=LogLines(sys.stderr)
         )
         checked = check(session)
-    except BaseException as error:
-        if answer is not None:
-            answer(json_errors(error))
-        raise
-    if answer is not None:
-        answer(as_line(_as_values(session.assembly, checked)))
-    else:
-        _print(session.assembly, checked)
+        show(CheckedSequence.of(session.assembly, checked))
+    if not as_json:
+        for warning in checked.warnings:
+            say(*warning_lines(warning), stream=sys.stderr)
 
 
-def _print(assembly: Assembly, checked: CheckReport) -> None:
-    block = "█" if encodes(sys.stdout.encoding, "█") else "#"
-    text_width = 2 + max(map(len, timeline_table(checked.timeline, block, 0)))
-    room = shutil.get_terminal_size((text_width + BAR_WIDTH, 24)).columns - text_width
-    width = max(0, min(BAR_WIDTH, room))
-    parts = (
-        columns(_subject(assembly)),
-        timeline_table(checked.timeline, block, width),
-        lines_table(checked.lines, checked.longest_shot_s, block, width),
-        columns(
-            [("output", "when nothing plays"), *checked.idle_outputs.items()] if checked.idle_outputs else []
-        ),
-        columns([*_totals(checked, assembly), *_rehearsed(checked)]),
-        columns(_limits(assembly)),
-    )
-    say("\n\n".join("\n".join(lines) for lines in parts if lines))
-    for warning in checked.warnings:
-        say(*warning_lines(warning), stream=sys.stderr)
-
-
-def _as_values(assembly: Assembly, checked: CheckReport) -> dict[str, Any]:
-    rehearsal = checked.rehearsal
-    return {
-        "problems": [],
-        "warnings": [*map(asdict, checked.warnings)],
-        "timeline": [
-            {"step": number, "name": name, "bars": [*map(asdict, bars)]}
-            for number, (name, bars) in enumerate(checked.timeline)
-        ],
-        "shots": checked.n_shots,
-        "shot_s": [checked.shortest_shot_s, checked.longest_shot_s],
-        "points": checked.n_points,
-        "run_s": checked.run_s,
-        "lines": checked.lines,
-        "idle_outputs": checked.idle_outputs,
-        "n_images": checked.n_images,
-        "shot_bytes": checked.shot_bytes,
-        "run_bytes": None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
-        "first_cycle_s": None if rehearsal is None else _quantiles(rehearsal),
-        "calibrations": [
-            {"kind": entry.kind, "id": entry.id, "taken_utc": entry.taken_utc, "age_s": age_s(entry)}
-            for entry in assembly.hardware.calibrations.values()
-        ],
-    }
-
-
-def _quantiles(rehearsal: Rehearsal) -> dict[str, float]:
-    median, p95 = rehearsal.quantile_s(0.5), rehearsal.quantile_s(0.95)
-    return {"median": median, "p95": p95, "n_loadings": rehearsal.n_loadings}
-
-
-def _subject(assembly: Assembly) -> list[tuple[str, str]]:
+def _subject(assembly: Assembly) -> Facts:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
@@ -204,12 +284,14 @@ def _subject(assembly: Assembly) -> list[tuple[str, str]]:
         ),
         *([] if target.is_none else [("target", f"{target.name}, {sites}")]),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
-        *(
-            ("calibration", f"{one.kind} {one.id}, {age_text(age_s(one), ' old')}, {quality_text(one)}")
-            for one in assembly.hardware.calibrations.values()
-        ),
+        *(("calibration", _calibration(entry)) for entry in assembly.hardware.calibrations.values()),
         *(("scan", text) for text in _scanned(assembly)),
     ]
+
+
+def _calibration(entry: CalibrationEntry) -> str:
+    quality = quality_text(entry.kind, entry.quality)
+    return f"{entry.kind} {entry.id}, {age_text(age_s(entry), ' old')}, {quality}"
 
 
 def _scanned(assembly: Assembly) -> list[str]:
@@ -248,34 +330,7 @@ def _ends(axis: Axis) -> str:
     return f"{first} to {last}" if len(axis.values) > 1 else first
 
 
-def _totals(checked: CheckReport, assembly: Assembly) -> list[tuple[str, str]]:
-    shot = [format_quantity(t, "time") for t in (checked.shortest_shot_s, checked.longest_shot_s)]
-    n = checked.n_shots
-    run = [clock_time(t) for t in checked.run_s]
-    points = "" if checked.n_points is None else f"{plural(checked.n_points, 'point')}, "
-    points = f"at most {points}" if assembly.search is not None else points
-    size = "of unknown size" if checked.shot_bytes is None else f"{size_text(checked.shot_bytes)} each"
-    disk = "unknown" if checked.shot_bytes is None else f"{size_text(n * checked.shot_bytes)} at most"
-    root = next(
-        folder for folder in (data_root().absolute(), *data_root().absolute().parents) if folder.exists()
-    )
-    free = size_text(shutil.disk_usage(root).free)
-    return [
-        ("shot", f"{shot[0]} to {shot[1]}, {plural(checked.n_images, 'image')} at most, {size}"),
-        ("run", f"{points}{plural(n, 'shot')}, {run[0]} to {run[1]}, {disk} on disk, {free} free"),
-    ]
-
-
-def _rehearsed(checked: CheckReport) -> list[tuple[str, str]]:
-    if checked.rehearsal is None:
-        return []
-    found = _quantiles(checked.rehearsal)
-    median, p95 = (format_quantity(found[name], "time") for name in ("median", "p95"))
-    text = f"median {median}, 95th percentile {p95}, over {checked.rehearsal.n_loadings} random loadings"
-    return [("first cycle", text)]
-
-
-def _limits(assembly: Assembly) -> list[tuple[str, str]]:
+def _limits(assembly: Assembly) -> Facts:
     profile, spec = assembly.hardware.profile, assembly.sequence
     motion, timeouts = profile.motion, profile.timeouts
     tones = f"{motion.max_row_tones} x {motion.max_column_tones} tones"

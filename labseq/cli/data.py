@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from labseq.analysis.campaigns import campaign_in, export_campaign
 from labseq.analysis.scanned import ScanRequest, scan_report
-from labseq.console.output import as_line, say
+from labseq.console.output import say
+from labseq.console.report import Column, print_report, table
 from labseq.console.runs import chosen_run, existing_run
-from labseq.console.text import columns, plural
+from labseq.console.text import plural
 from labseq.data import Run
 from labseq.data.export import ENDINGS, check_export, export_run, files_of, write_columns
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained
 from labseq.messages import visible
 from labseq.recording import data_root
-from labseq.recording.doctor import Report, examine as find_damage
+from labseq.recording.doctor import Finding, examine as find_damage
 
 MAX_ROWS: Final = 200
 """Maximum number of findings that are printed."""
@@ -36,60 +39,67 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
             raise ConfigError(Problem("there is no such folder", visible(str(root)), hint=hint))
         root = existing_run(data)
     report = find_damage(root, dry_run=dry_run)
-    if as_json:
-        say(as_line(_as_values(report)))
-    else:
-        say(*table(report, root, dry_run=dry_run), *summary(report, dry_run=dry_run))
-    return RecordingError.exit_code if any(one.left for one in report.findings) else 0
+    examined = Examination(
+        root, dry_run, report.n_runs, report.n_shots, tuple(report.in_progress), tuple(report.findings)
+    )
+    print_report(examined, as_json=as_json)
+    return RecordingError.exit_code if examined.n_left else 0
 
 
-def table(report: Report, root: Path, *, dry_run: bool) -> list[str]:
-    """A row per finding, and an empty line; nothing without findings."""
-    if not report.findings:
-        return []
-    shown = report.findings[:MAX_ROWS]
-    rows = [
-        ("what", "where", "to do" if dry_run else "done"),
-        *((visible(one.what), visible(_shown(one.where, root)), visible(one.done)) for one in shown),
-    ]
-    n_more = len(report.findings) - MAX_ROWS
-    return [*columns(rows), *([f"and {n_more} more"] if n_more > 0 else []), ""]
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """The damage in a folder.
+
+    Attributes:
+        folder: The data folder or run that was examined.
+        dry_run: Whether nothing was changed.
+        runs: Number of runs that were checked.
+        shots: Number of their intact shots.
+        in_progress: Runs that are in progress, and were not checked.
+        findings: The defects.
+    """
+
+    folder: Path
+    dry_run: bool
+    runs: int
+    shots: int
+    in_progress: tuple[Path, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def n_left(self) -> int:
+        """Number of defects that remain."""
+        return sum(finding.left for finding in self.findings)
+
+    def as_text(self) -> list[str]:
+        """A row per finding, the number of runs and shots checked, and the result."""
+        lines = [f"{plural(self.runs, 'run')} checked, {plural(self.shots, 'shot')} intact"]
+        if self.in_progress:
+            lines.append(f"{plural(len(self.in_progress), 'run')} in progress not checked")
+        n_findings = len(self.findings)
+        if not n_findings:
+            return [*lines, "no damage found"]
+        result = f"{n_findings - self.n_left} repaired, {self.n_left} left"
+        defects = f"{plural(n_findings, 'defect')} found"
+        lines.append(f"{defects}; nothing was changed" if self.dry_run else f"{defects}: {result}")
+        return [*self._findings(), "", *lines]
+
+    def _findings(self) -> list[str]:
+        columns: Sequence[Column[Finding]] = (
+            Column("what", lambda finding: visible(finding.what)),
+            Column("where", lambda finding: visible(_within(finding.where, self.folder))),
+            Column("to do" if self.dry_run else "done", lambda finding: visible(finding.done)),
+        )
+        n_more = len(self.findings) - MAX_ROWS
+        rest = [f"and {n_more} more"] if n_more > 0 else []
+        return [*table(self.findings[:MAX_ROWS], columns), *rest]
 
 
-def summary(report: Report, *, dry_run: bool) -> list[str]:
-    """The number of runs and shots checked, and the result."""
-    lines = [f"{plural(report.n_runs, 'run')} checked, {plural(report.n_shots, 'shot')} intact"]
-    if report.in_progress:
-        lines.append(f"{plural(len(report.in_progress), 'run')} in progress not checked")
-    n_left = sum(one.left for one in report.findings)
-    if not report.findings:
-        lines.append("no damage found")
-    elif dry_run:
-        lines.append(f"{plural(len(report.findings), 'defect')} found; nothing was changed")
-    else:
-        n_done = len(report.findings) - n_left
-        lines.append(f"{plural(len(report.findings), 'defect')} found: {n_done} repaired, {n_left} left")
-    return lines
-
-
-def _shown(path: Path, root: Path) -> str:
-    try:
-        return str(path.relative_to(root.absolute())) if path != root.absolute() else path.name
-    except ValueError:
-        return str(path)
-
-
-def _as_values(report: Report) -> dict[str, Any]:
-    findings = [
-        {"what": one.what, "where": str(one.where), "done": one.done, "left": one.left}
-        for one in report.findings
-    ]
-    return {
-        "runs": report.n_runs,
-        "shots": report.n_shots,
-        "in_progress": [str(path) for path in report.in_progress],
-        "findings": findings,
-    }
+def _within(path: Path, root: Path) -> str:
+    """A path as seen from a folder."""
+    if path == root.absolute():
+        return path.name
+    return str(path.relative_to(root.absolute()) if path.is_relative_to(root.absolute()) else path)
 
 
 def export_to(run: Path | None, kind: str | None, output: Path | None, *, frames: bool, replace: bool) -> int:

@@ -4,24 +4,129 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from labseq.assembly.plugin_choice import DryRun, load_plugins
 from labseq.config.document import plugin_paths
 from labseq.config.profile import load_profile
-from labseq.console.errors import json_errors, report
-from labseq.console.output import as_line, report_compiling, say, stdout_to_stderr
-from labseq.console.text import columns
-from labseq.errors import ConfigError, DeviceError
+from labseq.console.errors import report
+from labseq.console.output import report_compiling, say
+from labseq.console.report import Column, aligned, reporting, table
+from labseq.console.text import time_text
+from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.kernel import announcing
 from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.safety.devices import CheckedDevice, DevicesReport, check_devices
 from labseq.safety.safe import make_profile_safe, stand_by
-from labseq.units import format_quantity
 
-_HEADER = ("device", "plugin", "model", "serial number", "firmware", "latency", "state")
+
+@dataclass(frozen=True, slots=True)
+class Versions:
+    """The version of a library or firmware here, and those that the driver was tried with."""
+
+    here: str
+    tried: str
+
+    @property
+    def differs(self) -> bool:
+        """Whether the driver was tried, but not with the version here."""
+        return bool(self.tried) and self.here not in self.tried.split(", ")
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceRow:
+    """A device of a profile, see :class:`labseq.safety.devices.CheckedDevice`.
+
+    Attributes:
+        reason: Why it failed, on one line; None if it works.
+    """
+
+    name: str
+    plugin: str
+    ok: bool
+    reason: str | None
+    model: Any
+    serial_number: Any
+    firmware: Any
+    versions: Mapping[str, Versions]
+    versions_failure: str | None
+    latency_s: float | None
+    self_test: bool
+    described: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, device: CheckedDevice, plugin: str) -> DeviceRow:
+        """What was found of a device."""
+        return cls(
+            name=device.name,
+            plugin=plugin,
+            ok=device.ok,
+            reason=_reason(device) or None,
+            model=device.described.get("model"),
+            serial_number=device.described.get("serial_number"),
+            firmware=device.described.get("firmware"),
+            versions={what: Versions(*versions) for what, versions in device.versions.items()},
+            versions_failure=None if device.unversioned is None else str(device.unversioned),
+            latency_s=device.latency_s,
+            self_test=device.tested,
+            described=device.described,
+        )
+
+
+def _reason(device: CheckedDevice) -> str:
+    errors = (
+        ("", device.failure),
+        ("NOT SAFE: ", device.unsafe),
+        ("could not be closed: ", device.unclosed),
+    )
+    texts = [f"{about}{error}" for about, error in errors if error is not None]
+    return "; ".join(line for text in texts for line in text.splitlines())
+
+
+def _named(value: Any) -> str:
+    return "-" if value in (None, "") else clean(str(value))
+
+
+DEVICES: Final[Sequence[Column[DeviceRow]]] = (
+    Column("device", lambda device: device.name),
+    Column("plugin", lambda device: device.plugin),
+    Column("model", lambda device: _named(device.model)),
+    Column("serial number", lambda device: _named(device.serial_number)),
+    Column("firmware", lambda device: _named(device.firmware)),
+    Column("latency", lambda device: time_text(device.latency_s), right=True),
+    Column("state", lambda device: device.reason or ("ok" if device.self_test else "ok, no self test")),
+)
+VERSIONS: Final = ("device", "version of", "here", "tried with", "")
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """The devices of a profile.
+
+    Attributes:
+        problems: Mistakes of the profile; none if its devices were opened.
+    """
+
+    devices: Sequence[DeviceRow]
+    warnings: Sequence[str]
+    problems: Sequence[Problem] = ()
+
+    def as_text(self) -> list[str]:
+        """A row per device; below it one for each of their versions."""
+        versions = [
+            (device.name, what, clean(one.here) or "unknown", one.tried or "none", "differs" * one.differs)
+            for device in self.devices
+            for what, one in device.versions.items()
+        ]
+        versions += [
+            (device.name, "-", f"cannot be read: {clean(device.versions_failure)}", "-", "")
+            for device in self.devices
+            if device.versions_failure is not None
+        ]
+        return [*table(self.devices, DEVICES), *(["", *aligned([VERSIONS, *versions])] if versions else [])]
 
 
 def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool) -> int:
@@ -35,86 +140,23 @@ def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_
         DeviceError: Another process uses the same devices; none was opened.
         StopRequested: It was stopped by Ctrl-C or SIGTERM; the devices tested so far were printed.
     """
-    answer = stdout_to_stderr() if as_json else None
-    try:
+    with reporting(as_json=as_json) as show:
         with announcing(report_compiling):
-            report = check_devices(profile, overrides, dry_run)
-    except BaseException as error:
-        if answer is not None:
-            answer(json_errors(error))
-        raise
-    for warning in report.warnings:
-        say(f"warning: {warning}", stream=sys.stderr)
-    if answer is not None:
-        answer(as_line(_as_values(report)))
-    else:
-        say(*table(report))
-    if report.stopped is not None:
-        raise report.stopped
-    return exit_code(report)
+            checked = check_devices(profile, overrides, dry_run)
+        for warning in checked.warnings:
+            say(f"warning: {warning}", stream=sys.stderr)
+        rows = [DeviceRow.of(device, checked.plugins[device.name]) for device in checked.devices]
+        show(Devices(rows, checked.warnings))
+    if checked.stopped is not None:
+        raise checked.stopped
+    return exit_code(checked)
 
 
 def exit_code(report: DevicesReport) -> int:
     """0 if all devices work, 3 if one failed, else 2 if one could not be constructed."""
-    if any(not found.ok and found.constructed for found in report.devices):
+    if any(not device.ok and device.constructed for device in report.devices):
         return DeviceError.exit_code
-    return 0 if all(found.ok for found in report.devices) else ConfigError.exit_code
-
-
-def table(report: DevicesReport) -> list[str]:
-    """A row per device; below it one for each of their versions."""
-    rows = [_HEADER, *(_row(found, report.plugins[found.name]) for found in report.devices)]
-    versions = [
-        (found.name, what, clean(here) or "unknown", tried or "none", "differs" * differs)
-        for found in report.devices
-        for what, (here, tried) in found.versions.items()
-        for differs in [bool(tried) and here not in tried.split(", ")]
-    ]
-    versions += [
-        (found.name, "-", f"cannot be read: {clean(str(found.unversioned))}", "-", "")
-        for found in report.devices
-        if found.unversioned is not None
-    ]
-    below = ["", *columns([("device", "version of", "here", "tried with", ""), *versions])]
-    return [*columns(rows, right=(_HEADER.index("latency"),)), *(below if versions else ())]
-
-
-def _row(found: CheckedDevice, plugin: str) -> tuple[str, ...]:
-    values = (found.described.get(key) for key in ("model", "serial_number", "firmware"))
-    identity = ("-" if value in (None, "") else clean(str(value)) for value in values)
-    latency = "-" if found.latency_s is None else format_quantity(found.latency_s, "time")
-    state = _reason(found) or ("ok" if found.tested else "ok, no self test")
-    return found.name, plugin, *identity, latency, state
-
-
-def _reason(found: CheckedDevice) -> str:
-    """Why a device failed, on one line; "" if it works."""
-    parts = [("", found.failure), ("NOT SAFE: ", found.unsafe), ("could not be closed: ", found.unclosed)]
-    texts = [f"{about}{error}" for about, error in parts if error is not None]
-    return "; ".join(line for text in texts for line in text.splitlines())
-
-
-def _as_values(report: DevicesReport) -> dict[str, Any]:
-    devices = [
-        {
-            "name": found.name,
-            "plugin": report.plugins[found.name],
-            "ok": found.ok,
-            "reason": _reason(found) or None,
-            "model": found.described.get("model"),
-            "serial_number": found.described.get("serial_number"),
-            "firmware": found.described.get("firmware"),
-            "versions": {
-                what: {"here": here, "tried": tried} for what, (here, tried) in found.versions.items()
-            },
-            "versions_failure": None if found.unversioned is None else str(found.unversioned),
-            "latency_s": found.latency_s,
-            "self_test": found.tested,
-            "described": found.described,
-        }
-        for found in report.devices
-    ]
-    return {"devices": devices, "warnings": report.warnings, "problems": []}
+    return 0 if all(device.ok for device in report.devices) else ConfigError.exit_code
 
 
 def secure_profile(profile: str, overrides: Sequence[str], *, end: bool | None = None) -> int:
@@ -168,37 +210,53 @@ class _Lines:
             say(f"warning: {values['text']}")
 
 
+@dataclass(frozen=True, slots=True)
+class PluginRow(PluginInfo):
+    """A plugin, and what it offers: "planner:psca"."""
+
+    offers: Sequence[str] = ()
+
+
+PLUGINS: Final[Sequence[Column[PluginRow]]] = (
+    Column("plugin", lambda plugin: plugin.name),
+    Column("state", lambda plugin: plugin.state),
+    Column("version", lambda plugin: plugin.version or "-"),
+    Column("origin", lambda plugin: plugin.origin),
+    Column("offers", lambda plugin: ", ".join(plugin.offers) or "-"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Plugins:
+    """The plugins that were found."""
+
+    plugins: Sequence[PluginRow]
+
+    @classmethod
+    def of(cls, host: PluginHost) -> Plugins:
+        """Those of a host, and those in ``./plugins`` that nothing names."""
+        rows: list[PluginRow] = []
+        for info in (*host.infos, *host.unused()):
+            offers = [f"{kind}:{name}" for kind, name in host.registry.offers(info.name)]
+            rows.append(PluginRow(**asdict(info), offers=offers))
+        return cls(rows)
+
+    def as_text(self) -> list[str]:
+        """A row per plugin; below the table the reasons why plugins failed to load, and notes."""
+        remarks: list[str] = []
+        for plugin in self.plugins:
+            remarks += [f"{plugin.name}: {plugin.reason}"] if plugin.reason else []
+            remarks += [f"{plugin.name}: warning: {note}" for note in plugin.notes]
+        return [*table(self.plugins, PLUGINS), *([""] if remarks else []), *remarks]
+
+
 def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
     """Print a table of the plugins, those in the folders of a profile and those in ``./plugins`` included."""
-    answer = stdout_to_stderr() if as_json else None
-    if profile is None:
-        host = load_plugins()
-    else:
-        document, spec = load_profile(profile, beside=Path())  # the plugins that it names need not exist
-        host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load)
-    host.import_all()
-    if answer is None:
-        say(*plugins_table(host))
-    else:
-        answer(as_line({"plugins": [_values(host, info) for info in (*host.infos, *host.unused())]}))
-
-
-def plugins_table(host: PluginHost) -> list[str]:
-    """A row per plugin; below the table the reasons why plugins failed to load, and notes."""
-    rows = [("plugin", "state", "version", "origin", "offers")]
-    remarks: list[str] = []
-    for info in (*host.infos, *host.unused()):
-        offers = ", ".join(_offers(host, info)) or "-"
-        rows.append((info.name, info.state, info.version or "-", info.origin, offers))
-        remarks += [f"{info.name}: {info.reason}"] if info.reason else []
-        remarks += [f"{info.name}: warning: {note}" for note in info.notes]
-    return [*columns(rows), *([""] if remarks else []), *remarks]
-
-
-def _offers(host: PluginHost, info: PluginInfo) -> list[str]:
-    return [f"{kind}:{name}" for kind, name in host.registry.offers(info.name)]
-
-
-def _values(host: PluginHost, info: PluginInfo) -> dict[str, Any]:
-    names = ("name", "state", "version", "origin", "source", "reason", "notes")
-    return {**{name: getattr(info, name) for name in names}, "offers": _offers(host, info)}
+    with reporting(as_json=as_json) as show:
+        if profile is None:
+            host = load_plugins()
+        else:
+            document, spec = load_profile(profile, beside=Path())  # the plugins that it names need not exist
+            host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load)
+        host.import_all()
+        show(Plugins.of(host))

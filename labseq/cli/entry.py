@@ -123,9 +123,10 @@ def _usage_json(error: Any) -> str:
     problem = ConfigError(" ".join(str(error.format_message()).split()))
     command = error.ctx.info_name if error.ctx is not None else ""
     if command == "check":
-        from labseq.cli.check import json_errors
+        from labseq.console.errors import json_errors
+        from labseq.console.output import as_line
 
-        return json_errors(problem)
+        return as_line(json_errors(problem))
     if command in ("run", "show"):
         from labseq.cli.run import json_result
 

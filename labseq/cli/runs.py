@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.console.output import as_line, say
-from labseq.console.text import columns, plural, size_text
+from labseq.console.report import Column, print_report, table
+from labseq.console.text import plural, size_text
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import visible
 from labseq.recording import data_root
@@ -15,7 +17,89 @@ from labseq.recording.folders import runs_in
 from labseq.recording.index import read_index
 from labseq.recording.run_file import read_run, read_state
 
-_HEADER: Final = ("run", "started", "profile", "shots", "status", "hardware", "seed", "size")
+
+@dataclass(frozen=True, slots=True)
+class RunRow:
+    """A run in a data folder; of a damaged one only its name and the error are known."""
+
+    run: str
+    run_dir: Path
+    t_start_utc: str | None = None
+    sequence: str | None = None
+    profile: str | None = None
+    shots: int | None = None
+    n_shots: int | None = None
+    status: str = "damaged"
+    error: str | None = None
+    simulated: bool | None = None
+    seed: int | None = None
+    bytes: int | None = None
+
+    @classmethod
+    def of(cls, folder: Path) -> RunRow:
+        """What the files of a run say."""
+        row = cls(_id(folder), folder)
+        try:
+            record, (status, error) = read_run(folder), read_state(folder)
+            index = read_index(folder)[0]
+        except (RecordingError, OSError) as failure:
+            return replace(row, error=str(failure))
+        resolved: Any = record.get("resolved")
+        profile = resolved.get("profile") if isinstance(resolved, dict) else None
+        return replace(
+            row,
+            t_start_utc=record.get("t_start_utc"),
+            sequence=record["name"],
+            profile=profile.get("name") if isinstance(profile, dict) else None,
+            shots=len({shot.shot for shot in index if shot.counts}),
+            n_shots=record["n_shots"],
+            status=status,
+            error=error,
+            simulated=record["simulated"],
+            seed=record["seed"],
+            bytes=sum(shot.bytes for shot in index),
+        )
+
+
+COLUMNS: Final[Sequence[Column[RunRow]]] = (
+    Column("run", lambda run: visible(run.run)),
+    Column("started", lambda run: _local_time(run.t_start_utc)),
+    Column("profile", lambda run: visible(str(run.profile or "-"))),
+    Column("shots", lambda run: "-" if run.shots is None else f"{run.shots} of {run.n_shots}", right=True),
+    Column("status", lambda run: run.status),
+    Column("hardware", lambda run: {None: "-", True: "simulated", False: "real"}[run.simulated]),
+    Column("seed", lambda run: "-" if run.seed is None else run.seed, right=True),
+    Column("size", lambda run: "-" if run.bytes is None else size_text(run.bytes), right=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RunList:
+    """The newest runs in a data folder, the newest last.
+
+    Attributes:
+        folder: The data folder.
+        name: Part of the names that was asked for; "" for all runs.
+        n_runs: Number of all of these runs.
+        runs: The newest of them.
+    """
+
+    folder: Path
+    name: str
+    n_runs: int
+    runs: tuple[RunRow, ...]
+
+    def as_text(self) -> list[str]:
+        """A row per run, and how many are damaged or not listed."""
+        if not self.runs:
+            named = f" with {visible(self.name)!r} in their name" if self.name else ""
+            return [f"no runs{named} in {visible(str(self.folder))}"]
+        lines = table(self.runs, COLUMNS)
+        if n_damaged := sum(run.status == "damaged" for run in self.runs):
+            lines += ["", f"{plural(n_damaged, 'run')} cannot be read: `labseq doctor` says why"]
+        if self.n_runs > len(self.runs):
+            lines += ["", f"the newest of {plural(self.n_runs, 'run')}; --limit {self.n_runs} lists all"]
+        return lines
 
 
 def list_runs(data: Path | None, name: str, limit: int, *, as_json: bool) -> None:
@@ -28,62 +112,12 @@ def list_runs(data: Path | None, name: str, limit: int, *, as_json: bool) -> Non
     if data is not None and not root.is_dir():
         raise ConfigError(Problem("there is no such folder", visible(str(root)), hint="give a data folder"))
     folders = [folder for folder in runs_in(root) if name.lower() in _id(folder).lower()]
-    found = [_about(folder) for folder in folders[-limit:]]
-    if as_json:
-        say(as_line({"folder": str(root), "n_runs": len(folders), "runs": found}))
-    elif not found:
-        say(f"no runs{f' with {visible(name)!r} in their name' if name else ''} in {visible(str(root))}")
-    else:
-        say(*columns([_HEADER, *map(_row, found)], right=(3, 6, 7)))
-        n_damaged = sum(about["status"] == "damaged" for about in found)
-        if n_damaged:
-            say("", f"{plural(n_damaged, 'run')} cannot be read: `labseq doctor` says why")
-        if len(folders) > len(found):
-            say("", f"the newest of {plural(len(folders), 'run')}; --limit {len(folders)} lists all")
+    runs = RunList(root, name, len(folders), tuple(map(RunRow.of, folders[-limit:])))
+    print_report(runs, as_json=as_json)
 
 
 def _id(folder: Path) -> str:
     return f"{folder.parent.name}/{folder.name}"
-
-
-def _about(folder: Path) -> dict[str, Any]:
-    """What is known of a run; the reason, if its files cannot be read."""
-    about: dict[str, Any] = {"run": _id(folder), "run_dir": str(folder)}
-    try:
-        record, (status, error) = read_run(folder), read_state(folder)
-        rows = read_index(folder)[0]
-    except (RecordingError, OSError) as failure:
-        keys = ("t_start_utc", "sequence", "profile", "shots", "n_shots", "simulated", "seed", "bytes")
-        return about | dict.fromkeys(keys) | {"status": "damaged", "error": str(failure)}
-    resolved: Any = record.get("resolved")
-    profile = resolved.get("profile") if isinstance(resolved, dict) else None
-    return about | {
-        "t_start_utc": record.get("t_start_utc"),
-        "sequence": record["name"],
-        "profile": profile.get("name") if isinstance(profile, dict) else None,
-        "shots": len({row.shot for row in rows if row.counts}),
-        "n_shots": record["n_shots"],
-        "status": status,
-        "error": error,
-        "simulated": record["simulated"],
-        "seed": record["seed"],
-        "bytes": sum(row.bytes for row in rows),
-    }
-
-
-def _row(about: dict[str, Any]) -> tuple[str, ...]:
-    if about["n_shots"] is None:
-        return visible(about["run"]), "-", "-", "-", about["status"], "-", "-", "-"
-    return (
-        visible(about["run"]),
-        _local_time(about["t_start_utc"]),
-        visible(str(about["profile"] or "-")),
-        f"{about['shots']} of {about['n_shots']}",
-        about["status"],
-        "simulated" if about["simulated"] else "real",
-        str(about["seed"]),
-        size_text(about["bytes"]),
-    )
 
 
 def _local_time(t_utc: Any) -> str:

@@ -15,8 +15,9 @@ from labseq.cli.summary import MAX_ROWS, json_summary, summary_lines
 from labseq.console.errors import lines_of
 from labseq.console.events import outcome, scanned_values
 from labseq.console.output import as_line, say
+from labseq.console.report import aligned
 from labseq.console.runs import chosen_run
-from labseq.console.text import columns, percent, settings_text
+from labseq.console.text import percent, settings_text
 from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
@@ -87,7 +88,7 @@ def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
     if wanted.timing:
         values["timing"] = _json_timing(run)
     if wanted.scan is not None:
-        values |= {"points": []} if _all_skipped(run) else scan_report(run, wanted.scan).as_dict()
+        values |= {"points": []} if _all_skipped(run) else scan_report(run, wanted.scan).as_json()
     if wanted.devices:
         values["devices"] = _devices(run)
     return values
@@ -101,7 +102,7 @@ def shot_table(run: Run, *, details: bool = False, most: int = 0) -> list[str]:
     at = 1 + len(addresses)
     if details:
         header.insert(at + 3, "batches")
-    return columns([header, *rows], right=[i for i in range(len(header)) if i != at], most=most)
+    return aligned([header, *rows], right=[i for i in range(len(header)) if i != at], most=most)
 
 
 def _all_attempts(run: Run) -> list[Shot]:
@@ -132,7 +133,7 @@ def scan_table(run: Run, request: ScanRequest) -> list[str]:
     """
     if _all_skipped(run):
         return [f"no point of the scan has a shot: {len(run.skipped)} of {run.n_shots} were skipped"]
-    return scan_report(run, request).lines()
+    return scan_report(run, request).as_text()
 
 
 def _all_skipped(run: Run) -> bool:
@@ -146,7 +147,7 @@ def timing_table(run: Run) -> list[str]:
     heads = [head for clock in clocks for head in (f"{clock} p50", "p99")]
     header = ("stage", "a shot", "budget", *heads, "share", "over budget")
     rows = [_stage_row(stage, n_clocks=len(clocks)) for stage in timing.stages]
-    lines = columns([header, *rows], right=range(1, len(header)))
+    lines = aligned([header, *rows], right=range(1, len(header)))
     p50_s, p99_s = (format_quantity(s, "time") for s in timing.shot_s)
     return [*lines, "", f"shot: {p50_s} (p50), {p99_s} (p99), of {timing.n_read} of {len(run.shots)} shots"]
 

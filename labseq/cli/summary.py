@@ -17,13 +17,13 @@ from labseq.analysis.scanned import (
     value_text,
 )
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
-from labseq.console.text import columns, count_of, plural, quoted
+from labseq.console.report import aligned
+from labseq.console.text import count_of, plural, quoted
 from labseq.data import Run
 from labseq.data.best import best_point
 from labseq.data.follower import Follower
 from labseq.messages import clean
 from labseq.model.estimate import mean
-from labseq.plain import to_plain
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
 
@@ -59,7 +59,7 @@ def summary_lines(run: Run) -> list[str]:
     resume = (
         [f"resume it with: labseq resume {quoted(run.path)}"] if run.status in ("stopped", "failed") else []
     )
-    return [*table, *([""] if table else []), *columns(rows), *resume]
+    return [*table, *([""] if table else []), *aligned(rows), *resume]
 
 
 def _best_rows(run: Run) -> list[tuple[str, str]]:
@@ -89,11 +89,11 @@ def json_summary(run: Run | None) -> dict[str, Any]:
     if run is None:
         nothing = {"defect_free": None, "filling_fraction": None}
         return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
-    values = run.summary() | {"statistics": statistics_of(run.shots, run.target).as_dict()}
+    values = run.summary() | {"statistics": statistics_of(run.shots, run.target)}
     if scanned(run) is not None:
-        values |= scan_report(run, ScanRequest()).as_dict()
+        values |= scan_report(run, ScanRequest()).as_json()
     if (best := best_point(run)) is not None:
-        values["best"] = to_plain(best.as_dict())
+        values["best"] = best
     if run.skipped:
         values["skipped_shots"] = [{"shots": shots, "why": why} for why, shots in _by_reason(run)]
     return values | ({"error": run.error} if run.error else {})
@@ -104,7 +104,7 @@ def cycle_table(statistics: Statistics) -> list[str]:
     if not statistics.cycles:
         return []
     header = ("cycle", "shots", "defect-free", "filling", "atom moves", "batches", "left out")
-    lines = columns([header, *map(_cycle_row, statistics.cycles)], right=range(len(header)))
+    lines = aligned([header, *map(_cycle_row, statistics.cycles)], right=range(len(header)))
     ended = statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots
     reached = "; only shots that reached it count" if ended else ""
     return [*lines, f"each cycle is judged on its own final image{reached}"]

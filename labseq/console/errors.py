@@ -9,11 +9,10 @@ import shutil
 import sys
 import traceback
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from labseq.console.output import as_line, say
+from labseq.console.output import say
 from labseq.console.text import plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.messages import MAX_ERROR, error_text, format_error, visible
@@ -119,10 +118,10 @@ def warning_lines(warning: Problem) -> list[str]:
     return [f"warning: {warning}", *excerpt(warning), *(f"      = {note}" for note in warning.notes)]
 
 
-def json_errors(error: BaseException) -> str:
-    """Why a file was refused, as one line of JSON."""
+def json_errors(error: BaseException) -> dict[str, Any]:
+    """Why a file was refused, as a report has it."""
     problems = error.problems if isinstance(error, ConfigError) else [Problem(t) for t in lines_of(error)]
-    return as_line({"problems": [asdict(problem) for problem in problems], "warnings": []})
+    return {"problems": problems, "warnings": []}
 
 
 def lines_of(error: BaseException) -> list[str]:

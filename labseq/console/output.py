@@ -90,7 +90,10 @@ def compiling_text(about_s: float) -> str:
 
 
 def as_line(values: Any) -> str:
-    """Any values as JSON on one line, nan as null; in ASCII, so that every terminal can show it."""
+    """Any values as JSON on one line, in ASCII, so that every terminal can show it.
+
+    Dataclasses become objects of their fields, nan becomes null.
+    """
     from labseq.plain import to_plain
 
     return json.dumps(to_plain(values))

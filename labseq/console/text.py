@@ -1,95 +1,13 @@
-"""Numbers, counts, times and tables as text."""
+"""Numbers, counts and times as text."""
 
 from __future__ import annotations
 
 import math
-import re
-import shutil
-import sys
-import textwrap
-from collections.abc import Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, cast
 
-
-def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int = 0) -> list[str]:
-    """Lay out rows in columns two spaces apart.
-
-    Where stdout is a terminal that is too narrow for the table, texts are wrapped between words; columns
-    that still do not fit follow in a second table. A word that is wider than the terminal, such as a path,
-    stays whole. In a pipe or a file every row stays one line.
-
-    Args:
-        rows: The cells; all rows have the same number of them.
-        right: Indices of the columns that are aligned on the right; below the header they are not wrapped.
-        most: Maximum number of rows below the header, 0 for all; the middle ones are left out.
-
-    Example:
-        >>> columns([["image", "45 ms"], ["load", "500 ms"]], right=[1])
-        ['image   45 ms', 'load   500 ms']
-    """
-    if 0 < most < len(rows) - 1:
-        gap = ["...", *[""] * (len(rows[0]) - 1)]
-        rows = [*rows[: most // 2 + 1], gap, *rows[-(most // 2) :]]
-    table = [list(column) for column in zip(*rows, strict=True)]
-    widths = [max(map(len, column)) for column in table]
-    room = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
-    if not room or _total(widths) <= room:
-        return _lines(table, right, widths)
-    least = [_least(column, i in right) for i, column in enumerate(table)]
-    n_fit = len(least)
-    while n_fit > 2 and _total(least[:n_fit]) > room:
-        n_fit -= 1
-    least[n_fit - 1] = min(least[n_fit - 1], max(_MIN_WIDTH, room - _total([*least[: n_fit - 1], 0])))
-    widths = widths[:n_fit]
-    while _total(widths) > room and widths != least[:n_fit]:
-        widest = max(range(n_fit), key=lambda i: (widths[i] > least[i], widths[i]))
-        widths[widest] -= 1
-    lines = _lines(table[:n_fit], right, widths)
-    if n_fit == len(table):
-        return lines
-    rest = [0, *range(n_fit, len(table))]
-    others = columns([[row[i] for i in rest] for row in rows], [k for k, i in enumerate(rest) if i in right])
-    return [*lines, "", *others]
-
-
-_MIN_WIDTH: Final = 10
-_UNIT: Final = re.compile(r"(?<=[\d)]) (?=(?:%|[munk]?s|[munk]?m|[kMG]?Hz|[munk]?[VW]|[kMGT]B|px|degC)\b|%)")
-
-
-def _words(cell: str) -> str:
-    """A cell in which a number and its unit are one word."""
-    return _UNIT.sub("\xa0", cell)
-
-
-def _total(widths: Sequence[int]) -> int:
-    return sum(widths) + 2 * (len(widths) - 1)
-
-
-def _least(column: Sequence[str], is_number: bool) -> int:
-    """The width of a column below which a word or a number would be broken; a drawing is one word."""
-    whole = [cell for cell in column[1:] if is_number or cell.startswith(" ")]
-    words = [word for cell in column for word in _words(cell).split(" ")]
-    return max(map(len, [*whole, *words]))
-
-
-def _lines(table: Sequence[Sequence[str]], right: Sequence[int], widths: Sequence[int]) -> list[str]:
-    lines: list[str] = []
-    for row in zip(*table, strict=True):
-        cells = [
-            [cell]
-            if len(cell) <= width
-            else textwrap.wrap(_words(cell), width, break_long_words=False, break_on_hyphens=False)
-            for cell, width in zip(row, widths, strict=True)
-        ]
-        for parts in zip_longest(*cells, fillvalue=""):
-            padded = (
-                part.rjust(width) if i in right else part.ljust(width)
-                for i, (part, width) in enumerate(zip(parts, widths, strict=True))
-            )
-            lines.append("  ".join(padded).replace("\xa0", " ").rstrip())
-    return lines
+from labseq.units import format_quantity
 
 
 def plural(n: int, noun: str) -> str:
@@ -122,6 +40,18 @@ def count_of(n: int, total: int) -> str:
         ('7 of 20 (35.0 %)', '0 of 0')
     """
     return f"{n} of {total} ({percent(n / total)})" if total else "0 of 0"
+
+
+def time_text(duration_s: float | None) -> str:
+    """Write a duration with its unit; "-" if it is None or nan.
+
+    Example:
+        >>> time_text(0.0012), time_text(None)
+        ('1.2 ms', '-')
+    """
+    if duration_s is None or math.isnan(duration_s):
+        return "-"
+    return format_quantity(duration_s, "time")
 
 
 def clock_time(duration_s: float) -> str:

@@ -37,7 +37,7 @@ class BestPoint:
     suggested: Mapping[str, str]
     is_fitted: bool
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """The result, JSON-ready."""
         return {
             "figure": self.quantity.name,

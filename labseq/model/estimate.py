@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, TypeAlias
 
@@ -50,6 +49,10 @@ class Estimate:
         """The value minus and plus its standard error."""
         return self.value - self.error, self.value + self.error
 
+    def as_json(self) -> dict[str, float]:
+        """The value as the mean that it usually is."""
+        return {"mean": self.value, "error": self.error}
+
     def scaled(self, factor: float) -> Estimate:
         """The same in another unit."""
         return Estimate(self.value * factor, self.error * factor)
@@ -91,6 +94,10 @@ class Rate:
         """Its 1 sigma interval, see :func:`jeffreys`."""
         return jeffreys(self.n, self.n_trials)
 
+    def as_json(self) -> dict[str, Any]:
+        """With the rate and its interval."""
+        return {"n": self.n, "n_trials": self.n_trials, "rate": self.value, "interval": self.interval}
+
 
 Estimated: TypeAlias = Estimate | Rate
 """A mean with its standard error, or a rate with its Jeffreys interval."""
@@ -129,25 +136,3 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
     low = float(betaincinv(a, b, tail)) if n else 0.0
     high = float(betaincinv(a, b, 1.0 - tail)) if n < n_trials else 1.0
     return low, high
-
-
-def as_mapping(value: Any) -> Any:
-    """Convert dataclasses to mappings: a rate with its interval, an estimate as "mean" and "error"."""
-    match value:
-        case Rate():
-            return {
-                "n": value.n,
-                "n_trials": value.n_trials,
-                "rate": value.value,
-                "interval": [*value.interval],
-            }
-        case Estimate():
-            return {"mean": value.value, "error": value.error}
-        case Mapping():
-            return {name: as_mapping(one) for name, one in value.items()}
-        case tuple():
-            return [as_mapping(one) for one in value]
-        case _ if is_dataclass(value):
-            return {field.name: as_mapping(getattr(value, field.name)) for field in fields(value)}
-        case _:
-            return value

@@ -16,7 +16,8 @@ from labseq.assembly.occupancies import read_source
 from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.console.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
-from labseq.console.text import columns, count_of, encodes, percent, plural
+from labseq.console.report import aligned
+from labseq.console.text import count_of, encodes, percent, plural
 from labseq.kernel import interpret
 from labseq.model import Batch, TonePaths
 from labseq.pictures.plans import occupancies, on_grid
@@ -207,7 +208,7 @@ def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     width = console.width if console.is_terminal else PLAIN_WIDTH
     shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
     canvas = ArrayPair(moves.target, shear, width, glyphs_for(console.encoding))
-    _print(console, *map(Text, columns(subject(moves))), Text())
+    _print(console, *map(Text, aligned(subject(moves))), Text())
     arrow = "→" if encodes(console.encoding, "→") else "->"
     if step:
         _print_steps(console, batch_lines(moves, canvas, arrow))
@@ -217,7 +218,7 @@ def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     if key := canvas.key(before, after):
         _print(console, key, Text())
     _print(console, *refused_lines(moves, canvas, arrow))
-    _print(console, *map(Text, columns(totals(moves))))
+    _print(console, *map(Text, aligned(totals(moves))))
 
 
 def _print_steps(console: Console, steps: Iterable[list[Text]]) -> None:

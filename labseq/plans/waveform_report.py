@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from labseq.console.output import check_different, json_writer, report_compiling, say
-from labseq.console.text import columns, percent, plural, size_text
+from labseq.console.report import aligned
+from labseq.console.text import percent, plural, size_text
 from labseq.model import RfSpec
 from labseq.plans.axis_statistics import AxisStatistics
 from labseq.plans.plan import subject, warnings
@@ -87,7 +88,7 @@ def report(waveform: PlannedWaveform, both: Both) -> list[str]:
         ("duration", f"{duration}, {on} of it with tones on"),
         ("samples", f"{n} per channel at {rate}, {size_text(waveform.n_bytes)}"),
     ]
-    return [*columns(rows), "", *columns(_table(both, waveform.moves.motion.rf))]
+    return [*aligned(rows), "", *aligned(_table(both, waveform.moves.motion.rf))]
 
 
 def title(waveform: PlannedWaveform) -> str:

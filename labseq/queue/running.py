@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
@@ -17,11 +17,11 @@ from labseq.assembly.options import Options
 from labseq.config.find import find_profile
 from labseq.console.errors import exit_code_of, report, warning_lines
 from labseq.console.output import say
-from labseq.console.text import columns, plural
+from labseq.console.report import Column, print_report, table
+from labseq.console.text import plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import data_root, explained
 from labseq.messages import MAX_ERROR, clean, visible
-from labseq.plain import dumps
 from labseq.processes import Process
 from labseq.queue.queue import Entry, Queue
 from labseq.roles import RunObserver
@@ -185,9 +185,6 @@ def _open(entry: Entry, observer: RunObserver) -> Session:
     return Session(assemble(entry.sequence, options, kept=entry.stored_text), options, observer)
 
 
-_HEADER = ("id", "state", "sequence", "added", "options")
-
-
 def add_entry(sequence: Path, options: Options) -> None:
     """Check a sequence and add it to the queue."""
     entry, checked = add_checked(Queue(data_root()), sequence, options)
@@ -196,19 +193,98 @@ def add_entry(sequence: Path, options: Options) -> None:
     say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, with its present text")
 
 
+@dataclass(frozen=True, slots=True)
+class EntryRow:
+    """An entry of the queue.
+
+    Attributes:
+        changed: Whether its sequence was changed or removed since; the queued text will run.
+    """
+
+    id: int
+    state: str
+    sequence: Path
+    changed: bool
+    added_utc: str
+    options: Options
+    run_dir: Path | None
+    error: str | None
+
+    @classmethod
+    def of(cls, entry: Entry) -> EntryRow:
+        """An entry as the queue's file has it."""
+        return cls(
+            id=entry.id,
+            state=entry.state,
+            sequence=entry.sequence,
+            changed=entry.has_changed,
+            added_utc=entry.added_utc,
+            options=entry.options,
+            run_dir=entry.run_dir,
+            error=entry.error or None,
+        )
+
+    @property
+    def added_text(self) -> str:
+        """When it was added, by this computer's clock."""
+        return f"{datetime.fromisoformat(self.added_utc).astimezone():%Y-%m-%d %H:%M}"
+
+    @property
+    def options_text(self) -> str:
+        """The options that differ from their defaults."""
+        return clean(", ".join(f"{address}={value}" for address, value in self.options.changes().items()))
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user should know of it, for example why its run ended."""
+        notes: list[str] = []
+        if self.changed and self.state != "complete":
+            what = "was changed or removed since; the queued text will run"
+            notes.append(f"{clean(_short(self.sequence))} {what}")
+        if self.error:
+            notes.append(visible(self.error.splitlines()[0][:MAX_ERROR]))
+        if self.state in {"stopped", "failed"} and self.run_dir is not None:
+            notes.append(f"labseq resume {visible(str(self.run_dir))}")
+        return [f"{self.id}: {note}" for note in notes]
+
+
+ENTRIES: Final[Sequence[Column[EntryRow]]] = (
+    Column("id", lambda entry: entry.id, right=True),
+    Column("state", lambda entry: entry.state),
+    Column("sequence", lambda entry: clean(_short(entry.sequence))),
+    Column("added", lambda entry: entry.added_text),
+    Column("options", lambda entry: entry.options_text),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class QueueList:
+    """The entries of the queue, in order.
+
+    Attributes:
+        run_by: The process that runs them, or None.
+        paused: Whether no further entry is started.
+    """
+
+    entries: Sequence[EntryRow]
+    run_by: str | None
+    paused: bool
+
+    def as_text(self) -> list[str]:
+        """A row per entry, notes on some of them, and the state of the queue."""
+        lines = table(self.entries, ENTRIES) if self.entries else ["the queue is empty"]
+        notes = [note for entry in self.entries for note in entry.notes]
+        state = [] if self.run_by is None else [f"run by: {self.run_by}"]
+        state += ["paused: 'labseq queue pause --off' continues it"] if self.paused else []
+        return [*lines, *([""] if notes else []), *notes, *([""] if state else []), *state]
+
+
 def list_entries(*, as_json: bool) -> None:
     """Print the entries of the queue, in order."""
     queue = Queue(data_root())
-    entries = queue.entries()
-    if as_json:
-        say(dumps({"entries": [_as_values(entry) for entry in entries]}))
-        return
-    holder = queue.holder()
-    notes = [note for entry in entries for note in _notes(entry)]
-    table = columns([_HEADER, *map(_row, entries)], right=(0,)) if entries else ["the queue is empty"]
-    state = [] if holder is None else [f"run by: {holder}"]
-    state += ["paused: 'labseq queue pause --off' continues it"] if queue.is_paused else []
-    say(*table, *([""] if notes else []), *notes, *([""] if state else []), *state)
+    entries, holder = [EntryRow.of(entry) for entry in queue.entries()], queue.holder()
+    run_by = None if holder is None else str(holder)
+    print_report(QueueList(entries, run_by, queue.is_paused), as_json=as_json)
 
 
 def pause_queue(is_paused: bool) -> None:
@@ -237,42 +313,6 @@ def _report(entry: Entry) -> None:
     say(f"queue: {entry.id} {clean(str(entry.sequence))}{again}")
 
 
-def _row(entry: Entry) -> tuple[str, ...]:
-    added = f"{datetime.fromisoformat(entry.added_utc).astimezone():%Y-%m-%d %H:%M}"
-    return (
-        str(entry.id),
-        entry.state,
-        clean(_short(entry.sequence)),
-        added,
-        clean(", ".join(f"{address}={value}" for address, value in entry.options.changes().items())),
-    )
-
-
 def _short(path: Path) -> str:
     """The path relative to the current folder if it is below it."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
-
-
-def _notes(entry: Entry) -> list[str]:
-    notes: list[str] = []
-    if entry.has_changed and not entry.is_complete:
-        what = "was changed or removed since; the queued text will run"
-        notes.append(f"{entry.id}: {clean(_short(entry.sequence))} {what}")
-    if entry.error:
-        notes.append(f"{entry.id}: {visible(entry.error.splitlines()[0][:MAX_ERROR])}")
-    if entry.state in {"stopped", "failed"} and entry.run_dir is not None:
-        notes.append(f"{entry.id}: labseq resume {visible(str(entry.run_dir))}")
-    return notes
-
-
-def _as_values(entry: Entry) -> dict[str, Any]:
-    return {
-        "id": entry.id,
-        "state": entry.state,
-        "sequence": str(entry.sequence),
-        "changed": entry.has_changed,
-        "added_utc": entry.added_utc,
-        "options": {key: str(v) if isinstance(v, Path) else v for key, v in asdict(entry.options).items()},
-        "run_dir": None if entry.run_dir is None else str(entry.run_dir),
-        "error": entry.error or None,
-    }

@@ -314,7 +314,7 @@ class Session(PreparedRun):
         """Record the best point of an adaptive scan, with its value and the suggested one."""
         best = best_point(open_run(run_dir))
         if best is not None:
-            self.observers.event("scan_result", best.as_dict())
+            self.observers.event("scan_result", best.as_json())
 
     def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
         """Write to disk at the end of a run; a full disk must not hide the error that ended the run."""

@@ -19,6 +19,7 @@ from labseq.analysis.statistics import statistics_of
 from labseq.analysis.timing import StageTotals
 from labseq.errors import RecordingError
 from labseq.files import read_file
+from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.web.endpoint import Endpoint, describe, in_thread
 from labseq.web.history import finite
@@ -158,7 +159,7 @@ class Api:
         return {
             "n_read": len(shots),
             "n_shots": len(counted),
-            "statistics": statistics_of(shots, run.target).as_dict(),
+            "statistics": to_plain(statistics_of(shots, run.target)),
             "stages": stage_rows(totals, simulated=bool(run.record["simulated"])),
         }
 

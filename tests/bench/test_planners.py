@@ -17,6 +17,7 @@ from labseq.bench.planners import Where, compare
 from labseq.bench.report import Report
 from labseq.bench.work import draw, set_up
 from labseq.errors import ConfigError, PlanError
+from labseq.plain import to_plain
 
 SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
 TIMES = {"planning_s", "duration_s"}
@@ -84,7 +85,7 @@ def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) 
     comparison = replace(SMALL, planner_entries=entries, conditions=conditions)
     alone, together = compare(comparison, ALONE), compare(comparison)
     assert alone.ended_by is together.ended_by is None
-    assert without_times(alone.as_dict()) == without_times(together.as_dict())
+    assert without_times(to_plain(alone)) == without_times(to_plain(together))
     assert all(np.array_equal(a.counts, b.counts) for a, b in zip(alone.rows, together.rows, strict=True))
     in_the_corner = [index for index in range(60) if draw((8, 8), 0.75, SMALL.seed, index)[0, 0]]
     for moody, psca, *_ in (alone.rows, together.rows):
@@ -102,7 +103,7 @@ def test_a_cluster_finds_what_one_process_finds(report: Report) -> None:
     ) as cluster:
         where = Where(scheduler=cluster.scheduler_address)
         found = compare(replace(SMALL, planner_entries=TWICE), where)
-    assert without_times(found.as_dict()) == without_times(report.as_dict())
+    assert without_times(to_plain(found)) == without_times(to_plain(report))
 
 
 def test_a_row_sums_up_what_the_planner_did(report: Report) -> None:
@@ -130,7 +131,7 @@ def test_losses_are_predicted_by_those_of_the_profile(report: Report) -> None:
 
 
 def test_csv_and_json_hold_the_same(report: Report) -> None:
-    values = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    values = json.loads(json.dumps(to_plain(report), allow_nan=False))
     lines = list(csv.DictReader(io.StringIO(report.as_csv())))
     assert [line["label"] for line in lines] == ["psca", "psca degree_of_parallelism=2"]
     for line, row in zip(lines, values["rows"], strict=True):

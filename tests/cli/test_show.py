@@ -13,8 +13,8 @@ import pytest
 from labseq.analysis.scanned import ScanRequest
 from labseq.cli.show import Tables, show_run
 from labseq.cli.summary import MAX_ROWS, summary_lines
+from labseq.console.report import aligned
 from labseq.console.runs import newest_run
-from labseq.console.text import columns
 from labseq.data import open_run
 from labseq.errors import ConfigError
 from labseq.model import StageTiming
@@ -78,7 +78,7 @@ def test_json(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.parametrize("n_rows", [MAX_ROWS, MAX_ROWS + 1])
 def test_a_long_table_is_cut_in_the_middle(n_rows: int) -> None:
-    lines = columns([["shot"], *([str(i)] for i in range(n_rows))], most=MAX_ROWS)
+    lines = aligned([["shot"], *([str(i)] for i in range(n_rows))], most=MAX_ROWS)
     assert (lines[1], lines[-1]) == ("0", str(n_rows - 1))
     assert len(lines) == 1 + MAX_ROWS + ("..." in lines)
     assert ("..." in lines) is (n_rows > MAX_ROWS)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from labseq.console.output import discard_unwritten, say
-from labseq.console.text import columns
+from labseq.console.report import aligned
 from labseq.errors import RecordingError
 
 FULL = Path("/dev/full")
@@ -21,7 +21,7 @@ CELLS = st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=8)
 
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1), st.sets(st.integers(0, 2)))
 def test_columns_keep_every_cell_in_its_column(rows: list[tuple[str, ...]], right: set[int]) -> None:
-    lines = columns(rows, right=sorted(right))
+    lines = aligned(rows, right=sorted(right))
     widths = [max(len(row[i]) for row in rows) for i in range(3)]
     for row, line in zip(rows, lines, strict=True):
         start = 0
@@ -34,11 +34,11 @@ def test_columns_keep_every_cell_in_its_column(rows: list[tuple[str, ...]], righ
 
 def test_a_table_that_is_too_wide_for_the_terminal_is_wrapped(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [("name", "n", "reason"), ("camera", "12", "raised OSError: no such port")]
-    wide = columns(rows, right=[1])
+    wide = aligned(rows, right=[1])
     monkeypatch.setenv("COLUMNS", "24")
-    assert columns(rows, right=[1]) == wide, "in a pipe every row stays one line"
+    assert aligned(rows, right=[1]) == wide, "in a pipe every row stays one line"
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    lines = columns(rows, right=[1])
+    lines = aligned(rows, right=[1])
     assert lines[0] == wide[0]
     assert len(lines) > 2
     assert max(map(len, lines)) <= 24

@@ -16,6 +16,7 @@ from labseq.analysis.statistics import statistics_of
 from labseq.data import Run, open_run
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
 from labseq.model.estimate import Rate
+from labseq.plain import to_plain
 from labseq.recording import RunWriter
 
 from .records import make_run, make_shot
@@ -81,7 +82,7 @@ def test_each_cycle_is_judged_on_its_own_image(of_defects: Any, recorded: Any) -
     found = statistics_of(run.shots, run.target)
     assert [cycle.defect_free for cycle in found.cycles] == [Rate(1, 4), Rate(3, 4), Rate(2, 4)]
     assert [cycle.seen for cycle in found.cycles] == [Rate(1, 4), Rate(3, 4), Rate(4, 4)]
-    written = json.loads(json.dumps(found.as_dict()))
+    written = json.loads(json.dumps(to_plain(found)))
     assert written["filling"] == {"mean": None, "error": None}
     assert written["cycles"][0]["defect_free"] == {
         "n": 1, "n_trials": 4, "rate": 0.25, "interval": [*Rate(1, 4).interval]
