@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 from labseq.config.addresses import Override
 from labseq.config.document import Document
-from labseq.config.scan import MAX_POINTS, Scan, read_scan, values_of
+from labseq.config.scan import MAX_POINTS, AdaptiveScan, Scan, read_scan, values_of
 from labseq.config.sequence import load_sequence
 from labseq.errors import ConfigError
 from labseq.units import split_quantity
@@ -128,6 +128,7 @@ def test_a_value_that_a_scanner_chooses_is_rounded_by_less_than_a_thousandth_of_
     low, width = round(low, 3), float(f"{10**log_width:.3g}")
     over = f"{{shot.sort.window: {{from: {low!r} ms, to: {low + width!r} ms}}}}"
     scan = scan_of(f"scan: {{use: climb, over: {over}, maximise: success, points: 3}}\n")
+    assert isinstance(scan, AdaptiveScan)
     ((_, node),) = scan.at([1e-3 * (low + part * width)]).values(0)
     amount, unit = split_quantity(str(node.value))
     assert unit == "ms"

@@ -74,7 +74,10 @@ def test_a_light_that_does_not_answer_refuses_the_exposure() -> None:
 
 
 class CoolingCamera(RecordingCamera):
-    settling_timeout_s = 60.0
+    @property
+    def settling_timeout_s(self) -> float:
+        return 60.0
+
     fails = False
 
     def settle(self) -> None:
@@ -104,7 +107,9 @@ def test_a_device_settles_after_all_are_open_and_before_the_first_shot() -> None
 
 
 class SettlingTweezers(RecordingMobileTweezers):
-    settling_timeout_s = 0.0
+    @property
+    def settling_timeout_s(self) -> float:
+        return 0.0
 
     def settle(self) -> None:
         self.use("settle")

@@ -149,7 +149,10 @@ def test_moves_are_lit_from_their_start_to_their_end() -> None:
 class EdgeCamera(RecordingCamera):
     """It sees the edge when it is read."""
 
-    facts = CameraFacts(triggers=("software", "external"))
+    @property
+    def facts(self) -> CameraFacts:
+        return CameraFacts(triggers=("software", "external"))
+
     armed_for = ""
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Any) -> None:
@@ -182,7 +185,9 @@ def test_a_blinding_line_refuses_an_exposure_with_em_gain() -> None:
     blinding = LineSpec("mot", 3, frozenset({"image"}), blinding=True)
 
     class Multiplying(RecordingCamera):
-        facts = CameraFacts(em_gain=300.0)
+        @property
+        def facts(self) -> CameraFacts:
+            return CameraFacts(em_gain=300.0)
 
     camera = Multiplying()
     made = with_camera(Rig((LOAD, IMAGE), line_specs=[blinding]), camera)

@@ -21,13 +21,18 @@ TRIGGERED = LineSpec("camera_trigger", 5, frozenset({"image"}), pulse_s=1e-3, tr
 
 
 class EmCamera(RecordingCamera):
-    facts = CameraFacts(em_gain=300.0, arm_s=5e-3)
+    @property
+    def facts(self) -> CameraFacts:
+        return CameraFacts(em_gain=300.0, arm_s=5e-3)
 
 
 class EdgeCamera(RecordingCamera):
     """While armed, an edge at its input starts an exposure; ``n_extra`` more come with the first."""
 
-    facts = CameraFacts(triggers=("software", "external"))
+    @property
+    def facts(self) -> CameraFacts:
+        return CameraFacts(triggers=("software", "external"))
+
     n_extra = 0
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Any) -> None:
@@ -119,10 +124,12 @@ def test_a_frame_of_an_extra_trigger_is_not_taken_for_the_next_image() -> None:
 
 
 def test_a_step_that_comes_after_the_exposure_that_the_camera_began_by_itself_fails() -> None:
-    camera = EdgeCamera()
-    vars(camera)["facts"] = CameraFacts(
-        triggers=("external_start",), line_trigger="external_start", cycle_s=0.05
-    )
+    class StartedCamera(EdgeCamera):
+        @property
+        def facts(self) -> CameraFacts:
+            return CameraFacts(triggers=("external_start",), line_trigger="external_start", cycle_s=0.05)
+
+    camera = StartedCamera()
     made = rig(camera, IMAGE, WAIT, IMAGE, line_specs=[TRIGGERED])
     late = r"5 ms too late .*`cycle_time`"
     with pytest.raises(TransientError, match=late):

@@ -126,7 +126,10 @@ class StaysPrepared(RecordingMobileTweezers):
 class WaitsForItsTrigger(RecordingMobileTweezers):
     """Right: with a line, ``play`` only arms them."""
 
-    waits_for_trigger = True
+    @property
+    def waits_for_trigger(self) -> bool:
+        return True
+
     armed: ToneProgram | None = None
 
     def open(self) -> None:
