@@ -58,7 +58,7 @@ def test_no_word_and_no_number_is_broken(
     arguments = command.split()
     arguments += {"check": ["s.yaml"], "show": ["screens"]}.get(arguments[0], [])
     _, wide, _ = call(*arguments)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    monkeypatch.setattr("shutil.get_terminal_size", lambda *_, **__: os.terminal_size((80, 24)))
     monkeypatch.setattr(type(sys.stdout), "isatty", lambda _: True)
     _, narrow, _ = call(*arguments)
     assert [line for line in narrow.splitlines() if len(line) > 80 and str(taken) not in line] == []
