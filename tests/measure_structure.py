@@ -106,11 +106,14 @@ print(json.dumps({"files": files, "changes": changes}))
 file: until the session was open, and from there until the shot began."""
 
 
-def virtual_run(root: Path) -> tuple[list[Path], list[int]]:
-    """What a run on virtual hardware loads of labseq, and how often its calls changed the file."""
-    with tempfile.TemporaryDirectory() as output:
-        command = [sys.executable, "-c", PROFILED, output]
-        done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+def virtual_run(root: Path, output: Path) -> tuple[list[Path], list[int]]:
+    """What a run on virtual hardware loads of labseq, and how often its calls changed the file.
+
+    Args:
+        output: Folder for the run.
+    """
+    command = [sys.executable, "-c", PROFILED, str(output)]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     printed = json.loads(done.stdout.splitlines()[-1])
     return [Path(file) for file in printed["files"]], printed["changes"]
 
@@ -207,7 +210,8 @@ def main(root: Path) -> None:
     branches, comments, n_once = density(list(core.values()))
     print(f"branches per function: {branches:.2f}; lines with a comment: {comments:.1%}")
     print(f"constants that are used once: {n_once}")
-    files, changes = virtual_run(root)
+    with tempfile.TemporaryDirectory() as output:
+        files, changes = virtual_run(root, Path(output))
     print(f"a virtual run loads {count_lines(files)} lines in {len(files)} modules")
     print(f"calls into another file: {changes[0]} until the session is open, then {changes[1]} until a shot")
 

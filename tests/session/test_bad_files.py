@@ -291,5 +291,7 @@ def test_an_object_without_the_methods_of_its_role_is_named() -> None:
     write({"{use: psca, degree_of_parallelism: 7}": "{use: mine}"})
     Path("plugins").mkdir()
     Path("plugins/mine.py").write_text(PLUGIN.replace("def plan(", "def plann("), encoding="utf-8")
-    with pytest.raises(PluginLoadError, match=r"planner 'mine' has no method plan; see labseq\.plugin\.Planner"):
+    with pytest.raises(
+        PluginLoadError, match=r"planner 'mine' has no method plan; see labseq\.plugin\.Planner"
+    ):
         check(labseq.Session.open("s.yaml", overrides=["plugin_folders=[plugins]"]))

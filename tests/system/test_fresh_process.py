@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+import labseq
+from tests.measure_structure import count_lines, virtual_run
+
 pytestmark = pytest.mark.system
 
 
@@ -40,7 +43,7 @@ except SystemExit as leaving:
     print("left with", leaving.code)
 print(loaded())
 import labseq.recording
-print(sorted({"h5py", "pydantic"} & set(sys.modules)))
+print(sorted({"h5py"} & set(sys.modules)))
 """
     first, own, *_, left, of_help, of_recording = printed(code, cwd=tmp_path).splitlines()
     assert (first, own, left) == ("[]", "[]", "left with 0")
@@ -62,6 +65,13 @@ print(*sorted(sys.modules))
     assert plugins == {"labseq_climb", "labseq_psca", "labseq_virtual"}
     assert "numba" in modules  # and what it imports: scipy
     assert not {"h5py", "lmfit", "matplotlib", "pandas", "rich", "xarray"} & {*modules}
+
+
+def test_the_core_is_what_a_virtual_run_loads(tmp_path: Path) -> None:
+    """A reader of the core reads no more than this; it should become less (``poe structure``)."""
+    files, _ = virtual_run(Path(labseq.__file__).parents[1], tmp_path)
+    assert len(files) <= 131
+    assert count_lines(files) <= 30_500
 
 
 def test_no_kernel_is_loaded_in_a_shot_of_the_virtual_lab(tmp_path: Path) -> None:
