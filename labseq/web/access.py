@@ -29,9 +29,7 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 COOKIE: Final = "labseq_web"
-COOKIE_S: Final = 30 * 86_400
 TOKEN_VARIABLE: Final = "LABSEQ_WEB_TOKEN"  # noqa: S105 - the name of a variable
-TOKEN_FILE: Final = "web.token"  # noqa: S105 - the name of a file
 MIN_TOKEN: Final = 16
 """Minimum number of characters of a token."""
 
@@ -49,41 +47,35 @@ _HEADERS: Final = {
     "cross-origin-opener-policy": "same-origin",
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
-_READING: Final = frozenset({"GET", "HEAD"})
-_PER_S, _BURST = 300.0, 600.0
-"""Requests of one address: a laboratory behind a proxy has only one."""
-_GUESSES_PER_S, _GUESSES = 0.2, 10.0
-"""Wrong tokens of one address."""
-_ACTIONS_PER_S, _ACTIONS = 2.0, 20.0
-"""Requests of one address that change something."""
-_MAX_ADDRESSES: Final = 1000
 SEND_S: Final = 60.0
-"""For so long a browser may leave what is sent to it unread."""
+"""Close a connection whose browser has not read for this long, in seconds."""
 
 
 @dataclass(slots=True)
 class Rate:
-    """Allows a number of events at once, and so many a second.
+    """Limits how often each address may do something: a burst at once, then a steady rate.
 
     Attributes:
         per_s: Events a second.
         burst: Events at once.
+        max_addresses: Addresses that are remembered; those that were quiet for longest are forgotten.
     """
 
     per_s: float
     burst: float
+    max_addresses: int = 1000
     _left: OrderedDict[str, tuple[float, float]] = field(
         default_factory=OrderedDict[str, tuple[float, float]]
     )
 
-    def allows(self, who: str, cost: float = 1.0) -> bool:
-        """Whether one more is allowed; it is then counted."""
+    def allows(self, address: str, cost: float = 1.0) -> bool:
+        """Whether an address may do it once more; if so, that is counted as ``cost`` events."""
         now_s = time.monotonic()
-        left, then_s = self._left.pop(who, (self.burst, now_s))
+        left, then_s = self._left.pop(address, (self.burst, now_s))
         left = min(self.burst, left + (now_s - then_s) * self.per_s)
         is_allowed = left >= 1.0
-        self._left[who] = (left - cost if is_allowed else left, now_s)
-        while len(self._left) > _MAX_ADDRESSES:
+        self._left[address] = (left - cost if is_allowed else left, now_s)
+        while len(self._left) > self.max_addresses:
             self._left.popitem(last=False)
         return is_allowed
 
@@ -108,7 +100,7 @@ class Access:
         return hmac.new(self.token.encode(), b"labseq web cookie", hashlib.sha256).hexdigest()
 
 
-def own_names(extra: tuple[str, ...] = ()) -> frozenset[str]:
+def server_names(extra: tuple[str, ...] = ()) -> frozenset[str]:
     """Names by which this computer is known, and those of a proxy."""
     host = socket.gethostname().lower()
     return frozenset(
@@ -117,20 +109,20 @@ def own_names(extra: tuple[str, ...] = ()) -> frozenset[str]:
 
 
 def find_token() -> str:
-    """The token: that of LABSEQ_WEB_TOKEN, else that of this user, which is made when it is first needed.
+    """The token: that of LABSEQ_WEB_TOKEN, else that of this user, which is created when it is first needed.
 
     Raises:
-        ConfigError: It is too short, or cannot be read or kept.
+        ConfigError: It is too short, or cannot be read or stored.
     """
     if given := os.environ.get(TOKEN_VARIABLE):
         if len(given) < MIN_TOKEN:
-            what = f"the token in {TOKEN_VARIABLE} has {len(given)} characters"
-            raise ConfigError(Problem(what, expected=f"at least {MIN_TOKEN}"))
+            problem = f"the token in {TOKEN_VARIABLE} has {len(given)} characters"
+            raise ConfigError(Problem(problem, expected=f"at least {MIN_TOKEN}"))
         return given
     folder = state_root()
     if folder is None:
-        raise ConfigError(Problem("there is no place for a token", hint=f"set {TOKEN_VARIABLE}"))
-    path = folder / TOKEN_FILE
+        raise ConfigError(Problem("there is no folder to store a token in", hint=f"set {TOKEN_VARIABLE}"))
+    path = folder / "web.token"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
@@ -145,13 +137,13 @@ def find_token() -> str:
     return token
 
 
-def _bad_token(path: Path, why: str) -> ConfigError:
+def _bad_token(path: Path, reason: str) -> ConfigError:
     hint = f"delete the file, or set {TOKEN_VARIABLE}"
-    return ConfigError(Problem(f"the token cannot be used: {why}", visible(str(path)), hint=hint))
+    return ConfigError(Problem(f"the token cannot be used: {reason}", visible(str(path)), hint=hint))
 
 
 class Guard:
-    """ASGI middleware that lets a request through only if it is allowed to.
+    """ASGI middleware that refuses requests that are not allowed.
 
     Args:
         app: The application.
@@ -161,8 +153,10 @@ class Guard:
     def __init__(self, app: App, access: Access) -> None:
         self._app = app
         self._access = access
-        self._requests, self._wrong_tokens = Rate(_PER_S, _BURST), Rate(_GUESSES_PER_S, _GUESSES)
-        self._actions = Rate(_ACTIONS_PER_S, _ACTIONS)
+        # all computers of a laboratory behind a proxy share one address
+        self._requests = Rate(per_s=300.0, burst=600.0)
+        self._wrong_tokens = Rate(per_s=0.2, burst=10.0)
+        self._actions = Rate(per_s=2.0, burst=20.0)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -172,17 +166,17 @@ class Guard:
         if scope["type"] != "http":
             return
         headers = _headers_of(scope)
-        who = (scope.get("client") or ("",))[0]
+        address = (scope.get("client") or ("",))[0]
 
         async def send_safely(message: Message) -> None:
             if message["type"] == "http.response.start":
-                known = {name.lower() for name, _ in message["headers"]}
-                added = [(k.encode(), v.encode()) for k, v in _HEADERS.items() if k.encode() not in known]
+                given = {name.lower() for name, _ in message["headers"]}
+                added = [(k.encode(), v.encode()) for k, v in _HEADERS.items() if k.encode() not in given]
                 message["headers"] = [*message["headers"], *added]
             async with asyncio.timeout(SEND_S):  # a browser that no longer reads
                 await send(message)
 
-        refusal = self._refusal(scope, headers, who)
+        refusal = self._refusal(scope, headers, address)
         if refusal is not None:
             await _answer(send_safely, *refusal)
         elif self._is_first_visit(scope):
@@ -191,36 +185,36 @@ class Guard:
             with suppress(TimeoutError):  # the connection is closed
                 await self._app(scope, receive, send_safely)
 
-    def _refusal(self, scope: Scope, headers: dict[str, str], who: str) -> tuple[int, str] | None:
+    def _refusal(self, scope: Scope, headers: dict[str, str], address: str) -> tuple[int, str] | None:
         """Status and reason if the request is refused."""
         access = self._access
-        if not self._requests.allows(who):
+        if not self._requests.allows(address):
             return 429, "too many requests; wait a few seconds"
         host = headers.get("host", "")
-        if not _is_own(host, access.names):
+        if not _is_of_server(host, access.names):
             return 421, "this address is not one of the server's; see `labseq web --name`"
         if not _is_same_origin(headers, host):
-            return 403, "requests of other pages are refused"
-        if scope["method"] not in _READING:
+            return 403, "requests from other websites are refused"
+        if scope["method"] not in ("GET", "HEAD"):
             if not access.may_act:
-                return 405, "this page only shows; start `labseq web --control` to act"
+                return 405, "this server is read-only; start `labseq web --control` to make changes"
             if "origin" not in headers or not headers.get("content-type", "").startswith("application/json"):
-                return 403, "only this server's own pages may act"
-            if not self._actions.allows(who):
+                return 403, "only this server's own pages may change anything"
+            if not self._actions.allows(address):
                 return 429, "too many changes; wait a few seconds"
-        return self._token_refusal(scope, headers, who) if access.token else None
+        return self._token_refusal(scope, headers, address) if access.token else None
 
-    def _token_refusal(self, scope: Scope, headers: dict[str, str], who: str) -> tuple[int, str] | None:
+    def _token_refusal(self, scope: Scope, headers: dict[str, str], address: str) -> tuple[int, str] | None:
         if _is_same(_cookie_of(headers), self._access.cookie):
             return None
         offered = _token_in(scope) or headers.get("authorization", "").removeprefix("Bearer ")
         if not offered:
             return 401, "open the address with the token that `labseq web` printed"
-        if not self._wrong_tokens.allows(who, cost=0.0):
+        if not self._wrong_tokens.allows(address, cost=0.0):
             return 429, "too many wrong tokens; wait a minute"
         if _is_same(offered, self._access.token):
             return None
-        self._wrong_tokens.allows(who)
+        self._wrong_tokens.allows(address)
         return 401, "the token is wrong; open the address that `labseq web` printed"
 
     def _is_first_visit(self, scope: Scope) -> bool:
@@ -231,7 +225,7 @@ class Guard:
         query = parse_qs(scope["query_string"].decode("latin-1"))
         rest = urlencode([(k, v) for k, values in query.items() for v in values if k != "token"])
         path = "/" + scope["path"].lstrip("/\\")  # "//host" would lead to another server
-        cookie = f"{COOKIE}={self._access.cookie}; Path=/; HttpOnly; SameSite=Lax; Max-Age={COOKIE_S}"
+        cookie = f"{COOKIE}={self._access.cookie}; Path=/; HttpOnly; SameSite=Lax; Max-Age={30 * 86_400}"
         return {
             "location": urlsplit(path).path + (f"?{rest}" if rest else ""),
             "set-cookie": cookie + ("; Secure" if scope.get("scheme") == "https" else ""),
@@ -239,6 +233,7 @@ class Guard:
 
 
 def _is_same(given: str, right: str) -> bool:
+    # in constant time, so that the time of an answer tells nothing about the token
     return hmac.compare_digest(given.encode(), right.encode())
 
 
@@ -255,8 +250,11 @@ def _cookie_of(headers: dict[str, str]) -> str:
     return next((value for name, _, value in pairs if name == COOKIE), "")
 
 
-def _is_own(host: str, names: frozenset[str]) -> bool:
-    """Whether a Host header names this server; a page elsewhere can only point a name at it, no address."""
+def _is_of_server(host: str, names: frozenset[str]) -> bool:
+    """Whether a Host header names this server.
+
+    Addresses always do: another site can point a name at this server (DNS rebinding), but not an address.
+    """
     try:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:

@@ -1,4 +1,4 @@
-"""What visitors may do if the server is started with `--control`."""
+"""Endpoints that change something: only on a server started with `--control`."""
 
 from __future__ import annotations
 
@@ -28,10 +28,8 @@ from labseq.web.runs import MAX_NOTE, Catalogue, NoSuchRun, text_of, write_notes
 MAX_BODY: Final = 64 << 10
 CHECK_S: Final = 60.0
 """Longest time to check a sequence, in seconds; the first time kernels are compiled."""
-_MAX_CHANGES: Final = 100
-_SKIPPED: Final = frozenset({"labseq", "name", "profile", "plugin_folders", "use", "pattern"})
+_NOT_IN_FORM: Final = frozenset({"labseq", "name", "profile", "plugin_folders", "use", "pattern"})
 """Keys that say what the sequence is, rather than how it runs."""
-_MAX_FIELDS: Final = 300
 _LIMITS: Final = {"minimum": "min", "maximum": "max"}
 
 Schema = Mapping[str, Any]
@@ -63,7 +61,7 @@ class Actions:
                 f"{run}/notes",
                 self.notes,
                 method="POST",
-                body={"comment": "the comment; replaces the one before", "tags": "list of tags"},
+                body={"comment": "the comment; replaces the previous one", "tags": "list of tags"},
             ),
             Endpoint(
                 "/queue/add",
@@ -83,12 +81,12 @@ class Actions:
 
     def sequences(self, _: Request) -> Any:
         """The sequences that can be queued: those in ./sequences, and those that come with labseq."""
-        return {"sequences": [*_known()]}
+        return {"sequences": [*_sequences()]}
 
     def form(self, request: Request) -> Any:
         """The values of a sequence, with what the schema says of each."""
         name = request.path_params["sequence"]
-        path = _known().get(name)
+        path = _sequences().get(name)
         if path is None:
             raise NoSuchRun(f"there is no sequence '{text_of(name, 80)}'")
         data = Document.read(path).data
@@ -117,24 +115,24 @@ class Actions:
         if not isinstance(tags, list) or not all(isinstance(tag, str) for tag in tags):  # pyright: ignore[reportUnknownVariableType]
             raise ConfigError(Problem("the tags are not a list of texts"))
         write_notes(run.folder, comment, tags)  # pyright: ignore[reportUnknownArgumentType]
-        return {"done": "kept"}
+        return {"done": "saved"}
 
     async def add(self, request: Request) -> Any:
         """Check a known sequence with changed values, and add it at the end of the queue."""
         values = await body_of(request)
-        path = _known().get(str(values.get("sequence")))
+        path = _sequences().get(str(values.get("sequence")))
         if path is None:
             raise ConfigError(Problem("there is no such sequence", expected="one of /api/v1/sequences"))
         return await in_thread(partial(self._add, path, values))
 
     def _add(self, path: Path, values: Mapping[str, Any]) -> dict[str, str]:
         changes: Any = values.get("changes") or {}
-        if not isinstance(changes, dict) or len(changes) > _MAX_CHANGES:  # pyright: ignore[reportUnknownArgumentType]
+        if not isinstance(changes, dict) or len(changes) > 100:  # pyright: ignore[reportUnknownArgumentType]
             raise ConfigError("the changes are not a mapping of addresses to values")
         data = Document.read(path).data
-        known = {field["address"] for field in form_fields(data, self._schemas())}
-        if unknown := [*{str(address) for address in changes} - known]:  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-            # not what --set can do beyond: plugin folders and devices are the lab's own
+        addresses = {field["address"] for field in form_fields(data, self._schemas())}
+        if unknown := [*{str(address) for address in changes} - addresses]:  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+            # --set could also change plugin folders and devices, which visitors must not
             raise ConfigError(Problem(f"'{clean(unknown[0])}' is not a value of the form"))
         options = [f"--set={address}={value}" for address, value in changes.items()]  # pyright: ignore[reportUnknownVariableType]
         if profile := str(values.get("profile") or ""):
@@ -147,11 +145,11 @@ class Actions:
     async def move(self, request: Request) -> Any:
         """Put an entry of the queue before another one."""
         values = await body_of(request)
-        Queue(self._runs.root).move(_whole(values, "entry"), _whole(values, "before"))
+        Queue(self._runs.root).move(_whole_number(values, "entry"), _whole_number(values, "before"))
         return {"done": "moved"}
 
     async def pause(self, request: Request) -> Any:
-        """Let the queue start no further entry until it is continued; a run in progress goes on."""
+        """Let the queue start no further entry until it is resumed; a run in progress continues."""
         is_paused = (await body_of(request)).get("paused")
         Queue(self._runs.root).pause(is_paused is True)
         return {"done": "paused" if is_paused is True else "continued"}
@@ -163,7 +161,7 @@ class Actions:
         return self._schema
 
     def _labseq(self, arguments: list[str], variables: dict[str, str]) -> str:
-        """What a command prints.
+        """Run a labseq command and return what it prints.
 
         Raises:
             ConfigError: It reports a mistake.
@@ -189,18 +187,18 @@ class Actions:
         return done.stdout.decode("utf-8", "replace")
 
 
-def _known() -> dict[str, Path]:
+def _sequences() -> dict[str, Path]:
     """Name -> file of the sequences that can be queued."""
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for folder in (Path(SEQUENCES).absolute(), packaged_sequences_dir()):
         with suppress(OSError):
             for path in sorted(folder.iterdir()):
                 if path.suffix.lower() in (".yaml", ".yml") and path.is_file():
-                    found.setdefault(path.stem, path)
-    return found
+                    files.setdefault(path.stem, path)
+    return files
 
 
-def _whole(values: Mapping[str, Any], name: str) -> int:
+def _whole_number(values: Mapping[str, Any], name: str) -> int:
     value = values.get(name)
     if type(value) is not int:
         raise ConfigError(Problem(f"'{name}' is not a whole number"))
@@ -211,7 +209,7 @@ async def body_of(request: Request) -> dict[str, Any]:
     """The JSON object in the body of a request.
 
     Raises:
-        ConfigError: It is too long, or no JSON object.
+        ConfigError: It is too long, or not a JSON object.
     """
     content = b""
     async for part in request.stream():
@@ -221,9 +219,9 @@ async def body_of(request: Request) -> dict[str, Any]:
     try:
         values = json.loads(content or b"{}")
     except (ValueError, RecursionError) as error:
-        raise ConfigError("the request is no JSON") from error
+        raise ConfigError("the request is not JSON") from error
     if not isinstance(values, dict):
-        raise ConfigError("the request is no JSON object")
+        raise ConfigError("the request is not a JSON object")
     return values  # pyright: ignore[reportUnknownVariableType]
 
 
@@ -239,54 +237,54 @@ def form_fields(data: Mapping[str, Any], schema: Schema) -> list[dict[str, Any]]
         ``about``, ``choices``, ``min`` and ``max``.
     """
     definitions: Schema = schema.get("definitions") or {}
-    return list(_of_mapping(data, schema, definitions, ""))[:_MAX_FIELDS]
+    return list(_mapping_fields(data, schema, definitions, ""))[:300]
 
 
-def _of_mapping(
+def _mapping_fields(
     data: Mapping[str, Any], schema: Schema, definitions: Schema, prefix: str
 ) -> Iterator[dict[str, Any]]:
     properties = _properties(schema, definitions, data)
     for key in dict.fromkeys((*data, *properties)):
-        known, value = _resolved(properties.get(key) or {}, definitions), data.get(key)
-        if key in _SKIPPED or key == "scan":
+        about, value = _resolved(properties.get(key) or {}, definitions), data.get(key)
+        if key in _NOT_IN_FORM or key == "scan":
             continue
         address = f"{prefix}{key}"
         if isinstance(value, dict):
-            yield from _of_mapping(cast("dict[str, Any]", value), known, definitions, f"{address}.")
+            yield from _mapping_fields(cast("dict[str, Any]", value), about, definitions, f"{address}.")
         elif key == "shot" and isinstance(value, list):
-            yield from _of_steps(cast("list[Any]", value), known, definitions)
-        elif isinstance(value, list) or (value is None and not _is_scalar(known)):
+            yield from _step_fields(cast("list[Any]", value), about, definitions)
+        elif isinstance(value, list) or (value is None and not _is_scalar(about)):
             continue
         else:
-            yield _field(address, value, known)
+            yield _field(address, value, about)
 
 
-def _of_steps(steps: list[Any], schema: Schema, definitions: Schema) -> Iterator[dict[str, Any]]:
+def _step_fields(steps: list[Any], schema: Schema, definitions: Schema) -> Iterator[dict[str, Any]]:
     kinds = _properties(schema.get("items") or {}, definitions, {})
     for i, step in enumerate(steps):
         for kind, settings in cast("dict[str, Any]", step).items() if isinstance(step, dict) else ():
             if kind not in ("name", "policy"):
-                known = _resolved(kinds.get(kind) or {}, definitions)
-                yield from _of_mapping(settings or {}, known, definitions, f"shot.{i}.{kind}.")
+                about = _resolved(kinds.get(kind) or {}, definitions)
+                yield from _mapping_fields(settings or {}, about, definitions, f"shot.{i}.{kind}.")
 
 
 def _properties(schema: Schema, definitions: Schema, data: Mapping[str, Any]) -> dict[str, Any]:
     """The properties of a mapping, with those of the plugin that it chooses."""
-    found = dict(schema.get("properties") or {})
+    properties = dict(schema.get("properties") or {})
     for rule in schema.get("allOf") or ():
         if "$ref" in rule:
-            found |= _properties(_resolved(rule, definitions), definitions, data)
-        chosen: Mapping[str, Any] = rule.get("if", {}).get("properties", {})
-        if chosen and all(data.get(key) == one.get("const") for key, one in chosen.items()):
-            found |= _properties(_resolved(rule.get("then") or {}, definitions), definitions, data)
-    return found
+            properties |= _properties(_resolved(rule, definitions), definitions, data)
+        condition: Mapping[str, Any] = rule.get("if", {}).get("properties", {})
+        if condition and all(data.get(key) == value.get("const") for key, value in condition.items()):
+            properties |= _properties(_resolved(rule.get("then") or {}, definitions), definitions, data)
+    return properties
 
 
 def _resolved(schema: Schema, definitions: Schema) -> Schema:
-    """A schema with what it refers to; of alternatives, the first that says most."""
+    """A schema with its reference filled in; of alternatives, the first that is not null."""
     if "$ref" in schema:
         return {**(definitions.get(str(schema["$ref"]).rpartition("/")[2]) or {}), **schema}
-    alternatives = [one for one in schema.get("anyOf") or () if one.get("type") != "null"]
+    alternatives = [option for option in schema.get("anyOf") or () if option.get("type") != "null"]
     if alternatives:
         return {
             **_resolved(alternatives[0], definitions),
@@ -304,7 +302,7 @@ def _is_scalar(schema: Schema) -> bool:
 
 def _field(address: str, value: Any, schema: Schema) -> dict[str, Any]:
     kinds: Any = schema.get("type")
-    choices = [text_of(one, 80) for one in schema.get("enum") or ()]
+    choices = [text_of(choice, 80) for choice in schema.get("enum") or ()]
     if kinds == "boolean" or isinstance(value, bool):
         choices = ["true", "false"]
     limits = {

@@ -31,14 +31,6 @@ from labseq.web.store import calibration_picture, calibrations, queue_values
 
 BASE: Final = "/api/v1"
 MAX_LISTED: Final = 500
-MAX_FILE: Final = 1 << 20
-"""Maximum number of characters of a file's text."""
-MAX_STATISTICS: Final = 500
-"""Maximum number of shots that the statistics of a run are worked out from."""
-MAX_TIMED: Final = 50
-"""Maximum number of shots whose files are opened for the times of stages."""
-_FRAME_S, _MAX_FRAMES = 2.0, 8
-"""For so long a frame is kept, and so many."""
 _RUN: Final = "/runs/{day}/{name}"
 _TEXTS: Final = {"sequence": SEQUENCE_FILE, "profile": PROFILE_FILE}
 
@@ -99,7 +91,7 @@ class Api:
     async def events(self, request: Request) -> Response:
         """The same state as server-sent events, each time it changes: of the newest run, or of one run.
 
-        The answer to `Last-Event-ID` is the present state, or nothing if it is still the same.
+        After `Last-Event-ID` the current state is sent, or nothing if it is still the same.
         """
         if self._live.n_viewers >= MAX_VIEWERS:
             return JSONResponse({"error": f"{MAX_VIEWERS} pages are open already"}, 503)
@@ -112,9 +104,9 @@ class Api:
 
     def runs(self, request: Request) -> Any:
         """The runs, the newest first."""
-        asked = request.query_params
-        first, most = _number(asked, "first", 0), min(MAX_LISTED, _number(asked, "n", 50))
-        return self._runs.search(asked.get("q", "")[:200], asked.get("status", "")[:20], first, most)
+        query = request.query_params
+        first, most = _number(query, "first", 0), min(MAX_LISTED, _number(query, "n", 50))
+        return self._runs.search(query.get("q", "")[:200], query.get("status", "")[:20], first, most)
 
     def run(self, request: Request) -> Any:
         """A run: its head, figures, trend, losses, what was changed, and its files."""
@@ -128,14 +120,16 @@ class Api:
             "figures": figures_of(columns),
             "trend": columns.trend(N_BINS),
             "losses": losses_of(columns),
-            "changes": readings_of({address: one["written"] for address, one in changes.items()}),
+            "changes": readings_of({address: change["written"] for address, change in changes.items()}),
             "calibrations": readings_of(record.get("calibrations") or {}),
             "devices": {
-                text_of(name, 80): readings_of(one) if isinstance(one, dict) else text_of(one, 200)
-                for name, one in (record.get("devices") or {}).items()
+                text_of(name, 80): readings_of(device) if isinstance(device, dict) else text_of(device, 200)
+                for name, device in (record.get("devices") or {}).items()
             },
-            "plugins": [readings_of(one) for one in record.get("plugins") or () if isinstance(one, dict)],
-            "provenance": readings_of(_unfolded(record.get("provenance") or {})),
+            "plugins": [
+                readings_of(plugin) for plugin in record.get("plugins") or () if isinstance(plugin, dict)
+            ],
+            "provenance": readings_of(_flattened(record.get("provenance") or {})),
             "n_damaged_lines": run.history.n_damaged,
             "has_scan": bool(record.get("scan")),
             "files": [kind for kind, name in _TEXTS.items() if (run.folder / name).is_file()],
@@ -151,9 +145,11 @@ class Api:
         run = self._opened(request)
         run.history.update()
         counted = run.history.columns().counted.tolist()
-        shots = run.with_rows(_evenly(counted, MAX_STATISTICS))
+        shots = run.with_rows(_evenly(counted, 500))
         totals = StageTotals()
-        for shot in _evenly(shots, MAX_TIMED):
+        for shot in _evenly(
+            shots, 50
+        ):  # the times of stages are in the files of shots, which are slow to read
             with suppress(RecordingError):
                 totals.add_timing(shot.timing)
         return {
@@ -202,15 +198,15 @@ class Api:
     async def frame(self, request: Request) -> Response:
         """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""
         key, now_s = str(request.url), time.monotonic()
-        kept = self._frames.get(key)
-        if kept is None or now_s - kept[0] > _FRAME_S:  # else many pages ask for the same one, at once
-            kept = self._frames[key] = (
+        cached = self._frames.get(key)
+        if cached is None or now_s - cached[0] > 2.0:  # many pages ask for the same one at once
+            cached = self._frames[key] = (
                 now_s,
                 asyncio.ensure_future(in_thread(partial(self._frame, request))),
             )
-            while len(self._frames) > _MAX_FRAMES:
+            while len(self._frames) > 8:
                 self._frames.popitem(last=False)
-        png, factor = await asyncio.shield(kept[1])
+        png, factor = await asyncio.shield(cached[1])  # a page that leaves must not cancel it for the others
         headers = {"cache-control": "private, max-age=600", "x-reduced": str(factor)}
         return Response(png, media_type="image/png", headers=headers)
 
@@ -227,7 +223,7 @@ class Api:
         if name is None:
             raise NoSuchRun("a run has the files 'sequence' and 'profile'")
         text = read_file(run.folder / name).decode("utf-8", "replace")
-        return PlainTextResponse(text_of(text, MAX_FILE))
+        return PlainTextResponse(text_of(text, most=1 << 20))
 
     def queue(self, _: Request) -> Any:
         """The queue: its entries in the order in which they are taken, and the process that takes them."""
@@ -261,10 +257,16 @@ class Api:
     def openapi(self) -> dict[str, Any]:
         """The API as an OpenAPI document."""
         paths: dict[str, dict[str, Any]] = {}
-        for one in self.endpoints():
-            paths.setdefault(BASE + one.path, {})[one.method.lower()] = describe(one)
-        about = {"title": "labseq", "version": labseq.__version__, "description": _ABOUT}
-        return {"openapi": "3.1.0", "info": about, "paths": paths}
+        for endpoint in self.endpoints():
+            paths.setdefault(BASE + endpoint.path, {})[endpoint.method.lower()] = describe(endpoint)
+        description = (
+            "Runs, shots, scans, queue and calibrations of a labseq data folder. Times are in seconds, "
+            "fractions from 0 to 1, intervals of 68 %. Shots, images, cycles and sites are counted from 0. "
+            'Unknown numbers are null. An error has the form {"error": "..."}. With a token, send '
+            '"Authorization: Bearer TOKEN".'
+        )
+        info = {"title": "labseq", "version": labseq.__version__, "description": description}
+        return {"openapi": "3.1.0", "info": info, "paths": paths}
 
     def metrics(self) -> str:
         """The state of the newest run in the format of Prometheus."""
@@ -294,22 +296,15 @@ class Api:
         return "\n".join(lines) + "\n"
 
 
-_ABOUT: Final = (
-    "Runs, shots, scans, queue and calibrations of a labseq data folder. Times are in seconds, fractions "
-    "from 0 to 1, intervals of 68 %. Shots, images, cycles and sites are counted from 0. Unknown numbers are "
-    'null. An error has the form {"error": "..."}. With a token, send "Authorization: Bearer TOKEN".'
-)
-
-
-def _unfolded(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values with those of the mappings in it: "git.commit"."""
-    found: dict[str, Any] = {}
+def _flattened(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values under dotted names, such as "git.commit"."""
+    flat: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, dict):
-            found |= {f"{name}.{key}": one for key, one in cast("dict[str, Any]", value).items()}
+            flat |= {f"{name}.{key}": inner for key, inner in cast("dict[str, Any]", value).items()}
         else:
-            found[name] = value
-    return found
+            flat[name] = value
+    return flat
 
 
 def _label(text: str) -> str:
@@ -317,10 +312,10 @@ def _label(text: str) -> str:
 
 
 def _number(values: Mapping[str, Any], name: str, default: int) -> int:
-    """A whole number that the address contains.
+    """A whole number from the address, -1 for all negative ones.
 
     Raises:
-        NoSuchRun: It is none.
+        NoSuchRun: It is not a whole number.
     """
     text = str(values.get(name, default))
     if not (text.removeprefix("-").isdecimal() and len(text) < 12):
@@ -329,5 +324,6 @@ def _number(values: Mapping[str, Any], name: str, default: int) -> int:
 
 
 def _evenly(items: Any, n_most: int) -> list[Any]:
+    """At most ``n_most`` of the items, evenly spaced."""
     step = max(1, math.ceil(len(items) / n_most))
     return list(items[::step])

@@ -18,7 +18,7 @@ from starlette.routing import Route
 from labseq.web.access import Access, App, Guard
 from labseq.web.acting import Actions
 from labseq.web.api import BASE, Api
-from labseq.web.endpoint import Endpoint, answered, in_thread
+from labseq.web.endpoint import Endpoint, answer, in_thread
 from labseq.web.runs import Catalogue
 from labseq.web.state import Limits
 
@@ -27,6 +27,7 @@ PAGES: Final = (
     *("/", "/now", "/scan", "/runs", "/compare", "/queue", "/calibrations", "/api"),
     *("/runs/{day}/{name}", "/runs/{day}/{name}/shots/{shot}"),
 )
+"""Addresses of pages: one HTML file, whose script shows what the address asks for."""
 _KINDS: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 
 
@@ -35,24 +36,24 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
 
     Args:
         root: The data folder.
-        access: Who may use it; by default everybody who can reach it, only to look.
+        access: Who may use it; by default everybody who can reach it, without changing anything.
         limits: When alarms are raised.
     """
     allowed = access or Access()
     catalogue = Catalogue(root)
-    importlib.import_module("scipy.special")  # 0.3 s that the first answer should not take
-    Image.preinit()  # and 0.1 s
+    importlib.import_module("scipy.special")  # takes 0.3 s, which the first answer should not
+    Image.preinit()  # takes 0.1 s, likewise
     threading.Thread(target=catalogue.warm, daemon=True).start()
     api = Api(catalogue, limits or Limits(), Actions(catalogue).endpoints() if allowed.may_act else ())
-    files = {path.name: _file(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}
+    files = {path.name: _read_static(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}
     page = files["index.html"]
 
     async def show_page(_: Request) -> Response:
-        return _copy(page)
+        return _respond_with(page)
 
     async def show_file(request: Request) -> Response:
-        found = files.get(request.path_params["file"])
-        return _copy(found) if found is not None else PlainTextResponse("there is no such file\n", 404)
+        file = files.get(request.path_params["file"])
+        return _respond_with(file) if file is not None else PlainTextResponse("there is no such file\n", 404)
 
     async def show_api(_: Request) -> Response:
         return JSONResponse(api.openapi())
@@ -66,20 +67,20 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
         Route("/static/{file}", show_file),
         Route(f"{BASE}/openapi.json", show_api),
         Route("/metrics", show_metrics),
-        *(_route(one) for one in api.endpoints()),
+        *map(_route, api.endpoints()),
     ]
     return Guard(Starlette(routes=routes, exception_handlers={404: _missing}), allowed)
 
 
-def _route(one: Endpoint) -> Route:
-    return Route(BASE + one.path, partial(answered, one), methods=[one.method])
+def _route(endpoint: Endpoint) -> Route:
+    return Route(BASE + endpoint.path, partial(answer, endpoint), methods=[endpoint.method])
 
 
-def _file(path: Path) -> tuple[bytes, str]:
+def _read_static(path: Path) -> tuple[bytes, str]:
     return path.read_bytes(), _KINDS.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "text/plain"
 
 
-def _copy(file: tuple[bytes, str]) -> Response:
+def _respond_with(file: tuple[bytes, str]) -> Response:
     content, kind = file
     return Response(content, media_type=kind, headers={"cache-control": "no-cache"})
 

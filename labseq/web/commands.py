@@ -33,7 +33,7 @@ def web(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="A further name of the server, as a proxy in front of it uses; may be given several times.",
+            help="A further name of the server, such as that of a proxy in front of it; may be repeated.",
             show_default=False,
         ),
     ] = None,
@@ -57,7 +57,7 @@ def web(
 ) -> None:
     """Show runs, scans, queue and calibrations in a browser.
 
-    The server only reads the data folder: runs neither need nor notice it. It prints the address to open,
+    The server only reads the data folder: runs do not depend on it. It prints the address to open,
     which contains a token if other computers can reach it or visitors may act.
     """
     from labseq.web.serve import Serving, serve

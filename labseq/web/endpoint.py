@@ -1,4 +1,4 @@
-"""Endpoints of the API: what they are, how a request is answered, and how OpenAPI describes them."""
+"""Endpoints of the API: their description, the answer to a request, and their OpenAPI entry."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from labseq.web.runs import NoSuchRun, text_of
 
 T = TypeVar("T")
 _THREADS: Final = ThreadPoolExecutor(6, "labseq web")
+"""Few, because each thread keeps memory of its own."""
 _DESCRIPTIONS: Final = {
     "day": "date of the run's folder, 2026-11-20",
     "name": "name of the run's folder, 0001_compact-225",
     "shot": "index of the shot, from 0",
     "image": "index of the image in the shot, from 0",
-    "attempt": "an attempt that does not count; without it the shot that counts",
+    "attempt": "an attempt that does not count; by default the one that counts",
     "q": "words that date, name, profile, outcome, comment or tags must contain",
     "status": "running, complete, stopped, failed or damaged",
     "first": "number of rows to leave out",
@@ -64,28 +65,29 @@ class Endpoint:
         return inspect.cleandoc(self.answer.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
 
 
-async def answered(one: Endpoint, request: Request) -> Response:
-    """Answer a request; what cannot be shown is a reason in the answer, never a crash."""
+async def answer(endpoint: Endpoint, request: Request) -> Response:
+    """Answer a request; an error becomes an answer that gives the reason."""
     try:
-        if inspect.iscoroutinefunction(one.answer):
-            found = await one.answer(request)
+        if inspect.iscoroutinefunction(endpoint.answer):
+            content = await endpoint.answer(request)
         else:
-            found = await in_thread(partial(one.answer, request))
+            content = await in_thread(partial(endpoint.answer, request))
     except NoSuchRun as error:
         return JSONResponse({"error": text_of(error)}, 404)
     except (LabseqError, OSError) as error:
         return JSONResponse({"error": text_of(error)}, 409)
     except Exception as error:  # noqa: BLE001 - a file with other values than expected
-        what = f"a file of it has values that cannot be read: {format_error(error)}"
-        return JSONResponse({"error": text_of(what)}, 409)
-    if isinstance(found, Response):
-        return found
-    content = encode(to_plain(found))
-    return Response(content, media_type="application/json", headers={"cache-control": "no-store"})
+        message = f"one of its files has values that cannot be read: {format_error(error)}"
+        return JSONResponse({"error": text_of(message)}, 409)
+    if isinstance(content, Response):
+        return content
+    return Response(
+        encode(to_plain(content)), media_type="application/json", headers={"cache-control": "no-store"}
+    )
 
 
 async def in_thread(work: Callable[[], T]) -> T:
-    """Do what takes time in one of a few threads: each keeps memory of its own."""
+    """Run a slow function in a thread, so that it does not hold up other requests."""
     return await asyncio.get_running_loop().run_in_executor(_THREADS, work)
 
 
@@ -94,25 +96,27 @@ def encode(values: object) -> str:
     return json.dumps(values, allow_nan=False, separators=(",", ":"), default=str)
 
 
-def describe(one: Endpoint) -> dict[str, Any]:
+def describe(endpoint: Endpoint) -> dict[str, Any]:
     """The operation of an endpoint for OpenAPI."""
-    in_path = [part.partition("}")[0] for part in one.path.split("{")[1:]]
-    parameters = [_parameter(name, "path") for name in in_path] + [_parameter(n, "query") for n in one.query]
-    found: dict[str, Any] = {
-        "operationId": getattr(one.answer, "__name__", "answer"),
-        "summary": one.description,
+    in_path = [part.partition("}")[0] for part in endpoint.path.split("{")[1:]]
+    parameters = [_parameter(name, "path") for name in in_path] + [
+        _parameter(n, "query") for n in endpoint.query
+    ]
+    operation: dict[str, Any] = {
+        "operationId": getattr(endpoint.answer, "__name__", "answer"),
+        "summary": endpoint.description,
         "parameters": parameters,
         "responses": {
-            "200": {"description": "as described", "content": {one.content: {}}},
+            "200": {"description": "as described", "content": {endpoint.content: {}}},
             "404": {"description": "there is no such thing"},
-            "409": {"description": "it cannot be read, or not be done; 'error' says why"},
+            "409": {"description": "it cannot be read or cannot be done; 'error' says why"},
         },
     }
-    if one.body is not None:
-        keys = {name: {"description": about} for name, about in one.body.items()}
+    if endpoint.body is not None:
+        keys = {name: {"description": about} for name, about in endpoint.body.items()}
         schema = {"type": "object", "properties": keys}
-        found["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
-    return found
+        operation["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
+    return operation
 
 
 def _parameter(name: str, place: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The shots of a run in columns, which grow as the run writes its index."""
+"""The index of a run as columns of numbers, which grow while the run writes it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ from labseq.plain import parse_object
 from labseq.recording.folders import INDEX_FILE
 from labseq.recording.index import IndexRow, row_of
 
-_BIN: Final = 5
-"""Minimum number of shots of a point of a trend, once there are enough."""
 _NUMBERS: Final[Mapping[str, Callable[[IndexRow], float]]] = {
     "success": lambda row: math.nan if row.success is None else row.success,
     "filling": lambda row: row.filling_fraction,
@@ -176,13 +174,18 @@ class Columns:
     @property
     def losses(self) -> dict[str, Estimate]:
         """Cause -> atoms lost in a shot."""
-        found = {name: column[self.counted] for name, column in sorted(self._lost.items())}
-        return {name: mean(column[~np.isnan(column)]) for name, column in found.items()}
+        losses = {name: column[self.counted] for name, column in sorted(self._lost.items())}
+        return {name: mean(column[~np.isnan(column)]) for name, column in losses.items()}
 
-    def trend(self, n_most: int) -> list[dict[str, Any]]:
-        """Filling and defect-free fraction of successive shots, in at most so many bins of five or more."""
+    def trend(self, n_most: int, min_shots: int = 5) -> list[dict[str, Any]]:
+        """Filling and defect-free fraction of successive shots.
+
+        Args:
+            n_most: Maximum number of bins.
+            min_shots: Minimum number of shots in a bin; with fewer than twice as many shots, each is a bin.
+        """
         shot, filling, success = self.shot[self.counted], self.of_shots("filling"), self.of_shots("success")
-        n_bins = min(n_most, len(shot) // _BIN if len(shot) >= 2 * _BIN else len(shot))
+        n_bins = min(n_most, len(shot) // min_shots if len(shot) >= 2 * min_shots else len(shot))
         edges = np.linspace(0, len(shot), n_bins + 1).round().astype(int) if n_bins else np.zeros(1, int)
         bins = list[dict[str, Any]]()
         for first, end in itertools.pairwise(edges):
@@ -199,7 +202,7 @@ class Columns:
 
 
 def rate_of(success: NDArray[np.float64]) -> Rate:
-    """The rate of ones among zeros and ones."""
+    """The fraction of ones among zeros and ones."""
     return Rate(int(success.sum()), len(success))
 
 

@@ -1,4 +1,4 @@
-"""Passes the state of runs on to browsers; one that is slow misses states, and holds nothing up."""
+"""Sends the state of runs to browsers; a slow browser misses states without delaying the others."""
 
 from __future__ import annotations
 
@@ -15,19 +15,17 @@ from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.state import Limits, RunState, alarm
 
 POLL_S: Final = 0.1
-"""Interval at which the files of a run are looked at while somebody watches it."""
-IDLE_S: Final = 1.0
-"""The same for a run that is over."""
+"""Interval at which the files of a run in progress are read while a browser watches it, in seconds."""
 HEARTBEAT_S: Final = 15.0
-"""A connection is used at least so often, so that one that is dead is noticed."""
+"""Something is sent at least this often, in seconds, so that a dead connection is noticed."""
 MAX_VIEWERS: Final = 100
 
 
 class Channel:
     """One run, or the newest one, for all browsers that watch it.
 
-    There is one slot: the latest state, encoded once. A browser that is slow finds the latest when it is
-    ready for the next one.
+    Only the latest state is kept, encoded once for all. A slow browser gets the latest when it is ready for
+    the next one.
 
     Args:
         read: Returns the state of the run; may take time, and is called in a thread.
@@ -47,7 +45,7 @@ class Channel:
         The last shot, which is half of a state, is an event of its own, sent before the state if it is new.
 
         Args:
-            after: Id of the last event that the browser has; the present state is left out if it is that.
+            after: Id of the last event that the browser has; the current state is left out if it is the same.
         """
         self.n_viewers += 1
         if self._task is None or self._task.done():
@@ -71,7 +69,7 @@ class Channel:
             self.n_viewers -= 1
 
     async def _follow(self) -> None:
-        """Read the run as long as somebody watches."""
+        """Read the run while at least one browser watches it."""
         while self.n_viewers:
             state = await in_thread(self._read)
             shot, text = encode(state.pop("shot", None)), encode(state)
@@ -81,7 +79,7 @@ class Channel:
                 self._changed.set()
                 self._changed = asyncio.Event()
             is_running = (state.get("run") or {}).get("status") == "running"
-            await asyncio.sleep(POLL_S if is_running or state.get("error") else IDLE_S)
+            await asyncio.sleep(POLL_S if is_running or state.get("error") else 1.0)
 
 
 class Live:
@@ -105,7 +103,7 @@ class Live:
 
     def channel(self, day: str, name: str) -> Channel:
         """The channel of a run; of the newest if both are empty."""
-        self._channels = {key: one for key, one in self._channels.items() if one.n_viewers}
+        self._channels = {key: channel for key, channel in self._channels.items() if channel.n_viewers}
         key = f"{day}/{name}"
         if key not in self._channels:
             self._channels[key] = Channel(lambda: self.state(day, name))
@@ -118,11 +116,11 @@ class Live:
             if run is None:
                 return {"run": None, "running": [], "alarms": [], "error": ""}
             return self._state_of(run).update() | {"running": self._catalogue.running(), "error": ""}
-        except Exception as error:  # noqa: BLE001 - whatever a damaged file leads to, the page goes on
+        except Exception as error:  # noqa: BLE001 - whatever a damaged file leads to, the page must stay
             is_known = isinstance(error, LabseqError | OSError | NoSuchRun)
             text = text_of(error if is_known else format_error(error))
-            found = alarm("error", "This cannot be shown", text)
-            return {"run": None, "running": [], "alarms": [found], "error": text}
+            alarms = [alarm("error", "This cannot be shown", text)]
+            return {"run": None, "running": [], "alarms": alarms, "error": text}
 
     def _state_of(self, run: OpenRun) -> RunState:
         state = self._states.get(run.id)

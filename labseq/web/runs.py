@@ -31,13 +31,9 @@ MAX_NOTE: Final = 10_000
 """Maximum number of characters of a comment."""
 MAX_TAGS: Final = 20
 _LISTED_S: Final = 0.5
-"""For so long the list of folders is not read again, in seconds."""
-_PAUSE_S: Final = 0.001
-_MAX_OPEN: Final = 12
-"""Maximum number of runs that are kept open: 20,000 shots take 3 MB."""
+"""The list of folders is read again only after this time, in seconds."""
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
-_MAX_EVENTS: Final = 40
-_NOTED: Final = frozenset(
+_LISTED_EVENTS: Final = frozenset(
     {"warning", "safe_state", "closed", "shot_repeated", "window_too_short", "window_exceeded"}
     | {"scan_ended", "leader_awaited", "left_on", "run_finished", "run_starting"}
 )
@@ -51,7 +47,7 @@ def text_of(value: object, most: int = MAX_TEXT) -> str:
     return "\n".join(visible(line.replace("\t", "    ")) for line in text.split("\n"))
 
 
-class NoSuchRun(LookupError):  # noqa: N818 - a page that is not there is no failure
+class NoSuchRun(LookupError):  # noqa: N818 - a missing page is not a failure
     """The data folder has no run of this name."""
 
 
@@ -116,19 +112,19 @@ class OpenRun:
             self.first_shot_s = event.t_s
         elif event.name == "scan_point":
             self.scan_events.append(dict(event.values))
-        if event.name in _NOTED and not (
+        if event.name in _LISTED_EVENTS and not (
             event.name in ("safe_state", "closed") and event.values.get("ok") is True
         ):
             self.events.append(event)
-            del self.events[:-_MAX_EVENTS]
+            del self.events[:-40]
 
     def with_rows(self, lines: Iterable[int]) -> list[Shot]:
         """The shots of some lines of the index; those that cannot be read are left out."""
-        found = list[Shot]()
+        shots = list[Shot]()
         for line in lines:
             with suppress(RecordingError):
-                found.append(self.shot(line))
-        return found
+                shots.append(self.shot(line))
+        return shots
 
     def shot(self, line: int) -> Shot:
         """The shot of a line of the index.
@@ -139,7 +135,7 @@ class OpenRun:
         return self.follower.shot(self.history.row(line))
 
     def outline(self) -> Run:
-        """The run with no more of its shots than how they were judged, however many there are."""
+        """The run whose shots know only how they were judged, which is fast for any number of shots."""
         status, error = self.follower.state()
         if not len(self.history):
             return Run(self.folder, self.record, status, error, (), ())
@@ -187,7 +183,7 @@ class Catalogue:
                 except OSError as error:
                     self._folders = []
                     reason = f"the data folder cannot be read: {error.strerror}"
-                    raise RecordingError(self.root, reason, "it is tried again") from error
+                    raise RecordingError(self.root, reason, "it is read again at the next request") from error
                 self._listed_s = time.monotonic()
             return self._folders
 
@@ -199,8 +195,8 @@ class Catalogue:
         """
         folders = [folder for folder in self.folders()[-20:] if (folder / RUN_FILE).exists()]
         running = [folder for folder in folders if read_state(folder)[0] == "running"]
-        chosen = (running or folders)[-1:]
-        return self._opened(chosen[0]) if chosen else None
+        candidates = running or folders
+        return self._opened(candidates[-1]) if candidates else None
 
     def running(self) -> list[str]:
         """The runs in progress, among the newest 20.
@@ -208,7 +204,7 @@ class Catalogue:
         Raises:
             RecordingError: The data folder cannot be read.
         """
-        return [run_id(one) for one in self.folders()[-20:] if read_state(one)[0] == "running"]
+        return [run_id(folder) for folder in self.folders()[-20:] if read_state(folder)[0] == "running"]
 
     def open(self, day: str, name: str) -> OpenRun:
         """Open a run by its day and the name of its folder.
@@ -228,17 +224,18 @@ class Catalogue:
             if run is None or run.follower.is_replaced():
                 run = OpenRun(folder)
             self._open[str(folder)] = run
-            while len(self._open) > _MAX_OPEN:
+            while len(self._open) > 12:  # each takes 3 MB for 20,000 shots
                 self._open.popitem(last=False)
             return run
 
     def summary(self, folder: Path) -> dict[str, Any]:
-        """A run in a line of the list; it is only read again if one of its files has changed."""
+        """A run as a line of the list; it is read again only if one of its files has changed."""
         names = (RUN_FILE, STATE_FILE, INDEX_FILE, NOTES_FILE)
         stamp = [_stamp(folder / name) for name in names]
-        known = self._summaries.get(folder)
-        if known is not None and known[0] == stamp and known[1]["status"] != "running":
-            return known[1]
+        cached = self._summaries.get(folder)
+        # a run that died still says "running": its process has to be looked at each time
+        if cached is not None and cached[0] == stamp and cached[1]["status"] != "running":
+            return cached[1]
         run = self._open.get(str(folder))
         values = _summary(OpenRun(folder) if run is None or run.follower.is_replaced() else run)
         self._summaries[folder] = (stamp, values)
@@ -251,7 +248,7 @@ class Catalogue:
                 newest.history.update()
             for folder in self.folders()[::-1]:
                 self.summary(folder)
-                time.sleep(_PAUSE_S)
+                time.sleep(0.001)
 
     def search(self, text: str, status: str, first: int, most: int) -> dict[str, Any]:
         """The newest runs whose line contains all the words.
@@ -268,8 +265,8 @@ class Catalogue:
         folders = self.folders()[::-1]
         words = text.lower().split()
         if not words and not status:
-            found = [self.summary(folder) for folder in folders[first : first + most]]
-            return {"n_runs": len(folders), "n_found": len(folders), "runs": found}
+            runs = [self.summary(folder) for folder in folders[first : first + most]]
+            return {"n_runs": len(folders), "n_found": len(folders), "runs": runs}
         matching = [
             summary
             for folder in folders
@@ -289,10 +286,10 @@ def run_id(folder: Path) -> str:
 
 def _stamp(path: Path) -> object:
     try:
-        about = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return about.st_ino, about.st_mtime_ns, about.st_size
+    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _matches(summary: Mapping[str, Any], words: Iterable[str]) -> bool:
@@ -344,8 +341,11 @@ def read_notes(folder: Path) -> dict[str, Any]:
         if (folder / NOTES_FILE).exists():
             values = parse_object(read_file(folder / NOTES_FILE, 1 << 20)) or {}
     tags: Any = values.get("tags")
-    kept = cast("list[Any]", tags)[:MAX_TAGS] if isinstance(tags, list) else []
-    return {"comment": text_of(values.get("comment") or "", MAX_NOTE), "tags": [text_of(t, 60) for t in kept]}
+    listed = cast("list[Any]", tags)[:MAX_TAGS] if isinstance(tags, list) else []
+    return {
+        "comment": text_of(values.get("comment") or "", MAX_NOTE),
+        "tags": [text_of(t, 60) for t in listed],
+    }
 
 
 def write_notes(folder: Path, comment: str, tags: list[str]) -> None:
@@ -354,6 +354,6 @@ def write_notes(folder: Path, comment: str, tags: list[str]) -> None:
     Raises:
         RecordingError: The folder cannot be written to.
     """
-    words = list(dict.fromkeys(word for tag in tags if (word := " ".join(tag.split())[:60])))[:MAX_TAGS]
-    values = {"comment": comment[:MAX_NOTE], "tags": words, "t_utc": now_utc()}
+    tidied = dict.fromkeys(text for tag in tags if (text := " ".join(tag.split())[:60]))
+    values = {"comment": comment[:MAX_NOTE], "tags": list(tidied)[:MAX_TAGS], "t_utc": now_utc()}
     write_file(folder / NOTES_FILE, dumps(values, indent=1).encode() + b"\n")

@@ -21,14 +21,12 @@ from labseq.errors import ConfigError, Problem
 from labseq.files import data_root
 from labseq.messages import install_hint, visible
 from labseq.processes import Process, is_loopback
-from labseq.web.access import Access, find_token, own_names
+from labseq.web.access import Access, find_token, server_names
 
 HOST: Final = "127.0.0.1"
 PORT: Final = 8642
 _PORTS: Final = 20
 """Number of ports that `labseq run --web` tries."""
-_LOOK_S: Final = 2.0
-"""Interval at which a server looks whether its terminal is still there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +54,7 @@ class Serving:
     ends_with: int | None = None
 
 
-def serve(data: Path | None, how: Serving) -> None:
+def serve(data: Path | None, serving: Serving) -> None:
     """Serve the pages of a data folder until Ctrl-C.
 
     Raises:
@@ -71,18 +69,20 @@ def serve(data: Path | None, how: Serving) -> None:
     root = (data or data_root()).expanduser().absolute()
     if data is not None and not root.is_dir():
         raise ConfigError(Problem("there is no such folder", visible(str(root)), expected="a data folder"))
-    for path in (how.certificate, how.key):
+    for path in (serving.certificate, serving.key):
         if path is not None and not path.is_file():
             raise ConfigError(Problem("there is no such file", visible(str(path)), expected="a PEM file"))
-    is_open = is_loopback(how.host) and not how.names
-    token = "" if is_open and not how.control else find_token()
-    listener = _listener(how.host, how.port)
-    app = make_app(root, Access(token, own_names(how.names), how.control), Limits(how.calibration_age_s))
-    for line in _greeting(root, how, listener.getsockname()[1], token):
+    is_open = is_loopback(serving.host) and not serving.names
+    token = "" if is_open and not serving.control else find_token()
+    listener = _listener(serving.host, serving.port)
+    app = make_app(
+        root, Access(token, server_names(serving.names), serving.control), Limits(serving.calibration_age_s)
+    )
+    for line in _greeting(root, serving, listener.getsockname()[1], token):
         say(line)
     config = uvicorn.Config(
         app,  # pyright: ignore[reportArgumentType]
-        log_level="critical",  # what goes wrong is in the answers
+        log_level="critical",  # errors are in the answers
         access_log=False,
         server_header=False,
         ws="none",
@@ -90,12 +90,12 @@ def serve(data: Path | None, how: Serving) -> None:
         limit_concurrency=400,
         timeout_keep_alive=20,
         timeout_graceful_shutdown=1,
-        ssl_certfile=how.certificate,
-        ssl_keyfile=how.key,
+        ssl_certfile=serving.certificate,
+        ssl_keyfile=serving.key,
     )
     server = uvicorn.Server(config)
-    if how.ends_with is not None:
-        threading.Thread(target=_end_with, args=(how.ends_with, server), daemon=True).start()
+    if serving.ends_with is not None:
+        threading.Thread(target=_end_with, args=(serving.ends_with, server), daemon=True).start()
     with suppress(KeyboardInterrupt):
         server.run(sockets=[listener])
 
@@ -124,7 +124,7 @@ def _listener(host: str, port: int) -> socket.socket:
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         listener = socket.socket(family, socket.SOCK_STREAM)
-        if os.name != "nt":  # there it would let another process take the port
+        if os.name != "nt":  # Windows would let another process take the port
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
         listener.listen(128)
@@ -135,23 +135,25 @@ def _listener(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _greeting(root: Path, how: Serving, port: int, token: str) -> list[str]:
-    scheme = "https" if how.certificate else "http"
-    any_address = how.host in ("0.0.0.0", "::")  # noqa: S104 - compared, not bound
-    host = how.names[0] if how.names else socket.gethostname() if any_address else how.host
+def _greeting(root: Path, serving: Serving, port: int, token: str) -> list[str]:
+    scheme = "https" if serving.certificate else "http"
+    any_address = serving.host in ("0.0.0.0", "::")  # noqa: S104 - compared, not bound
+    host = serving.names[0] if serving.names else socket.gethostname() if any_address else serving.host
     host = f"[{host}]" if ":" in host else host
     query = f"?token={token}" if token else ""
     lines = [f"{scheme}://{host}:{port}/{query}", f"shows {root}; Ctrl-C ends it"]
-    if not is_loopback(how.host) and not how.certificate:
-        lines.append("warning: without TLS, everybody in this network can read what it sends, the token too")
+    if not is_loopback(serving.host) and not serving.certificate:
+        lines.append(
+            "warning: without TLS, everybody in this network can read all traffic, including the token"
+        )
     return lines
 
 
 def _end_with(pid: int, server: Any) -> None:
     """End the server when a process has ended."""
-    other = _process(pid)
-    while other is not None and other.is_running:
-        time.sleep(_LOOK_S)
+    process = _process(pid)
+    while process is not None and process.is_running:
+        time.sleep(2.0)
     server.should_exit = True
 
 
@@ -209,7 +211,7 @@ def _spawn(root: Path, port: int) -> int:
         f"--port={port}",
         f"--ends-with={os.getppid()}",
     ]
-    # Ctrl-C must end the run alone
+    # Ctrl-C in the terminal must end only the run
     own_group: dict[str, Any] = (
         {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}  # type: ignore[attr-defined]
         if os.name == "nt"
@@ -219,5 +221,5 @@ def _spawn(root: Path, port: int) -> int:
     process = subprocess.Popen(  # noqa: S603 - this Python
         command, stdin=nothing, stdout=nothing, stderr=nothing, **own_group
     )
-    process.returncode = 0  # it goes on after the run: no warning that it was not waited for
+    process.returncode = 0  # it outlives the run: keep Popen from warning that it was not waited for
     return process.pid

@@ -1,4 +1,4 @@
-"""One shot for the pages: images, cycle by cycle moves, times and readings; frames as 8 bit PNG."""
+"""One shot for the pages: images, cycle by cycle moves, times and readings; frames as 8-bit PNG."""
 
 from __future__ import annotations
 
@@ -25,9 +25,6 @@ from labseq.web.runs import text_of
 
 _RANGE: Final = (0.01, 0.998)
 """Fractions of the pixels below black and white."""
-_MAX_READINGS: Final = 200
-MAX_SIDE: Final = 1024
-"""Maximum height and width of a picture of a frame, in pixels."""
 
 
 def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
@@ -41,7 +38,7 @@ def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
         RecordingError: Its file is missing or damaged.
     """
     images, target = shot.images, shot.target
-    kept = {"all": range(len(images)), "last": range(len(images))[-1:]}.get(record_frames, range(0))
+    recorded = {"all": range(len(images)), "last": range(len(images))[-1:]}.get(record_frames, range(0))
     return {
         "shot": shot.index,
         "attempt": shot.attempt,
@@ -51,20 +48,20 @@ def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
         "filling": finite(shot.filling_fraction),
         "success": shot.row.success,
         "seen_defect_free_cycle": shot.seen_defect_free_cycle,
-        "images": [_image(image, target, has_frame=i in kept) for i, image in enumerate(images)],
+        "images": [_image(image, target, has_frame=i in recorded) for i, image in enumerate(images)],
         "cycles": [_cycle(cycle) for cycle in shot.cycles],
         "stages": [
             {
-                "stage": text_of(one.stage, 80),
-                "step": one.step,
-                "cycle": one.cycle,
-                "t_start_s": finite(one.t_start_s),
-                "duration_s": finite(one.duration_s),
-                "host_s": finite(one.host_s),
-                "budget_s": finite(one.budget_s),
-                "over": bool(one.over_budget),
+                "stage": text_of(stage.stage, 80),
+                "step": stage.step,
+                "cycle": stage.cycle,
+                "t_start_s": finite(stage.t_start_s),
+                "duration_s": finite(stage.duration_s),
+                "host_s": finite(stage.host_s),
+                "budget_s": finite(stage.budget_s),
+                "over": bool(stage.over_budget),
             }
-            for one in shot.timing
+            for stage in shot.timing
         ],
         "sites_px": None if shot.sites_px is None else np.round(shot.sites_px, 1).tolist(),
         "readings": readings_of(shot.row.readings),
@@ -80,7 +77,7 @@ def readings_of(values: Mapping[str, Any]) -> dict[str, Any]:
     plain: dict[str, Any] = to_plain(values)
     return {
         text_of(name, 120): text_of(value, 200) if isinstance(value, str | list | dict) else value
-        for name, value in list(plain.items())[:_MAX_READINGS]
+        for name, value in list(plain.items())[:200]
     }
 
 
@@ -120,12 +117,15 @@ def _cycle(cycle: CycleRecord) -> dict[str, Any]:
 
 
 def frame_png(shot: Shot, image: int, width: int) -> tuple[bytes, int]:
-    """The frame of an image as a grey PNG of 8 bit, and the whole factor by which it is reduced.
+    """The frame of an image as a grey 8-bit PNG, and the integer factor by which it is reduced.
+
+    Args:
+        width: Maximum height and width in pixels, at most 1024.
 
     Raises:
         RecordingError: The file is damaged, or has no such frame.
     """
-    return _cached_png(shot.file, shot.row.sha256, image, min(width, MAX_SIDE))
+    return _cached_png(shot.file, shot.row.sha256, image, min(width, 1024))
 
 
 @lru_cache(maxsize=8)
@@ -159,6 +159,6 @@ def reduced(frame: NDArray[np.uint16], factor: int) -> NDArray[np.uint8]:
 def encode_png(grey: NDArray[np.uint8]) -> bytes:
     """A grey PNG of uint8 (height, width)."""
     file = io.BytesIO()
-    # frames are noise: looking for longer repeats takes twice the time and saves no bytes
+    # frames are mostly noise: a better compression takes twice the time and saves nothing
     Image.fromarray(grey).save(file, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
     return file.getvalue()

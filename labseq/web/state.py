@@ -33,15 +33,8 @@ from labseq.web.shots import rows_of, shot_values
 
 N_BINS: Final = 40
 """Maximum number of points of a trend."""
-_KEPT_SHOTS: Final = 50
-"""Number of latest shots whose stages are summed up."""
-_OPENED: Final = (20, 1)
-"""Maximum number of new shots that are opened at first, and later at once; older ones are not."""
 _OPEN_S: Final = 0.5
-"""Minimum time between two openings: reading a shot's file takes 10 to 20 ms of the processor."""
-_SILENT_FACTOR: Final = 10
-_SILENT_S: Final = 120.0
-_LEAST_FREE: Final = 2e9
+"""Minimum time between opening shots, in seconds: reading a shot's file takes 10 to 20 ms of CPU."""
 _MAX_POINTS: Final = 2000
 """Maximum number of points of a scan, and of visits of points."""
 
@@ -100,7 +93,7 @@ class RunState:
                 "shot": self._last,
                 "scan": self._scan_now(record, status),
                 "alarms": self._alarms(record, status, error, columns),
-                "log": [log_line(one) for one in self.run.events[-12:]],
+                "log": [log_line(event) for event in self.run.events[-12:]],
             }
 
     def _head(self, record: Mapping[str, Any], status: str, error: str) -> dict[str, Any]:
@@ -115,13 +108,14 @@ class RunState:
         return taken_s / n_new * max(0, head["n_shots"] - head["n_done"])
 
     def _open_shots(self, record: Mapping[str, Any], status: str) -> None:
-        """Read the newest shots; during a run not if some have just been read: a later update does it."""
+        """Read the newest shots, but not too often during a run: a later update reads the rest."""
         lines = len(self.run.history)
         is_too_soon = status == "running" and time.monotonic() - self._opened_s < _OPEN_S
         if lines == self._n_opened or is_too_soon:
             return
         self._opened_s, self._shot_error = time.monotonic(), ""
-        for line in range(max(self._n_opened, lines - _OPENED[self._n_opened > 0]), lines):
+        n_newest = 1 if self._n_opened else 20  # enough for the stages; older files are not read
+        for line in range(max(self._n_opened, lines - n_newest), lines):
             try:
                 shot = self.run.shot(line)
                 self._stages[shot.index, shot.attempt] = shot.timing
@@ -131,7 +125,7 @@ class RunState:
                 self._shot_error = text_of(error, 400)
                 self._last = {"error": self._shot_error}
         self._n_opened = lines
-        while len(self._stages) > _KEPT_SHOTS:
+        while len(self._stages) > 50:  # stages are summed over these
             self._stages.popitem(last=False)
         self._rows = self._stage_rows(record)
 
@@ -147,7 +141,7 @@ class RunState:
         return stage_rows(totals, simulated=bool(record["simulated"]))
 
     def _scan_now(self, record: Mapping[str, Any], status: str) -> dict[str, Any] | None:
-        """The scan, worked out at most every half second."""
+        """The scan, computed at most every half second during a run."""
         if not record.get("scan"):
             return None
         if self._scan is None or time.monotonic() - self._scan_s > 0.5 or status != "running":
@@ -158,21 +152,21 @@ class RunState:
     def _alarms(
         self, record: Mapping[str, Any], status: str, error: str, columns: Columns
     ) -> list[dict[str, str]]:
-        found = [
+        alarms = [
             *_run_alarms(self.run, status, error, columns),
             *self._budget_alarms(),
             *calibration_alarms(self.run.folder, record, self._limits.calibration_s),
             *disk_alarms(self.run.folder, self._limits.free_share),
         ]
         if self._shot_error:
-            found.append(alarm("warning", "The last shot cannot be read", self._shot_error))
-        return found
+            alarms.append(alarm("warning", "The last shot cannot be read", self._shot_error))
+        return alarms
 
     def _budget_alarms(self) -> list[dict[str, str]]:
         over: dict[str, int] = {}
         for timing in self._stages.values():
-            for one in timing:
-                over[one.stage] = over.get(one.stage, 0) + one.over_budget
+            for stage in timing:
+                over[stage.stage] = over.get(stage.stage, 0) + stage.over_budget
         n_shots = plural(len(self._stages), "shot")
         return [
             alarm(
@@ -184,7 +178,7 @@ class RunState:
 
 
 def head_of(run: OpenRun, record: Mapping[str, Any], status: str, error: str) -> dict[str, Any]:
-    """What the head of a run's page says."""
+    """Name, state, progress and target of a run, for the head of its page."""
     grid: Any = {}
     with suppress(KeyError, TypeError):
         grid = record["resolved"]["profile"]["grid"]
@@ -233,30 +227,32 @@ def figures_of(columns: Columns) -> dict[str, Any]:
 
 def losses_of(columns: Columns) -> list[dict[str, Any]]:
     """Atoms lost per shot by cause, the greatest first; empty on real hardware."""
-    found = [
+    losses = [
         {"cause": text_of(cause.replace("_", " "), 60), "mean": value.value, "error": finite(value.error)}
         for cause, value in columns.losses.items()
         if value.value > 0
     ]
-    return sorted(found, key=lambda one: -cast("float", one["mean"]))
+    return sorted(losses, key=lambda loss: -cast("float", loss["mean"]))
 
 
 def stage_rows(totals: StageTotals, *, simulated: bool) -> list[dict[str, Any]]:
     """Stages of the latest shots: host times in a simulated run, as measured on real hardware."""
     rows = list[dict[str, Any]]()
-    for one in totals.stages():
-        median_s, p99_s = one.host_s if simulated else one.session_s
-        whole = one.stage.startswith(STEP)
+    for stage in totals.stages():
+        median_s, p99_s = stage.host_s if simulated else stage.session_s
+        whole = stage.stage.startswith(STEP)
         rows.append(
             {
-                "stage": text_of(one.stage.removeprefix(STEP) if whole else one.stage, 80).replace("_", " "),
+                "stage": text_of(stage.stage.removeprefix(STEP) if whole else stage.stage, 80).replace(
+                    "_", " "
+                ),
                 "is_step": whole,
-                "n": one.n,
+                "n": stage.n,
                 "median_s": finite(median_s),
                 "p99_s": finite(p99_s),
-                "modelled_s": finite(one.session_s[0]) if simulated else None,
-                "budget_s": finite(one.budget_s),
-                "n_over": one.n_over,
+                "modelled_s": finite(stage.session_s[0]) if simulated else None,
+                "budget_s": finite(stage.budget_s),
+                "n_over": stage.n_over,
                 "margin_s": OVERSHOOT_S,
             }
         )
@@ -269,10 +265,10 @@ def alarm(level: str, title: str, text: str = "") -> dict[str, str]:
 
 
 def _run_alarms(run: OpenRun, status: str, error: str, columns: Columns) -> list[dict[str, str]]:
-    found = list[dict[str, str]]()
+    alarms = list[dict[str, str]]()
     if status == "failed":
         title = "The run died" if "process" in error else "The run failed"
-        found.append(alarm("error", title, text_of(error)))
+        alarms.append(alarm("error", title, text_of(error)))
     n_failed = len(columns.shot) - len(columns.counted)
     if n_failed:
         last = int((~columns.counts).nonzero()[0][-1])
@@ -280,15 +276,17 @@ def _run_alarms(run: OpenRun, status: str, error: str, columns: Columns) -> list
         with suppress(RecordingError):
             row = run.history.row(last)
             text = f"the last: shot {row.shot}, {row.status}: {text_of(row.error, 300)}"
-        found.append(alarm("warning", f"{plural(n_failed, 'attempt')} at a shot failed", text))
+        alarms.append(alarm("warning", f"{plural(n_failed, 'attempt')} at a shot failed", text))
     if run.history.n_damaged:
         text = "they are left out here; `labseq doctor` repairs what can be repaired"
-        found.append(
+        alarms.append(
             alarm("warning", f"{plural(run.history.n_damaged, 'line')} of the index cannot be read", text)
         )
     if status == "running" and (silent_s := _silent_s(run, columns)):
-        found.append(alarm("warning", f"No shot for {age_text(silent_s)}", "the process of the run is there"))
-    return found
+        alarms.append(
+            alarm("warning", f"No shot for {age_text(silent_s)}", "the process of the run is still there")
+        )
+    return alarms
 
 
 def _silent_s(run: OpenRun, columns: Columns) -> float:
@@ -299,20 +297,20 @@ def _silent_s(run: OpenRun, columns: Columns) -> float:
         return 0.0
     t_s = columns.of_shots("t_s")[-20:]
     usual_s = float(abs(t_s[1:] - t_s[:-1]).mean()) if len(t_s) > 1 else 0.0
-    return silent_s if silent_s > max(_SILENT_S, _SILENT_FACTOR * usual_s) else 0.0
+    return silent_s if silent_s > max(120.0, 10 * usual_s) else 0.0
 
 
 def calibration_alarms(folder: Path, record: Mapping[str, Any], limit_s: float) -> list[dict[str, str]]:
     """An alarm for each calibration of a run that is older than allowed."""
-    found = list[dict[str, str]]()
+    alarms = list[dict[str, str]]()
     for kind in list(record.get("calibrations") or {})[:20]:
         with suppress(LabseqError, ValueError, OverflowError, OSError):
             taken = datetime.fromisoformat(read_entry(folder / f"calibration_{kind}.json").taken_utc)
             age_s = (now() - taken).total_seconds()
             if age_s > limit_s:
                 title = f"The calibration '{text_of(kind, 40)}' is {age_text(age_s, ' old')}"
-                found.append(alarm("warning", title, f"limit: {age_text(limit_s)}"))
-    return found
+                alarms.append(alarm("warning", title, f"limit: {age_text(limit_s)}"))
+    return alarms
 
 
 def disk_alarms(folder: Path, free_share: float) -> list[dict[str, str]]:
@@ -321,7 +319,7 @@ def disk_alarms(folder: Path, free_share: float) -> list[dict[str, str]]:
         disk = shutil.disk_usage(folder)
     except OSError:
         return []
-    if disk.free >= max(_LEAST_FREE, free_share * disk.total):
+    if disk.free >= max(2e9, free_share * disk.total):
         return []
     free = f"{size_text(disk.free)} of {size_text(disk.total)} free ({percent(disk.free / disk.total)})"
     return [alarm("warning" if disk.free else "error", "The disk is nearly full", free)]
@@ -348,26 +346,29 @@ def scan_values(run: OpenRun) -> dict[str, Any]:
     """The scan of a run, JSON-ready; "error" if it cannot be shown."""
     scan = run.record["scan"]
     try:
-        found = scanned(open_run(run.folder) if SCANNER in scan else run.outline())
+        shown = scanned(open_run(run.folder) if SCANNER in scan else run.outline())
     except (LabseqError, KeyError, IndexError, TypeError, ValueError) as error:
         return {"error": text_of(f"the scan cannot be shown: {error}", 400)}
-    if found is None:
-        addresses = [text_of(one, 200) for one in scan.get("addresses") or ()]
-        return {"axes": [{"address": one, "words": [], "numbers": None} for one in addresses], "points": []}
+    if shown is None:
+        addresses = [text_of(address, 200) for address in scan.get("addresses") or ()]
+        return {
+            "axes": [{"address": address, "words": [], "numbers": None} for address in addresses],
+            "points": [],
+        }
     values = {
-        "axes": [_axis(found, i) for i in range(len(found.axes))],
-        "is_map": found.is_map,
+        "axes": [_axis(shown, i) for i in range(len(shown.axes))],
+        "is_map": shown.is_map,
         "n_planned": None if SCANNER in scan else len(scan.get("points") or ()),
         "points": [
             _point(point, place)
-            for point, place in list(zip(found.points, found.places, strict=True))[:_MAX_POINTS]
+            for point, place in list(zip(shown.points, shown.places, strict=True))[:_MAX_POINTS]
         ],
     }
     return values | _adaptive(run) if SCANNER in scan else values
 
 
-def _axis(found: Scanned, index: int) -> dict[str, Any]:
-    axis = found.axes[index]
+def _axis(scan: Scanned, index: int) -> dict[str, Any]:
+    axis = scan.axes[index]
     numbers = axis.numbers
     return {
         "address": text_of(axis.address, 200),
@@ -394,7 +395,7 @@ def _adaptive(run: OpenRun) -> dict[str, Any]:
     """What the scanner optimises, its value at each visit of a point, and the best so far."""
     scan = run.record["scan"]
     visits = [
-        {"point": event.get("point"), "value": event.get("value"), "written": _words(event.get("written"))}
+        {"point": event.get("point"), "value": event.get("value"), "written": _texts(event.get("written"))}
         for event in run.scan_events[-_MAX_POINTS:]
     ]
     last: Any = run.scan_events[-1].get("best") if run.scan_events else None
@@ -403,7 +404,7 @@ def _adaptive(run: OpenRun) -> dict[str, Any]:
         best = {
             "point": last.get("point"),
             "value": last.get("value"),
-            "written": _words(last.get("written")),
+            "written": _texts(last.get("written")),
         }
     return {
         "figure": text_of(scan.get("figure") or "", 120),
@@ -413,5 +414,5 @@ def _adaptive(run: OpenRun) -> dict[str, Any]:
     }
 
 
-def _words(written: Any) -> dict[str, str]:
+def _texts(written: Any) -> dict[str, str]:
     return {text_of(k, 200): text_of(v, 60) for k, v in written.items()} if isinstance(written, dict) else {}

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, cast
 
 from labseq.assembly.calibrations import DRY_RUN_FOLDER, FOLDER
 from labseq.calibration_store import DECIDING, Damaged, Store, Stored, figure_of
@@ -16,12 +16,6 @@ from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
 from labseq.queue.queue import Entry, Queue
 from labseq.web.history import finite
 from labseq.web.runs import Catalogue, run_id, text_of
-
-_MAX_ENTRIES: Final = 500
-_MAX_CALIBRATIONS: Final = 1000
-_MAX_PICTURE: Final = 8 << 20
-_RUNS: Final = 30
-"""Number of latest runs whose profiles are looked up."""
 
 
 def queue_values(root: Path) -> dict[str, Any]:
@@ -37,7 +31,7 @@ def queue_values(root: Path) -> dict[str, Any]:
         "entries": [],
     }
     try:
-        values["entries"] = [_entry(entry) for entry in queue.entries()[:_MAX_ENTRIES]]
+        values["entries"] = [_entry(entry) for entry in queue.entries()[:500]]
     except RecordingError as error:
         values["error"] = text_of(error)
     return values
@@ -59,7 +53,7 @@ def _entry(entry: Entry) -> dict[str, Any]:
 
 def calibrations(catalogue: Catalogue) -> dict[str, Any]:
     """The calibrations of the profiles in ./hardware_profiles and of the latest runs."""
-    return {"stores": [_store_values(key, *one) for key, one in _stores(catalogue).items()]}
+    return {"stores": [_store_values(key, *store) for key, store in _stores(catalogue).items()]}
 
 
 def calibration_picture(catalogue: Catalogue, store: str, file: str) -> bytes | None:
@@ -68,28 +62,28 @@ def calibration_picture(catalogue: Catalogue, store: str, file: str) -> bytes | 
     Raises:
         RecordingError: It cannot be read.
     """
-    known = _stores(catalogue).get(store)
-    if known is None or Path(file).name != file:
+    entry = _stores(catalogue).get(store)
+    if entry is None or Path(file).name != file:
         return None
-    path = known[1] / f"{file}.png"
-    return read_file(path, _MAX_PICTURE) if path.is_file() else None
+    path = entry[1] / f"{file}.png"
+    return read_file(path, 8 << 20) if path.is_file() else None
 
 
 def _stores(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:
-    """Key -> profile and folder, of the folders of calibrations that exist."""
+    """The folders of calibrations that exist: key -> name of the profile, and folder."""
     folders: dict[Path, str] = {}
     for place in (Path(PROFILES).absolute() / FOLDER, packaged_profiles_dir() / FOLDER):
         with suppress(OSError):
             folders |= {folder: folder.name for folder in sorted(place.iterdir()) if folder.is_dir()}
     with suppress(RecordingError, OSError):
-        for folder in catalogue.folders()[-_RUNS:]:
+        for folder in catalogue.folders()[-30:]:
             with suppress(LabseqError, OSError, KeyError, TypeError, ValueError):
-                found = _folder_of(catalogue.open(folder.parent.name, folder.name).record)
-                folders.setdefault(found, found.name)
+                store = _folder_of(catalogue.open(folder.parent.name, folder.name).record)
+                folders.setdefault(store, store.name)
     with_dry_runs = {
         folder: name
-        for one, profile in folders.items()
-        for folder, name in ((one, profile), (one / DRY_RUN_FOLDER, f"{profile}, dry runs"))
+        for store, profile in folders.items()
+        for folder, name in ((store, profile), (store / DRY_RUN_FOLDER, f"{profile}, dry runs"))
     }
     return {_key(folder): (name, folder) for folder, name in with_dry_runs.items() if folder.is_dir()}
 
@@ -97,27 +91,28 @@ def _stores(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:
 def _folder_of(record: Mapping[str, Any]) -> Path:
     """The folder of calibrations of a run's profile."""
     profile = Path(str(record["profile_path"]))
-    chosen: Any = record["resolved"]["profile"]["calibrations"]["folder"]
-    return Path(chosen) if isinstance(chosen, str) else profile_dir(profile) / FOLDER / profile.stem
+    folder: Any = record["resolved"]["profile"]["calibrations"]["folder"]
+    return Path(folder) if isinstance(folder, str) else profile_dir(profile) / FOLDER / profile.stem
 
 
 def _key(folder: Path) -> str:
+    """What stands for a folder in an address, which should not contain a path."""
     return hashlib.sha256(str(folder).encode("utf-8", "replace")).hexdigest()[:12]
 
 
 def _store_values(key: str, profile: str, folder: Path) -> dict[str, Any]:
     store, error = Store(folder), ""
     used: dict[str, str] = {}
-    found: list[Stored | Damaged] = []
+    entries: list[Stored | Damaged] = []
     try:
-        found = store.entries()[-_MAX_CALIBRATIONS:]
-        used = {kind: one.file for kind, one in store.active().items()}
+        entries = store.entries()[-1000:]
+        used = {kind: active.file for kind, active in store.active().items()}
     except (ConfigError, OSError) as failure:
         error = text_of(failure)
     kinds: dict[str, list[dict[str, Any]]] = {}
-    for one in found:
-        kind = one.kind if isinstance(one, Damaged) else one.entry.kind
-        kinds.setdefault(kind, []).append(_calibration(one, used.get(kind) == one.path.name))
+    for stored in entries:
+        kind = stored.kind if isinstance(stored, Damaged) else stored.entry.kind
+        kinds.setdefault(kind, []).append(_calibration(stored, used.get(kind) == stored.path.name))
     return {
         "key": key,
         "profile": text_of(profile, 200),
@@ -134,11 +129,11 @@ def _store_values(key: str, profile: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def _calibration(one: Stored | Damaged, in_use: bool) -> dict[str, Any]:
-    head = {"file": one.path.stem, "in_use": in_use}
-    if isinstance(one, Damaged):
-        return {"id": text_of(one.id, 40), **head, "error": text_of(one.error), "taken_utc": None}
-    entry = one.entry
+def _calibration(stored: Stored | Damaged, in_use: bool) -> dict[str, Any]:
+    head = {"file": stored.path.stem, "in_use": in_use}
+    if isinstance(stored, Damaged):
+        return {"id": text_of(stored.id, 40), **head, "error": text_of(stored.error), "taken_utc": None}
+    entry = stored.entry
     figure = figure_of(entry) if entry.kind in DECIDING else math.nan
     return {
         "id": entry.id,
@@ -148,5 +143,5 @@ def _calibration(one: Stored | Damaged, in_use: bool) -> dict[str, Any]:
         "figure": finite(figure),
         "quality": {text_of(name, 60): finite(value) for name, value in entry.quality.items()},
         "run": text_of(entry.origin.get("run") or entry.origin.get("command") or "", 200),
-        "has_picture": one.picture is not None,
+        "has_picture": stored.picture is not None,
     }

@@ -383,7 +383,7 @@ def check_that_a_comment_is_kept_and_found(full: Server, page: Any, run: Path) -
     page.goto(f"http://127.0.0.1:{full.port}/runs/{run.parent.name}/{run.name}")
     page.get_by_label("Comment", exact=True).last.fill("a new lens")
     page.get_by_role("button", name="Keep").click()
-    expect(page.get_by_text("kept")).to_be_visible()
+    expect(page.get_by_text("saved")).to_be_visible()
     page.goto(f"http://127.0.0.1:{full.port}/runs")
     page.get_by_role("searchbox").fill("new LENS")
     expect(page.locator("main .note").first).to_have_text(re.compile("1 of 2 runs"))

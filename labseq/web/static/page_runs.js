@@ -104,7 +104,7 @@ function notesPanel(run) {
   const comment = el("textarea", { rows: 3, value: run.comment, "aria-label": "Comment" }), tags = el("input", { value: run.tags.join(", "), "aria-label": "Tags, separated by commas", placeholder: "tags, separated by commas" });
   const note = el("span.note", { role: "status" });
   const keep = async () => {
-    try { await post(`/runs/${runPath(run.id)}/notes`, { comment: comment.value, tags: tags.value.split(",") }); note.textContent = "kept"; } catch (error) { note.textContent = error.message; }
+    try { await post(`/runs/${runPath(run.id)}/notes`, { comment: comment.value, tags: tags.value.split(",") }); note.textContent = "saved"; } catch (error) { note.textContent = error.message; }
   };
   return panel("Comment", { class: "half" }, el("div.form", {}, comment, tags, el("div", {}, el("button", { type: "button", onclick: keep }, "Keep"), " ", note)));
 }
