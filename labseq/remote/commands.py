@@ -12,21 +12,19 @@ Examples:
   labseq serve-devices camera_pc --bind tcp://0.0.0.0:5760
   labseq serve-devices practice --plain --bind tcp://127.0.0.1:5760
 """
-KEYS_EXAMPLES = """\b
-Examples:
-  labseq keys new
-  labseq keys new camera-pc
-"""
 
 keys = typer.Typer(
     name="keys",
-    help="Keys with which computers that share devices know one another.",
+    help="Keys by which computers that share devices recognise each other.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 
-@keys.command(epilog=KEYS_EXAMPLES, short_help="Make the key of this computer.")
+@keys.command(
+    epilog="\b\nExamples:\n  labseq keys new\n  labseq keys new camera-pc\n",
+    short_help="Make the key of this computer.",
+)
 def new(
     name: Annotated[
         str | None,
@@ -67,14 +65,16 @@ def serve_devices(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Serve this device only; may be given several times. Default: the real ones, else all.",
+            help="Serve only this device; may be repeated. Default: all real ones, or all if none is real.",
             show_default=False,
         ),
     ] = None,
     key: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="Which key of this computer, if it has several.", show_default=False
+            metavar="NAME",
+            help="Which of this computer's keys to use, if it has several.",
+            show_default=False,
         ),
     ] = "",
     plain: Annotated[
@@ -85,8 +85,8 @@ def serve_devices(
 ) -> None:
     """Serve the devices of a profile to a labseq on another computer, which uses them as its own.
 
-    Each device is tested and made safe first. A client that is gone is noticed within a second, and its
-    devices are made safe. Ctrl-C makes all devices safe and ends it.
+    Each device is tested and made safe first. If a client disappears, its devices are made safe within a
+    second. Ctrl-C makes all devices safe and ends the server.
     """
     from labseq.console.output import say
     from labseq.remote.server import Serving, serve_devices

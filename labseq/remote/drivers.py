@@ -1,6 +1,6 @@
 """The driver that a server constructs for a client, and what the client may call.
 
-Each client has an object of the driver of its own. Several may be constructed at a time; one of them is open.
+Each client has its own driver object. Several may exist at a time, but only one of them is open.
 """
 
 from __future__ import annotations
@@ -33,25 +33,21 @@ METHODS: Final[Mapping[str, frozenset[str]]] = {
     "device": _COMMON | {"command", "read", "check_command"},
     "lines": _COMMON | {"check_program", "idle", "compile", "arm", "fire", "wait"},
 }
-"""Kind of device -> what clients may call, beside ``open`` and ``close``."""
-LOOKS: Final = frozenset({"describe", "versions"})
-"""What a client that has not opened the device gets from the driver of the one that has."""
-_WITHOUT_OPENING: Final = LOOKS | {"safe_state", "warm", "check_program", "check_command"}
+"""Kind of device -> methods that clients may call, besides ``open`` and ``close``."""
+DESCRIBING: Final = frozenset({"describe", "versions"})
+"""Methods that are called on the driver of the client that has opened the device, whichever client asks."""
+_WITHOUT_OPENING: Final = DESCRIBING | {"safe_state", "warm", "check_program", "check_command"}
 
-_OF_HARDWARE: Final = ("settling_timeout_s", "idle_output")
-_LIVE: Final = ("start_delay_s", "beginning_s")
+_HARDWARE_PROPERTIES: Final = ("settling_timeout_s", "idle_output")
+_PLAYING_PROPERTIES: Final = ("start_delay_s", "beginning_s")
 _PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
-    "camera": (*_OF_HARDWARE, "facts"),
-    "static_tweezers": (*_OF_HARDWARE, "facts"),
-    "mobile_tweezers": (*_OF_HARDWARE, "waits_for_trigger", *_LIVE),
-    "device": _OF_HARDWARE,
-    "lines": (*_OF_HARDWARE, "lines_facts"),
+    "camera": (*_HARDWARE_PROPERTIES, "facts"),
+    "static_tweezers": (*_HARDWARE_PROPERTIES, "facts"),
+    "mobile_tweezers": (*_HARDWARE_PROPERTIES, "waits_for_trigger", *_PLAYING_PROPERTIES),
+    "device": _HARDWARE_PROPERTIES,
+    "lines": (*_HARDWARE_PROPERTIES, "lines_facts"),
 }
 """Kind of device -> properties that the client gets after ``attach`` and ``open``."""
-_CHANGES_LIVE: Final = frozenset({"prepare", "prepare_beginning", "append", "play"})
-
-RESCUE_S: Final = 5.0
-"""Longest time for a safe state beside a call that hangs; then the watchdog switches the device off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,31 +56,31 @@ class DeviceEntry:
 
     Attributes:
         name: Its role, or its name in the profile.
-        chosen: Its plugin.
+        plugin: Its plugin.
         simulation: The plugin of the simulation that it acts on, if it is simulated.
         identities: What identifies the hardware, for its marker; none if it is simulated.
     """
 
     name: str
-    chosen: ChosenPlugin
+    plugin: ChosenPlugin
     simulation: ChosenPlugin | None = None
     identities: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
         """Kind of the device, "camera"."""
-        return self.chosen.entry.kind
+        return self.plugin.entry.kind
 
     @property
     def key(self) -> str:
-        """Stands for the profile in the device's marker."""
+        """Name of this server in the device's marker, where a run has its profile."""
         return f"labseq serve-devices {self.name}"
 
 
 class ClientDriver:
     """A client's own object of the driver of a served device, with its watchdog.
 
-    All methods are called in the thread of the device, except for :meth:`make_safe_beside`.
+    All methods are called in the thread of the device, except for :meth:`make_safe_during_call`.
 
     Attributes:
         device: The driver.
@@ -94,7 +90,7 @@ class ClientDriver:
 
     Args:
         entry: The device.
-        about: The client's context: name, grid, motion, lines and calibrations.
+        client_context: The client's context: name, grid, motion, lines and calibrations.
         abort: Ends waits of the driver.
         report: Receives what happens, for the operator.
 
@@ -103,7 +99,11 @@ class ClientDriver:
     """
 
     def __init__(
-        self, entry: DeviceEntry, about: Mapping[str, Any], abort: StopFlag, report: Callable[[str], object]
+        self,
+        entry: DeviceEntry,
+        client_context: Mapping[str, Any],
+        abort: StopFlag,
+        report: Callable[[str], object],
     ) -> None:
         self.clock = RealClock(abort)
         self.is_open = self.is_safe = False
@@ -111,24 +111,24 @@ class ClientDriver:
         self._abort = abort
         self._report = report
         self._watchdog: Watchdog | None = None
-        name, lines = about["name"], tuple(about["lines"])
-        if entry.chosen.virtual_time and name in [line.triggers for line in lines]:
-            what = f"'{entry.name}' is simulated at its server, where no line can trigger it"
-            raise ConfigError(Problem(what, hint="'--dry-run' simulates all devices in one place"))
+        name, lines = client_context["name"], tuple(client_context["lines"])
+        if entry.plugin.virtual_time and name in [line.triggers for line in lines]:
+            problem = f"'{entry.name}' is simulated at its server, where no line can trigger it"
+            raise ConfigError(Problem(problem, hint="'--dry-run' simulates all devices in one place"))
         context = Context(
             name,
-            about["grid"],
-            about["motion"],
+            client_context["grid"],
+            client_context["motion"],
             self.clock,
-            calibrations=about["calibrations"],
+            calibrations=client_context["calibrations"],
             lines=lines,
         )
-        chosen = {name: entry.chosen}
+        plugins = {name: entry.plugin}
         if entry.simulation is not None:
-            chosen["simulation"] = entry.simulation
-        made, _ = construct(chosen, context, seed=0)
-        self.device = made[name]
-        self._simulation = made.get("simulation")
+            plugins["simulation"] = entry.simulation
+        devices, _ = construct(plugins, context, seed=0)
+        self.device = devices[name]
+        self._simulation = devices.get("simulation")
 
     def abilities(self) -> list[str]:
         """The methods that the driver has itself; the client need not ask for the others."""
@@ -164,7 +164,7 @@ class ClientDriver:
         if name not in METHODS[self._entry.kind]:
             raise DeviceError(self._entry.name, f"a client cannot call {name[:40]!r}")
         if not self.is_open and name not in _WITHOUT_OPENING:
-            raise DeviceError(self._entry.name, "this connection has not opened it")
+            raise DeviceError(self._entry.name, "this connection has not opened the device")
         if name == "warm":
             self.device.warm()
             return load_kernels()
@@ -173,7 +173,7 @@ class ClientDriver:
         self.is_safe = self.is_safe and name in _WITHOUT_OPENING
         value = getattr(self.device, name)(*args, **named)
         if name == "leave_on" and value:
-            self.is_safe = True  # it must not be switched off
+            self.is_safe = True  # it is meant to stay on, so the watchdog must not switch it off
             self._give_up()
         return dict(value) if isinstance(value, Mapping) else value
 
@@ -182,8 +182,8 @@ class ClientDriver:
         is_mobile = self._entry.kind == "mobile_tweezers"
         if name in ("attach", "open"):
             names = _PROPERTIES[self._entry.kind]
-        elif is_mobile and name in _CHANGES_LIVE:
-            names = _LIVE
+        elif is_mobile and name in ("prepare", "prepare_beginning", "append", "play"):
+            names = _PLAYING_PROPERTIES
         else:
             return {}
         state = {name: getattr(self.device, name) for name in names}
@@ -191,11 +191,14 @@ class ClientDriver:
             state["timings"] = dict(self.device.timings())
         return state
 
-    def make_safe_beside(self) -> str:
-        """Make the device safe while a call hangs in its thread; returns why that failed, or ""."""
+    def make_safe_during_call(self, timeout_s: float = 5.0) -> str:
+        """Make the device safe while a call hangs in its thread; returns why that failed, or "".
+
+        If it fails or takes longer than ``timeout_s``, the watchdog switches the device off.
+        """
         guard = Guard(self._abort)
         with self._abort.held():
-            failure = attempt(guard, self._entry.name, RESCUE_S, self.device.safe_state)
+            failure = attempt(guard, self._entry.name, timeout_s, self.device.safe_state)
         guard.end()
         if failure is not None and self._watchdog is not None:
             self._watchdog.end()  # it switches off what it was not asked to forget
@@ -205,21 +208,21 @@ class ClientDriver:
         """Make the device safe, unless it is, and close it; returns what failed."""
         failures: list[str] = []
 
-        def attempt_each(method: Callable[[], object], what: str) -> None:
+        def try_call(method: Callable[[], object], name: str) -> None:
             try:
                 method()
             except BaseException as error:  # noqa: BLE001 - of the driver's class
-                failures.append(f"{what} failed: {format_error(error)}")
+                failures.append(f"{name} failed: {format_error(error)}")
 
         with self._abort.held():
             if self.is_open and not self.is_safe:
-                attempt_each(self._make_safe, "safe_state()")
-            attempt_each(self.device.close, "close()")
+                try_call(self._make_safe, "safe_state()")
+            try_call(self.device.close, "close()")
             if self._simulation is not None:
-                attempt_each(self._simulation.close, "close() of its simulation")
+                try_call(self._simulation.close, "close() of its simulation")
         if self.is_open and not self.is_safe:
-            acts = "its watchdog switches it off" if self._watchdog else "nothing else can switch it off"
-            failures.append(f"it is NOT SAFE: {acts}")
+            watchdog = "its watchdog switches it off" if self._watchdog else "nothing else can switch it off"
+            failures.append(f"the device is NOT SAFE: {watchdog}")
         self._give_up()
         return failures
 
@@ -232,7 +235,7 @@ class ClientDriver:
         self.is_safe = True
 
     def _give_up(self) -> None:
-        """Let others use the device. A watchdog that is not told to forget it switches it off."""
+        """Let other clients use the device; the watchdog switches it off unless it is safe."""
         self.is_open = False
         if self._watchdog is not None:
             if self.is_safe:
@@ -244,7 +247,7 @@ class ClientDriver:
                 clear_active(self._entry.key, self._entry.identities)
 
     def _mark(self) -> None:
-        """Leave a marker until the device is safe, as a run does: `labseq safe` and `devices` see it."""
+        """Leave a marker until the device is safe, as a run does, for `labseq safe` and `labseq devices`."""
         if not self._entry.identities:
             return
         try:

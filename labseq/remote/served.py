@@ -1,7 +1,7 @@
 """A device that is served: its socket, and the one thread in which all calls into its drivers are made.
 
-One client at a time, the owner, may open the device; the others may ask for what is known without opening,
-and for what the owner's driver describes. The calls of a client are made in the order of their numbers.
+One client at a time, the owner, may open the device; the others may ask for what needs no open device,
+and for the description by the owner's driver. The calls of a client are made in the order of their numbers.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any, Final
 
 from labseq.errors import DeviceError, StopRequested
 from labseq.messages import format_error
-from labseq.remote.drivers import LOOKS, ClientDriver, DeviceEntry
+from labseq.remote.drivers import DESCRIBING, ClientDriver, DeviceEntry
 from labseq.remote.sessions import Session
 from labseq.wire import MAX_CONNECTIONS, Connections, MessageError, pack, report_error, unpack
 
-LOOK_S: Final = 0.03
-"""How often threads that wait look for what else there is to do."""
+POLL_S: Final = 0.03
+"""Longest time that a thread waits for messages before it does its other work, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,9 @@ def read_call(parts: list[Any]) -> Call:
         MessageError: The message is damaged, or is not a call.
     """
     message = unpack(parts)
-    if not isinstance(message, dict) or any(type(message.get(key)) is not one for key, one in _TYPES.items()):
+    if not isinstance(message, dict) or any(
+        type(message.get(key)) is not kind for key, kind in _TYPES.items()
+    ):
         raise MessageError("it is not a call")
     return Call(**{key: message[key] for key in _TYPES})
 
@@ -65,8 +67,8 @@ class ServedDevice:
         name: Its role, or its name in the profile.
         kind: Kind of the device, "camera".
         sessions: Token -> session.
-        ended: Token -> why that session ended, of the last ones.
-        is_busy: Whether its thread does something else than wait for messages.
+        ended: Token -> why that session ended, for the last 64.
+        is_busy: Whether its thread is doing anything but waiting for messages.
         failure: What ended its thread, or None.
 
     Args:
@@ -115,10 +117,10 @@ class ServedDevice:
     def owner(self) -> Session | None:
         """The session that has opened the device, or None."""
         sessions = list(self.sessions.values())
-        return next((one for one in sessions if one.driver is not None and one.driver.is_open), None)
+        return next((s for s in sessions if s.driver is not None and s.driver.is_open), None)
 
     def end_session(self, session: Session, why: str) -> None:
-        """Have a session ended by the device's thread, at once or after the call in progress."""
+        """Ask the device's thread to end a session; the call in progress is aborted."""
         if not session.ended:
             session.ended = why
             session.abort_call()
@@ -126,22 +128,22 @@ class ServedDevice:
     def rescue_stuck(self) -> None:
         """Make the device safe in another thread if a call does not end after it was aborted."""
         for session in list(self.sessions.values()):
-            session.rescue_if_stuck(self._report_own)
+            session.rescue_if_stuck(self._report_with_name)
 
-    def _report_own(self, text: str) -> None:
+    def _report_with_name(self, text: str) -> None:
         self._report(f"{self.name}: {text}")
 
     def _serve(self) -> None:
         import zmq
 
-        self._socket.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
-        connections, looked_s = Connections(self._socket), time.monotonic()
+        self._socket.set(zmq.RCVTIMEO, int(1e3 * POLL_S))
+        connections, checked_s = Connections(self._socket), time.monotonic()
         try:
             while not (self._ended.is_set() and not self.sessions):
-                if time.monotonic() - looked_s > LOOK_S:
-                    connections.ended()  # nothing asks which
+                if time.monotonic() - checked_s > POLL_S:
+                    connections.ended()  # discards them: sessions end at the control port
                     connections.limit(0 if self._ended.is_set() else MAX_CONNECTIONS)
-                    looked_s = time.monotonic()
+                    checked_s = time.monotonic()
                 self._step()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
             self.failure = error
@@ -153,7 +155,7 @@ class ServedDevice:
             self._socket.close()
 
     def _step(self) -> None:
-        """Answer the next message, if one comes within LOOK_S, and close sessions that have ended."""
+        """Answer the next message, if one comes within POLL_S, and close sessions that have ended."""
         import zmq
 
         self.is_busy = False
@@ -164,7 +166,7 @@ class ServedDevice:
         self.is_busy = True
         if frames:
             self._handle(frames)
-        for session in [one for one in list(self.sessions.values()) if one.ended]:
+        for session in [session for session in list(self.sessions.values()) if session.ended]:
             self._close(session)
 
     def _handle(self, frames: list[Any]) -> None:
@@ -175,7 +177,7 @@ class ServedDevice:
                 with suppress(zmq.ZMQError):  # the client is gone
                     self._socket.send_multipart([frames[0], *parts], copy=False)
         except Exception as error:  # noqa: BLE001 - no message may end this thread
-            self._report_own(f"a message could not be answered: {format_error(error)}")
+            self._report_with_name(f"a message could not be answered: {format_error(error)}")
 
     def _answer(self, frames: list[Any]) -> list[Any]:
         """The reply to a message; empty for one that is not answered."""
@@ -187,9 +189,9 @@ class ServedDevice:
         if session is None:
             return self._refusal(call.n, why_ended(self.ended, call.session))
         peer = frames[-1].get("User-Id") if session.peer else ""
-        if refused := self._why_refused(session, peer, call.n):
-            return self._refusal(call.n, refused)
-        if call.n <= session.number:  # sent twice, or an old one again
+        if reason := self._why_refused(session, peer, call.n):
+            return self._refusal(call.n, reason)
+        if call.n <= session.number:  # a repetition: the method must not be called twice
             return session.reply if call.n == session.number else []
         session.begin_call(call.n, call.call)
         session.reply = self._reply(session, call)
@@ -215,7 +217,7 @@ class ServedDevice:
             answer["value"] = self._carry_out(session, call)
             if session.driver is not None:
                 answer["state"] = session.driver.state_after(call.call)
-                answer["now"] = session.driver.clock.now()  # the client's clock has another zero
+                answer["now"] = session.driver.clock.now()  # the client's clock has a different zero
         except BaseException as error:  # noqa: BLE001 - of the driver's class; it goes to the client
             if session.ended and isinstance(error, StopRequested):
                 error = DeviceError(self.name, f"the server has ended the connection: {session.ended}")
@@ -223,7 +225,7 @@ class ServedDevice:
         try:
             return pack(answer)
         except MessageError as error:
-            return self._refusal(call.n, f"what {call.call}() gave cannot be sent: {error}")
+            return self._refusal(call.n, f"the result of {call.call}() cannot be sent: {error}")
 
     def _carry_out(self, session: Session, call: Call) -> Any:
         if call.call == "attach":
@@ -235,29 +237,29 @@ class ServedDevice:
         if call.call == "close":
             return self._close_driver(session.driver)
         driver, owner = session.driver, self.owner
-        if call.call in LOOKS and owner is not None and owner.driver is not None:
+        if call.call in DESCRIBING and owner is not None and owner.driver is not None:
             driver = owner.driver
         return driver.call(call.call, call.args, call.named)
 
-    def _attach(self, session: Session, about: dict[str, Any]) -> dict[str, Any]:
+    def _attach(self, session: Session, client_context: dict[str, Any]) -> dict[str, Any]:
         """Construct the client's driver."""
         if session.driver is not None:
-            raise DeviceError(self.name, "the connection has a driver already")
-        session.driver = ClientDriver(self._entry, about, session.abort, self._report)
-        chosen = self._entry.chosen
+            raise DeviceError(self.name, "the connection already has a driver")
+        session.driver = ClientDriver(self._entry, client_context, session.abort, self._report)
+        plugin = self._entry.plugin
         return {
             "abilities": session.driver.abilities(),
-            "plugin": chosen.entry.name,
-            "settings": chosen.dump(),
+            "plugin": plugin.entry.name,
+            "settings": plugin.dump(),
         }
 
     def _open(self, session: Session, driver: ClientDriver) -> None:
         owner = self.owner
         if owner not in (None, session):
             assert owner is not None
-            raise DeviceError(self.name, f"in use by {owner.who}; one at a time can use it")
+            raise DeviceError(self.name, f"in use by {owner.who}; only one client at a time can use it")
         if owner is None:
-            self._report_own(f"in use by {session.who}")
+            self._report_with_name(f"in use by {session.who}")
         driver.open(partial(self.end_session, session))
 
     def _close_driver(self, driver: ClientDriver) -> None:
@@ -270,15 +272,15 @@ class ServedDevice:
         self.ended = {**dict(latest), session.token: session.ended}
         try:
             if session.driver is not None and session.driver.is_open:
-                begun_s = time.monotonic()
+                start_s = time.monotonic()
                 failures = session.driver.close()
-                outcome = "; ".join(failures) or f"made safe in {1e3 * (time.monotonic() - begun_s):.0f} ms"
+                outcome = "; ".join(failures) or f"made safe in {1e3 * (time.monotonic() - start_s):.0f} ms"
                 who, why = session.who, session.ended
-                self._report_own(f"the connection of {who} ended ({why}); {outcome}")
+                self._report_with_name(f"the connection of {who} ended ({why}); {outcome}")
         finally:
             del self.sessions[session.token]
 
 
 def why_ended(ended: dict[bytes, str], token: Any) -> str:
-    """Why there is no session of a token."""
+    """Why there is no longer a session with this token."""
     return ended.get(token, "the connection has ended, or the server was started again")

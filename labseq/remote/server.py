@@ -1,7 +1,7 @@
 """`labseq serve-devices`: serves the devices of a profile, each on a port of its own.
 
-The first port is for control: connections begin there, heartbeats go there, and calls that block are asked
-after and aborted there, by a thread that carries out no calls.
+The first port is for control: connections and heartbeats, and requests to abort a call that blocks. Its
+thread makes no calls into drivers, so it always answers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from labseq.messages import clean, format_error
 from labseq.plain import now
 from labseq.recording import clear_active
 from labseq.remote.drivers import DeviceEntry
-from labseq.remote.served import LOOK_S, ServedDevice, why_ended
+from labseq.remote.served import POLL_S, ServedDevice, why_ended
 from labseq.remote.sessions import CLOSED, Session
 from labseq.safety.devices import check_each_device
 from labseq.safety.locks import lock_devices
@@ -57,14 +57,10 @@ from labseq.wire import (
     unpack,
 )
 
-LOOK_AT_KEYS_S: Final = 0.2
-"""How often the server looks which keys are known."""
 MAX_SESSIONS: Final = 64
-"""Connections at a time; of a client that makes more, something is wrong."""
+"""Maximum number of connections at a time; a client that makes more is faulty."""
 END_S: Final = 10.0
-"""How long the devices may take to become safe when the server ends."""
-N_SPARE: Final = 32
-"""Files that may still be opened to make the devices safe when connections have used up all others."""
+"""Longest time for the devices to become safe when the server ends, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +81,7 @@ class Serving:
 
 
 def serve_devices(
-    profile: str, overrides: Sequence[str], how: Serving, report: Callable[[str], object]
+    profile: str, overrides: Sequence[str], options: Serving, report: Callable[[str], object]
 ) -> None:
     """Serve devices until Ctrl-C or SIGTERM; then they are made safe.
 
@@ -98,36 +94,38 @@ def serve_devices(
     """
     require_packages()
     stop = StopFlag()
-    with stop_on_signals(stop), serving(profile, overrides, how, report) as server:
+    with stop_on_signals(stop), serving(profile, overrides, options, report) as server:
         try:
             while True:
-                stop.wait(LOOK_S)
+                stop.wait(POLL_S)
                 server.check()
         except StopRequested:
-            report("ends; devices in use are made safe")
+            report("stopping; devices in use are made safe")
 
 
 @contextmanager
 def serving(
-    profile: str, overrides: Sequence[str], how: Serving, report: Callable[[str], object]
+    profile: str, overrides: Sequence[str], options: Serving, report: Callable[[str], object]
 ) -> Generator[Server]:
-    """The same within a block."""
+    """Context manager: serves the devices as :func:`serve_devices` does, until the end of the block."""
     try:
-        host, port = parse_address(how.address)
+        host, port = parse_address(options.address)
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    if how.plain and not is_loopback(host):
+    if options.plain and not is_loopback(host):
         hint = "'labseq keys new' makes keys; --plain is for addresses such as tcp://127.0.0.1:5760"
-        raise ConfigError(Problem(f"{how.address} can be reached by others, and needs keys", hint=hint))
-    keys = None if how.plain else find_keys(keys_root(), how.key)
+        raise ConfigError(
+            Problem(f"{options.address} can be reached from other computers, and needs keys", hint=hint)
+        )
+    keys = None if options.plain else find_keys(keys_root(), options.key)
     whole = resolve_profile(profile, overrides=profile_overrides(overrides))
-    hardware = replace(whole, chosen=_served(whole, how.devices))
+    hardware = replace(whole, chosen=_served(whole, options.devices))
     simulation = None
-    if any(one.virtual_time for one in hardware.chosen.values()):
+    if any(plugin.virtual_time for plugin in hardware.chosen.values()):
         simulation = whole.chosen.get("simulation")
     with ExitStack() as stack:
         stack.enter_context(lock_devices(hardware, "labseq serve-devices", report))
-        report(f"tests {', '.join(hardware.chosen)}")
+        report(f"testing {', '.join(hardware.chosen)}")
         _test(hardware, simulation, report)
         with suppress(RecordingError):  # all are safe now
             clear_active(hardware.key, hardware.identities)
@@ -139,40 +137,40 @@ def serving(
 
 def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> dict[str, ChosenPlugin]:
     """The devices that are served: those named, else the real ones, else all."""
-    able = {name: one for name, one in hardware.chosen.items() if one.entry.role.is_hardware}
+    devices = {name: plugin for name, plugin in hardware.chosen.items() if plugin.entry.role.is_hardware}
     for name in names:
-        if name not in able:
-            expected = one_of([*able])
+        if name not in devices:
+            expected = one_of([*devices])
             raise ConfigError(Problem(f"the profile has no device '{clean(name)}'", expected=expected))
-        if able[name].entry.name == "remote":
+        if devices[name].entry.name == "remote":
             raise ConfigError(f"'{name}' is itself on another computer; serve it there")
-    here = {name: one for name, one in able.items() if one.entry.name != "remote"}
-    real = [name for name, one in here.items() if not one.virtual_time]
-    return {name: here[name] for name in names or real or here}
+    local = {name: plugin for name, plugin in devices.items() if plugin.entry.name != "remote"}
+    real = [name for name, plugin in local.items() if not plugin.virtual_time]
+    return {name: local[name] for name in names or real or local}
 
 
 def _entries(hardware: ResolvedProfile, simulation: ChosenPlugin | None) -> list[DeviceEntry]:
     entries: list[DeviceEntry] = []
-    for name, chosen in hardware.chosen.items():
-        identities = tuple(one for one, role in hardware.identities.items() if role == name)
-        entries.append(DeviceEntry(name, chosen, simulation if chosen.virtual_time else None, identities))
+    for name, plugin in hardware.chosen.items():
+        identities = tuple(identity for identity, role in hardware.identities.items() if role == name)
+        entries.append(DeviceEntry(name, plugin, simulation if plugin.virtual_time else None, identities))
     return entries
 
 
 def _test(
     hardware: ResolvedProfile, simulation: ChosenPlugin | None, report: Callable[[str], object]
 ) -> None:
-    """Raise the first failure of a device, after all were tried."""
+    """Test all devices, then raise the first failure."""
     if simulation is not None:
         hardware = replace(hardware, chosen={**hardware.chosen, "simulation": simulation})
     stop = StopFlag()
-    made, refused = construct_hardware(hardware, RealClock(stop))
-    made_simulation = made.pop("simulation", None)
-    failures: list[LabseqError] = [*refused.values()]
+    devices, errors = construct_hardware(hardware, RealClock(stop))
+    device_simulation = devices.pop("simulation", None)
+    failures: list[LabseqError] = [*errors.values()]
     for device in check_each_device(
-        made.items(), timeouts_of(hardware.profile), stop, made_simulation, report
+        devices.items(), timeouts_of(hardware.profile), stop, device_simulation, report
     ):
-        failures += [one for one in (device.failure, device.unsafe, device.unclosed) if one is not None]
+        failures += filter(None, (device.failure, device.unsafe, device.unclosed))
     for failure in failures[1:]:
         report(f"error: {failure}")
     if failures:
@@ -208,7 +206,8 @@ class Server:
         self._ended = threading.Event()
         self._failure: BaseException | None = None
         self._key_failure = ""
-        self._spare = [os.open(os.devnull, os.O_RDONLY) for _ in range(N_SPARE)]
+        # closed at the end: files can then be opened to make devices safe, even if connections used up all
+        self._spare = [os.open(os.devnull, os.O_RDONLY) for _ in range(32)]
         self.devices: dict[str, ServedDevice] = {}
         try:
             self._control = server_socket(self._zmq, host, port, keys)
@@ -234,7 +233,7 @@ class Server:
             device.start()
         self._thread.start()
         places = ", ".join(f"{name} at {port}" for name, port in self._ports.items())
-        self._report(f"serves {places}; control at tcp://{self._host}:{self._port}; Ctrl-C ends it")
+        self._report(f"serves {places}; control at tcp://{self._host}:{self._port}; Ctrl-C stops it")
         if self._keys is not None:
             names = (
                 ", ".join(sorted(self._known.values())) or f"none: put public keys into {keys_root()}/known"
@@ -242,17 +241,17 @@ class Server:
             self._report(f"known keys: {names}")
 
     def end(self) -> None:
-        """Make all devices safe, all at once, and end all threads."""
+        """Make all devices safe, at the same time, and end all threads."""
         for device in self.devices.values():
             device.begin_end()
         while self._spare:
             os.close(self._spare.pop())
         until_s = time.monotonic() + END_S
-        while (left := [one for one in self.devices.values() if one.is_alive]) and time.monotonic() < until_s:
-            for device in left:
+        while (alive := [d for d in self.devices.values() if d.is_alive]) and time.monotonic() < until_s:
+            for device in alive:
                 device.rescue_stuck()
-            time.sleep(LOOK_S)
-        late = [device.name for device in left]
+            time.sleep(POLL_S)
+        late = [device.name for device in alive]
         self._ended.set()
         self._thread.join(1.0)
         if self._auth is not None:
@@ -282,9 +281,9 @@ class Server:
     def _serve(self) -> None:
         import zmq
 
-        self._control.set(zmq.RCVTIMEO, int(1e3 * LOOK_S))
+        self._control.set(zmq.RCVTIMEO, int(1e3 * POLL_S))
         self._connections = Connections(self._control)
-        looked_s = keys_s = time.monotonic()
+        checked_s = keys_s = time.monotonic()
         try:
             while not self._ended.is_set():
                 try:
@@ -294,40 +293,43 @@ class Server:
                 if frames:
                     with suppress(zmq.ZMQError):  # the client is gone
                         self._control.send_multipart([frames[0], *self._answer(frames)])
-                if (now_s := time.monotonic()) - keys_s > LOOK_AT_KEYS_S and self._keys is not None:
+                if (now_s := time.monotonic()) - keys_s > 0.2 and self._keys is not None:
                     keys_s = now_s
-                    self._look_at_keys()
-                if now_s - looked_s > LOOK_S:
+                    self._read_keys()
+                if now_s - checked_s > POLL_S:
                     self._connections.limit()
-                    self._look(now_s, now_s - looked_s, self._connections.ended())
-                    looked_s = time.monotonic()
+                    self._end_lost_sessions(now_s, now_s - checked_s, self._connections.ended())
+                    checked_s = time.monotonic()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
             self._failure = error
         finally:
             self._connections.close()
             self._control.close()
 
-    def _look_at_keys(self) -> None:
-        """Read the known keys; those known before stay if that fails, which is reported once."""
+    def _read_keys(self) -> None:
+        """Read the known keys again; if that fails, report it once and keep the previous ones."""
         failure = ""
         try:
             self._known = known_keys(keys_root())
-        except Exception as error:  # noqa: BLE001 - no look at them may end the server
-            failure = f"the known keys cannot be read, and stay as they are: {format_error(error)}"
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with them must not end the server
+            failure = (
+                f"the known keys cannot be read, and the previous ones stay valid: {format_error(error)}"
+            )
         if failure and failure != self._key_failure:
             self._report(failure)
         self._key_failure = failure
 
-    def _look(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
-        """End the sessions of clients that are gone, or no longer known."""
-        stood_still_s = passed_s if passed_s > LOST_S / 2 else 0.0  # this computer, not the client
+    def _end_lost_sessions(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
+        """End the sessions of clients that have disappeared, or whose key was withdrawn."""
+        # after a long pause this computer stood still, and could not receive heartbeats
+        stood_still_s = passed_s if passed_s > LOST_S / 2 else 0.0
         for device in self.devices.values():
             for session in list(device.sessions.values()):
                 session.beat_s += stood_still_s
                 if session.connection in ended:
                     device.end_session(session, "its process has ended")
                 elif now_s - session.beat_s > LOST_S:
-                    device.end_session(session, f"no sign of life for {LOST_S:g} s")
+                    device.end_session(session, f"no heartbeat for {LOST_S:g} s")
                 elif not self.is_known(session.peer):
                     device.end_session(session, "its key was withdrawn")
             device.rescue_stuck()
@@ -357,16 +359,16 @@ class Server:
             return self._hello(message, peer, self._connections.named(frame.get(zmq.SRCFD)))
         if message["op"] == "status":
             return self._status()
-        ask = {"beat": self._beat, "bye": self._bye, "abort": self._abort}.get(message["op"])
-        if ask is None:
-            raise MessageError("it asks for something unknown")
-        return ask(message, *self._of(message, peer))
+        handler = {"beat": self._beat, "bye": self._bye, "abort": self._abort}.get(message["op"])
+        if handler is None:
+            raise MessageError("its request is unknown")
+        return handler(message, *self._of(message, peer))
 
     def _hello(self, message: Mapping[str, Any], peer: str, connection: tuple[int, int]) -> dict[str, Any]:
         if message["protocol"] != PROTOCOL:
             theirs = f"{clean(str(message['labseq']))} speaks protocol {clean(str(message['protocol']))}"
             ours = f"labseq {labseq.__version__} of the server speaks {PROTOCOL}"
-            raise DeviceError("server", f"labseq {theirs}, and {ours}; update one")
+            raise DeviceError("server", f"labseq {theirs}, and {ours}; update one of them")
         device = self.devices.get(str(message["device"]))
         if device is None:
             text = f"there is no device '{clean(str(message['device']))}'; expected {one_of([*self.devices])}"
@@ -375,8 +377,8 @@ class Server:
             used = clean(str(message["kind"]))
             text = f"'{device.name}' is of the kind {device.kind}, and the profile uses it as {used}"
             raise DeviceError("server", text)
-        if sum(len(one.sessions) for one in self.devices.values()) >= MAX_SESSIONS:
-            raise DeviceError("server", f"it has {MAX_SESSIONS} connections already")
+        if sum(len(other.sessions) for other in self.devices.values()) >= MAX_SESSIONS:
+            raise DeviceError("server", f"it already has {MAX_SESSIONS} connections")
         name = self._known.get(peer.encode(), "this computer")
         session = Session(peer, f"{name} ({clean(str(message['who']))})", connection)
         device.sessions[session.token] = session
@@ -401,7 +403,7 @@ class Server:
                 if session.ended:
                     raise DeviceError(device.name, session.ended)
                 return device, session
-        ended = {key: why for one in self.devices.values() for key, why in one.ended.items()}
+        ended = {key: why for device in self.devices.values() for key, why in device.ended.items()}
         raise DeviceError("server", why_ended(ended, token))
 
     def _beat(self, _message: Mapping[str, Any], device: ServedDevice, session: Session) -> dict[str, Any]:

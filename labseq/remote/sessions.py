@@ -13,10 +13,10 @@ from labseq.guard import StopFlag
 from labseq.remote.drivers import ClientDriver
 
 GRACE_S: Final = 0.3
-"""How long a call may take to end after it was aborted, before the device is made safe beside it."""
+"""Longest time for an aborted call to end, in seconds; then another thread makes the device safe."""
 
 CLOSED: Final = "closed"
-"""Why a session is over that the client has ended."""
+"""Why a session has ended, if the client ended it."""
 
 
 class Abort(StopFlag):
@@ -34,17 +34,17 @@ class Session:
     Attributes:
         peer: The client's public key; "" without keys.
         who: What the client calls itself, for other users.
-        connection: The connection that its signs of life come from; see :class:`labseq.wire.Connections`.
+        connection: The connection that its heartbeats come from; see :class:`labseq.wire.Connections`.
         token: Names the session in each message.
-        beat_s: When it last gave a sign of life.
-        ended: Why it is over; "" while it is not.
+        beat_s: Time of its last heartbeat.
+        ended: Why it has ended; "" while it has not.
         driver: Its own object of the driver; None before the client has sent its context.
         number: Number of the last call.
         call: Name of the last call.
         reply: The parts of the last reply, in case the message comes twice.
         began_s: When the call in progress began; None while none is.
-        rescue: Outcome of a safe state beside that call: "" if there was none, "under way", "safe", or why
-            it failed.
+        rescue: Outcome of making the device safe during that call: "" if it was not necessary, "under way",
+            "safe", or why it failed.
     """
 
     peer: str
@@ -65,15 +65,15 @@ class Session:
     _deciding: threading.Lock = field(default_factory=threading.Lock)
 
     def begin_call(self, number: int, call: str) -> None:
-        """Note that a call is carried out from now on."""
+        """Record the start of a call."""
         self.number, self.call, self.reply = number, call, []
         self.abort.clear()
         self._aborted_s, self.rescue, self.began_s = None, "", time.monotonic()
 
     def end_call(self) -> None:
-        """Note that it has ended; waits for the end of a safe state beside it.
+        """Record the end of a call; if another thread is making the device safe, wait for that first.
 
-        A driver need not bear further calls while ``safe_state()`` is carried out.
+        A driver need not accept other calls while ``safe_state()`` runs.
         """
         with self._deciding:
             self.began_s = None
@@ -98,6 +98,6 @@ class Session:
         threading.Thread(target=self._rescue, args=[self.driver, report], daemon=True).start()
 
     def _rescue(self, driver: ClientDriver, report: Callable[[str], object]) -> None:
-        self.rescue = driver.make_safe_beside() or "safe"
-        report(f"{self.call}() does not return; made safe beside it: {self.rescue}")
+        self.rescue = driver.make_safe_during_call() or "safe"
+        report(f"{self.call}() does not return; made safe from another thread: {self.rescue}")
         self._is_rescued.set()

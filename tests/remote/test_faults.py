@@ -493,7 +493,7 @@ def test_a_simulated_device_refuses_a_line_that_nothing_can_switch_there(server:
 def test_a_client_cannot_replace_the_driver_of_an_open_device(server: Served) -> None:
     with instrument(server) as device:
         connection = device.link.connect()
-        with pytest.raises(DeviceError, match="has a driver already"):
+        with pytest.raises(DeviceError, match="already has a driver"):
             connection.call("attach", connection._about(Context("laser")))
         device.command("open")
 
