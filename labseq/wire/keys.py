@@ -1,7 +1,7 @@
 """The keys of this computer and of those that it knows: a file for each.
 
-The folder of keys contains ``NAME.key_secret``, the own key of this computer, ``NAME.key``, its public part,
-which others need, and a folder ``known`` with the public keys of others.
+The folder of keys contains ``NAME.key_secret``, the secret key of this computer, ``NAME.key``, its public
+key, which other computers need, and a folder ``known`` with the public keys of other computers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ SECRET: Final = ".key_secret"  # noqa: S105 - the end of a file's name
 PUBLIC: Final = ".key"
 KNOWN: Final = "known"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
-_LINE: Final = re.compile(rb'^\s*(public|secret)-key = "([!#-~]{40})"\s*$', re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -35,8 +34,8 @@ class Keys:
 
 def keys_root() -> Path:
     """Folder of keys: LABSEQ_KEYS, else ``keys`` in the user's folder of configurations."""
-    if own := os.environ.get("LABSEQ_KEYS"):
-        return Path(own).expanduser()
+    if folder := os.environ.get("LABSEQ_KEYS"):
+        return Path(folder).expanduser()
     import platformdirs
 
     return Path(platformdirs.user_config_dir("labseq", appauthor=False)) / "keys"
@@ -49,7 +48,7 @@ def new_keys(name: str, folder: Path) -> tuple[Path, Path]:
         The files of the secret and of the public key.
 
     Raises:
-        ConfigError: The name cannot be one of files, or there is such a key already.
+        ConfigError: The name cannot be that of a file, or such a key already exists.
         RecordingError: The files cannot be written.
     """
     import zmq
@@ -63,12 +62,12 @@ def new_keys(name: str, folder: Path) -> tuple[Path, Path]:
     secret, public = folder / f"{name}{SECRET}", folder / f"{name}{PUBLIC}"
     for path in (secret, public):
         if path.exists():
-            raise ConfigError(Problem("there is such a key already", str(path), hint="choose another name"))
+            raise ConfigError(Problem("such a key already exists", str(path), hint="choose another name"))
     public_key, secret_key = zmq.curve_keypair()
     with explained(secret):
         (folder / KNOWN).mkdir(parents=True, exist_ok=True)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-        with os.fdopen(os.open(secret, flags, 0o600), "wb") as file:  # before anybody can read it
+        with os.fdopen(os.open(secret, flags, 0o600), "wb") as file:  # closed to others from the start
             file.write(_content(public_key, secret_key))
     write_file(public, _content(public_key))
     return secret, public
@@ -91,13 +90,15 @@ def find_keys(folder: Path, name: str = "") -> Keys:
     """
     files = sorted(folder.glob(f"{name or '*'}{SECRET}"))
     if len(files) != 1:
-        what = "there are several keys" if files else "there is no key of this computer"
+        problem = "there are several keys" if files else "this computer has no key"
         hint = "name one of them with `key`" if files else "'labseq keys new' makes one"
-        raise ConfigError(Problem(what, str(folder), hint=hint))
-    found = _read(files[0])
-    if len(found) != 2:
-        raise ConfigError(Problem("it is damaged", str(files[0]), expected="a public and a secret key"))
-    return Keys(found[b"public"], found[b"secret"])
+        raise ConfigError(Problem(problem, str(folder), hint=hint))
+    keys = _read(files[0])
+    if len(keys) != 2:
+        raise ConfigError(
+            Problem("this file is damaged", str(files[0]), expected="a public and a secret key")
+        )
+    return Keys(keys[b"public"], keys[b"secret"])
 
 
 def read_public(path: Path) -> bytes:
@@ -106,10 +107,10 @@ def read_public(path: Path) -> bytes:
     Raises:
         ConfigError: It does not exist, or is damaged.
     """
-    found = _read(path)
-    if b"public" not in found:
-        raise ConfigError(Problem("it is damaged", str(path), expected="a public key"))
-    return found[b"public"]
+    keys = _read(path)
+    if b"public" not in keys:
+        raise ConfigError(Problem("this file is damaged", str(path), expected="a public key"))
+    return keys[b"public"]
 
 
 def known_keys(folder: Path) -> dict[bytes, str]:
@@ -121,12 +122,13 @@ def known_keys(folder: Path) -> dict[bytes, str]:
     """
     names: list[str] = []
     with suppress(FileNotFoundError):
-        names = sorted(os.listdir(folder / KNOWN))  # noqa: PTH208 - glob() hides what fails
+        names = sorted(os.listdir(folder / KNOWN))  # noqa: PTH208 - glob() hides errors
     known: dict[bytes, str] = {}
     for path in [folder / KNOWN / name for name in names if name.endswith(PUBLIC)]:
         try:
             public = _values(path).get(b"public")
         except RecordingError as error:
+            # with no files left to open every key would seem withdrawn, and all clients would be cut off
             if getattr(error.__cause__, "errno", 0) in (errno.EMFILE, errno.ENFILE):
                 raise
             continue
@@ -137,8 +139,8 @@ def known_keys(folder: Path) -> dict[bytes, str]:
 
 def _read(path: Path) -> dict[bytes, bytes]:
     if path.parent.name == KNOWN and not path.exists():
-        what, hint = f"there is no key of {path.stem}", "copy the public key of that computer there"
-        raise ConfigError(Problem(what, str(path), hint=hint))
+        problem, hint = f"there is no key of {path.stem}", "copy the public key of that computer there"
+        raise ConfigError(Problem(problem, str(path), hint=hint))
     try:
         return _values(path)
     except RecordingError as error:
@@ -146,4 +148,6 @@ def _read(path: Path) -> dict[bytes, bytes]:
 
 
 def _values(path: Path) -> dict[bytes, bytes]:
-    return dict(_LINE.findall(read_file(path, 4096)))
+    """The keys in a file, by "public" and "secret"; it has the format of ZeroMQ's certificates."""
+    pattern = rb'^\s*(public|secret)-key = "([!#-~]{40})"\s*$'
+    return dict(re.findall(pattern, read_file(path, 4096), re.MULTILINE))

@@ -1,7 +1,7 @@
-"""A message: one part of msgpack for its structure, a raw one for all small arrays, and some for each other.
+"""Messages: a part of msgpack for the structure, a raw part for all small arrays, and one per large array.
 
-Nothing that arrives is executed: it can become plain values, arrays of numbers, the types of :data:`TYPES`
-and the errors of :mod:`labseq.errors`, whose own constructors check their values.
+Nothing that arrives is executed: it can only become plain values, arrays of numbers, the types of
+:data:`TYPES` and the errors of :mod:`labseq.errors`, whose own constructors check their values.
 """
 
 from __future__ import annotations
@@ -27,21 +27,20 @@ Part: TypeAlias = bytes | memoryview
 MAX_HEADER: Final = 1 << 20
 """Largest first part, in bytes."""
 MAX_PART: Final = 1 << 26
-"""Largest part, in bytes; a frame of 4096 x 4096 pixels has half of that."""
+"""Largest part, in bytes: twice a frame of 4096 x 4096 pixels."""
 SMALL: Final = 1 << 14
-"""Arrays of at most so many bytes share a part."""
+"""Arrays of up to this many bytes share a part, because a part costs more than copying them."""
 ALIGNMENT: Final = 16
-"""Where arrays begin in it, in bytes."""
+"""Arrays in the shared part begin at multiples of this, in bytes."""
 MAX_PARTS: Final = 256
 MAX_DEPTH: Final = 16
-MAX_DIMENSIONS: Final = 4
 
 _NUMBERS: Final = re.compile(r"[|<](?:b1|[iu][1248]|f[48])")
 _TEXT: Final = re.compile(r"\|S\d{1,4}|<U\d{1,4}")
 
 TYPES: Final[Mapping[str, type]] = {
-    one.__name__: one
-    for one in (
+    cls.__name__: cls
+    for cls in (
         model.AxisTones,
         model.CalibrationEntry,
         model.CameraFacts,
@@ -59,12 +58,12 @@ TYPES: Final[Mapping[str, type]] = {
     )
 }
 """The types that a message may contain, by name."""
-_FIELDS: Final = {name: [f.name for f in dataclasses.fields(one) if f.init] for name, one in TYPES.items()}
+_FIELDS: Final = {name: [f.name for f in dataclasses.fields(cls) if f.init] for name, cls in TYPES.items()}
 _ARRAY, _OBJECT, _TUPLE, _SET = 1, 2, 3, 4
 
 
 class MessageError(ValueError):
-    """A message that is damaged, too large, or contains what no message may contain."""
+    """A message that is damaged, too large, or contains a value that messages cannot carry."""
 
 
 def pack(value: Any) -> list[Part]:
@@ -78,20 +77,20 @@ def pack(value: Any) -> list[Part]:
     arrays: list[Part] = []
     small = bytearray()
 
-    def substitute(one: Any) -> Any:
-        if isinstance(one, np.ndarray):
-            place, dtype, shape, about = _described(one, arrays, small)
-            return msgpack.ExtType(_ARRAY, inner([place, dtype, list(shape), about]))
-        if (fields := _FIELDS.get(type(one).__name__)) and type(one) is TYPES[type(one).__name__]:
-            return msgpack.ExtType(_OBJECT, inner([type(one).__name__, [getattr(one, f) for f in fields]]))
-        if isinstance(one, tuple):
-            return msgpack.ExtType(_TUPLE, inner(list(cast("tuple[Any]", one))))
-        if isinstance(one, AbstractSet):
-            return msgpack.ExtType(_SET, inner(sorted(cast("AbstractSet[Any]", one))))
-        return _plain(one)
+    def substitute(item: Any) -> Any:
+        if isinstance(item, np.ndarray):
+            place, dtype, shape, descriptions = _add_array(item, arrays, small)
+            return msgpack.ExtType(_ARRAY, inner([place, dtype, list(shape), descriptions]))
+        if (fields := _FIELDS.get(type(item).__name__)) and type(item) is TYPES[type(item).__name__]:
+            return msgpack.ExtType(_OBJECT, inner([type(item).__name__, [getattr(item, f) for f in fields]]))
+        if isinstance(item, tuple):
+            return msgpack.ExtType(_TUPLE, inner(list(cast("tuple[Any]", item))))
+        if isinstance(item, AbstractSet):
+            return msgpack.ExtType(_SET, inner(sorted(cast("AbstractSet[Any]", item))))
+        return _plain(item)
 
-    def inner(one: Any) -> bytes:
-        return cast("bytes", msgpack.packb(one, default=substitute, strict_types=True))
+    def inner(item: Any) -> bytes:
+        return cast("bytes", msgpack.packb(item, default=substitute, strict_types=True))
 
     try:
         header = inner(value)
@@ -103,11 +102,11 @@ def pack(value: Any) -> list[Part]:
     return parts
 
 
-def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> list[Any]:
-    """Where an array is, its dtype and its shape.
+def _add_array(array: NDArray[Any], arrays: list[Part], small: bytearray) -> list[Any]:
+    """Add an array to the parts of a message.
 
-    The place is [index of its part, where it begins there]. Small arrays share the first part after the
-    header, because a part costs more than copying.
+    Returns:
+        Its place [index of the part, first byte], dtype, shape, and the descriptions of its columns.
     """
     dtype = array.dtype
     if not dtype.isnative or sys.byteorder == "big":
@@ -116,7 +115,7 @@ def _described(array: NDArray[Any], arrays: list[Part], small: bytearray) -> lis
         array = np.ascontiguousarray(array, dtype).reshape(array.shape)
     if array.nbytes <= SMALL:
         place = [1, len(small)]
-        small.extend(array.tobytes() + bytes(ALIGNMENT - array.nbytes % ALIGNMENT))  # never nothing
+        small.extend(array.tobytes() + bytes(ALIGNMENT - array.nbytes % ALIGNMENT))  # never empty
     else:
         place = [len(arrays) + 2, 0]
         arrays.append(array.reshape(-1).view(np.uint8).data)
@@ -132,24 +131,24 @@ def _dtype_text(dtype: np.dtype[Any]) -> str:
     raise TypeError(f"an array of {dtype}")
 
 
-def _plain(one: Any) -> Any:
-    """A value that msgpack knows, for one of a kindred type."""
-    if isinstance(one, Enum):
-        return one.value
-    if isinstance(one, bool | np.bool_):
-        return bool(one)
-    if isinstance(one, np.generic):
-        return one.item()
+def _plain(value: Any) -> Any:
+    """Convert a value to the nearest type that msgpack knows."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, np.generic):
+        return value.item()
     for kind in (int, float, str):
-        if isinstance(one, kind):
-            return kind(one)
-    if isinstance(one, PurePath):
-        return str(one)
-    if isinstance(one, Mapping):
-        return {str(key): item for key, item in cast("Mapping[Any, Any]", one).items()}
-    if isinstance(one, Sequence):
-        return list(cast("Sequence[Any]", one))
-    raise TypeError(f"a value of the type {type(one).__name__}")
+        if isinstance(value, kind):
+            return kind(value)
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): item for key, item in cast("Mapping[Any, Any]", value).items()}
+    if isinstance(value, Sequence):
+        return list(cast("Sequence[Any]", value))
+    raise TypeError(f"a value of the type {type(value).__name__}")
 
 
 def unpack(parts: Sequence[Part]) -> Any:
@@ -158,7 +157,7 @@ def unpack(parts: Sequence[Part]) -> Any:
     Sizes and shapes are checked before anything is made of them.
 
     Raises:
-        MessageError: It is damaged, too large, or contains what no message may contain.
+        MessageError: It is damaged, too large, or contains a value that messages cannot carry.
     """
     import msgpack
 
@@ -170,7 +169,7 @@ def unpack(parts: Sequence[Part]) -> Any:
         nonlocal depth
         depth += 1
         if depth > MAX_DEPTH:
-            raise MessageError("it is nested too deep")
+            raise MessageError("it is nested too deeply")
         content = inner(data)
         depth -= 1
         if not isinstance(content, list):
@@ -193,28 +192,28 @@ def unpack(parts: Sequence[Part]) -> Any:
         return inner(header)
     except MessageError:
         raise
-    except Exception as error:  # of msgpack's many kinds, and of constructors
+    except Exception as error:  # msgpack and constructors raise many kinds
         raise MessageError(f"it is damaged: {format_error(error)[:200]}") from error
 
 
 def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
-    place, dtype, shape, about = content
+    place, dtype, shape, descriptions = content
     if isinstance(dtype, list):
-        columns = [(str(name), _known_dtype(one)) for name, one in cast("list[Any]", dtype)]
-        kind = np.dtype(columns, metadata={"descriptions": dict(about)})
+        columns = [(str(name), _checked_dtype(text)) for name, text in cast("list[Any]", dtype)]
+        kind = np.dtype(columns, metadata={"descriptions": dict(descriptions)})
     else:
-        kind = _known_dtype(dtype)
+        kind = _checked_dtype(dtype)
     if (
         not isinstance(shape, list)
-        or len(cast("list[Any]", shape)) > MAX_DIMENSIONS
+        or len(cast("list[Any]", shape)) > 4
         or any(type(n) is not int or not 0 <= n <= MAX_PART * MAX_PARTS for n in cast("list[Any]", shape))
     ):
         raise MessageError("an array has a wrong shape")
-    wanted = math.prod(cast("list[int]", shape)) * kind.itemsize
-    data = _data(parts, place, wanted)
-    if data.nbytes != wanted:
-        raise MessageError(f"an array of shape {tuple(shape)} has {data.nbytes} bytes; expected {wanted}")
-    array = np.frombuffer(data, kind).reshape(shape) if wanted else np.empty(shape, kind)
+    n_bytes = math.prod(cast("list[int]", shape)) * kind.itemsize
+    data = _data(parts, place, n_bytes)
+    if data.nbytes != n_bytes:
+        raise MessageError(f"an array of shape {tuple(shape)} has {data.nbytes} bytes; expected {n_bytes}")
+    array = np.frombuffer(data, kind).reshape(shape) if n_bytes else np.empty(shape, kind)
     if not array.flags.aligned:  # kernels are compiled for aligned arrays
         array = array.copy()
     array.flags.writeable = False
@@ -222,14 +221,14 @@ def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
 
 
 def _data(parts: Sequence[Part], place: Any, n_bytes: int) -> memoryview:
-    """The bytes of an array, from their place as :func:`_described` gives it."""
+    """The bytes of an array, from their place as :func:`_add_array` gives it."""
     part, begin = place
     if type(part) is not int or type(begin) is not int or not 1 <= part < len(parts) or begin < 0:
         raise MessageError("an array is missing")
     return memoryview(parts[part])[begin : begin + n_bytes]
 
 
-def _known_dtype(text: Any) -> np.dtype[Any]:
+def _checked_dtype(text: Any) -> np.dtype[Any]:
     if not isinstance(text, str) or not (_NUMBERS.fullmatch(text) or _TEXT.fullmatch(text)):
         raise MessageError(f"an array has the unknown dtype {str(text)[:20]!r}")
     return np.dtype(text)
@@ -246,13 +245,13 @@ def _object(content: list[Any]) -> Any:
 
 
 _ERRORS: Final = {
-    name: one for name, one in vars(errors).items() if isinstance(one, type) and issubclass(one, LabseqError)
+    name: cls for name, cls in vars(errors).items() if isinstance(cls, type) and issubclass(cls, LabseqError)
 }
 
 
 def report_error(error: BaseException) -> dict[str, Any]:
     """An error as a value for a message: its class, its text and its values."""
-    kind = next((one.__name__ for one in type(error).__mro__ if _ERRORS.get(one.__name__) is one), "")
+    kind = next((cls.__name__ for cls in type(error).__mro__ if _ERRORS.get(cls.__name__) is cls), "")
     if not kind:
         return {"class": "", "text": format_error(error), "values": {}}
     values: dict[str, Any] = {}
@@ -282,7 +281,8 @@ def error_of(report: Any, name: str, where: str) -> LabseqError:
     if issubclass(cls, DeviceError | errors.TransientError) and {"device", "message"} <= values.keys():
         values["device"], values["message"] = name, f"{one_line(str(values['message']))} (at {where})"
         text = f"{name}: {values['message']}"
-    made = cls.__new__(cls)
-    made.args = (text,)
-    made.__dict__.update(values)
-    return made
+    # not by its constructor, whose parameters differ from class to class
+    rebuilt = cls.__new__(cls)
+    rebuilt.args = (text,)
+    rebuilt.__dict__.update(values)
+    return rebuilt

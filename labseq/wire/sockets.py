@@ -20,13 +20,11 @@ if TYPE_CHECKING:
 PROTOCOL: Final = 2
 """Version of the messages; both computers need the same."""
 BEAT_S: Final = 0.15
-"""Interval of the heartbeats of a connection."""
+"""Interval of the heartbeats of a connection, in seconds."""
 LOST_S: Final = 0.75
-"""A connection without a heartbeat for so long is lost."""
-HANDSHAKE_S: Final = 2.0
-"""How long a connection may take to show its key."""
+"""A connection without a heartbeat for this long is lost, in seconds."""
 MAX_CONNECTIONS: Final = 128
-"""Connections at a port, beyond which it does not listen until some have ended."""
+"""Maximum number of connections at a port; with more it does not listen until some have ended."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]@]+):(\d{1,5})")
 
@@ -53,21 +51,21 @@ def parse_address(address: str) -> tuple[str, int]:
         >>> parse_address("tcp://camera-pc:5760")
         ('camera-pc', 5760)
     """
-    found = _ADDRESS.fullmatch(address)
-    if found is None or not 0 < int(found[2]) < 65_536:
+    match = _ADDRESS.fullmatch(address)
+    if match is None or not 0 < int(match[2]) < 65_536:
         raise ValueError(
-            f"'{clean(address)}' is not an address; expected tcp://HOST:PORT, as tcp://camera-pc:5760"
+            f"'{clean(address)}' is not an address; expected tcp://HOST:PORT, such as tcp://camera-pc:5760"
         )
-    return found[1].strip("[]"), int(found[2])
+    return match[1].strip("[]"), int(match[2])
 
 
 def client_socket(keys: Keys | None, server: bytes | None, timeout_s: float = -1e-3) -> zmq.Socket[Any]:
-    """A DEALER, not connected yet, that connects once: a connection that breaks stays broken.
+    """A DEALER socket, not connected yet, that never reconnects: a broken connection ends the session.
 
     Args:
-        keys: The keys of this computer; None on this computer only.
-        server: The public key of the server; None likewise.
-        timeout_s: Longest time that receiving may take; without it, for ever.
+        keys: The keys of this computer; None for a server on this computer.
+        server: The public key of the server; None for one on this computer.
+        timeout_s: Longest time to wait for a message, in seconds; by default without limit.
     """
     import zmq
 
@@ -91,7 +89,7 @@ def endpoint(host: str, port: int) -> str:
 
 
 def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | None) -> zmq.Socket[Any]:
-    """A ROUTER that listens.
+    """A ROUTER socket that listens.
 
     Raises:
         ConfigError: The address cannot be used.
@@ -100,7 +98,7 @@ def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | 
 
     socket = context.socket(zmq.ROUTER)
     _limit(socket)
-    socket.set(zmq.HANDSHAKE_IVL, round(1e3 * HANDSHAKE_S))
+    socket.set(zmq.HANDSHAKE_IVL, 2000)  # ms for a client to show its key
     if keys is not None:
         socket.zap_domain = b"labseq"
         socket.curve_server, socket.curve_secretkey = True, keys.secret
@@ -114,10 +112,10 @@ def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | 
 
 
 class Connections:
-    """The connections at a server's socket: the end of one shows that its process has died, at once.
+    """The connections at a server's socket: when a client's process dies, its connection ends at once.
 
-    The operating system gives the number of one that has ended to a new one. So a connection has two: that
-    one, and how many there were before with the same.
+    The operating system reuses the number of a connection that has ended. So a connection is named by two
+    numbers: that one, and how many connections had it before.
 
     Args:
         socket: The socket, which listens; used in the thread of the socket.
@@ -146,7 +144,7 @@ class Connections:
         return ended
 
     def limit(self, limit: int = MAX_CONNECTIONS) -> None:
-        """Listen only while there are fewer connections, or half as many once there were."""
+        """Stop listening at ``limit`` connections, and listen again below half as many."""
         import zmq
 
         self._read()
@@ -173,7 +171,7 @@ class Connections:
                 self._open.add(number)
 
     def close(self) -> None:
-        """End it, before the socket is closed."""
+        """Stop watching; call it before the socket is closed."""
         self._socket.disable_monitor()
         self._events.close()
 
