@@ -22,7 +22,7 @@ Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""
 
 MAX_SITES: Final = 1000
-"""Most rows or columns of a grid, as in a profile."""
+"""Maximum number of rows or columns of a grid, as in a profile."""
 
 
 def make_planner(
@@ -51,10 +51,10 @@ def make_planner(
         >>> planner = make_planner("psca", degree_of_parallelism=7)
     """
     entry = _find("planner", name, plugin_folders)
-    made = validate_values(entry.settings_model, settings, f"planner '{name}'")
+    values = validate_values(entry.settings_model, settings, f"planner '{name}'")
     if not isinstance(motion, MotionSpec | None):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ConfigError(Problem(f"motion is {motion!r}", expected="a labseq.MotionSpec"))
-    return construct_planner(ChosenPlugin(entry, made), _grid(grid), motion or MotionSpec())[0]
+    return construct_planner(ChosenPlugin(entry, values), _grid(grid), motion or MotionSpec())[0]
 
 
 def make_target(
@@ -83,8 +83,8 @@ def make_target(
         225
     """
     entry = _find("pattern", pattern, plugin_folders)
-    made = validate_values(entry.settings_model, settings, f"pattern '{pattern}'")
-    return construct_target(ChosenPlugin(entry, made), _grid(grid))
+    values = validate_values(entry.settings_model, settings, f"pattern '{pattern}'")
+    return construct_target(ChosenPlugin(entry, values), _grid(grid))
 
 
 def tone_program(
@@ -108,9 +108,9 @@ def tone_program(
         The tones of both axes; ``program.tones_at(t_s)`` says what is intended at a time.
 
     Raises:
-        ConfigError: The profile is not there, or wrong.
+        ConfigError: The profile does not exist, or has an error.
         PlanError: The plan does not fit onto the grid, or has fewer batches than asked for.
-        LimitError: AOD or amplifier would not bear the tones.
+        LimitError: The tones exceed a limit of AOD or amplifier.
 
     Example:
         >>> plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
@@ -120,23 +120,23 @@ def tone_program(
     """
     if profile is not None:
         document, spec = load_profile(profile, beside=Path())
-        own_grid, own_motion = calibrated_machine(document, spec)
-        grid, motion = grid or own_grid, motion or own_motion
+        profile_grid, profile_motion = calibrated_machine(document, spec)
+        grid, motion = grid or profile_grid, motion or profile_motion
     return _motion.tone_program(plan, grid, motion, n_batches)
 
 
 def _find(kind: str, name: str, folders: Folders) -> Entry:
     if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ConfigError(Problem(f"the name of the {kind} is {name!r}", expected="text"))
-    given = (folders,) if isinstance(folders, str | Path) else folders
-    return load_plugins([Path(folder) for folder in given]).get(kind, name)
+    paths = (folders,) if isinstance(folders, str | Path) else folders
+    return load_plugins([Path(path) for path in paths]).get(kind, name)
 
 
 def _grid(grid: SiteGrid | tuple[int, int] | None) -> SiteGrid:
     """The grid for a size.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: It is not the size of a grid.
     """
     if grid is None or isinstance(grid, SiteGrid):
         return grid or SiteGrid()

@@ -231,7 +231,7 @@ def test_a_cluster_takes_the_runs_where_it_sees_the_folder(file: Path) -> None:
         run_at_once(campaign, folder, workers(), lambda *_: None)
         elsewhere = file.parent / "elsewhere"
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("labseq.campaigns.running._keep", lambda *_, **__: None)
+            patch.setattr("labseq.campaigns.running._copy_file", lambda *_, **__: None)
             with pytest.raises(ConfigError, match=r"the worker on .* does not see this folder"):
                 run_at_once(campaign, elsewhere, workers(), lambda *_: None)
     assert [run.status for run in all_runs(folder)] == ["complete"] * 4

@@ -100,15 +100,15 @@ class Campaign:
             what = f"{settings.runs} runs cannot share {settings.repeats} shots"
             raise document.error(("runs",), what, "at most 'repeats'")
         if settings.runs > 1 and settings.seed is None:
-            what = "'seed' is missing, which those of the runs are made from"
+            what = "'seed' is missing; the seeds of the runs are made from it"
             raise document.error(("runs",), what, "'seed: 1', or another whole number")
         return cls(document, settings, axes)
 
     @property
     def sequence(self) -> Path:
         """The sequence file, or the name of one."""
-        beside = self.document.path.parent / self.settings.sequence
-        return beside if beside.is_file() else Path(self.settings.sequence)
+        path = self.document.path.parent / self.settings.sequence
+        return path if path.is_file() else Path(self.settings.sequence)
 
     def points(self) -> Iterator[Point]:
         """The indices of the values of each point; the last axis changes fastest."""
@@ -126,8 +126,8 @@ class Campaign:
 
     def _options(self, point: Point, part: int) -> Options:
         profile = self.settings.profile
-        if profile is not None and (beside := self.document.path.parent / profile).is_file():
-            profile = str(beside)
+        if profile is not None and (path := self.document.path.parent / profile).is_file():
+            profile = str(path)
         n_shots, more = divmod(self.settings.repeats, self.settings.runs)
         overrides = tuple(f"{a}={v}" for a, v in zip(self.axes, self.values(point), strict=True))
         return Options(profile, n_shots + (part < more), self._seed(part), overrides)
@@ -140,10 +140,10 @@ class Campaign:
         return int(np.random.SeedSequence(seed, spawn_key=(part,)).generate_state(1, np.uint64)[0] >> 1)
 
     def find_files(self) -> None:
-        """Raise if there is no such sequence or profile.
+        """Check that the sequence and the profile exist.
 
         Raises:
-            ConfigError: There is none; at its place in this file.
+            ConfigError: One does not exist; with its place in this file.
         """
         finds = {
             "sequence": lambda: read_bytes(find_sequence(self.sequence)),
@@ -158,7 +158,7 @@ class Campaign:
                 raise self.document.error((name,), problem.what, problem.expected, problem.hint) from error
 
     def placed(self, error: ConfigError, run: PlannedRun) -> ConfigError:
-        """An error of a run, at the place of the value in the campaign file if that is wrong."""
+        """An error of a run; if a value of the campaign file causes it, with the place of that value."""
         return ConfigError([self._placed(problem, run) for problem in error.problems])
 
     def _placed(self, problem: Problem, run: PlannedRun) -> Problem:
@@ -171,15 +171,15 @@ class Campaign:
 
 
 def run_folders(folder: Path) -> list[Path]:
-    """The folders of a campaign's runs, without those that are just being made."""
+    """The folders of a campaign's runs, without those that are still being created."""
     return [path for path in runs_in(folder) if (path / RUN_FILE).is_file()]
 
 
 def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
     """The campaign of a folder, and the runs that it has so far: point -> its runs.
 
-    Of two runs with the same shots, the one that was taken further counts: a cluster takes a run again if
-    the computer that began it is gone.
+    Of two runs with the same shots, the one with more shots counts: a cluster takes a run again if the
+    computer that started it has disappeared.
 
     Raises:
         ConfigError: A run has values of no point, or there are no runs.
@@ -189,20 +189,20 @@ def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
     planned = {
         _shots_of(campaign.values(run.point), run.options.changes()): run.point for run in campaign.runs()
     }
-    found: dict[Any, Run] = {}
+    best: dict[Any, Run] = {}
     for path in run_folders(folder):
         run = open_run(path)
         key = _shots_of([run.changes.get(address, "") for address in campaign.axes], run.changes)
         if key not in planned:
             what = f"this run belongs to no point of {CAMPAIGN_FILE}, which may have been changed since"
             raise ConfigError(Problem(what, visible(str(run.path))))
-        if key not in found or len(run.shots) > len(found[key].shots):
-            found[key] = run
-    if not found:
+        if key not in best or len(run.shots) > len(best[key].shots):
+            best[key] = run
+    if not best:
         raise ConfigError(Problem("the campaign has no runs yet", visible(str(folder))))
     runs: dict[Point, list[Run]] = {point: [] for point in campaign.points()}
     for key, point in planned.items():  # in the order of their seeds, whichever was begun first
-        runs[point] += [found[key]] if key in found else []
+        runs[point] += [best[key]] if key in best else []
     return campaign, runs
 
 

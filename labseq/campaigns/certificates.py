@@ -1,4 +1,4 @@
-"""The certificates with which the computers of a dask cluster know one another."""
+"""The certificates by which the computers of a dask cluster recognise each other."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ DAYS: Final = 730
 def make_certificates(folder: Path) -> list[Path]:
     """Make an authority, and a certificate with its key for scheduler, workers and clients.
 
-    The key of the authority is kept nowhere: for another certificate, all are made again. Existing files are
-    not replaced.
+    The key of the authority is not stored: another certificate means making all of them again. Existing
+    files are not replaced.
 
     Args:
         folder: Where they are written; created if it does not exist, and closed to other users.
@@ -79,8 +79,8 @@ def _certificate(name: str, key: Any, signer: Any, root: Any) -> Any:
     usage = dict.fromkeys(
         ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement"), False
     )
-    only = {"encipher_only": False, "decipher_only": False, "crl_sign": is_authority}
-    signs = x509.KeyUsage(digital_signature=True, key_cert_sign=is_authority, **usage, **only)
+    flags = {"encipher_only": False, "decipher_only": False, "crl_sign": is_authority}
+    signs = x509.KeyUsage(digital_signature=True, key_cert_sign=is_authority, **usage, **flags)
     signing_key = key if is_authority else signer
     authority = x509.AuthorityKeyIdentifier.from_issuer_public_key(signing_key.public_key())
     builder = (
@@ -89,7 +89,7 @@ def _certificate(name: str, key: Any, signer: Any, root: Any) -> Any:
         .issuer_name(subject if is_authority else root.subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(today - timedelta(days=1))
+        .not_valid_before(today - timedelta(days=1))  # the clocks of computers differ
         .not_valid_after(today + timedelta(days=DAYS))
         .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
         .add_extension(signs, critical=True)

@@ -28,9 +28,9 @@ def keys(
         Path, typer.Argument(metavar="FOLDER", help="A folder without certificates.", show_default=False)
     ],
 ) -> None:
-    """Make the certificates with which scheduler, workers and clients of a dask cluster know one another.
+    """Make the certificates by which scheduler, workers and clients of a dask cluster recognise each other.
 
-    Anyone who has one of the files can have the cluster run any code: copy them only to its machines.
+    Anyone who has one of the files can run any code on the cluster: copy them only to its machines.
     """
     from labseq.campaigns.certificates import DAYS, make_certificates
     from labseq.console.output import say
@@ -102,7 +102,7 @@ def _reporter(wanted: Campaign) -> Callable[[PlannedRun, Run], None]:
 def _result(runs: list[Run]) -> tuple[str, str, str]:
     """Number of shots, mean filling, and names of some runs."""
     shots = [shot for run in runs for shot in run.shots]
-    known = [one for shot in shots if not math.isnan(one := shot.filling_fraction)]
-    filling = f"{100 * sum(known) / len(known):.2f} %" if known else "-"
+    fillings = [filling for shot in shots if not math.isnan(filling := shot.filling_fraction)]
+    mean = f"{100 * sum(fillings) / len(fillings):.2f} %" if fillings else "-"
     first, *others = (f"{run.path.parent.name}/{run.path.name}" for run in runs)
-    return str(len(shots)), filling, f"{first} to {others[-1]}" if others else first
+    return str(len(shots)), mean, f"{first} to {others[-1]}" if others else first

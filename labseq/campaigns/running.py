@@ -32,11 +32,11 @@ Missing: TypeAlias = "list[tuple[PlannedRun, Path | None]]"
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """What the runs of a campaign are made from, as they would be today.
+class CampaignInputs:
+    """The files and plugins that the runs of a campaign would be made from now.
 
     Attributes:
-        texts: Point -> SHA-256 of sequence and profile.
+        texts: Point -> SHA-256 of the texts of sequence and profile.
         plugins: Name, origin and version of each plugin that is used.
     """
 
@@ -44,14 +44,14 @@ class Checked:
     plugins: frozenset[tuple[str, ...]]
 
 
-def check_campaign(campaign: Campaign, *, in_turn: bool) -> Checked:
+def check_campaign(campaign: Campaign, *, in_turn: bool) -> CampaignInputs:
     """Check the sequence at every point, before the first run, and compile its kernels.
 
     Args:
-        in_turn: Whether the runs are taken one after the other: only simulated ones can be taken at once.
+        in_turn: Whether the runs are taken one after the other; otherwise all hardware must be simulated.
 
     Raises:
-        ConfigError: It has an error; at the place of the value in the campaign file, if that is wrong.
+        ConfigError: The sequence has an error; if a value of the campaign file causes it, with its place.
     """
     campaign.find_files()
     plugins, texts = set[tuple[str, ...]](), dict[Point, tuple[str, str]]()
@@ -64,18 +64,18 @@ def check_campaign(campaign: Campaign, *, in_turn: bool) -> Checked:
             raise campaign.placed(error, run) from error
         assembly = session.assembly
         if not (in_turn or assembly.virtual_time):
-            chosen = assembly.hardware.chosen.items()
-            real = [role for role, one in chosen if one.entry.role.is_hardware and not one.virtual_time]
+            plugins_by_role = assembly.hardware.chosen.items()
+            real = [r for r, p in plugins_by_role if p.entry.role.is_hardware and not p.virtual_time]
             what = f"the profile '{assembly.hardware.profile.name}' has real hardware ({', '.join(real)})"
             expected = "simulated hardware, to take several runs at once"
             raise ConfigError(Problem(what, expected=expected, hint="leave out --workers and --scheduler"))
         if not in_turn and not texts:
-            session.warm(session.build_lab())  # here, as several processes would each compile the same
+            session.warm(session.build_lab())  # once here, or each worker would compile the same kernels
         documents = assembly.document, assembly.hardware.document
         sequence, profile = (sha256_of_text(document.text) for document in documents)
         texts[run.point] = sequence, profile
         plugins |= _plugins(assembly)
-    return Checked(texts, frozenset(plugins))
+    return CampaignInputs(texts, frozenset(plugins))
 
 
 def _plugins(assembly: Any) -> set[tuple[str, ...]]:
@@ -83,11 +83,11 @@ def _plugins(assembly: Any) -> set[tuple[str, ...]]:
 
 
 @contextmanager
-def begun(campaign: Campaign, folder: Path, checked: Checked) -> Generator[Missing]:
-    """Use a campaign's folder, alone, and find out which runs it lacks; it is created if need be.
+def campaign_folder(campaign: Campaign, folder: Path, inputs: CampaignInputs) -> Generator[Missing]:
+    """Lock a campaign's folder, which is created if necessary, and give the runs that are missing in it.
 
     Raises:
-        ConfigError: Another process uses it; or the runs in it are of other files, or not of this campaign.
+        ConfigError: Another process uses it; or its runs belong to other files or another campaign.
         RecordingError: A run is damaged, or the folder cannot be written to.
     """
     with explained(folder):
@@ -95,35 +95,35 @@ def begun(campaign: Campaign, folder: Path, checked: Checked) -> Generator[Missi
     lock = Lock(folder / LOCK_FILE, "labseq campaign run")
     with suppress(OSError):  # some network drives have no locks
         if (holder := lock.take()) is not None:
-            what, hint = f"this campaign is in progress: {holder}", "wait for its end, or stop that command"
+            what, hint = f"this campaign is in progress: {holder}", "wait until it ends, or stop that command"
             raise ConfigError(Problem(what, visible(str(folder)), hint=hint))
     try:
-        yield _missing(campaign, folder, checked)
+        yield _missing(campaign, folder, inputs)
     finally:
         lock.release()
 
 
-def _missing(campaign: Campaign, folder: Path, checked: Checked) -> Missing:
-    wanted = {_key(run): run for run in campaign.runs()}
-    found: dict[Any, Run] = {}
+def _missing(campaign: Campaign, folder: Path, inputs: CampaignInputs) -> Missing:
+    planned = {_key(run): run for run in campaign.runs()}
+    best: dict[Any, Run] = {}
     for path in run_folders(folder):
         run = open_run(path)
         key = tuple(run.changes.items())
-        if key not in wanted:
+        if key not in planned:
             what = "this run belongs to no point of the campaign, which may have been changed since"
             raise ConfigError(Problem(what, visible(str(run.path)), expected="another folder"))
         texts = run.record.get("sequence_sha256"), run.record.get("profile_sha256")
-        if texts != checked.texts[wanted[key].point]:
+        if texts != inputs.texts[planned[key].point]:
             what = "this run was taken with another text of the sequence or the profile"
             expected, hint = "another folder", "or the files as they were, which are in the run's folder"
             raise ConfigError(Problem(what, visible(str(run.path)), expected=expected, hint=hint))
-        if (key not in found or found[key].status != "complete") and not _is_elsewhere(run.path):
-            found[key] = run
-    _keep(campaign, folder, is_new=not found)
+        if (key not in best or best[key].status != "complete") and not _is_elsewhere(run.path):
+            best[key] = run
+    _copy_file(campaign, folder, is_new=not best)
     return [
-        (run, found[key].path if key in found else None)
-        for key, run in wanted.items()
-        if key not in found or found[key].status != "complete"
+        (run, best[key].path if key in best else None)
+        for key, run in planned.items()
+        if key not in best or best[key].status != "complete"
     ]
 
 
@@ -132,33 +132,33 @@ def _key(run: PlannedRun) -> tuple[tuple[str, str], ...]:
 
 
 def _is_elsewhere(run_dir: Path) -> bool:
-    """Whether another computer began a run and has not ended it: it may still write to the folder."""
+    """Whether a run was started by another computer and has not ended: that may still write to the folder."""
     owner = read_owner(run_dir)
     return is_running(run_dir) and owner is not None and not owner.is_here
 
 
-def _keep(campaign: Campaign, folder: Path, *, is_new: bool) -> None:
+def _copy_file(campaign: Campaign, folder: Path, *, is_new: bool) -> None:
     """Copy the campaign file to the folder, so that its results can be read without the original."""
-    kept, text = folder / CAMPAIGN_FILE, campaign.document.text
-    if kept.is_file() and Document.read(kept).text == text:
+    copy, text = folder / CAMPAIGN_FILE, campaign.document.text
+    if copy.is_file() and Document.read(copy).text == text:
         return
-    if is_new and kept.exists():
-        what, hint = "this file is of another campaign", "delete it if that campaign has ended"
-        raise ConfigError(Problem(what, visible(str(kept)), expected="another folder", hint=hint))
-    write_file(kept, text.encode())
+    if is_new and copy.exists():
+        what, hint = "this file belongs to another campaign", "delete it if that campaign has ended"
+        raise ConfigError(Problem(what, visible(str(copy)), expected="another folder", hint=hint))
+    write_file(copy, text.encode())
 
 
 def open_session(
-    campaign: Campaign, run: PlannedRun, folder: Path, begun: Path | None, observer: RunObserver | None
+    campaign: Campaign, run: PlannedRun, folder: Path, earlier: Path | None, observer: RunObserver | None
 ) -> Session:
     """Open a run of a campaign, or resume it.
 
     Args:
         folder: The campaign's folder.
-        begun: The folder of the run, if it was begun.
+        earlier: The folder of the run, if it was started before.
     """
-    if begun is not None:
-        return Session.resume(begun, observer=observer)
+    if earlier is not None:
+        return Session.resume(earlier, observer=observer)
     return Session.open(campaign.sequence, **asdict(replace(run.options, output=folder)), observer=observer)
 
 
@@ -166,10 +166,10 @@ def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> No
     """Take the missing runs of a campaign one after the other.
 
     Raises:
-        ConfigError: The campaign has an error, or the runs in the folder are not its own.
-        LabseqError: What ended a run; the campaign is continued by the same command.
+        ConfigError: The campaign has an error, or the runs in the folder belong to another one.
+        LabseqError: A run failed; the same command continues the campaign.
     """
-    with begun(campaign, folder, check_campaign(campaign, in_turn=True)) as missing:
+    with campaign_folder(campaign, folder, check_campaign(campaign, in_turn=True)) as missing:
         for run, earlier in missing:
 
             def start(observer: RunObserver | None, run: Any = run, earlier: Any = earlier) -> Session:
@@ -179,8 +179,8 @@ def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> No
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
-    """What a worker needs to know of a campaign.
+class WorkerTask:
+    """The campaign as it is sent to a worker.
 
     Attributes:
         file: The campaign file.
@@ -202,14 +202,14 @@ class RunTaker:
         ConfigError: This computer does not see the campaign's folder.
     """
 
-    def __init__(self, recipe: Recipe) -> None:
-        self._campaign = Campaign.read(recipe.file, recipe.text)
-        self._recipe = recipe
+    def __init__(self, task: WorkerTask) -> None:
+        self._campaign = Campaign.read(task.file, task.text)
+        self._task = task
         self._runs = [*self._campaign.runs()]
-        if not (recipe.folder / CAMPAIGN_FILE).is_file():
+        if not (task.folder / CAMPAIGN_FILE).is_file():
             what = f"the worker on {platform.node()} does not see this folder"
             expected = "a folder of a drive that all computers see at the same path"
-            raise ConfigError(Problem(what, clean(str(recipe.folder)), expected=expected))
+            raise ConfigError(Problem(what, clean(str(task.folder)), expected=expected))
 
     def __call__(self, number: int) -> tuple[str, LabseqError | None]:
         """Take a run, or resume it.
@@ -217,9 +217,9 @@ class RunTaker:
         Returns:
             Its folder, and the error that ended it or None.
         """
-        run, folder = self._runs[number], self._recipe.folder
-        with open_session(self._campaign, run, folder, self._begun(run), None) as session:
-            if other := _plugins(session.assembly) - self._recipe.plugins:
+        run, folder = self._runs[number], self._task.folder
+        with open_session(self._campaign, run, folder, self._earlier(run), None) as session:
+            if other := _plugins(session.assembly) - self._task.plugins:
                 name, _, version = min(other)
                 what = f"the worker on {platform.node()} has plugin '{name}' {version}"
                 raise ConfigError(Problem(what, expected="the same plugins as on the first computer"))
@@ -229,9 +229,9 @@ class RunTaker:
                 return str(session.run_dir or ""), portable(error)
             return str(session.run_dir), None
 
-    def _begun(self, run: PlannedRun) -> Path | None:
-        """The folder of a run that was begun here: by a worker that died, or an earlier command."""
-        for path in reversed(run_folders(self._recipe.folder)):
+    def _earlier(self, run: PlannedRun) -> Path | None:
+        """The folder of a run that was started here before: by a worker that died, or an earlier command."""
+        for path in reversed(run_folders(self._task.folder)):
             is_open = read_state(path)[0] != "complete" and not _is_elsewhere(path)
             if is_open and open_run(path).changes == run.options.changes():
                 return path
@@ -241,7 +241,7 @@ class RunTaker:
 def run_at_once(
     campaign: Campaign, folder: Path, workers: Workers, report: Callable[[PlannedRun, Run], None]
 ) -> None:
-    """Take the missing runs of a campaign, as many at a time as there are workers.
+    """Take the missing runs of a campaign, one per worker at a time.
 
     If a worker dies, another one resumes its run.
 
@@ -250,42 +250,44 @@ def run_at_once(
         report: Called with each run that is complete.
 
     Raises:
-        ConfigError: The campaign has an error, or the runs in the folder are not its own.
-        StopRequested: Ctrl-C or SIGTERM; the runs in progress are stopped, and resumed by the next command.
-        LabseqError: What ended a run; the campaign is continued by the same command.
+        ConfigError: The campaign has an error, or the runs in the folder belong to another one.
+        StopRequested: Ctrl-C or SIGTERM; the runs in progress are stopped; the same command resumes them.
+        LabseqError: A run failed; the same command continues the campaign.
     """
     stop = StopFlag()
     with closing(workers), stop_on_signals(stop):
-        checked = check_campaign(campaign, in_turn=False)
-        with begun(campaign, folder, checked) as missing, closing(workers):  # before the folder is free
+        inputs = check_campaign(campaign, in_turn=False)
+        # workers are closed before the folder's lock is released
+        with campaign_folder(campaign, folder, inputs) as missing, closing(workers):
             keys = {_key(run) for run, _ in missing}
-            left = {number: run for number, run in enumerate(campaign.runs()) if _key(run) in keys}
+            remaining = {number: run for number, run in enumerate(campaign.runs()) if _key(run) in keys}
             document = campaign.document
-            recipe = Recipe(document.path.resolve(), document.text, folder.resolve(), checked.plugins)
-            workers.prepare(RunTaker, recipe)
+            task = WorkerTask(document.path.resolve(), document.text, folder.resolve(), inputs.plugins)
+            workers.prepare(RunTaker, task)
             try:
-                _share_out(left, workers, report, stop)
+                _share_out(remaining, workers, report, stop)
             finally:
-                for path in filter(is_running, run_folders(folder) if left else ()):  # perhaps elsewhere
+                # also those on other computers, which no signal reaches
+                for path in filter(is_running, run_folders(folder) if remaining else ()):
                     ask_to_stop(path)
 
 
 def _share_out(
-    left: dict[int, PlannedRun],
+    remaining: dict[int, PlannedRun],
     workers: Workers,
     report: Callable[[PlannedRun, Run], None],
     stop: StopFlag,
 ) -> None:
-    """Give each worker a run at a time; runs that are complete are removed from those that are left."""
-    waiting, n_out = iter([*left]), 0
-    while left:
+    """Give each worker one run at a time, and remove complete runs from ``remaining``."""
+    waiting, n_out = iter([*remaining]), 0
+    while remaining:
         while n_out < workers.n_workers and (number := next(waiting, None)) is not None:
             workers.submit(number, number)
             n_out += 1
         stop.check()
         for number, (run_dir, error) in workers.finished(POLL_S):
             if error is not None:
-                stop.check()  # Ctrl-C reaches all processes
+                stop.check()  # Ctrl-C reaches the workers too: their errors are no failures then
                 raise error
-            report(left.pop(number), open_run(run_dir))
+            report(remaining.pop(number), open_run(run_dir))
             n_out -= 1
