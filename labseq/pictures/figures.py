@@ -24,13 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENDINGS: Final = (".png", ".svg", ".pdf")
-"""Kinds of pictures."""
+"""File name endings of pictures."""
 DARK, LIGHT, ORANGE, RED = "#1f4e8c", "#86b6e0", "#f28e2b", "#c8102e"
-"""Colours of points and lines, of areas, of a second series, and of what is compared."""
-
-_STYLE: Final[dict[str, Any]] = {"svg.hashsalt": "labseq", "text.parse_math": False}
-
-_UNDATED: Final = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Colours of points and lines, of areas, of a second series, and of what they are compared with."""
 
 
 def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
@@ -69,7 +65,7 @@ def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
 
 
 def show_plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis with as many plain numbers as fit: pictures have no powers of ten."""
+    """Label a logarithmic axis with as many plain numbers as fit, instead of powers of ten."""
     from matplotlib.ticker import LogFormatter
 
     axis.set_major_formatter(LogFormatter())
@@ -80,9 +76,11 @@ def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any
     """Draw a picture independently of the user's matplotlibrc: the same picture gives the same bytes."""
     from matplotlib import style
 
-    with style.context(["default", _STYLE]):
+    # dates, versions and random ids in the file would make equal pictures differ
+    undated = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+    with style.context(["default", {"svg.hashsalt": "labseq", "text.parse_math": False}]):
         data = io.BytesIO()
-        options.setdefault("metadata", _UNDATED[kind])
+        options.setdefault("metadata", undated[kind])
         draw().savefig(data, format=kind[1:], **options)
     return data.getvalue()
 
@@ -125,8 +123,6 @@ TITLE_IN: Final = 0.3
 """Room above each panel for its title, in inches."""
 HEAD_IN: Final = 0.9
 """Room at the top of the sheet for its title and key, in inches."""
-MIN_WIDTH_IN: Final = 9.0
-"""Width of a sheet's title and key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,9 +199,9 @@ def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
 
 
 def plan_timelines(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) -> Sheet:
-    """Choose the size of the panels, and their number in a row.
+    """Choose the size of the panels and how many are in a row.
 
-    The sheet is to be somewhat wider than high, with few empty places.
+    The sheet should be somewhat wider than high, with few empty places.
 
     Args:
         panel_in: Width of a panel, in inches, unless its sites become too small or too large.
@@ -221,14 +217,15 @@ def plan_timelines(extent: Extent, n_panels: int, panel_in: float = PANEL_IN) ->
     def size(n_cols: int) -> tuple[float, float]:
         return n_cols * width, math.ceil(n_panels / n_cols) * height + HEAD_IN
 
-    def fault(n_cols: int) -> float:
+    def badness(n_cols: int) -> float:
         across, down = size(n_cols)
         return abs(math.log(across / down / 1.5)) + 1.5 * (-n_panels % n_cols) / n_panels
 
-    n_cols = min(range(1, n_panels + 1), key=fault)
+    n_cols = min(range(1, n_panels + 1), key=badness)
     across, down = size(n_cols)
     n_rows = math.ceil(n_panels / n_cols)
-    return Sheet(n_cols, n_rows, site_in, max(across, MIN_WIDTH_IN), down, extent)
+    min_width_in = 9.0  # for title and key
+    return Sheet(n_cols, n_rows, site_in, max(across, min_width_in), down, extent)
 
 
 POINTS_PER_INCH: Final = 72
@@ -265,12 +262,8 @@ class MarkerStyle:
         }
 
 
-_TOUCHING = 1.01
-"""Distance up to which sites are neighbours, in units of the spacing."""
-
-
 def neighbours(grid: SiteGrid) -> NDArray[np.int64]:
-    """How far the nearest sites are, in rows and columns, counter-clockwise as seen in a picture.
+    """Steps to the nearest sites, in rows and columns, counter-clockwise as seen in a picture.
 
     Returns:
         int64 (n, 2), 6 of them on a triangular lattice and 4 on a square one.
@@ -281,7 +274,7 @@ def neighbours(grid: SiteGrid) -> NDArray[np.int64]:
     """
     steps = np.array([step for step in product((-1, 0, 1), repeat=2) if any(step)])
     x, y = place_sites(steps, grid).T
-    near = np.hypot(x, y) < _TOUCHING
+    near = np.hypot(x, y) < 1.01  # in units of the spacing, with room for rounding
     order = np.argsort(np.arctan2(y[near], x[near]), kind="stable")
     return steps[near][order]
 
@@ -309,14 +302,14 @@ def outline(sites: NDArray[np.bool_], grid: SiteGrid) -> Floats:
     padded = np.pad(sites, 1)
     stretches: list[Floats] = []
     for (row, col), edge in zip(neighbours(grid), _edges(grid), strict=True):
-        beside = np.roll(padded, (-row, -col), axis=(0, 1))[1:-1, 1:-1]
-        open_here = np.argwhere(sites & ~beside)
-        stretches.append(place_sites(open_here, grid)[:, None] + edge)
+        neighbour = np.roll(padded, (-row, -col), axis=(0, 1))[1:-1, 1:-1]
+        at_border = np.argwhere(sites & ~neighbour)
+        stretches.append(place_sites(at_border, grid)[:, None] + edge)
     return np.concatenate(stretches)
 
 
 def _edges(grid: SiteGrid) -> Floats:
-    """The stretch of the border towards each neighbour, float64 (n, 2, 2); each begins where one ends."""
+    """The edge of a cell towards each neighbour, float64 (n, 2, 2); each begins where the last one ends."""
     to = place_sites(neighbours(grid), grid)
     aside = np.stack([-to[:, 1], to[:, 0]], axis=1)
     half = np.tan(np.pi / len(to)) / 2

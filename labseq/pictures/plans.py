@@ -43,9 +43,9 @@ N_POINTS: Final = 16
 
 
 def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
-    """Separate moves that share a part of a line, so that they can be drawn next to one another.
+    """Separate moves that overlap on a line, so that they can be drawn next to each other.
 
-    Short ways get the low lanes. Opposite ways along a line need not be parted:
+    Short moves get the low lanes. Opposite moves along a line need no separate lanes:
     they are drawn on opposite sides of it.
 
     Args:
@@ -62,17 +62,17 @@ def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
     axis = (way[:, 0] != 0).astype(np.intp)  # 1 along a column, whose moves count rows
     each = np.arange(len(moves))
     line, start, end = moves[each, axis], moves[each, 1 - axis], moves[each, 3 - axis]
-    found = np.zeros(len(moves), np.intp)
+    lane_of_move = np.zeros(len(moves), np.intp)
     taken: dict[tuple[int, ...], list[tuple[int, int]]] = {}
     for i in np.argsort(np.abs(end - start), kind="stable"):
         low, high = sorted((int(start[i]), int(end[i])))
-        where = int(axis[i]), int(line[i]), int(end[i] > start[i])
+        track = int(axis[i]), int(line[i]), int(end[i] > start[i])
         lane = 0
-        while any(a < high and low < b for a, b in taken.get((*where, lane), ())):
+        while any(a < high and low < b for a, b in taken.get((*track, lane), ())):
             lane += 1
-        taken.setdefault((*where, lane), []).append((low, high))
-        found[i] = lane
-    return found
+        taken.setdefault((*track, lane), []).append((low, high))
+        lane_of_move[i] = lane
+    return lane_of_move
 
 
 def heights(lane: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -187,8 +187,8 @@ def lines_label(axis: Axis, lines: Iterable[int]) -> str:
     starts = [n for n, before in zip(numbers, [None, *numbers], strict=False) if before != n - 1]
     bounds = pairwise([*starts, 1 << 31])
     spans = [[n for n in numbers if start <= n < stop] for start, stop in bounds]
-    words = [str(span[0]) if span[0] == span[-1] else f"{span[0]}-{span[-1]}" for span in spans]
-    return f"{axis}{'s' if len(numbers) > 1 else ''} {', '.join(words)}"
+    ranges = [str(span[0]) if span[0] == span[-1] else f"{span[0]}-{span[-1]}" for span in spans]
+    return f"{axis}{'s' if len(numbers) > 1 else ''} {', '.join(ranges)}"
 
 
 ATOM, SURPLUS, RESERVOIR = "0.45", "#86c5ea", "0.80"
@@ -200,17 +200,15 @@ DEFECT_LOOK: Final = MarkerStyle("empty target site", "o", 0.62, "white", RING)
 SURPLUS_LOOK: Final = MarkerStyle("surplus atom", "o", 0.5, SURPLUS, SURPLUS)
 RESERVOIR_LOOK: Final = MarkerStyle("atom in the reservoir", "o", 0.5, RESERVOIR, RESERVOIR)
 EMPTY_LOOK: Final = MarkerStyle("empty site", "o", 0.14, DOT, DOT)
-MISSING_LOOK: Final = MarkerStyle("target site that stays empty", "o", 0.62, "white", DEFECT)
+STILL_EMPTY_LOOK: Final = MarkerStyle("target site that stays empty", "o", 0.62, "white", DEFECT)
 EJECTED_LOOK: Final = MarkerStyle("ejected", "X", 0.55, DEFECT, DEFECT)
 WRONG_LOOK: Final = MarkerStyle("refused", "D", 0.95, "none", DEFECT)
-ATTEMPTED: Final = "0.25"
-"""Colour of moves of a refused batch that break no rule themselves."""
 
 
 def paint_sites(
     axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern, *, final: bool
 ) -> list[MarkerStyle]:
-    """Paint every site; ``final``: target sites that are empty now stay so.
+    """Paint every site; ``final`` means that target sites that are empty stay empty.
 
     Returns:
         The markers that occur, in the order of the key.
@@ -218,15 +216,15 @@ def paint_sites(
     wanted, unwanted = target.fill, target.clear
     layers = (
         (EMPTY_LOOK, ~occupancy & ~wanted),
-        (MISSING_LOOK if final else DEFECT_LOOK, ~occupancy & wanted),
+        (STILL_EMPTY_LOOK if final else DEFECT_LOOK, ~occupancy & wanted),
         (RESERVOIR_LOOK, occupancy & ~wanted & ~unwanted),
         (SURPLUS_LOOK, occupancy & unwanted),
         (ATOM_LOOK, occupancy & wanted),
     )
     painted: list[MarkerStyle] = []
-    for look, here in layers:
-        if here.any():
-            x, y = place_sites(np.argwhere(here), grid).T
+    for look, sites in layers:
+        if sites.any():
+            x, y = place_sites(np.argwhere(sites), grid).T
             axes.plot(x, y, **look.keywords(sheet.site_in), zorder=1)
             painted.append(look)
     return painted
@@ -251,7 +249,7 @@ def paint_moves(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int1
 
 
 def paint_paths(axes: Axes, sheet: Sheet, grid: SiteGrid, batch: Batch, colour: Any) -> None:
-    """Paint the ways of all tweezers of a batch with paths of tones, dotted those without an atom."""
+    """Paint the ways of all tweezers of a batch with paths of tones; those without an atom are dotted."""
     paths, points = batch.tones, sheet.site_in * POINTS_PER_INCH
     assert paths is not None
     thick = min(1.5, 0.11 * points)
@@ -304,9 +302,7 @@ def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> No
 
 
 MAX_PANELS: Final = 38
-"""Most panels of batches; with the ones before and after that makes 40."""
-MAX_WORDS: Final = 24
-"""Characters for the lines in a panel's title; if they are more, the lines are only counted."""
+"""Maximum number of panels of batches; with those before and after that makes 40."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,9 +332,8 @@ class Panel:
             >>> Panel(2, 4, (("row", (7, 9)),)).title
             'batches 2-4: rows 7, 9'
         """
-        one = self.n_batches == 1
-        numbers = f"batch {self.first}" if one else f"batches {self.first}-{self.last}"
-        return f"{numbers}: " + "; ".join(_words(axis, lines) for axis, lines in self.moves_along)
+        numbers = f"batch {self.first}" if self.n_batches == 1 else f"batches {self.first}-{self.last}"
+        return f"{numbers}: " + "; ".join(_short_label(axis, lines) for axis, lines in self.moves_along)
 
 
 def make_panels(batches: Sequence[Lines], max_panels: int = MAX_PANELS) -> list[Panel]:
@@ -352,28 +347,31 @@ def make_panels(batches: Sequence[Lines], max_panels: int = MAX_PANELS) -> list[
     return [_panel(batches, range(n * i // n_panels, n * (i + 1) // n_panels)) for i in range(n_panels)]
 
 
-def _words(axis: Axis, lines: tuple[int, ...]) -> str:
-    words = lines_label(axis, lines)
-    return words if len(words) <= MAX_WORDS else f"{len(lines)} {axis}s"
+def _short_label(axis: Axis, lines: tuple[int, ...]) -> str:
+    """The lines for a panel's title, which has room for 24 characters; more are only counted."""
+    label = lines_label(axis, lines)
+    return label if len(label) <= 24 else f"{len(lines)} {axis}s"
 
 
 def _panel(batches: Sequence[Lines], group: range) -> Panel:
-    found: dict[Axis, set[int]] = {}
+    lines_by_axis: dict[Axis, set[int]] = {}
     for axis, lines in (batches[i] for i in group):
-        found.setdefault(axis, set()).update(lines)
-    return Panel(group[0], group[-1], tuple((axis, tuple(sorted(lines))) for axis, lines in found.items()))
+        lines_by_axis.setdefault(axis, set()).update(lines)
+    return Panel(
+        group[0], group[-1], tuple((axis, tuple(sorted(lines))) for axis, lines in lines_by_axis.items())
+    )
 
 
 DPI: Final = 150
 MAX_SITES: Final = 128
-"""Most rows, and most columns, of an array that can be made out in a picture."""
+"""Maximum number of rows or columns of an array whose sites can be told apart in a picture."""
 COLOURS: Final = ("plasma", 0.0, 0.82)
-"""Colour map of the order of batches, and the part of it that can be seen on white."""
+"""Colour map of the order of batches, and the part of it that is visible on white."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanDrawing:
-    """What is drawn: a plan, the occupancy before it, two lines of text at the top, and what is wrong."""
+    """What is drawn: a plan, the occupancy before it, two lines of text at the top, and a refusal."""
 
     title: str
     source: str
@@ -391,7 +389,7 @@ class PlanDrawing:
             return None
         batch, most = self.plan.batch(self.refused.batch), np.array(self.grid.shape) + 1
         starts, goals = (
-            np.clip(one, -2, most).astype(np.int16) for one in (batch.from_sites, batch.to_sites)
+            np.clip(sites, -2, most).astype(np.int16) for sites in (batch.from_sites, batch.to_sites)
         )
         return Batch(starts, goals)
 
@@ -412,7 +410,7 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
 def save_plan(path: Path, drawing: PlanDrawing) -> None:
     """Draw the array before and after, and between them a panel for each batch or some of them.
 
-    A plan that was refused is drawn up to the refused batch, with what is wrong in it.
+    A refused plan is drawn up to the refused batch, with its mistake.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -479,7 +477,7 @@ def _corners(grid: SiteGrid) -> NDArray[np.float64]:
 def _paint_refused(
     figure: Figure, sheet: Sheet, drawing: PlanDrawing, batch: Batch, index: int
 ) -> list[MarkerStyle]:
-    """Paint what is wrong into the panel of the refused batch, and write it beside it."""
+    """Mark the mistake in the panel of the refused batch, and write the reason next to it."""
     axes, error, grid = figure.axes[index], drawing.refused, drawing.grid
     assert error is not None
     axes.title.set_color(DEFECT)
@@ -489,7 +487,7 @@ def _paint_refused(
         np.arange(len(moves)) == error.move if error.move >= 0 else np.full(len(moves), error.site is None)
     )
     goes = (batch.from_sites != batch.to_sites).any(axis=1)
-    colours = np.where(wrong, DEFECT, ATTEMPTED)
+    colours = np.where(wrong, DEFECT, "0.25")  # grey: moves that break no rule themselves
     paint_moves(axes, sheet, grid, moves[goes], colours[goes])
     sites = moves[wrong & ~goes, :2] if error.site is None else np.array([error.site])
     x, y = place_sites(np.clip(sites, -2, np.array(grid.shape) + 1), grid).T
@@ -506,7 +504,7 @@ def _paint_panel(axes: Axes, sheet: Sheet, drawing: PlanDrawing, panel: Panel, *
     plan = drawing.plan
     offsets = plan.batch_offsets[panel.first : panel.last + 2]
     moves = plan.moves[offsets[0] : offsets[-1]]
-    if alone:  # else colours tell the batches of a panel apart
+    if alone:  # otherwise colours distinguish the batches of a panel
         of_batch = [colour_of(panel.first, plan.n_batches)]
     else:
         of_batch = [colour_of(i, panel.n_batches) for i in range(panel.n_batches)]

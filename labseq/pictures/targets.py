@@ -19,15 +19,13 @@ SITE_IN: Final = 0.18
 """Distance between neighbours in a picture of :func:`save_target`, in inches."""
 
 FILL_LOOK: Final = MarkerStyle("atom", "o", 0.76, "#1b5e8c", "#1b5e8c")
-CLEAR_LOOK: Final = MarkerStyle("must be empty", "o", 0.34, "white", "0.78")
-OTHER_LOOK: Final = MarkerStyle("reservoir", "o", 0.16, "0.6", "0.6")
 
 
 def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: float = SITE_IN) -> None:
     """Draw a target: atoms filled, sites that must be empty as rings, the reservoir as dots.
 
     Args:
-        axes: Where; gets limits that show the whole grid, and no axes.
+        axes: Where to draw; their limits show the whole grid, and their frame is hidden.
         grid: The grid that it lies on.
         site_in: Distance between neighbours in the finished picture, in inches.
 
@@ -36,12 +34,12 @@ def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: floa
     """
     if target.shape != grid.shape:
         raise ValueError(f"the target has {target.shape} sites and the grid {grid.shape}; expected the same")
-    for look, here in (
-        (OTHER_LOOK, ~target.fill & ~target.clear),
-        (CLEAR_LOOK, target.clear),
+    for look, sites in (
+        (MarkerStyle("reservoir", "o", 0.16, "0.6", "0.6"), ~target.fill & ~target.clear),
+        (MarkerStyle("must be empty", "o", 0.34, "white", "0.78"), target.clear),
         (FILL_LOOK, target.fill),
     ):
-        x, y = place_sites(np.argwhere(here), grid).T
+        x, y = place_sites(np.argwhere(sites), grid).T
         axes.plot(x, y, **look.keywords(site_in))
     extent = extent_of_sites(np.empty((0, 2), np.int64), grid)
     axes.set_xlim(extent.left, extent.right)

@@ -63,7 +63,7 @@ class AxisStatistics:
 
     @property
     def aod_peak_v(self) -> float:
-        """Highest voltage behind the amplifier, across 50 Ohm."""
+        """Highest voltage after the amplifier, across 50 Ohm."""
         return self.peak_v * math.sqrt(self.gain)
 
     @property

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 import numpy as np
 from rich.console import Console
@@ -22,9 +22,6 @@ from labseq.kernel import interpret
 from labseq.model import Batch, TonePaths
 from labseq.pictures.plans import occupancies, on_grid
 from labseq.units import format_quantity
-
-INTERPRETED_SITES: Final = 64 * 64
-"""Maximum number of sites up to which planning in plain Python is faster than loading numba."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +48,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         from labseq.pictures.plans import check_picture
 
         check_picture(output.png, source.occupancy.shape)
-    if source.occupancy.size <= INTERPRETED_SITES:
+    if source.occupancy.size <= 64 * 64:  # planning in plain Python is then faster than loading numba
         interpret()
     moves = plan_moves(request, source, announce=report_compiling, keep_refused=True)
     if output.png is not None:
@@ -72,10 +69,10 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
     if moves.refused is not None:
         return []
     texts: list[str] = []
-    asked, used = request.degree_of_parallelism, moves.degree_of_parallelism
-    if asked is not None and asked != used:
+    requested, used = request.degree_of_parallelism, moves.degree_of_parallelism
+    if requested is not None and requested != used:
         texts.append(
-            f"--dop {asked}: planned with {used}, the maximum that the planner and the machine allow"
+            f"--dop {requested}: planned with {used}, the maximum that the planner and the machine allow"
         )
     n_defects, n_surplus = moves.report.n_defects, moves.report.n_surplus
     n_atoms, n_sites = int(moves.occupancy.sum()), moves.target.n_atoms
@@ -96,8 +93,8 @@ def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
 def _draw(moves: PlannedMoves, path: Path) -> None:
     from labseq.pictures.plans import PlanDrawing, save_plan
 
-    what = moves.grid, moves.occupancy, moves.target, moves.plan, moves.report, moves.refused
-    save_plan(path, PlanDrawing(title(moves), moves.source, *what))
+    content = moves.grid, moves.occupancy, moves.target, moves.plan, moves.report, moves.refused
+    save_plan(path, PlanDrawing(title(moves), moves.source, *content))
 
 
 def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[list[Text]]:
@@ -136,7 +133,7 @@ def refused_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> list[Te
     elif error.site is not None:
         sites = batch.from_sites, np.array([error.site], np.int16)
         titles = "moves from", "site that breaks the rule"
-    marked = [one[on_grid(one, shape)] for one in sites]
+    marked = [ends[on_grid(ends, shape)] for ends in sites]
     atoms = moves.report.predicted
     ways = zip(map(tuple, batch.from_sites.tolist()), map(tuple, batch.to_sites.tolist()), strict=True)
     return [
@@ -161,13 +158,13 @@ def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[
     line_index, place = (1, 0) if along_column else (0, 1)
     line_name, place_name = ("column", "row") if along_column else ("row", "column")
     stays = on_grid(batch.to_sites, shape).tolist()
-    found: dict[int, list[str]] = {}
+    moves_of_line: dict[int, list[str]] = {}
     for start, end, lands in zip(batch.from_sites.tolist(), batch.to_sites.tolist(), stays, strict=True):
         goal = end[place] if lands else "ejected"
-        found.setdefault(start[line_index], []).append(f"{start[place]}{arrow}{goal}")
+        moves_of_line.setdefault(start[line_index], []).append(f"{start[place]}{arrow}{goal}")
     return [
         f"{line_name} {line}: {place_name}{'s' if len(ways) > 1 else ''} {', '.join(ways)}"
-        for line, ways in sorted(found.items())
+        for line, ways in sorted(moves_of_line.items())
     ]
 
 
@@ -186,10 +183,6 @@ def _paths_text(batch: Batch, paths: TonePaths, shape: tuple[int, int], arrow: s
     return [f"{'; '.join(lines)}, in {plural(paths.shape[0] - 1, 'leg')}", f"atoms {', '.join(ways)}"]
 
 
-PLAIN_WIDTH: Final = 132
-"""Characters per line without a terminal."""
-
-
 class _Console(Console):
     """A console that raises on a closed pipe, where rich would end the process."""
 
@@ -198,14 +191,14 @@ class _Console(Console):
 
 
 def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
-    """Print a plan, batch by batch if wanted; in a terminal each batch waits for Enter."""
+    """Print a plan; with ``step`` batch by batch, in a terminal waiting for Enter after each."""
     console = _Console(file=stream, highlight=False, soft_wrap=True)
     with writing_to(stream):
         _print_all(console, moves, step=step)
 
 
 def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
-    width = console.width if console.is_terminal else PLAIN_WIDTH
+    width = console.width if console.is_terminal else 132  # characters per line
     shear = moves.grid.shear if moves.grid.lattice == "triangular" else 0
     canvas = ArrayPair(moves.target, shear, width, glyphs_for(console.encoding))
     _print(console, *map(Text, aligned(subject(moves))), Text())

@@ -159,7 +159,7 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
         data: UTF-8.
 
     Raises:
-        ConfigError: It is no JSON, no plan, or a value in it is invalid; says what was expected.
+        ConfigError: It is not JSON, not a plan, or a value in it is invalid; says what was expected.
     """
     if len(data) > MAX_BYTES:
         raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_EXPECTED))
@@ -249,10 +249,12 @@ def read_plan(
 def _machine(file: PlanFile, name: str, request: PlanRequest) -> Machine:
     for_planner, for_profile = split_overrides(request.overrides)
     default = PlanRequest(request.occupancy)
-    given = [name for name in _OPTIONS if getattr(request, name) != getattr(default, name)]
-    if given or for_planner:
-        option = f"--{given[0]}".replace("degree_of_parallelism", "dop") if given else for_planner[0].source
-        what = f"{name} is a plan already: there is nothing to plan"
+    options = [name for name in _OPTIONS if getattr(request, name) != getattr(default, name)]
+    if options or for_planner:
+        option = (
+            f"--{options[0]}".replace("degree_of_parallelism", "dop") if options else for_planner[0].source
+        )
+        what = f"{name} is already a plan: there is nothing to plan"
         raise ConfigError(Problem(what, option, hint="leave the option out, or give an occupancy"))
     if request.profile is None and not for_profile:
         return Machine(file.grid, MotionSpec())

@@ -41,9 +41,7 @@ MAX_RATE_HZ: Final = 10e9
 
 PLAN_SUFFIX: Final = ".json"
 
-_OF_SHOT: Final = "the profile in the shot's file"
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_BATCHES: Final = re.compile(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +76,12 @@ def read_moves(
 
 
 def read_sample_rate(text: str | None, request: PlanRequest, machine: dict[str, Any]) -> SampleRate:
-    """Find the sample rate: the given one, else the profile's, else the paper's.
+    """Find the sample rate: that of the option, else the profile's, else the paper's.
 
     A profile has one if the plugin of its mobile tweezers has a setting ``sample_rate``.
 
     Args:
-        text: The given one, such as "625 MHz"; None if there is none.
+        text: Value of the option, such as "625 MHz"; None without it.
         request: Names the profile, if there is one.
         machine: The profile that a shot was taken with; may be empty.
     """
@@ -92,7 +90,9 @@ def read_sample_rate(text: str | None, request: PlanRequest, machine: dict[str, 
     if request.profile is not None:
         return _of_profile(request.profile, request.overrides)
     rate_hz = machine.get("mobile_tweezers", {}).get("sample_rate")
-    return SampleRate(rate_hz, _OF_SHOT) if isinstance(rate_hz, int | float) else SampleRate(DEFAULT_RATE_HZ)
+    if not isinstance(rate_hz, int | float):
+        return SampleRate(DEFAULT_RATE_HZ)
+    return SampleRate(rate_hz, "the profile in the shot's file")
 
 
 def _parse(text: str) -> SampleRate:
@@ -140,20 +140,20 @@ def read_batches(text: str | None, plan: Plan) -> range:
     if text is None:
         return range(n)
     option = clean(f"--batches {text}")
-    there_are = f"a number from 0 to {n - 1}, or two of them as in 0-{n - 1}" if n > 1 else "0, the only one"
-    match = _BATCHES.fullmatch(text)
+    expected = f"a number from 0 to {n - 1}, or two of them as in 0-{n - 1}" if n > 1 else "0, the only one"
+    match = re.fullmatch(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?", text)
     if match is None:
-        raise ConfigError(Problem("these are not batches", option, expected=there_are))
+        raise ConfigError(Problem("these are not batches", option, expected=expected))
     first, last = int(match[1]), int(match[2] or match[1])
     if not first <= last < n:
-        raise ConfigError(Problem("there are no such batches", option, expected=there_are))
+        raise ConfigError(Problem("there are no such batches", option, expected=expected))
     begins, ends = first, last
     while plan.linked[begins]:
         begins -= 1
     while ends + 1 < n and plan.linked[ends + 1]:
         ends += 1
     if (begins, ends) != (first, last):
-        what = "linked batches are cut, between which the tweezers stay on"
+        what = "this separates linked batches, between which the tweezers stay on"
         raise ConfigError(Problem(what, option, expected=f"--batches {begins}-{ends}"))
     return range(first, last + 1)
 
@@ -279,16 +279,16 @@ def plan_waveform(
         renderer = Renderer(program, rate.hz)
     segments = [i for i in range(program.n_segments) if program.batch[i] in batches]
     played = range(segments[0], segments[-1] + 1)
-    made = PlannedWaveform(moves, program, renderer, batches, played, tuple(filter(None, [rate.warning])))
-    if not made.tones_on_s * rate.hz >= 1:
-        what = f"there is nothing to play: tones are on for {made.tones_on_s} s"
+    waveform = PlannedWaveform(moves, program, renderer, batches, played, tuple(filter(None, [rate.warning])))
+    if not waveform.tones_on_s * rate.hz >= 1:
+        what = f"there is nothing to play: tones are on for {waveform.tones_on_s} s"
         raise ConfigError(Problem(what, moves.source))
-    if made.duration_s > MAX_DURATION_S:
-        what = f"the waveform is {format_quantity(made.duration_s, 'time')} long"
+    if waveform.duration_s > MAX_DURATION_S:
+        what = f"the waveform is {format_quantity(waveform.duration_s, 'time')} long"
         most = f"at most {format_quantity(MAX_DURATION_S, 'time')}"
         hint = "look at the grid's spacing and at the speed, or choose some of the batches with --batches"
         raise ConfigError(Problem(what, moves.source, expected=most, hint=hint))
-    return made
+    return waveform
 
 
 def _tones(moves: PlannedMoves, request: PlanRequest) -> ToneProgram:
@@ -314,9 +314,8 @@ def _refuse_slow(rate: SampleRate, program: ToneProgram) -> None:
         raise ConfigError(Problem(what, rate.source, expected=f"more than {least}"))
 
 
-SAMPLES_SUFFIX: Final = ".npz"
 FILE_CHUNK: Final = 1 << 20
-"""Number of samples that are rendered and written together."""
+"""Number of samples that are rendered and written at a time."""
 
 
 def check_samples_file(path: Path) -> None:
@@ -326,7 +325,7 @@ def check_samples_file(path: Path) -> None:
         ConfigError: It has another ending than .npz, its folder does not exist, or the path
             is not an ordinary file.
     """
-    check_output(path, "an NPZ file", SAMPLES_SUFFIX)
+    check_output(path, "an NPZ file", ".npz")
 
 
 def save_samples(path: Path, waveform: PlannedWaveform) -> None:

@@ -20,21 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WINDOW_S: Final = 6e-6
-"""Length of a Hann window: it separates tones 0.5 MHz apart, and a chirp of 1.6 MHz
-per site, of about 35 us, moves by less than that."""
-
-MAX_WINDOWS: Final = 8
-"""Windows whose power is averaged in a column, at most; a long program is only sampled."""
-
 AT_ONCE: Final = 32
-"""Windows that are transformed together: a few megabytes."""
+"""Windows that are transformed together, in a few megabytes."""
 
 CHUNK: Final = 1 << 18
-"""Samples that are looked at together."""
-
-FLOOR: Final = 1e-12
-"""Power that counts as none, relative to a tone at full scale."""
+"""Samples that are rendered at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +68,7 @@ class WaveformPieces:
 def spectrogram(
     renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int, band_hz: tuple[float, float]
 ) -> tuple[NDArray[np.float32], tuple[float, float]]:
-    """Find out how strong each frequency is, column by column, without ever holding all samples.
+    """Compute how strong each frequency is, column by column, without ever holding all samples.
 
     Args:
         channel: 0 for the row tones, 1 for the column tones.
@@ -89,13 +79,15 @@ def spectrogram(
         and the frequencies of the lower edge of the first bin and the upper edge of the last.
     """
     rate_hz = renderer.sample_rate_hz
-    length = max(16, round(WINDOW_S * rate_hz))
+    # a Hann window of 6 us separates tones 0.5 MHz apart, and a chirp of 1.6 MHz per site, which takes about
+    # 35 us, moves by less than that in it
+    length = max(16, round(6e-6 * rate_hz))
     n_fft = 2 << (length - 1).bit_length()
     window = np.hanning(length).astype(np.float32)
     low, high = (int(np.rint(hz / rate_hz * n_fft)) for hz in band_hz)
     low, high = max(0, low), min(n_fft // 2, max(low, high))
     wide = stretches.n_samples / n_columns
-    n_windows = min(MAX_WINDOWS, math.ceil(2 * wide / length))
+    n_windows = min(8, math.ceil(2 * wide / length))  # so of a long program not all samples are used
     centre = (np.arange(n_columns * n_windows) + 0.5) * (wide / n_windows)
     start = np.maximum(0, stretches.in_waveform(centre.astype(np.int64)) - length // 2)
     samples = np.empty((AT_ONCE, length), np.int16)
@@ -107,7 +99,7 @@ def spectrogram(
         spectrum = np.fft.rfft(samples[: len(its)] * window, n_fft)[:, low : high + 1]
         power[i : i + len(its)] = (2 / (window.sum() * FULL_SCALE) * np.abs(spectrum)) ** 2
     mean = power.reshape(n_columns, n_windows, -1).mean(axis=1)
-    level_db = 10 * np.log10(np.maximum(mean, FLOOR))
+    level_db = 10 * np.log10(np.maximum(mean, 1e-12))
     edges_hz = (low - 0.5) * rate_hz / n_fft, (high + 0.5) * rate_hz / n_fft
     return level_db.T.astype(np.float32), edges_hz
 
@@ -135,16 +127,10 @@ Floats = NDArray[np.float64]
 DPI: Final = 150
 SIZE_IN: Final = (11.0, 8.5)
 HEIGHTS: Final = (0.5, 3.0, 1.0, 3.0, 1.0)
-"""Of the strip with the batches, and of spectrogram and envelope of each axis; relative."""
-HEAD_BELOW: Final = 0.945
-"""Height below which everything but the head is laid out, as a part of the picture's."""
+"""Relative heights of the strip of batches, and of spectrogram and envelope of each axis."""
 N_COLUMNS: Final = 1400
 """Columns of a spectrogram, about as many as the picture has pixels."""
-ENVELOPE_S: Final = 2e-6
-"""Least width of a column of an envelope: some periods of the beat of neighbouring tones."""
 MARGIN_HZ: Final = 2.5e6
-RANGE_DB: Final = 50.0
-"""Range of levels that is shown, from the strongest tone down."""
 N_POINTS: Final = 25
 """Points of the line of a tone whose speed changes."""
 
@@ -154,13 +140,9 @@ KINDS: Final = {
     SegmentKind.DROP_OFF: ("drop-off", "#f28e2b"),
 }
 INTENDED, PEAK, CUT = "#c8102e", "#4e79a7", "0.35"
-SHADES: Final = ("white", "0.75", "0.4")
-"""From the weakest level to the strongest; the intended tones are drawn on top."""
-N_SHADES: Final = 25
-"""One per 2 dB: steps that the eye hardly sees halve the file."""
 DASHES: Final = (0, (4, 3))
 LABELS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-"""Every how many batches one is numbered."""
+"""Intervals of the batch numbers: the first whose labels have enough room is used."""
 LABEL_PART: Final = (0.008, 0.0067)
 """The space next to a number, and the width of a digit, as parts of the picture's width."""
 
@@ -212,7 +194,7 @@ def save_waveform(path: Path, drawing: WaveformDrawing) -> None:
 def _draw(drawing: WaveformDrawing) -> Figure:
     program, timeline = drawing.program, _lay_out(drawing)
     figure = make_figure(*SIZE_IN)
-    figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, HEAD_BELOW))
+    figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0, 0.945))  # room for the title
     panels: list[Axes] = list(
         figure.subplots(len(HEIGHTS), 1, sharex=True, gridspec_kw={"height_ratios": HEIGHTS})
     )
@@ -228,7 +210,7 @@ def _draw(drawing: WaveformDrawing) -> Figure:
     strongest_db = max(float(image.get_array().max()) for image in images)
     top_db = 5 * np.ceil(strongest_db / 5)
     for image in images:
-        image.set_clim(top_db - RANGE_DB, top_db)
+        image.set_clim(top_db - 50, top_db)
     bar = figure.colorbar(images[0], ax=panels[1:], pad=0.01, aspect=40)
     bar.set_label("samples: level / dB of a tone at full scale")
     left_out = " (vertical lines: pauses left out)" if _cuts(program, timeline) else ""
@@ -291,7 +273,7 @@ def _draw_batches(axes: Axes, program: ToneProgram, timeline: _Timeline) -> None
 
 
 def _fit(places: Floats, needed: float) -> bool:
-    """Whether things at these places have as much room as each needs."""
+    """Whether labels at these places are at least as far apart as needed."""
     return len(places) < 2 or float(np.diff(places).min()) >= needed
 
 
@@ -309,7 +291,8 @@ def _draw_spectrogram(axes: Axes, drawing: WaveformDrawing, channel: int, timeli
         drawing.renderer, channel, timeline.stretches, n_columns, (low_hz, high_hz)
     )
     extent = 0.0, 1e3 * float(timeline.at_s[-1]), 1e-6 * edges_hz[0], 1e-6 * edges_hz[1]
-    shades = LinearSegmentedColormap.from_list("samples", SHADES, N=N_SHADES)
+    # 25 shades, one per 2 dB: steps that the eye hardly sees halve the size of the file
+    shades = LinearSegmentedColormap.from_list("samples", ("white", "0.75", "0.4"), N=25)
     image = axes.imshow(
         level_db, extent=extent, origin="lower", aspect="auto", cmap=shades, interpolation="nearest"
     )
@@ -342,7 +325,8 @@ def tone_lines(program: ToneProgram, tones: AxisTones, on: list[int], at_s: Floa
 
 
 def _draw_envelope(axes: Axes, drawing: WaveformDrawing, channel: int, timeline: _Timeline) -> None:
-    n_columns = max(1, min(N_COLUMNS, int(timeline.at_s[-1] / ENVELOPE_S)))
+    # columns of at least 2 us: some periods of the beat of neighbouring tones
+    n_columns = max(1, min(N_COLUMNS, int(timeline.at_s[-1] / 2e-6)))
     volts = drawing.rf.full_scale_v * envelope(drawing.renderer, channel, timeline.stretches, n_columns)
     edges_ms = np.linspace(0.0, 1e3 * timeline.at_s[-1], n_columns + 1)
     axes.stairs(volts, edges_ms, fill=True, color=PEAK)

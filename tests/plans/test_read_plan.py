@@ -78,7 +78,7 @@ def test_a_plan_for_another_grid_than_the_profiles_is_refused() -> None:
 def test_options_that_only_planning_takes_are_refused(options: dict[str, Any], option: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read(planned(seed=1), **options)
-    assert str(caught.value).startswith(f"{option}: plan.json is a plan already")
+    assert str(caught.value).startswith(f"{option}: plan.json is already a plan")
 
 
 def test_values_of_a_profile_need_a_profile() -> None:
