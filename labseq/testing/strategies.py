@@ -22,7 +22,7 @@ def shapes(max_shape: Shape = (6, 6)) -> SearchStrategy[Shape]:
 
 
 def occupancies(shape: Shape | None = None, *, max_shape: Shape = (6, 6)) -> SearchStrategy[Occupancy]:
-    """Any loading, the empty and the full one too; bool (n_rows, n_cols).
+    """Any loading, including the empty and the full one; bool (n_rows, n_cols).
 
     Args:
         shape: The wanted shape, or None for any up to ``max_shape``.
@@ -59,7 +59,7 @@ def targets(shape: Shape | None = None, *, max_shape: Shape = (6, 6)) -> SearchS
 
 @st.composite
 def cases(draw: DrawFn, max_shape: Shape = (6, 6)) -> tuple[TargetPattern, Occupancy]:
-    """A target and an occupancy of the same shape: what a planner is given."""
+    """A target and an occupancy of the same shape, as a planner gets them."""
     target = draw(targets(max_shape=max_shape))
     return target, draw(occupancies(target.shape))
 

@@ -181,7 +181,7 @@ class ScannerContract:
         speed = ScanRange("profile.mobile_tweezers.speed", 0.05, 0.2, n_steps=10, start=0.13)
         two = ScanRange("shot.2.rearrange.cycles", 1, 2, is_whole=True)
         ranges = {"all kinds of range": (dop, ramp, speed), "one quantity": (ramp,), "two values": (two,)}
-        return {what: ScanSpace(of, self.n_points, 2, seed=5) for what, of in ranges.items()}
+        return {kind: ScanSpace(axes, self.n_points, 2, seed=5) for kind, axes in ranges.items()}
 
     @promise(GIVES_POINTS)
     def test_points_are_in_their_ranges(self, factory: ScannerFactory) -> None:
@@ -198,9 +198,10 @@ class ScannerContract:
             scanner = factory(space)
             visited = self.visited(scanner, space, _hill)
             for n in {0, 1, len(visited) // 2, len(visited)}:
-                answers = [_plain(one.next_point(_copies(visited[:n]))) for one in (scanner, factory(space))]
-                known = [_plain(visited[n].values)] if n < len(visited) else answers[:1]
-                assert answers == known * 2, f"on {what}, point {n} was {known[0]}, and is {answers}"
+                results = _copies(visited[:n])
+                answers = [_plain(each.next_point(_copies(results))) for each in (scanner, factory(space))]
+                earlier = _plain(visited[n].values) if n < len(visited) else answers[0]
+                assert answers == [earlier] * 2, f"on {what}, point {n} was {earlier}, and is {answers}"
 
     @promise("the input is left untouched")
     def test_leaves_its_input_untouched(self, factory: ScannerFactory) -> None:
@@ -239,11 +240,13 @@ def _check_point(point: Any, space: ScanSpace) -> None:
     """Fail for anything but a point of the space."""
     assert isinstance(point, Mapping), f"next_point() gave a {type(point).__name__}"
     values = cast("Mapping[str, Any]", point)
-    wanted = {one.address for one in space.ranges}
-    assert {*values} == wanted, f"next_point() gave values for {sorted(values)}; expected {sorted(wanted)}"
-    for one in space.ranges:
-        value = values[one.address]
-        assert one.allowed(value) is not None, f"{value!r} for '{one.address}' is not in its range"
+    expected = {axis.address for axis in space.ranges}
+    assert {*values} == expected, (
+        f"next_point() gave values for {sorted(values)}; expected {sorted(expected)}"
+    )
+    for axis in space.ranges:
+        value = values[axis.address]
+        assert axis.allowed(value) is not None, f"{value!r} for '{axis.address}' is not in its range"
 
 
 def _copies(visited: Sequence[VisitedPoint]) -> list[VisitedPoint]:
@@ -252,7 +255,7 @@ def _copies(visited: Sequence[VisitedPoint]) -> list[VisitedPoint]:
 
 
 def _hill(space: ScanSpace, point: Mapping[str, float]) -> float:
-    return -sum((one.fraction(point[one.address]) - 0.3) ** 2 for one in space.ranges)
+    return -sum((axis.fraction(point[axis.address]) - 0.3) ** 2 for axis in space.ranges)
 
 
 def _constant_score(score: float) -> Scores:
@@ -324,10 +327,10 @@ class AnalysisContract:
         first = {what: dumps(_result_of(analysis, shot)) for what, shot in shots.items()}
         for what, shot in reversed([*shots.items()]):
             assert dumps(_result_of(analysis, shot)) == first[what], (
-                f"{what} gives another one the second time"
+                f"{what} gives a different result the second time"
             )
             fresh = _result_of(factory(self.context()), shot)
-            assert dumps(fresh) == first[what], f"{what} gives another one from a fresh instance"
+            assert dumps(fresh) == first[what], f"{what} gives a different result from a fresh instance"
 
     @promise("the shot is left untouched")
     def test_leaves_the_shot_untouched(self, factory: AnalysisFactory) -> None:

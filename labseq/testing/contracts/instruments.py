@@ -98,7 +98,7 @@ class LinesContract(HardwareContract[Lines]):
     """Promises of a timing box.
 
     Attributes:
-        specs: What is wired to it; the channels must exist.
+        specs: The lines that are connected to it; the box must have their channels.
         tolerance_s: How far an edge may be from its place, relative to the first one, in seconds.
     """
 
@@ -107,7 +107,7 @@ class LinesContract(HardwareContract[Lines]):
     tolerance_s: ClassVar[float] = 1e-6
 
     def context(self) -> Context:
-        """With what is wired to it."""
+        """The context of a device with the lines in ``specs``."""
         return replace(super().context(), lines=self.specs)
 
     def program(self, kind: str = "image", duration_s: float = 10e-3) -> LineProgram:

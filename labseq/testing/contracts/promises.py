@@ -75,11 +75,12 @@ def failure_text(error: ContractViolation) -> str:
     """What pytest prints: the promise, what happened, what to do, and the lines of the plugin's own code."""
     frames = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ is not None else []
     here = Path(__file__).parent
-    first = next((i for i, one in enumerate(frames) if here not in Path(one.filename).parents), len(frames))
-    while first < len(frames) and any(here in Path(one.filename).parents for one in frames[first:]):
+    first = next((i for i, f in enumerate(frames) if here not in Path(f.filename).parents), len(frames))
+    while first < len(frames) and any(here in Path(f.filename).parents for f in frames[first:]):
         first += 1
-    own = [one for one in frames[first:] if Path(one.filename).name not in ("contextlib.py", "guard.py")]
-    return str(error) + "".join(["\n\n", *traceback.format_list(own)] if own else []).rstrip()
+    plugin_frames = [f for f in frames[first:] if Path(f.filename).name not in ("contextlib.py", "guard.py")]
+    lines = ["\n\n", *traceback.format_list(plugin_frames)] if plugin_frames else []
+    return str(error) + "".join(lines).rstrip()
 
 
 def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callable[P, None]]:
@@ -320,7 +321,7 @@ def process_state() -> list[object]:
 
 def changes_since(before: list[object]) -> list[str]:
     """The changes since an earlier :func:`process_state`, as sentences."""
-    return [what for what, was, now in zip(_STATES, before, process_state(), strict=True) if was != now]
+    return [change for change, was, now in zip(_STATES, before, process_state(), strict=True) if was != now]
 
 
 @contextmanager

@@ -128,9 +128,11 @@ class SimulationContract:
     @promise(SAME_SEED)
     def test_same_seed_same_frames(self, factory: Factory) -> None:
         """So a run can be repeated."""
-        made = {name: self._shots(factory, (0, 1), seed) for name, seed in (("1", 1), ("again", 1), ("2", 2))}
-        assert _equal(made["1"], made["again"]), "the second simulation with seed 1 shows other frames"
-        assert not _equal(made["1"], made["2"]), "simulations with the seeds 1 and 2 show the same frames"
+        frames = {
+            name: self._shots(factory, (0, 1), seed) for name, seed in (("1", 1), ("again", 1), ("2", 2))
+        }
+        assert _equal(frames["1"], frames["again"]), "the second simulation with seed 1 shows other frames"
+        assert not _equal(frames["1"], frames["2"]), "simulations with the seeds 1 and 2 show the same frames"
 
     @promise("a shot does not depend on those before it")
     def test_shots_are_independent(self, factory: Factory) -> None:
@@ -208,4 +210,4 @@ class SimulationContract:
 
 
 def _equal(some: list[np.ndarray[Any, Any]], others: list[np.ndarray[Any, Any]]) -> bool:
-    return all(np.array_equal(one, other) for one, other in zip(some, others, strict=True))
+    return all(np.array_equal(a, b) for a, b in zip(some, others, strict=True))

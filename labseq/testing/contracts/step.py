@@ -81,7 +81,7 @@ class StepContract:
         with quietly():
             step = factory()
             first = self._timeline(step)
-        assert self._timeline(step) == first, "the second call gave another one"
+        assert self._timeline(step) == first, "the second call gave a different one"
 
     @promise("needs_image and takes_image are known before the run")
     def test_declares_its_images(self, factory: Factory) -> None:

@@ -6,7 +6,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,6 @@ from labseq.sequencer.lines import idle_program, off_program
 
 Failure: TypeAlias = BaseException | Sequence[BaseException | None]
 """An error raised at every call; or a sequence of errors for successive calls, None for a call that works."""
-
-TEST_IS_OVER_S: Final = 30.0
-"""A hanging call continues after this time, in seconds, so that every test ends."""
 
 
 class Call(NamedTuple):
@@ -113,7 +110,7 @@ class Hang:
     def wait(self) -> None:
         """Hang."""
         self.reached.set()
-        self.release.wait(TEST_IS_OVER_S)
+        self.release.wait(30.0)  # so that every test ends
 
 
 class Faults:
@@ -235,18 +232,14 @@ class RecordingHardware(Hardware):
             raise DeviceError(self.name, f"{method}() was called while it is not open")
 
 
-def require_within(what: str, value: float, lowest: float, highest: float) -> None:
+def require_within(name: str, value: float, lowest: float, highest: float) -> None:
     """Refuse a number outside its limits, nan included.
 
     Raises:
         LimitError: It is outside.
     """
     if not (math.isfinite(value) and lowest <= value <= highest):
-        raise LimitError(what, value, f"{lowest:g} to {highest:g}")
-
-
-MAX_EXPOSURE_S: Final = 10.0
-BAND_HZ: Final = (50e6, 150e6)
+        raise LimitError(name, value, f"{lowest:g} to {highest:g}")
 
 
 class RecordingCamera(RecordingHardware, Camera):
@@ -270,7 +263,7 @@ class RecordingCamera(RecordingHardware, Camera):
         """Begin a series."""
         self.use("arm", n_frames, exposure_s, trigger)
         require_within("the number of frames", n_frames, 1, 1e6)
-        require_within("the exposure in seconds", exposure_s, 1e-6, MAX_EXPOSURE_S)
+        require_within("the exposure in seconds", exposure_s, 1e-6, 10.0)
         if trigger != "software":
             raise DeviceError(self.name, f"has no {trigger} trigger; expected 'software'")
         self.reset()
@@ -386,7 +379,7 @@ class RecordingMobileTweezers(RecordingHardware, MobileTweezers):
         self.use("prepare", program)
         for axis in (program.row, program.column):
             for frequency in (*axis.start_hz, *axis.end_hz):
-                require_within("a tone's frequency in Hz", float(frequency), *BAND_HZ)
+                require_within("a tone's frequency in Hz", float(frequency), 50e6, 150e6)
             for amplitude in (*axis.start_amplitude, *axis.end_amplitude):
                 require_within("a tone's amplitude", float(amplitude), 0.0, 1.0)
         self._prepared = program

@@ -191,9 +191,6 @@ _FAKE_OF_ROLE: Final = {
 }
 
 
-_ALWAYS: Final = ("camera", "static_tweezers", "mobile_tweezers")
-
-
 @dataclass(frozen=True, slots=True)
 class FakeLab(Lab):
     """A lab of fakes, with access for tests.
@@ -262,11 +259,11 @@ def fake_lab(
     context = Context("", grid, clock=clock, simulation=simulation, lines=specs)
     hangs = {call: Hang() for call in hang_on}
     names = (*devices, "lines") if specs else tuple(devices)
-    made = _make_hardware(context, calls, names, fail_on or {}, hangs)
+    hardware = _make_hardware(context, calls, names, fail_on or {}, hangs)
     fields: dict[str, Any] = {
-        **{role: made.pop(role) for role in _FAKE_OF_ROLE if role in made},
+        **{role: hardware.pop(role) for role in _FAKE_OF_ROLE if role in hardware},
         "line_specs": specs,
-        "devices": made,
+        "devices": hardware,
         "grid": grid,
         "motion": context.motion,
         "target": TargetPattern(mask, np.zeros(grid.shape, np.bool_)),
@@ -289,16 +286,16 @@ def _make_hardware(
     fail_on: Mapping[str, Failure],
     hang_on: Mapping[str, Hang],
 ) -> dict[str, RecordingHardware]:
-    made: dict[str, RecordingHardware] = {}
-    for name in (*_ALWAYS, *names):
+    hardware: dict[str, RecordingHardware] = {}
+    for name in ("camera", "static_tweezers", "mobile_tweezers", *names):
         fake = _FAKE_OF_ROLE.get(name, RecordingDevice)
         failures, hangs = _of_device(name, fail_on), _of_device(name, hang_on)
-        made[name] = fake(replace(context, name=name), calls, fail_on=failures, hang_on=hangs)
+        hardware[name] = fake(replace(context, name=name), calls, fail_on=failures, hang_on=hangs)
     for call in (*fail_on, *hang_on):  # a misspelt call would never fail
         device, _, method = call.rpartition(".")
-        if not hasattr(made.get(device), method):
+        if not hasattr(hardware.get(device), method):
             raise ValueError(f"no fake has the call '{call}'; expected 'camera.read' or the like")
-    return made
+    return hardware
 
 
 def _of_device(name: str, by_call: Mapping[str, T]) -> dict[str, T]:

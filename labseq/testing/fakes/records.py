@@ -105,7 +105,7 @@ def _path(
 
 
 def _shift(atoms: Occupancy, path: Sequence[Site]) -> Iterator[Batch]:
-    """Move every atom of a path on by one free place, towards its first site, which is free."""
+    """Move every atom of a path on by one free site, towards the first site of the path, which is free."""
     free = 0
     for place in range(1, len(path)):
         if not atoms[path[place]]:
@@ -132,7 +132,7 @@ def _inside(site: Site, shape: tuple[int, ...]) -> bool:
     return 0 <= site[0] < shape[0] and 0 <= site[1] < shape[1]
 
 
-_FIGURES = {
+_QUALITY = {
     "sites": {"residual_px": 0.02, "n_sites_found": 0.0},
     "thresholds": {"error": 5e-4},
     "tweezers": {"separable_spread": 3e-3},
@@ -167,7 +167,7 @@ def fake_calibration(
         [1e-07, 0.0]
     """
     grid = grid or SiteGrid()
-    figures = _FIGURES[kind] | ({"n_sites_found": float(np.prod(grid.shape))} if kind == "sites" else {})
+    figures = _QUALITY[kind] | ({"n_sites_found": float(np.prod(grid.shape))} if kind == "sites" else {})
     merged: Any = {**_values(kind, grid), **(values or {})}  # may be invalid, for tests of error messages
     return CalibrationEntry(
         kind,
