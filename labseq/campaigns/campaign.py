@@ -35,7 +35,9 @@ class CampaignSettings(Settings):
     """A campaign file."""
 
     labseq: Literal[1]
-    sequence: str = Field(description="the sequence file, beside this file, or the name of one")
+    sequence: str = Field(
+        description="the sequence file, in the folder of this file, or the name of a sequence"
+    )
     profile: str | None = Field(default=None, description="hardware profile, instead of the sequence's own")
     axes: dict[str, list[Any]] = Field(
         default={}, description="address, as for --set, and its values; every combination is a point"

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool = False) -> None:
     """Run a sequence, with ``web`` also in a browser; print the result even if it was stopped or failed."""
     if web:
-        from labseq.web.serve import start_beside
+        from labseq.web.serve import start_for_run
 
-        say(start_beside(options.output or data_root()), stream=sys.stderr)
+        say(start_for_run(options.output or data_root()), stream=sys.stderr)
 
     def start(observer: RunObserver | None) -> Session:
         return Session.open(sequence, **asdict(options), observer=observer)

@@ -231,7 +231,7 @@ class ClientDriver:
         with self._abort.held():
             self.device.safe_state()
         if self._simulation is not None:
-            self._simulation.begin_shot()  # an exposure that was ended keeps the next one from beginning
+            self._simulation.begin_shot()  # otherwise the interrupted exposure would block the next one
         self.is_safe = True
 
     def _give_up(self) -> None:

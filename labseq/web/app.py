@@ -16,7 +16,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from labseq.web.access import Access, App, Guard
-from labseq.web.acting import Actions
+from labseq.web.actions import Actions
 from labseq.web.api import BASE, Api
 from labseq.web.endpoint import Endpoint, answer, in_thread
 from labseq.web.runs import Catalogue

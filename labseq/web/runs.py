@@ -210,7 +210,7 @@ class Catalogue:
         """Open a run by its day and the name of its folder.
 
         Raises:
-            NoSuchRun: There is none.
+            NoSuchRun: There is no such run.
         """
         folder = self.root / day / name
         is_name = _DAY.fullmatch(day) and not {"/", "\\", "\0"} & set(name) and name.strip(".")

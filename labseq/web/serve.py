@@ -150,7 +150,7 @@ def _greeting(root: Path, serving: Serving, port: int, token: str) -> list[str]:
 
 
 def _end_with(pid: int, server: Any) -> None:
-    """End the server when a process has ended."""
+    """Wait until a process has ended, then end the server."""
     process = _process(pid)
     while process is not None and process.is_running:
         time.sleep(2.0)
@@ -167,7 +167,7 @@ def _process(pid: int) -> Process | None:
     return Process(pid, 0.0, Process.current().host)
 
 
-def start_beside(root: Path) -> str:
+def start_for_run(root: Path) -> str:
     """Start a server for a run in a process of its own, unless there is one for this data folder.
 
     Returns:

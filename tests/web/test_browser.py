@@ -30,7 +30,7 @@ from labseq.queue.queue import Queue
 from tests.recording.records import make_shot
 
 from .clients import TOKEN, path_of, shot_of_frames, write_run
-from .test_acting import entry
+from .test_actions import entry
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

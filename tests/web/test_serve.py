@@ -21,7 +21,7 @@ import sys
 from pathlib import Path
 from labseq.web import serve
 serve.PORT = int(sys.argv[2])
-print(serve.start_beside(Path(sys.argv[1])), flush=True)
+print(serve.start_for_run(Path(sys.argv[1])), flush=True)
 sys.stdin.read()
 """
 
@@ -58,6 +58,6 @@ def test_a_server_beside_a_run_is_started_once_and_ends_with_the_terminal(
             with pytest.raises(psutil.TimeoutExpired):
                 server.wait(0.1)
         assert data_of(address) == str(tmp_path / "data")
-        assert "process" not in serve.start_beside(tmp_path / "data")
+        assert "process" not in serve.start_for_run(tmp_path / "data")
         terminal.communicate("")
     server.wait(600)

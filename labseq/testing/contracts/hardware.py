@@ -328,7 +328,7 @@ class HardwareContract(Generic[D]):
         "check the arguments first, all in SI units, and raise LimitError(what, value, limit)",
     )
     def test_refuses_what_exceeds_limits(self, factory: Factory[D]) -> None:
-        """Neither does time pass nor does the simulation see anything, and the device goes on working."""
+        """No time passes, the simulation sees nothing, and the device still works."""
         with self.opened(factory) as (device, context):
             for what, ask in self.excesses().items():
                 self.ready(device)

@@ -106,7 +106,7 @@ class SimulationContract:
         """All of the same shape; a frame does not change when the next one is taken."""
         with self.opened(factory) as (simulation, context):
             frames: list[Any] = [*self.shot(simulation, context, 0)]
-            kept = [np.array(getattr(frame, "image", 0)) for frame in frames]
+            copies = [np.array(getattr(frame, "image", 0)) for frame in frames]
             for frame in frames:
                 assert isinstance(frame, Frame), f"expose() gave a {type(frame).__name__}"
                 text = f"the frame is {frame.image.dtype} {frame.image.shape}"
@@ -122,7 +122,7 @@ class SimulationContract:
             more = self.shot(simulation, context, 1)
             shapes = {frame.image.shape for frame in [*frames, *more]}
             assert len(shapes) == 1, f"frames have the shapes {sorted(shapes)}"
-            same = all(np.array_equal(was, frame.image) for was, frame in zip(kept, frames, strict=True))
+            same = all(np.array_equal(was, frame.image) for was, frame in zip(copies, frames, strict=True))
             assert same, "the next exposures overwrote a frame"
 
     @promise(SAME_SEED)

@@ -18,7 +18,7 @@ from labseq.assembly.plugin_choice import load_plugins
 from labseq.queue.queue import Entry, Queue
 from labseq.queue.running import QueueRun
 from labseq.scaffold.schemas import file_schema
-from labseq.web.acting import form_fields
+from labseq.web.actions import form_fields
 from tests.recording.damages import rewrite_state
 
 from .clients import Client, client_of, path_of, write_run
@@ -136,7 +136,7 @@ def test_a_known_sequence_is_queued_with_values_of_its_form(
         called.append([*command[3:], env.get("LABSEQ_DATA", "")])
         return subprocess.CompletedProcess(command, 0, b"{}" if "schema" in command else b"1: queued\n", b"")
 
-    monkeypatch.setattr("labseq.web.acting.subprocess.run", labseq)
+    monkeypatch.setattr("labseq.web.actions.subprocess.run", labseq)
     monkeypatch.chdir(ROOT)
     assert "compact_225" in acting.get("/api/v1/sequences").json()["sequences"]
     values = {"sequence": "compact_225", "profile": "virtual", "changes": {"shots": "5; rm -rf"}}
