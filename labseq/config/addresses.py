@@ -23,7 +23,6 @@ MAY_ADD: Final = (
 """Keys of the profile whose mappings an override may add."""
 NAMED: Final = ("devices",)
 """Mappings of the profile whose keys are names that the user chose."""
-_SHOWN: Final = 80
 
 
 class Override(NamedTuple):
@@ -43,7 +42,7 @@ class Override(NamedTuple):
     def source(self) -> str:
         """The place of the value, for messages."""
         text = self.origin or f"--set {self.address}={self.value}"
-        return visible(text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...")
+        return visible(text if len(text) <= 80 else text[:77] + "...")
 
 
 def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Override]]:
@@ -166,9 +165,9 @@ def _keys_of_part(node: Node, part: str) -> Loc:
 def _missing_part(node: Node, part: str, where: str, source: str) -> Problem:
     """Explain why an address does not exist."""
     if isinstance(node.value, dict):
-        known = list(node.value)
+        keys = list(node.value)
         what = f"there is no '{clean(part)}' in {where}"
-        return Problem(what, source, expected=listing(known), hint=did_you_mean(part, known))
+        return Problem(what, source, expected=listing(keys), hint=did_you_mean(part, keys))
     if isinstance(node.value, list):
         names = [item for item in map(_item_name, node.value) if item]
         what = f"{where} has no item '{clean(part)}'"

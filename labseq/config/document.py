@@ -160,7 +160,7 @@ class Document:
             may_add: Addresses of mappings that are added if the file has none.
 
         Raises:
-            ConfigError: The address does not exist, or the value is no YAML.
+            ConfigError: The address does not exist, or the value is not valid YAML.
         """
         loc = find(self.root, address, origin, may_add)
         node = compose(value, origin, is_option=True) or Node(None, Mark(origin))
@@ -197,8 +197,7 @@ class Document:
         """
         document = self
         with collecting(found) as problems:
-            for one in overrides:
-                override = Override(*one)
+            for override in (Override(*pair) for pair in overrides):
                 with problems:
                     document = document.override(
                         override.address, override.value, override.source, may_add=may_add
@@ -268,11 +267,6 @@ def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
     return paths
 
 
-# Without them, known plugins would count as unknown, and the target would not match the grid.
-_NEEDED: Final = ("plugin_folders", "profile")
-_MAX_PASSES: Final = 5
-
-
 @dataclass(frozen=True, slots=True)
 class FallbackValues:
     """Valid values that replace invalid ones, so that the rest of a file can still be checked.
@@ -304,7 +298,8 @@ def load_checked(
         if found is None:
             raise
         repaired = _without_wrong_values(document, model, fallbacks)
-        if any(repaired.get((key,)) != document.get((key,)) for key in _NEEDED):
+        # Without these two, plugins would count as unknown, and the target would not match the grid.
+        if any(repaired.get((key,)) != document.get((key,)) for key in ("plugin_folders", "profile")):
             raise
         spec = repaired.validate(model, called=called)
         found.add(error)
@@ -314,12 +309,12 @@ def load_checked(
 def _without_wrong_values(document: Document, model: SettingsType, fallbacks: FallbackValues) -> Document:
     """A copy whose invalid values are replaced by fallbacks, or removed if there is no fallback."""
     root, seen, replaced = document.root, set[Loc](), set[Loc]()
-    for _ in range(_MAX_PASSES):  # validators of a whole list run once all its items are right
-        found = check(model, root, ValidationContext("", needs_units=True))
-        if not isinstance(found, list):
+    for _ in range(5):  # validators of a whole list run once all its items are right
+        findings = check(model, root, ValidationContext("", needs_units=True))
+        if not isinstance(findings, list):
             break
         values = dict(cast("dict[str, Node]", root.value))
-        for loc in dict.fromkeys(finding.loc[:2] for finding in found if finding.loc):
+        for loc in dict.fromkeys(finding.loc[:2] for finding in findings if finding.loc):
             key, around = str(loc[0]), values.get(str(loc[0]))
             if len(loc) > 1 and key in fallbacks.items and around and around.at(loc[1:]) and loc not in seen:
                 item = node_of(fallbacks.items[key], around.mark)

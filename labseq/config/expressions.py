@@ -309,7 +309,7 @@ class _Evaluation:
                     at = self._operator(left, right)
                     return _OPERATORS[type(sign)](x, y)
                 case ast.Call(ast.Name() as function, arguments, []):
-                    return _call(self._function(function), [self.value(one) for one in arguments])
+                    return _call(self._function(function), [self.value(argument) for argument in arguments])
                 case _:
                     raise _unexpected(self.text, at + self.parsed.shift)
         except OverflowError:
@@ -336,7 +336,6 @@ class _Evaluation:
 
 
 _KNOWN: Final = "an expression can use values of its own file, not defaults"
-_LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -357,12 +356,12 @@ class Expressions:
 
     def following(self, loc: Loc) -> list[Loc]:
         """The expressions that depend on a value, or on a part of it."""
-        return [own for own, read in self.reads.items() if any(_overlap(loc, other) for other in read)]
+        return [reader for reader, read in self.reads.items() if any(_overlap(loc, other) for other in read)]
 
 
-def _overlap(one: Loc, other: Loc) -> bool:
-    n = min(len(one), len(other))
-    return one[:n] == other[:n]
+def _overlap(loc: Loc, other: Loc) -> bool:
+    n = min(len(loc), len(other))
+    return loc[:n] == other[:n]
 
 
 def is_expression(node: Node) -> bool:
@@ -379,7 +378,7 @@ def evaluate(root: Node, text: str) -> Expressions:
     Raises:
         ConfigError: All errors in them.
     """
-    evaluator = _Evaluator(root, _LINE_BREAK.split(text))
+    evaluator = _Evaluator(root, re.split(r"\r\n|\r|\n", text))
     result = root
     for loc, node in root.leaves():
         if is_expression(node) and loc[0] != "scan":
@@ -498,7 +497,7 @@ class _Evaluator:
     def _report_cycle(self, ring: list[Loc], references: Mapping[Loc, Mapping[str, Loc]]) -> None:
         start = ring.index(next(loc for loc in self.nodes if loc in ring))
         ring = [*ring[start:-1], *ring[: start + 1]]
-        way = " -> ".join(".".join(map(str, one)) for one in ring)
+        way = " -> ".join(".".join(map(str, loc)) for loc in ring)
         parsed = _parse(str(self.nodes[ring[0]].value))
         address = next(text for text, loc in references[ring[0]].items() if loc == ring[1])
         at = next(at for at, value in parsed.values.items() if value == address) + parsed.shift

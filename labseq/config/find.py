@@ -58,9 +58,9 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
         what, expected = f"there is {kind} at {visible(str(path))}", ""
         hint = alike_file(path)
     else:
-        found = _named(name_or_path, folders)
-        if found is not None:
-            return found
+        path = _named(name_or_path, folders)
+        if path is not None:
+            return path
         names = _names(folders[1:])
         places = ", ".join(visible(str(folder)) for folder in folders)
         what = f"there is no hardware profile '{clean(name_or_path)}' in {places}"
@@ -89,9 +89,9 @@ def find_sequence(given: Path) -> Path:
             raise ConfigError(Problem("there is no such file", visible(name), hint=_hint_at(packaged)))
         return given
     folders = (Path(), Path(SEQUENCES), packaged_sequences_dir())
-    found = given if is_file(given) else _named(name, folders)
-    if found is not None or something_else(given):
-        return found or given
+    path = given if is_file(given) else _named(name, folders)
+    if path is not None or something_else(given):
+        return path or given
     names = _names([*folders[1:]])
     places = ", ".join(visible(str(folder)) for folder in folders)
     what = f"there is no sequence '{clean(name)}' in {places}"
@@ -100,7 +100,7 @@ def find_sequence(given: Path) -> Path:
 
 
 def _hint_at(packaged: Path) -> str:
-    return f"say '{packaged.stem}' for the one that comes with labseq, or copy it by 'labseq demo --copy .'"
+    return f"use '{packaged.stem}' for the one that comes with labseq, or copy it with 'labseq demo --copy .'"
 
 
 def _named(name: str, folders: Sequence[Path]) -> Path | None:

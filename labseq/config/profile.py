@@ -42,8 +42,6 @@ from labseq.units import format_quantity
 if TYPE_CHECKING:
     from labseq.config.scan import Scan
 
-_DEVICE_NAME: Final = re.compile(r"[^\W\d][\w-]*")
-
 
 class BlindingSettings(Settings):
     """When a device's light would damage a camera with EM gain."""
@@ -110,7 +108,7 @@ class PowerMeterSettings(Settings):
 
 def check_name(name: str, what: str) -> None:
     """Raise for a name that cannot be used in an address or a file."""
-    if not _DEVICE_NAME.fullmatch(name):
+    if not re.fullmatch(r"[^\W\d][\w-]*", name):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
         raise setting_error(f"{what} is called '{clean(name)}'", expected, at=(name,), key=True)
 
@@ -182,12 +180,8 @@ class CalibrationSettings(Settings):
         return {"folder": value} if isinstance(value, str) else value
 
 
-MAX_PULSE_S: Final = 1.0
-
-
 _TRIGGERED: Final = {"camera": "image", "mobile_tweezers": "rearrange"}
 """Role -> the kind of step that begins with its trigger."""
-_SHAPES: Final = ("lead", "lag", "pulse")
 
 
 class ChannelSettings(Settings):
@@ -201,7 +195,7 @@ class ChannelSettings(Settings):
     )
     lead: Duration = Field(default=0.0, description="how long before such a step it is turned on")
     lag: Duration = Field(default=0.0, description="how long after such a step it is turned off")
-    pulse: Annotated[Duration, Field(le=MAX_PULSE_S)] = Field(
+    pulse: Annotated[Duration, Field(le=1.0)] = Field(
         default=0.0,
         description="a pulse of this length at the beginning of such a step, instead of being on throughout",
     )
@@ -227,7 +221,9 @@ class ChannelSettings(Settings):
                 "`on: [release]`",
                 at=("on",),
             )
-        if self.turns_off and (extra := next((key for key in _SHAPES if getattr(self, key)), None)):
+        if self.turns_off and (
+            extra := next((key for key in ("lead", "lag", "pulse") if getattr(self, key)), None)
+        ):
             what = f"{extra} is set for a line that turns the static tweezers off"
             raise setting_error(what, "none: it is on as long as the release", at=(extra,), key=True)
         if self.pulse and self.lag:
@@ -442,8 +438,8 @@ class ProfileSpec(Settings):
     @property
     def choices(self) -> dict[str, Choice]:
         """The plugins chosen in this file, by role; lines and simulation only if they are given."""
-        chosen = {role: getattr(self, role) for role in ROLES}
-        return {role: choice for role, choice in chosen.items() if choice is not None}
+        choices = {role: getattr(self, role) for role in ROLES}
+        return {role: choice for role, choice in choices.items() if choice is not None}
 
     @property
     def motion(self) -> MotionSpec:

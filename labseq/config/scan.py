@@ -28,10 +28,6 @@ ScanOrder = Literal["sequential", "shuffled"]
 
 MAX_POINTS: Final = 10_000
 """Maximum number of points of a scan, and of values of an address."""
-MAX_RANGES: Final = 6
-"""Maximum number of addresses of an adaptive scan, since all combinations of their ends are checked."""
-
-_ORDER_KEY: Final = 0x5CA4  # separate from every shot's random numbers, whose keys have two parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +104,8 @@ class Scan:
         points = np.arange(self.n_points, dtype=np.int32)
         if self.order == "sequential":
             return np.repeat(points, self.repeats)
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_ORDER_KEY,)))
+        # A key of one part: the random numbers of shots have keys of two parts.
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x5CA4,)))
         return np.concatenate([rng.permutation(points) for _ in range(self.repeats)])
 
     def bound(self, document: Document) -> Self:
@@ -117,14 +114,14 @@ class Scan:
         Raises:
             ConfigError: Addresses that do not exist in it, or whose settings a scan cannot change.
         """
-        found, groups = ProblemCollector(), list[Group]()
+        problems, groups = ProblemCollector(), list[Group]()
         for group in self.groups:
             axes: list[Axis] = []
             for axis in group:
-                with found:
+                with problems:
                     axes.append(_placed_in_profile(axis, document) if axis.of_profile else axis)
             groups.append(tuple(axes))
-        found.raise_any()
+        problems.raise_any()
         _refuse_twice(groups)
         return replace(self, groups=tuple(groups))
 
@@ -154,8 +151,8 @@ class Scan:
 
 def put(values: Iterable[tuple[Axis, Node]], document: Document, *, profile: bool) -> Document:
     """A copy of the sequence or of the profile with the values of its axes."""
-    own = [(axis.loc, node, axis.key) for axis, node in values if axis.of_profile == profile]
-    return document.with_values(own) if own else document
+    placed = [(axis.loc, node, axis.key) for axis, node in values if axis.of_profile == profile]
+    return document.with_values(placed) if placed else document
 
 
 def _marks(node: Node) -> Iterator[Mark]:
@@ -165,8 +162,6 @@ def _marks(node: Node) -> Iterator[Mark]:
         for child in node.value.values() if isinstance(node.value, dict) else node.value:
             yield from _marks(child)
 
-
-_DIGITS: Final = 4  # below the range of an axis: finer than any setting needs
 
 End: TypeAlias = Annotated[Any, WithJsonSchema({"type": ["number", "string"]})]
 """A number or quantity; which one depends on the address."""
@@ -186,8 +181,9 @@ class EndsSettings(Settings):
 class AdaptiveChoice(Choice):
     """A scanner chosen by name, with the scanner's settings as further keys of the same mapping."""
 
+    # At most 6, since all combinations of their ends are checked before the run.
     over: dict[str, EndsSettings] = Field(
-        min_length=1, max_length=MAX_RANGES, description="addresses and their ranges"
+        min_length=1, max_length=6, description="addresses and their ranges"
     )
     maximise: Text | None = Field(default=None, description="quantity to maximise")
     minimise: Text | None = Field(default=None, description="quantity to minimise")
@@ -241,7 +237,8 @@ class RangeAxis(Axis):
         """The axis at one value, SI, as a user would write it; without steps, rounded to a few digits."""
         if not isinstance(value, int) and not self.n_steps:
             low, high = self.low.amount, self.high.amount
-            n_decimals = _DIGITS - math.floor(math.log10(high - low))
+            # A ten-thousandth of the range is finer than any setting needs.
+            n_decimals = 4 - math.floor(math.log10(high - low))
             amount = min(max(round(value / factor_of(self.unit), n_decimals), low), high)
             value = scaled(amount, factor_of(self.unit))
         text = written(value, self.unit)
@@ -298,12 +295,12 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None
     """
     node = document.root.child("scan")
     if node is None or node.value is None:
-        found = ProblemCollector()
+        problems = ProblemCollector()
         for key in ("repeats", "order"):
             if document.get((key,)) is not None:
                 what = f"'{key}' is given without a scan"
-                found.add(document.error((key,), what, "a 'scan' beside it", key=True))
-        found.raise_any()
+                problems.add(document.error((key,), what, "a 'scan' beside it", key=True))
+        problems.raise_any()
         return None
     if isinstance(node.value, dict) and "use" in node.value:
         return _read_adaptive(document, fixed)
@@ -322,20 +319,20 @@ def _read_listed(document: Document, node: Node, fixed: Sequence[Override]) -> S
     Raises:
         ConfigError: All errors in its form.
     """
-    found, notes, groups = ProblemCollector(), list[str](), list[Group]()
-    for mapping in _mappings(node, found):
+    problems, notes, groups = ProblemCollector(), list[str](), list[Group]()
+    for mapping in _mappings(node, problems):
         axes: list[Axis] = []
         for address, (key, values) in mapping.items():
-            with found:
+            with problems:
                 axis = _placed(Axis(address, (), tuple(values_of(values, address)), key), document)
                 axes += [axis] if _is_free(axis, fixed, document, notes) else []
-        with found:
+        with problems:
             _check_together(axes)
         groups += [tuple(axes)] if axes else []
-    if not found.problems:
-        with found:
+    if not problems.problems:
+        with problems:
             _refuse_twice(groups)
-    found.raise_any()
+    problems.raise_any()
     order: ScanOrder = "shuffled" if document.get(("order",)) == "shuffled" else "sequential"
     scan = Scan(tuple(groups), _repeats(document), order, tuple(notes))
     if scan.n_points > MAX_POINTS:
@@ -348,21 +345,21 @@ _Written = Mapping[str, tuple[Mark, Node]]
 """A group as written: address -> its place and values."""
 
 
-def _mappings(node: Node, found: ProblemCollector) -> list[_Written]:
+def _mappings(node: Node, problems: ProblemCollector) -> list[_Written]:
     """In a mapping each address is a separate group; in a list each mapping is a group."""
     expected = "a mapping of addresses and their values, or a list of such mappings"
     items = node.value if isinstance(node.value, list) else [node]
     groups: list[_Written] = []
     if not items:
-        found.add(node.mark.error("scan is empty", expected))
+        problems.add(node.mark.error("scan is empty", expected))
     for item in items:
         if not isinstance(item.value, dict) or not item.value:
-            called = "scan" if item is node else "a group of the scan"
-            came = "empty" if item.value == {} else shown(item.plain(), item.raw)
-            found.add(item.mark.error(f"{called} is {came}", expected))
+            name = "scan" if item is node else "a group of the scan"
+            value = "empty" if item.value == {} else shown(item.plain(), item.raw)
+            problems.add(item.mark.error(f"{name} is {value}", expected))
             continue
         written = {address: (item.keys[address], values) for address, values in item.value.items()}
-        groups += [{address: one} for address, one in written.items()] if item is node else [written]
+        groups += [{address: entry} for address, entry in written.items()] if item is node else [written]
     return groups
 
 
@@ -371,8 +368,10 @@ def _check_together(group: Sequence[Axis]) -> None:
     for axis in group[1:]:
         n, n_first = len(axis.values), len(group[0].values)
         if n != n_first:
-            own, first = clean(axis.address), clean(group[0].address)
-            what = f"'{own}' has {n} value{'s' if n > 1 else ''}, but '{first}' in its group has {n_first}"
+            address, first = clean(axis.address), clean(group[0].address)
+            what = (
+                f"'{address}' has {n} value{'s' if n > 1 else ''}, but '{first}' in its group has {n_first}"
+            )
             raise axis.key.error(what, "as many", "for every combination, make each a group of its own")
     seen: set[str] = set()
     for i, node in enumerate(group[0].values if group else ()):
@@ -390,8 +389,8 @@ def _refuse_twice(groups: Sequence[Group]) -> None:
         for other in axes[:i]:
             n = min(len(axis.loc), len(other.loc))
             if n and axis.of_profile == other.of_profile and axis.loc[:n] == other.loc[:n]:
-                own, others = clean(axis.address), clean(other.address)
-                what = f"'{own}' is scanned, and so is '{others}', which holds the same value"
+                address, other_address = clean(axis.address), clean(other.address)
+                what = f"'{address}' is scanned, and so is '{other_address}', which holds the same value"
                 raise axis.key.error(what, "each value in one place of the scan")
 
 
@@ -404,11 +403,11 @@ def _is_free(axis: Axis, fixed: Sequence[Override], document: Document, notes: l
                 other = find(document.root, override.address)
             except ConfigError:  # reported where it was applied
                 continue
-        own: Loc = tuple(axis.address.split(".")) if axis.of_profile else axis.loc
-        if other == own[: len(other)]:
+        loc: Loc = tuple(axis.address.split(".")) if axis.of_profile else axis.loc
+        if other == loc[: len(other)]:
             notes.append(f"{override.source} replaces the scan of '{clean(axis.address)}'")
             return False
-        if own and own == other[: len(own)]:
+        if loc and loc == other[: len(loc)]:
             what = f"the scan changes the whole of '{clean(axis.address)}'"
             raise ConfigError(Problem(what, override.source, expected=f"--set {clean(axis.address)}=..."))
     return True
@@ -421,23 +420,23 @@ def _read_adaptive(document: Document, fixed: Sequence[Override]) -> AdaptiveSca
         ConfigError: All errors in its form.
     """
     choice = document.validate(AdaptiveChoice, ("scan",), called="an adaptive scan").placed("scan")
-    found, notes, groups, repeats = ProblemCollector(), list[str](), list[Group](), _repeats(document)
+    problems, notes, groups, repeats = ProblemCollector(), list[str](), list[Group](), _repeats(document)
     if document.get(("order",)) is not None:
         what = "'order' is given, but the points are chosen one after another"
-        found.add(document.error(("order",), what, "no 'order' beside 'use'", key=True))
+        problems.add(document.error(("order",), what, "no 'order' beside 'use'", key=True))
     for address, range_ in choice.over.items():
-        with found:
+        with problems:
             axis = _range_axis(document, address, range_.steps or 0)
             groups += [(axis,)] if _is_free(axis, fixed, document, notes) else []
-    with found:
+    with problems:
         _refuse_twice(groups)
     shots, n_points = document.get(("shots",)), choice.points or 0
     if not n_points and type(shots) is int and shots >= 1:
         n_points = math.ceil(shots / repeats)
     if not n_points:
         what = "'points' is missing from 'scan' (the maximum number of points)"
-        found.add(document.error(("scan",), what, "a whole number"))
-    found.raise_any()
+        problems.add(document.error(("scan",), what, "a whole number"))
+    problems.raise_any()
     if not groups:
         raise document.error(("scan", "over"), "nothing is left to choose: options set every address")
     return AdaptiveScan(
@@ -551,9 +550,6 @@ def _number(node: Node) -> Number:
 _VALUES: Final = "a list such as [3, 5, 7], {linspace: [50 um/ms, 200 um/ms, 4]} or {range: [0, 20, 5]}"
 
 
-_TOLERANCE: Final = 1e-9  # of a step: rounding must not drop the last value of a range
-
-
 def values_of(node: Node, address: str) -> list[Node]:
     """The values that an address takes, each with its place.
 
@@ -602,7 +598,8 @@ def _range(mark: Mark, limits: list[Node]) -> tuple[list[float], Number]:
         raise limits[2].mark.error(what, "a step towards the stop")
     if n_steps >= MAX_POINTS:
         raise mark.error(f"the range has {n_steps:.3g} values", f"at most {MAX_POINTS}")
-    amounts = [start.amount + i * step.amount for i in range(math.floor(n_steps + _TOLERANCE) + 1)]
+    n_values = math.floor(n_steps + 1e-9) + 1  # rounding must not drop the last value
+    amounts = [start.amount + i * step.amount for i in range(n_values)]
     return amounts, start._replace(is_whole=start.is_whole and step.is_whole)
 
 

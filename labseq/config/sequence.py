@@ -126,8 +126,6 @@ Analyses: TypeAlias = Annotated[tuple[AnalysisChoice, ...], empty_is(()), AfterV
 
 DEFAULT_PLANNER: Final = "psca"
 
-_BESIDE: Final = ("name", "policy")
-"""Keys of a step other than its kind."""
 _STEP_NAME: Final = re.compile(r"[^\W\d][\w-]*")
 
 
@@ -158,7 +156,7 @@ def _step(value: Any) -> StepSpec:
     if not isinstance(value, dict):
         raise setting_error(f"a step is {shown(value)}", "a mapping such as 'image: {exposure: 45 ms}'")
     item = cast("dict[str, Any]", value)
-    kinds = [key for key in item if key not in _BESIDE]
+    kinds = [key for key in item if key not in ("name", "policy")]
     if not kinds:
         raise setting_error("this step has no action", "a mapping such as 'image: {exposure: 45 ms}'")
     if len(kinds) > 1:
@@ -270,7 +268,7 @@ def load_sequence(
     with collecting(found) as problems:
         document = document.override_all(overrides, may_add=("policy",), found=problems).evaluated()
         document, scan = _at_first_point(
-            document, [Override(*one) for one in overrides], profile_set, problems
+            document, [Override(*pair) for pair in overrides], profile_set, problems
         )
     return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, found), scan
 

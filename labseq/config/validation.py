@@ -74,8 +74,9 @@ class ValidationContext:
     def known_keys(self, model: SettingsType, loc: Loc) -> list[str]:
         """The keys of the mapping at a location."""
         keys = keys_of(models_at(model, loc))
-        own = keys if loc else [*(key for key in keys if key not in self.drop), *self.other_keys]
-        return list(dict.fromkeys(own))
+        if not loc:
+            keys = [*(key for key in keys if key not in self.drop), *self.other_keys]
+        return list(dict.fromkeys(keys))
 
     def mapping(self, loc: Loc) -> str:
         """The description of the mapping at a location, for messages."""
@@ -99,7 +100,7 @@ def validate(model: type[M], node: Node, context: ValidationContext) -> M:
     if not isinstance(result, list):
         return result
     placed: list[tuple[Mark, Problem]]
-    placed = [(node.mark_at(found.loc, found.key), found.problem) for found in result]
+    placed = [(node.mark_at(finding.loc, finding.key), finding.problem) for finding in result]
     placed.sort(key=lambda pair: pair[0].order)
     raise ConfigError([mark.problem(p.what, p.expected, p.hint) for mark, p in placed])
 
@@ -132,7 +133,7 @@ def _validated(model: type[M], text: str, context: Mapping[str, Any]) -> M:
         return adapter.validate_json(text, strict=True, context=context, by_alias=True, by_name=False)
     except ValidationError as error:
         # Behind a validator of the model's own, strict wants a tuple from the start.
-        if all(_is_list_for_tuple(one) for one in error.errors(include_url=False)):
+        if all(_is_list_for_tuple(details) for details in error.errors(include_url=False)):
             return adapter.validate_json(text, context=context, by_alias=True, by_name=False)
         raise
 
@@ -177,32 +178,39 @@ def _findings(
     error: ValidationError, model: SettingsType, top: Node, context: ValidationContext
 ) -> list[Finding]:
     raised = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
-    errors = [_place(one, top) for one in raised if not (_is_list_for_tuple(one) or _is_long_enough(one))]
-    chosen = [one for one in errors if one.union is None]
+    errors = [
+        _place(details, top)
+        for details in raised
+        if not (_is_list_for_tuple(details) or _is_long_enough(details))
+    ]
+    # Of a value that fits none of several types, only the errors of one type are reported.
+    reported = [placed for placed in errors if placed.union is None]
     unions: dict[Loc, list[_Placed]] = {}
-    for one in errors:
-        if one.union is not None:
-            unions.setdefault(one.union, []).append(one)
+    for placed in errors:
+        if placed.union is not None:
+            unions.setdefault(placed.union, []).append(placed)
     findings: list[Finding] = []
     for union in unions.values():
-        if all(one.is_wrong_type for one in union):
+        if all(placed.is_wrong_type for placed in union):
             findings.append(_no_type_fits(union, top, context))
         else:
-            chosen += _best_branch(union)
-    missing = {one.loc for one in chosen if one.kind == "missing"}
-    unknown = [one for one in chosen if one.kind in _UNKNOWN][:MAX_HINTS]
-    meant = {one.loc: closest(str(one.loc[-1]), context.known_keys(model, one.loc[:-1])) for one in unknown}
+            reported += _best_branch(union)
+    missing = {placed.loc for placed in reported if placed.kind == "missing"}
+    unknown = [placed.loc for placed in reported if placed.kind in _UNKNOWN][:MAX_HINTS]
+    meant = {loc: closest(str(loc[-1]), context.known_keys(model, loc[:-1])) for loc in unknown}
     misspelt = {(*loc[:-1], key) for loc, key in meant.items()}
-    for one in chosen:
-        if one.kind in _UNKNOWN:
-            findings.append(_unknown_key(one.loc, meant.get(one.loc, ""), model, top, context))
-        elif one.kind != "missing":
-            findings.append(_wrong_value(one, top, context))
-        elif isinstance(index := one.loc[-1], int):
-            if (*one.loc[:-1], index + 1) not in missing:
-                findings.append(_missing_item(one.loc[:-1], index, top, context))
-        elif one.loc not in misspelt:  # a misspelt key is not missing as well
-            findings.append(_missing_key(one.loc, model, top, context))
+    for placed in reported:
+        loc = placed.loc
+        if placed.kind in _UNKNOWN:
+            findings.append(_unknown_key(loc, meant.get(loc, ""), model, top, context))
+        elif placed.kind != "missing":
+            findings.append(_wrong_value(placed, top, context))
+        elif isinstance(index := loc[-1], int):
+            # The last missing item says how many entries are needed.
+            if (*loc[:-1], index + 1) not in missing:
+                findings.append(_missing_item(loc[:-1], index, top, context))
+        elif loc not in misspelt:  # a misspelt key is not missing as well
+            findings.append(_missing_key(loc, model, top, context))
     return findings
 
 
@@ -227,12 +235,12 @@ def _place(error: Mapping[str, Any], top: Node) -> _Placed:
 def _best_branch(union: list[_Placed]) -> list[_Placed]:
     """The errors of the most likely branch: the one in which the longest part is valid."""
     branches: dict[str, list[_Placed]] = {}
-    for one in union:
-        branches.setdefault(one.branch, []).append(one)
+    for placed in union:
+        branches.setdefault(placed.branch, []).append(placed)
 
     def fit(errors: list[_Placed]) -> tuple[int, bool, int]:
-        is_about_value = not any(one.is_wrong_type for one in errors)
-        return max(len(one.loc) for one in errors), is_about_value, -len(errors)
+        is_about_value = not any(placed.is_wrong_type for placed in errors)
+        return max(len(placed.loc) for placed in errors), is_about_value, -len(errors)
 
     return max(branches.values(), key=fit)
 
@@ -240,22 +248,22 @@ def _best_branch(union: list[_Placed]) -> list[_Placed]:
 def _no_type_fits(union: list[_Placed], top: Node, context: ValidationContext) -> Finding:
     loc = union[0].loc
     node = top.at(loc) or top
-    *others, last = dict.fromkeys(_TYPES[one.kind] for one in union)
+    *others, last = dict.fromkeys(_TYPES[placed.kind] for placed in union)
     expected = f"{', '.join(others)} or {last}" if others else last
     return Finding(
         loc, Problem(f"{context.value(loc)} is {shown(node.plain(), node.raw)}", expected=expected)
     )
 
 
-def _wrong_value(one: _Placed, top: Node, context: ValidationContext) -> Finding:
-    details = one.error.get("ctx", {})
-    at = (details["discriminator"].strip("'"),) if one.kind == "union_tag_invalid" else ()
-    loc = one.loc + tuple(details.get("at", at))
-    if "[key]" in one.error["loc"]:
-        name = f"the key '{clean(str(one.loc[-1]))}'"
-        return Finding(loc, explain(one.error, name, one.loc[-1], ""), key=True)
-    node = top.at(one.loc) or top
-    problem = explain(one.error, context.value(one.loc), node.plain(), node.raw)
+def _wrong_value(placed: _Placed, top: Node, context: ValidationContext) -> Finding:
+    details = placed.error.get("ctx", {})
+    at = (details["discriminator"].strip("'"),) if placed.kind == "union_tag_invalid" else ()
+    loc = placed.loc + tuple(details.get("at", at))
+    if "[key]" in placed.error["loc"]:
+        name = f"the key '{clean(str(placed.loc[-1]))}'"
+        return Finding(loc, explain(placed.error, name, placed.loc[-1], ""), key=True)
+    node = top.at(placed.loc) or top
+    problem = explain(placed.error, context.value(placed.loc), node.plain(), node.raw)
     return Finding(loc, problem, bool(details.get("key")))
 
 
@@ -355,14 +363,16 @@ def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Proble
     if kind in _TYPES:
         return Problem(what, expected=_TYPES[kind], hint=_type_hint(kind, value))
     if kind in _LIMITS:
-        words, key = _LIMITS[kind]
+        comparison, key = _LIMITS[kind]
         limit = f"{details[key]:g}" if isinstance(details[key], float) else str(details[key])
         si = " (in SI units)" if isinstance(value, str) and details[key] != 0 else ""
-        return Problem(what, expected=f"{words} {limit}{si}")
+        return Problem(what, expected=f"{comparison} {limit}{si}")
     if kind in _LENGTHS:
-        words, key, one, many = _LENGTHS[kind]
+        comparison, key, singular, plural = _LENGTHS[kind]
         n = len(value)
-        return Problem(f"{name} has {n} {one if n == 1 else many}", expected=f"{words} {details[key]}")
+        return Problem(
+            f"{name} has {n} {singular if n == 1 else plural}", expected=f"{comparison} {details[key]}"
+        )
     if kind == "finite_number":
         return Problem(what, expected="a finite number")
     if kind in ("literal_error", "enum"):
@@ -425,8 +435,8 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
         ConfigError: All errors in them.
     """
     root = node_of(dict(values), Mark(called))
-    made = validate(model or NoSettings, root, ValidationContext("", "it"))
-    return None if model is None else cast("M", made)
+    settings = validate(model or NoSettings, root, ValidationContext("", "it"))
+    return None if model is None else cast("M", settings)
 
 
 def node_of(value: Any, mark: Mark) -> Node:
