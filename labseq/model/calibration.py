@@ -21,8 +21,6 @@ from labseq.model.grid import Floats, SiteGrid, axis_positions_m, mean_step_hz, 
 CalibrationKind = Literal["sites", "thresholds", "tweezers", "amplitudes", "frequencies", "overlay", "timing"]
 CALIBRATION_KINDS: Final[tuple[CalibrationKind, ...]] = get_args(CalibrationKind)
 
-ID_DIGITS: Final = 12
-
 VALUE_SHAPES: Final[Mapping[str, Mapping[str, tuple[str | int, ...]]]] = MappingProxyType(
     {
         "sites": {"positions_px": ("rows", "cols", 2), "frame": (2,)},
@@ -35,8 +33,6 @@ VALUE_SHAPES: Final[Mapping[str, Mapping[str, tuple[str | int, ...]]]] = Mapping
     }
 )
 """Kind -> the values that it must have, and their shapes; "rows" and "cols" are the grid's."""
-
-_SPACING_TOLERANCE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,16 +142,16 @@ def grid_facts(grid: SiteGrid) -> dict[str, Any]:
     }
 
 
-def same_grid(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+def same_grid(grid: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Whether two grids have the same sites; the shear of a square lattice is ignored.
 
     Args:
-        one: From :func:`grid_facts`.
+        grid: From :func:`grid_facts`.
         other: From :func:`grid_facts`.
     """
-    keys = ("rows", "cols", "lattice", *(("shear",) if one["lattice"] == "triangular" else ()))
-    is_alike = math.isclose(one["spacing_m"], other["spacing_m"], rel_tol=_SPACING_TOLERANCE)
-    return is_alike and all(one[key] == other[key] for key in keys)
+    keys = ("rows", "cols", "lattice", *(("shear",) if grid["lattice"] == "triangular" else ()))
+    is_alike = math.isclose(grid["spacing_m"], other["spacing_m"], rel_tol=1e-6)
+    return is_alike and all(grid[key] == other[key] for key in keys)
 
 
 def _facts(grid: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,7 +184,7 @@ def _content_id(entry: CalibrationEntry) -> str:
     content = [entry.kind, entry.grid, values, entry.taken_utc]
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return digest.lstrip(string.digits)[:ID_DIGITS]
+    return digest.lstrip(string.digits)[:12]
 
 
 def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:

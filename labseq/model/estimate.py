@@ -10,9 +10,6 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_ROUNDING: Final = 1e-12
-"""Relative error below which a scatter is only rounding."""
-
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -34,7 +31,8 @@ class Estimate:
         """
         if math.isnan(self.value):
             return "-"
-        if not math.isfinite(self.error) or self.error <= _ROUNDING * abs(self.value):
+        # A relative scatter below 1e-12 is only rounding.
+        if not math.isfinite(self.error) or self.error <= 1e-12 * abs(self.value):
             return f"{self.value:.4g}"
         digit = math.floor(math.log10(self.error))
         if round(self.error / 10.0**digit) == 10:

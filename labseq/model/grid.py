@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -142,16 +142,12 @@ def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:
     return (sites - (n_sites - 1) / 2) * spacing_m
 
 
-SINGLE_SITE_STEP_HZ: Final = 1.6e6
-"""Change of frequency by a move of one spacing on a 1 x 1 grid, in Hz (the paper's step)."""
-
-
 def mean_step_hz(site_hz: Floats, other_hz: Floats) -> float:
     """Mean step from tone to tone of an axis, in Hz; of a single tone that of the other axis."""
     for values in (site_hz, other_hz):
         if len(values) > 1:
             return float(values[-1] - values[0]) / (len(values) - 1)
-    return SINGLE_SITE_STEP_HZ
+    return 1.6e6  # for a grid of one site: the step of the paper
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -111,13 +111,13 @@ class LineProgram:
         """
         column = self.on[:, self.lines.index(line)]
         ends = [*self.t_s[1:].tolist(), max(self.duration_s, float(self.t_s[-1]))]
-        found: list[tuple[float, float]] = []
+        spans: list[tuple[float, float]] = []
         for start, end, is_on in zip(self.t_s.tolist(), ends, column.tolist(), strict=True):
-            if is_on and found and found[-1][1] == start:
-                found[-1] = (found[-1][0], end)
+            if is_on and spans and spans[-1][1] == start:
+                spans[-1] = (spans[-1][0], end)
             elif is_on and end > start:
-                found.append((start, end))
-        return found
+                spans.append((start, end))
+        return spans
 
     def rising(self, line: str) -> list[float]:
         """Times at which a line switches on, in seconds from the start of the program; 0 if it starts on."""

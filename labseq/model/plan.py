@@ -81,11 +81,11 @@ class TonePaths:
             int (n, 2), row tone and column tone of each; -1 where none starts there.
         """
         wanted = np.asarray(sites).reshape(-1, 2)
-        found = np.full(wanted.shape, -1)
+        tones = np.full(wanted.shape, -1)
         for axis, path in enumerate((self.row, self.column)):
             site, tone = np.nonzero(wanted[:, axis, None] == path[0])
-            found[site, axis] = tone
-        return found
+            tones[site, axis] = tone
+        return tones
 
     def path_of(self, row_tone: int, column_tone: int) -> NDArray[np.float64]:
         """Positions of a crossing at each knot until it goes off, float64 (n, 2), in sites."""
@@ -184,7 +184,7 @@ class Plan:
 
     def is_same(self, other: Plan) -> bool:
         """Whether another plan has the same moves in the same batches, along the same paths."""
-        return all(np.array_equal(getattr(self, one.name), getattr(other, one.name)) for one in fields(self))
+        return all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     def _check_paths(self, n_batches: int) -> None:
         shapes = read_only(self.path_shapes, np.int32, (-1, 3), "path_shapes")
@@ -194,8 +194,8 @@ class Plan:
             raise ValueError(f"path_shapes has {len(shapes)} rows; the plan has {n_batches} batches")
         stop, off_stop = _path_ends(shapes)
         if (shapes < 0).any() or (len(positions), len(off)) != (stop, off_stop):
-            came = f"{len(positions)} and {len(off)} came"
-            raise ValueError(f"path_shapes asks for {stop} positions and {off_stop} knots; {came}")
+            given = f"{len(positions)} and {len(off)} are given"
+            raise ValueError(f"path_shapes asks for {stop} positions and {off_stop} knots; {given}")
         object.__setattr__(self, "path_shapes", shapes if shapes.any() else NO_SHAPES)
         object.__setattr__(self, "path_positions", positions)
         object.__setattr__(self, "path_off", off)
@@ -208,14 +208,14 @@ class Plan:
             >>> Plan.from_batches([([(0, 0)], [(0, 3)])]).n_atom_moves
             1
         """
-        made = [b if isinstance(b, Batch) else Batch(_sites(b[0]), _sites(b[1])) for b in batches]
-        offsets = np.cumsum([0, *(len(batch) for batch in made)], dtype=np.int32)
+        batch_list = [b if isinstance(b, Batch) else Batch(_sites(b[0]), _sites(b[1])) for b in batches]
+        offsets = np.cumsum([0, *(len(batch) for batch in batch_list)], dtype=np.int32)
         moves = np.empty((int(offsets[-1]), 4), np.int16)
-        for batch, start in zip(made, offsets, strict=False):
+        for batch, start in zip(batch_list, offsets, strict=False):
             moves[start : start + len(batch), :2] = batch.from_sites
             moves[start : start + len(batch), 2:] = batch.to_sites
-        linked = np.array([batch.linked for batch in made], np.bool_)
-        return cls(moves, offsets, linked, *_flat_paths([batch.tones for batch in made]))
+        linked = np.array([batch.linked for batch in batch_list], np.bool_)
+        return cls(moves, offsets, linked, *_flat_paths([batch.tones for batch in batch_list]))
 
     @property
     def n_batches(self) -> int:
@@ -321,7 +321,7 @@ def _flat_paths(
     """The last three arrays of a :class:`Plan`."""
     if not any(paths):
         return NO_SHAPES, NO_POSITIONS, NO_KNOTS
-    shapes = np.array([(0, 0, 0) if one is None else one.shape for one in paths], np.int32)
-    positions = [part.ravel() for one in paths if one for part in (one.row, one.column)]
-    off = [part for one in paths if one for part in (one.row_off, one.column_off)]
+    shapes = np.array([(0, 0, 0) if path is None else path.shape for path in paths], np.int32)
+    positions = [part.ravel() for path in paths if path for part in (path.row, path.column)]
+    off = [part for path in paths if path for part in (path.row_off, path.column_off)]
     return shapes, np.concatenate(positions), np.concatenate(off)

@@ -30,13 +30,13 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
         >>> unique_names(["load", "image", "rearrange", "image"])
         ('load', 'step_1_image', 'rearrange', 'step_3_image')
     """
-    found: list[str] = []
+    step_names: list[str] = []
     for i, name in enumerate(names):
         unique = f"{STEP}{i}_{name}" if names.count(name) > 1 else name
-        while unique in found or (unique != name and unique in names):
+        while unique in step_names or (unique != name and unique in names):
             unique += "_"
-        found.append(unique)
-    return tuple(found)
+        step_names.append(unique)
+    return tuple(step_names)
 
 
 @dataclass(frozen=True, slots=True)

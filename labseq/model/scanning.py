@@ -7,12 +7,9 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-
-_ROUNDING: Final = 1e-9  # of a range or step
-_KEY: Final = 0x0ADA  # separates these from the random numbers of shots
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +64,8 @@ class ScanRange:
         if not self.low - self.high <= number - self.low <= 2 * (self.high - self.low):  # nan is not, either
             return None
         near = self.at(self.fraction(number))
-        dust = _ROUNDING * (self.high - self.low) / (self.n_steps or 1)
-        return near if abs(near - number) <= dust else None
+        tolerance = 1e-9 * (self.high - self.low) / (self.n_steps or 1)
+        return near if abs(near - number) <= tolerance else None
 
     def fraction(self, value: float) -> float:
         """The opposite of :meth:`at`: 0 at ``low``, 1 at ``high``."""
@@ -97,7 +94,8 @@ class ScanSpace:
         Args:
             n_visited: Number of points that have been visited so far.
         """
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(_KEY, n_visited)))
+        # The first number separates these from the random numbers of shots.
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0x0ADA, n_visited)))
 
 
 @dataclass(frozen=True, slots=True)
