@@ -94,9 +94,6 @@ class NoSettings(Settings):
     """The settings of a plugin that takes none."""
 
 
-_SI_UNIT: Final = re.compile(r"(?<!_per)_(m_s|s|m|k|hz|v|w|db)$")
-
-
 def key_without_unit(name: str) -> str:
     """The key in a file for an attribute in SI: in a file the unit stands beside the value.
 
@@ -104,7 +101,7 @@ def key_without_unit(name: str) -> str:
         >>> key_without_unit("speed_m_s"), key_without_unit("distance_per_m")
         ('speed', 'distance_per_m')
     """
-    return _SI_UNIT.sub("", name)
+    return re.sub(r"(?<!_per)_(m_s|s|m|k|hz|v|w|db)$", "", name)
 
 
 IN_SI: Final = ConfigDict(
@@ -229,7 +226,7 @@ def settings_of(model: SettingsType | None) -> tuple[Setting, ...]:
 def _setting(name: str, field: FieldInfo) -> Setting:
     annotation = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
     parts = list(_parts(annotation))
-    dimensions = {found for part in parts if (found := dimension_read_by(part))}
+    dimensions = set(filter(None, map(dimension_read_by, parts)))
     return Setting(
         key=field.validation_alias if isinstance(field.validation_alias, str) else name,
         name=name,
@@ -266,23 +263,23 @@ def settings_at(model: SettingsType | None, loc: Loc) -> Sequence[Setting]:
 
     Indices, and names that the user chooses, count as the list or mapping that they are in.
     """
-    found: Sequence[Setting] = ()
+    settings: Sequence[Setting] = ()
     models: Sequence[SettingsType | None] = [model]
     for step in loc:
-        named = [one for inner in models for one in settings_of(inner) if one.key == step]
+        named = [setting for inner in models for setting in settings_of(inner) if setting.key == step]
         if named:
-            found, models = named, [inner for one in named for inner in one.models]
-    return found
+            settings, models = named, [inner for setting in named for inner in setting.models]
+    return settings
 
 
 def models_at(model: SettingsType, loc: Loc) -> list[SettingsType]:
     """The settings models of a location below a model: several in a union."""
     settings = settings_at(model, loc)
-    return [inner for one in settings for inner in one.models] if settings else [model]
+    return [inner for setting in settings for inner in setting.models] if settings else [model]
 
 
 def si_unit_at(model: SettingsType | None, loc: Loc) -> str:
-    """SI unit of the setting at a location in a settings model; "" for one that has or is none.
+    """SI unit of the setting at a location in a settings model; "" if there is no setting or no unit.
 
     Example:
         >>> class Mine(Settings):
@@ -290,7 +287,7 @@ def si_unit_at(model: SettingsType | None, loc: Loc) -> str:
         >>> si_unit_at(Mine, ("windows", 2))
         's'
     """
-    return next((one.si_unit for one in settings_at(model, loc) if one.si_unit), "")
+    return next((setting.si_unit for setting in settings_at(model, loc) if setting.si_unit), "")
 
 
 def _not_too_long(duration_s: float) -> float:
@@ -364,7 +361,7 @@ class Choice(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_no_bare_name(cls, value: Any) -> Any:
+    def _refuse_bare_name(cls, value: Any) -> Any:
         if isinstance(value, str):
             name = clean(value)
             raise setting_error(f"there is just '{name}' here", "a mapping", f"write '{{{cls.key}: {name}}}'")
@@ -403,8 +400,6 @@ placed_by_field: Final = AfterValidator(_placed_by_field)
 FORMAT: Final = 1
 """Version of the file format that this labseq reads."""
 
-_VARIABLE: Final = re.compile(r"[^\W\d]\w*")
-
 
 def _is_version(value: Any) -> Any:
     if type(value) is not int or value != FORMAT:  # neither true nor 1.0 is a version
@@ -437,9 +432,9 @@ def si_of(value: Any) -> Any:
         raise setting_error(what, "a number, or a number with a unit such as '20 ms'") from None
 
 
-def _named_well(variables: dict[str, int | float]) -> dict[str, int | float]:
+def _check_names(variables: dict[str, int | float]) -> dict[str, int | float]:
     for name in variables:
-        if not _VARIABLE.fullmatch(name):
+        if not re.fullmatch(r"[^\W\d]\w*", name):
             what = f"a variable is called '{clean(name)}'"
             raise setting_error(what, "letters, digits and '_', a letter first", at=(name,), key=True)
     return variables
@@ -452,6 +447,6 @@ Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=80), AfterValida
 Folders: TypeAlias = Annotated[list[Text], empty_is([])]
 """Folders, relative to the file that names them."""
 Variables: TypeAlias = Annotated[
-    dict[str, Annotated[int | float, BeforeValidator(si_of)]], AfterValidator(_named_well), empty_is({})
+    dict[str, Annotated[int | float, BeforeValidator(si_of)]], AfterValidator(_check_names), empty_is({})
 ]
 """Name -> value, SI."""
