@@ -48,16 +48,15 @@ PACKAGE_PREFIX: Final = "labseq_"
 
 _PLUGIN_NAME: Final = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _FILE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9]*([_-][A-Za-z0-9]+)*")
-_YAML_WORDS: Final = frozenset({"true", "false", "null"})
 _RESERVED: Final = frozenset({"labseq", "labseq_local", "plugins", "conftest"}) | sys.stdlib_module_names
-_WINDOWS: Final = frozenset(
+_WINDOWS_DEVICES: Final = frozenset(
     {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
 )
 
 
 @dataclass(frozen=True, slots=True)
 class CreatedFiles:
-    """What was made.
+    """The files that `labseq new` has created, and the next commands.
 
     Attributes:
         path: The file, or the plugin's folder.
@@ -73,29 +72,29 @@ class CreatedFiles:
 def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
     """Make a plugin, a sequence or a profile, and print its files and what to do next."""
     if kind not in (*ROLES, *FILE_KINDS):
-        known = (*ROLES, *FILE_KINDS)
+        kinds = (*ROLES, *FILE_KINDS)
         what = f"there is no kind '{clean(kind)}'"
-        raise ConfigError(Problem(what, expected=listing(known), hint=did_you_mean(kind, known)))
+        raise ConfigError(Problem(what, expected=listing(kinds), hint=did_you_mean(kind, kinds)))
     if package and kind in FILE_KINDS:
         raise ConfigError(Problem(f"--package does not apply to a {kind}", hint="leave it out"))
     if profile is not None and kind != "sequence":
         raise ConfigError(Problem(f"--profile does not apply to a {_called(kind)}", hint="leave it out"))
     if kind in FILE_KINDS:
-        made = make_file(kind, name, folder, profile=profile or "virtual")
+        created = make_file(kind, name, folder, profile=profile or "virtual")
     else:
-        made = make_plugin(kind, name, folder, package=package)
-    say(*lines_of(kind, name, made))
+        created = make_plugin(kind, name, folder, package=package)
+    say(*lines_of(kind, name, created))
 
 
-def lines_of(kind: str, name: str, made: CreatedFiles) -> list[str]:
+def lines_of(kind: str, name: str, created: CreatedFiles) -> list[str]:
     """What is printed about the new files.
 
     Example:
         >>> lines_of("sequence", "a", CreatedFiles(Path("a.yaml"), (Path("a.yaml"),), ("labseq run a.yaml",)))
         ['made the sequence a:', '  a.yaml', '', 'next:', '  labseq run a.yaml']
     """
-    files = [f"  {path}" for path in made.files]
-    return [f"made the {_called(kind)} {name}:", *files, "", "next:", *(f"  {c}" for c in made.commands)]
+    files = [f"  {path}" for path in created.files]
+    return [f"made the {_called(kind)} {name}:", *files, "", "next:", *(f"  {c}" for c in created.commands)]
 
 
 def _called(kind: str) -> str:
@@ -200,20 +199,20 @@ def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> N
     """Refuse a name that a plugin cannot have, or that is taken.
 
     Raises:
-        ConfigError: It is refused; the message suggests another name.
+        ConfigError: The name cannot be used; the message suggests another name.
     """
     if not _PLUGIN_NAME.fullmatch(name) or len(name) > MAX_LENGTH:
         guess = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")[:MAX_LENGTH]
         allowed = f"a lower-case word of at most {MAX_LENGTH} letters, digits and '_'"
         what = "it is not a valid name for a Python package"
         expected = f"{allowed} that begins with a letter"
-        raise _refused(kind, name, what, expected, guess if _PLUGIN_NAME.fullmatch(guess) else "")
+        raise _name_error(kind, name, what, expected, guess if _PLUGIN_NAME.fullmatch(guess) else "")
     entry = host.registry.find(kind, name)
     taken = next((info for info in host.infos if info.name == package), None)
     reasons = (
         (keyword.iskeyword(name) or hasattr(builtins, name), "Python itself uses this word"),
         (name in _RESERVED, "a part of Python or labseq has this name"),
-        (name in _WINDOWS, "Windows allows no file of this name"),
+        (name in _WINDOWS_DEVICES, "Windows allows no file of this name"),
         (entry, f"the plugin '{entry and entry.origin}' offers a {_called(kind)} of that name"),
         (taken, f"there is a plugin '{package}' ({taken and taken.origin})"),
         (_is_installed(package), f"there is a Python package '{package}', which the plugin would hide"),
@@ -225,17 +224,17 @@ def check_file_name(kind: str, name: str, profiles: Path) -> None:
     """Refuse a name that a sequence or profile cannot have.
 
     Raises:
-        ConfigError: It is refused; the message suggests another name.
+        ConfigError: The name cannot be used; the message suggests another name.
     """
     if not _FILE_NAME.fullmatch(name) or len(name) > MAX_LENGTH:
         guess = re.sub(r"\.ya?ml$", "", name, flags=re.IGNORECASE)
         guess = re.sub(r"[^A-Za-z0-9]+", "_", guess).strip("_0123456789")[:MAX_LENGTH]
         expected = f"at most {MAX_LENGTH} letters, digits, '-' and '_', beginning with a letter, no ending"
         what = "it is not a valid file name"
-        raise _refused(kind, name, what, expected, guess if _FILE_NAME.fullmatch(guess) else "")
+        raise _name_error(kind, name, what, expected, guess if _FILE_NAME.fullmatch(guess) else "")
     reasons = (
-        (name.lower() in _WINDOWS, "Windows allows no file of this name"),
-        (name.lower() in _YAML_WORDS, "YAML does not read it as text"),
+        (name.lower() in _WINDOWS_DEVICES, "Windows allows no file of this name"),
+        (name.lower() in ("true", "false", "null"), "YAML does not read it as text"),
         (
             kind == "profile" and (profiles / f"{name}.yaml").exists(),
             "a profile of that name comes with labseq, and yours would hide it",
@@ -247,10 +246,10 @@ def check_file_name(kind: str, name: str, profiles: Path) -> None:
 def _refuse_if(reasons: Iterable[tuple[object, str]], kind: str, name: str) -> None:
     for is_refused, why in reasons:
         if is_refused:
-            raise _refused(kind, name, why, "another name", f"my_{name}")
+            raise _name_error(kind, name, why, "another name", f"my_{name}")
 
 
-def _refused(kind: str, name: str, why: str, expected: str, guess: str) -> ConfigError:
+def _name_error(kind: str, name: str, why: str, expected: str, guess: str) -> ConfigError:
     called = _called(kind)
     what = f"{'an' if called[0] in 'aeiou' else 'a'} {called} cannot be called '{clean(name)}': {why}"
     return ConfigError(Problem(what, expected=expected, hint=f"for example '{guess}'" if guess else ""))

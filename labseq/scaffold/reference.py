@@ -147,7 +147,7 @@ def _unmarked(text: str) -> str:
 
 FILES: Final[Mapping[str, SettingsType]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
 """Kind of file -> its model."""
-_CHOSEN: Final = {"target": "pattern", "devices": "device", "shot": "step", "scan": "scanner"}
+_PLUGIN_KINDS: Final = {"target": "pattern", "devices": "device", "shot": "step", "scan": "scanner"}
 """Key that names plugins -> their kind, if that is not the key itself."""
 _ADDED_BY_LOADER: Final[Mapping[tuple[SettingsType | None, str], str]] = {
     (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`",
@@ -214,18 +214,22 @@ def definition(function: Callable[..., Any], *, is_value: bool = False, name: st
         is_value: Whether it is a property.
         name: What it is called by, where that is not its own name.
     """
-    found = inspect.signature(function)
-    arguments = [one for key, one in found.parameters.items() if key != "self"]
-    text = str(found.replace(parameters=arguments)).replace("'", "").replace("Ellipsis", "...")
+    signature = inspect.signature(function)
+    arguments = [parameter for key, parameter in signature.parameters.items() if key != "self"]
+    text = str(signature.replace(parameters=arguments)).replace("'", "").replace("Ellipsis", "...")
     called = f": {text.partition(' -> ')[2]}" if is_value else text.removesuffix(" -> None")
     return Definition((name or function.__name__) + called, docstring(function))
 
 
 def public(module: Any, is_kind: Callable[[object], bool]) -> list[Any]:
     """What a module, or a package with its modules, defines for others, in the order of the source."""
-    found = [one for name, one in vars(module).items() if is_kind(one) and not name.startswith("_")]
+    members = [
+        member for name, member in vars(module).items() if is_kind(member) and not name.startswith("_")
+    ]
     home = module.__name__
-    return [one for one in found if one.__module__ == home or one.__module__.startswith(f"{home}.")]
+    return [
+        member for member in members if member.__module__ == home or member.__module__.startswith(f"{home}.")
+    ]
 
 
 # Roles, hooks, errors, events
@@ -233,15 +237,15 @@ def public(module: Any, is_kind: Callable[[object], bool]) -> list[Any]:
 
 def roles_by_name() -> dict[str, type]:
     """Name -> role."""
-    return {one.__name__: one for one in public(roles, inspect.isclass)}
+    return {role_type.__name__: role_type for role_type in public(roles, inspect.isclass)}
 
 
-def role(found: type) -> list[Block]:
+def role(role_type: type) -> list[Block]:
     """What a role is, and a definition per method."""
-    shared = [base.__name__ for base in found.__bases__ if base.__name__ in roles_by_name()]
-    blocks: list[Block] = [docstring(found)]
+    shared = [base.__name__ for base in role_type.__bases__ if base.__name__ in roles_by_name()]
+    blocks: list[Block] = [docstring(role_type)]
     blocks += [f"All that `{', '.join(shared)}` asks for, and:"] if shared else []
-    for member in vars(found).values():
+    for member in vars(role_type).values():
         function = member.fget if isinstance(member, property) else member
         if inspect.isfunction(function) and not function.__name__.startswith("_"):
             blocks.append(definition(function, is_value=isinstance(member, property)))
@@ -264,17 +268,17 @@ def errors_by_name() -> dict[str, type[LabseqError]]:
     return {error.__name__: error for error in walk(LabseqError)}
 
 
-def error(found: type[LabseqError]) -> Definition:
+def error(error_type: type[LabseqError]) -> Definition:
     """An error, its fields and its exit code."""
-    code = str(found.exit_code)
-    if found is StopRequested:
+    code = str(error_type.exit_code)
+    if error_type is StopRequested:
         code = " or ".join(str(exit_code_of(StopRequested(number))) for number in (SIGINT, SIGTERM))
-    return Definition(found.__name__, f"{docstring(found)}\n\nExit code {code}.")
+    return Definition(error_type.__name__, f"{docstring(error_type)}\n\nExit code {code}.")
 
 
-def kinds_of(found: type[LabseqError]) -> list[type[LabseqError]]:
+def kinds_of(error_type: type[LabseqError]) -> list[type[LabseqError]]:
     """The errors that are kinds of an error."""
-    return [kind for kind in found.__subclasses__() if kind.__module__ == errors.__name__]
+    return [kind for kind in error_type.__subclasses__() if kind.__module__ == errors.__name__]
 
 
 def exit_codes() -> list[Block]:
@@ -294,8 +298,8 @@ def events() -> list[Block]:
     return [_named("event", EVENTS)]
 
 
-def _named(title: str, found: Mapping[str, str]) -> Table:
-    return Table((title, "meaning"), [(f"`{name}`", about) for name, about in found.items()])
+def _named(title: str, rows: Mapping[str, str]) -> Table:
+    return Table((title, "meaning"), [(f"`{name}`", about) for name, about in rows.items()])
 
 
 # The shot's file
@@ -345,34 +349,36 @@ def quantities() -> list[Block]:
 
 # Commands
 
-_LIMIT: Final = re.compile(r"x(>=|<=|>|<)(\S+)")
-_LIMIT_WORDS: Final = {">=": "At least", "<=": "At most", ">": "More than", "<": "Less than"}
+_COMPARISONS: Final = {">=": "At least", "<=": "At most", ">": "More than", "<": "Less than"}
 
 
-def command(names: Sequence[str], found: Any) -> list[Block]:
+def command(names: Sequence[str], typer_command: Any) -> list[Block]:
     """Usage, arguments, options and examples of a command.
 
     Args:
         names: ["bench", "planners"]; none for the options of all commands.
-        found: The command, as typer sees it.
+        typer_command: The command, as typer sees it.
     """
-    arguments = [one for one in found.params if one.param_type_name == "argument"]
-    options = [one for one in found.params if one.param_type_name == "option" and not one.hidden]
+    arguments = [param for param in typer_command.params if param.param_type_name == "argument"]
+    options = [
+        param for param in typer_command.params if param.param_type_name == "option" and not param.hidden
+    ]
     usage = ["labseq", *names, *map(_argument_name, arguments)]
-    usage += (["COMMAND", "..."] if hasattr(found, "commands") else []) + (["[OPTIONS]"] if options else [])
-    blocks: list[Block] = [Code("text", " ".join(usage)), found.help]
+    usage += ["COMMAND", "..."] if hasattr(typer_command, "commands") else []
+    usage += ["[OPTIONS]"] if options else []
+    blocks: list[Block] = [Code("text", " ".join(usage)), typer_command.help]
     for title, spell, params in (("argument", _argument_name, arguments), ("option", _option_name, options)):
-        rows = [(f"`{spell(one)}`", _meaning(found, one)) for one in params]
+        rows = [(f"`{spell(param)}`", _meaning(typer_command, param)) for param in params]
         blocks += [Table((title, "meaning"), rows)] if rows else []
-    examples = [line.strip() for line in (found.epilog or "").splitlines() if "labseq " in line]
+    examples = [line.strip() for line in (typer_command.epilog or "").splitlines() if "labseq " in line]
     return [*blocks, Code("console", "\n".join(examples))] if examples else blocks
 
 
-def commands_below(found: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def commands_below(group: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Every command below the program or a group, with its names."""
-    for name, one in getattr(found, "commands", {}).items():
-        yield (*names, name), one
-        yield from commands_below(one, (*names, name))
+    for name, subcommand in getattr(group, "commands", {}).items():
+        yield (*names, name), subcommand
+        yield from commands_below(subcommand, (*names, name))
 
 
 def _argument_name(argument: Any) -> str:
@@ -388,24 +394,22 @@ def _option_name(option: Any) -> str:
     return spellings + value if value.startswith("[=") else f"{spellings} {value}"
 
 
-def _meaning(found: Any, parameter: Any) -> str:
+def _meaning(typer_command: Any, parameter: Any) -> str:
     """The help with its limits and default in words."""
     import typer
 
-    text: str = parameter.get_help_record(typer.Context(found))[1]
+    text: str = parameter.get_help_record(typer.Context(typer_command))[1]
     text, _, extra = text.rstrip("]").partition("  [")
-    for one in filter(None, extra.split("; ")):
-        if limit := _LIMIT.fullmatch(one):
-            text += f" {_LIMIT_WORDS[limit[1]]} {limit[2]}."
-        elif one.startswith("default: "):
-            text += f" Default: `{one.removeprefix('default: ')}`."
+    for note in filter(None, extra.split("; ")):
+        if limit := re.fullmatch(r"x(>=|<=|>|<)(\S+)", note):
+            text += f" {_COMPARISONS[limit[1]]} {limit[2]}."
+        elif note.startswith("default: "):
+            text += f" Default: `{note.removeprefix('default: ')}`."
     return text
 
 
 # What can be looked up
 
-MAX_WIDTH: Final = 110
-"""Widest line of an explanation."""
 _TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
     "unit": ("quantities and their units", units),
     "quantity": ("numbers of each shot: to plot, to optimise in a scan, to watch in a policy", quantities),
@@ -432,29 +436,35 @@ def topics(registry: Registry, program: Any) -> dict[str, Topic]:
         registry: The loaded plugins.
         program: The command ``labseq``, as typer sees it.
     """
-    found: dict[str, Topic] = {}
+    by_name: dict[str, Topic] = {}
     for kind, model in FILES.items():
-        found[kind] = Topic(f"the keys of a {kind}", partial(_blocks, settings, model, top=True))
-        found |= _file_topics(kind, registry)
+        by_name[kind] = Topic(f"the keys of a {kind}", partial(_blocks, settings, model, top=True))
+        by_name |= _file_topics(kind, registry)
     for kind, group in groupby(registry.entries(), key=lambda entry: entry.kind):
         entries = list(group)
-        found[kind] = Topic(", ".join(one.name for one in entries), partial(_offered, entries))
+        by_name[kind] = Topic(", ".join(entry.name for entry in entries), partial(_offered, entries))
         for entry in entries:
-            found[f"{kind} {entry.name}"] = Topic(_about_entry(entry), partial(entry_blocks, entry))
-            found |= _key_topics((kind, entry.name), entry.settings_model)
+            by_name[f"{kind} {entry.name}"] = Topic(_about_entry(entry), partial(entry_blocks, entry))
+            by_name |= _key_topics((kind, entry.name), entry.settings_model)
     for name, (about, table) in _TABLES.items():
-        found |= {name: Topic(about, table), **dict(_row_topics(name, table()))}
-    own = {f"role {name}": Topic(summary(one), partial(role, one)) for name, one in roles_by_name().items()}
-    own |= {
-        f"error {one}": Topic(summary(e), partial(_blocks, error, e)) for one, e in errors_by_name().items()
+        by_name |= {name: Topic(about, table), **dict(_row_topics(name, table()))}
+    core_topics = {
+        f"role {name}": Topic(summary(kind), partial(role, kind)) for name, kind in roles_by_name().items()
     }
-    for names, one in commands_below(program):
-        about = one.get_short_help_str(200)
-        own[f"command {' '.join(names)}"] = Topic(about, partial(command, names, one))
+    core_topics |= {
+        f"error {name}": Topic(summary(e), partial(_blocks, error, e)) for name, e in errors_by_name().items()
+    }
+    for names, subcommand in commands_below(program):
+        about = subcommand.get_short_help_str(200)
+        core_topics[f"command {' '.join(names)}"] = Topic(about, partial(command, names, subcommand))
     for name, about in _LISTED.items():
-        rows = {key.partition(" ")[2]: one.about for key, one in own.items() if key.startswith(f"{name} ")}
-        found[name] = Topic(about, partial(_blocks, _named, name, rows))
-    return found | own | {"hook": Topic("functions of a plugin that labseq calls", hooks)}
+        rows = {
+            key.partition(" ")[2]: topic.about
+            for key, topic in core_topics.items()
+            if key.startswith(f"{name} ")
+        }
+        by_name[name] = Topic(about, partial(_blocks, _named, name, rows))
+    return by_name | core_topics | {"hook": Topic("functions of a plugin that labseq calls", hooks)}
 
 
 def _blocks(make: Callable[..., Block], *arguments: Any, **options: Any) -> list[Block]:
@@ -493,43 +503,43 @@ def _key_blocks(
     """The row of a key, those of the mapping that it holds, and what else there is."""
     inner = _inner_model(setting)
     rows = [_row(key, owner, setting)]
-    rows += [_row(f"{key}.{name}", of, one) for name, of, one in _keys_of(inner)]
+    rows += [_row(f"{key}.{name}", model, nested) for name, model, nested in _keys_of(inner)]
     return [Table(_KEY_HEADER, rows), *further]
 
 
 def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
     """The keys of a file; those that name a plugin with the plugins that there are."""
-    found = _key_topics((kind,), FILES[kind])
+    by_name = _key_topics((kind,), FILES[kind])
     for key, owner, setting in _keys_of(FILES[kind], top=True):
-        chosen = key if key in ROLES else _CHOSEN.get(key, "")
-        if not chosen:
+        plugin_kind = key if key in ROLES else _PLUGIN_KINDS.get(key, "")
+        if not plugin_kind:
             continue
         models = [AdaptiveChoice] if key == "scan" else models_at(FILES[kind], (key,))
-        found |= _key_topics((kind, key), next((m for m in models if issubclass(m, Choice)), None))
-        further = partial(_choice_blocks, models, [e for e in registry.entries() if e.kind == chosen])
-        found[f"{kind} {key}"] = Topic(
+        by_name |= _key_topics((kind, key), next((m for m in models if issubclass(m, Choice)), None))
+        further = partial(_choice_blocks, models, [e for e in registry.entries() if e.kind == plugin_kind])
+        by_name[f"{kind} {key}"] = Topic(
             setting.description, lambda a=(key, owner, setting), more=further: _key_blocks(*a, more())
         )
-    return found | _key_topics((kind, "shot", "policy"), StepPolicySettings if kind == "sequence" else None)
+    return by_name | _key_topics((kind, "shot", "policy"), StepPolicySettings if kind == "sequence" else None)
 
 
 def _choice_blocks(models: Sequence[SettingsType], entries: Sequence[Entry]) -> list[Block]:
     """The keys beside the name of a plugin, and the plugins."""
-    own = [settings(model) for model in models if issubclass(model, Choice)]
-    return [*own, "The plugins, with settings of their own:", *_offered(entries)]
+    key_tables = [settings(model) for model in models if issubclass(model, Choice)]
+    return [*key_tables, "The plugins, with settings of their own:", *_offered(entries)]
 
 
-def overview(found: Mapping[str, Topic], names: Iterable[str] | None = None) -> list[Block]:
+def overview(by_name: Mapping[str, Topic], names: Iterable[str] | None = None) -> list[Block]:
     """A row for each of these topics; by default for those with a name of one word."""
-    chosen = [name for name in found if " " not in name] if names is None else names
-    return [_named("name", {name: found[name].about for name in chosen})]
+    shown = [name for name in by_name if " " not in name] if names is None else names
+    return [_named("name", {name: by_name[name].about for name in shown})]
 
 
-def find(found: Mapping[str, Topic], what: str) -> list[str]:
+def find(by_name: Mapping[str, Topic], request: str) -> list[str]:
     """The names of the topics that a user means.
 
     Args:
-        what: Words, with spaces or dots between: "step image", "profile.camera", "psca".
+        request: Words, with spaces or dots between: "step image", "profile.camera", "psca".
 
     Returns:
         One name; several if the words fit several names.
@@ -537,8 +547,8 @@ def find(found: Mapping[str, Topic], what: str) -> list[str]:
     Raises:
         ConfigError: There is no such topic.
     """
-    words = _folded(what)
-    folded = {_folded(name): name for name in found}
+    words = _folded(request)
+    folded = {_folded(name): name for name in by_name}
     if words in folded:
         return [folded[words]]
     ending = [name for key, name in folded.items() if words[-1:] == key[-1:] and _has_in_order(key, words)]
@@ -549,7 +559,7 @@ def find(found: Mapping[str, Topic], what: str) -> list[str]:
         words[-1] if words else "", (key[-1] for key in folded), None
     )
     hint = f"did you mean '{near}'?" if near else "`labseq explain` lists what there is"
-    raise ConfigError(Problem(f"there is nothing called '{clean(what)}' to explain", hint=hint))
+    raise ConfigError(Problem(f"there is nothing called '{clean(request)}' to explain", hint=hint))
 
 
 def _has_in_order(key: tuple[str, ...], words: tuple[str, ...]) -> bool:
@@ -578,17 +588,19 @@ def explain_topic(what: str, program: Any) -> None:
     host.import_all()
     left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
     left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
-    found = topics(host.registry, program)
-    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    by_name = topics(host.registry, program)
+    width = min(shutil.get_terminal_size().columns, 110)  # wider lines are hard to read
     try:
-        names = find(found, what) if what else []
+        names = find(by_name, what) if what else []
     except ConfigError:
         say(*left_out, stream=sys.stderr)
         raise
     if len(names) == 1:
-        say(names[0], "", *plain(found[names[0]].blocks(), width))
+        say(names[0], "", *plain(by_name[names[0]].blocks(), width))
     elif names:
-        say(f"{what} can be:", "", *plain(overview(found, names), width))
+        say(f"{what} can be:", "", *plain(overview(by_name, names), width))
     else:
-        say("labseq explain WHAT, for example labseq explain step image", "", *plain(overview(found), width))
+        say(
+            "labseq explain WHAT, for example labseq explain step image", "", *plain(overview(by_name), width)
+        )
         say(*left_out, stream=sys.stderr)

@@ -99,10 +99,10 @@ class _Generator(GenerateJsonSchema):
 
     def literal_schema(self, schema: core_schema.LiteralSchema) -> JsonSchema:
         """One of the values; an expression may stand for numbers."""
-        found = super().literal_schema(schema)
-        is_number = self.expressions and "enum" in found and found.get("type") in ("number", "integer")
+        literal = super().literal_schema(schema)
+        is_number = self.expressions and "enum" in literal and literal.get("type") in ("number", "integer")
         text = {"type": "string", "pattern": _EXPRESSION}
-        return {"anyOf": [found, text]} if is_number else found
+        return {"anyOf": [literal, text]} if is_number else literal
 
     def function_plain_schema(self, schema: core_schema.PlainValidatorFunctionSchema) -> JsonSchema:
         """Everything: a validator does not say what it accepts."""
@@ -249,8 +249,6 @@ _ROLES: Final[dict[str, type[Choice]]] = {
     "simulation": Choice,
 }
 _SCANNER: Final = "scanner"
-_AIMS: Final = ("maximise", "minimise")
-_MAY_BE_EMPTY: Final = frozenset({"lines", "simulation"})
 
 
 class _FileSchema:
@@ -277,7 +275,7 @@ class _FileSchema:
         keys = file["properties"]
         for role, core in _ROLES.items():
             choice = self._choice(role, core)
-            self._fill(keys, role, or_empty(choice) if role in _MAY_BE_EMPTY else choice)
+            self._fill(keys, role, or_empty(choice) if role in ("lines", "simulation") else choice)
         is_camera = {"type": "object", "properties": {"role": {"const": "camera"}}, "required": ["role"]}
         camera, device = self._choice("camera", DeviceChoice, "devices"), self._choice("device", DeviceChoice)
         either = {"if": is_camera, "then": camera, "else": device}
@@ -357,7 +355,9 @@ class _FileSchema:
     def _scan(self) -> JsonSchema:
         """Values of addresses, or a scanner with its settings and ranges; without expressions."""
         scanner = self._choice(_SCANNER, AdaptiveChoice)
-        aims = [{"required": [aim], "properties": {aim: {"type": "string"}}} for aim in _AIMS]
+        aims = [
+            {"required": [aim], "properties": {aim: {"type": "string"}}} for aim in ("maximise", "minimise")
+        ]
         is_adaptive: JsonSchema = {"type": "object", "required": [AdaptiveChoice.key]}
         return {"if": is_adaptive, "then": {**scanner, "oneOf": aims}, "else": _grid_scan()}
 

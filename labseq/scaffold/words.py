@@ -66,19 +66,19 @@ def _words(annotation: Any, metadata: Sequence[Any]) -> Words:
     if get_origin(annotation) is Annotated:
         plain, *more = get_args(annotation)
         return _words(plain, [*more, *metadata])
-    flat = [one for item in metadata for one in (item.metadata if isinstance(item, FieldInfo) else [item])]
+    flat = [part for item in metadata for part in (item.metadata if isinstance(item, FieldInfo) else [item])]
     dimension = next(filter(None, map(dimension_read_by, flat)), "")
-    found = Words(dimension) if dimension else _noun(annotation)
-    limits = [found.limits, _limits(flat, dimension), _lengths(flat, annotation)]
-    return Words(found.noun, ", ".join(filter(None, limits)))
+    value = Words(dimension) if dimension else _noun(annotation)
+    limits = [value.limits, _limits(flat, dimension), _lengths(flat, annotation)]
+    return Words(value.noun, ", ".join(filter(None, limits)))
 
 
 def _noun(annotation: Any) -> Words:
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
-        return _union([_words(one, ()) for one in inner if one is not type(None)])
+        return _union([_words(kind, ()) for kind in inner if kind is not type(None)])
     if origin is Literal:
-        return Words(_either([f"`{_written(one, '')}`" for one in inner]))
+        return Words(_either([f"`{_written(value, '')}`" for value in inner]))
     if origin is dict:
         return Words(f"mapping of names to {_plural(_words(inner[1], ()).noun)}")
     if origin is list or (origin is tuple and inner[-1] is Ellipsis):
@@ -92,15 +92,15 @@ def _noun(annotation: Any) -> Words:
     return Words(_NOUNS.get(annotation) or annotation.__name__.removesuffix("Spec").lower())
 
 
-def _list(length: str, one: Words) -> Words:
-    return Words(f"list of {length}{_plural(one.noun)}", f"each {one.limits}" if one.limits else "")
+def _list(length: str, item: Words) -> Words:
+    return Words(f"list of {length}{_plural(item.noun)}", f"each {item.limits}" if item.limits else "")
 
 
-def _union(found: Sequence[Words]) -> Words:
-    nouns = sorted(dict.fromkeys(words.noun for words in found), key=lambda noun: " or " not in noun)
+def _union(members: Sequence[Words]) -> Words:
+    nouns = sorted(dict.fromkeys(words.noun for words in members), key=lambda noun: " or " not in noun)
     if "number" in nouns and "whole number" in nouns:
         nouns.remove("whole number")
-    limits = dict.fromkeys(words.limits.removeprefix("each ") for words in found if words.limits)
+    limits = dict.fromkeys(words.limits.removeprefix("each ") for words in members if words.limits)
     return Words(_either(nouns), "; ".join(limits))
 
 
@@ -161,7 +161,7 @@ def _written(value: Any, dimension: str) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):
-        return f"[{', '.join(_written(one, dimension) for one in value)}]"
+        return f"[{', '.join(_written(item, dimension) for item in value)}]"
     if isinstance(value, int | float) and dimension:
         return _quantity(value, dimension)
     if isinstance(value, str):
@@ -184,15 +184,14 @@ def _quantity(value: float, dimension: str) -> str:
     return next((t for t in texts if math.isclose(parse_quantity(t, dimension), value)), str(value))
 
 
-_TITLES: Final = {"Args": "Arguments", "Attributes": "Fields"}
-_SECTION: Final = re.compile(r"^(Args|Attributes|Example|Raises|Returns):$", re.MULTILINE)
 _ITEM: Final = re.compile(r"^(\*{0,2}\w+): ", re.MULTILINE)
 
 
 def summary(*documented: object) -> str:
     """The first paragraph of the first docstring that there is, on one line."""
-    own = (one for one in documented if inspect.isroutine(one) or isinstance(one, type))
-    texts = (" ".join(_sections(one)[""].partition("\n\n")[0].split()) for one in own)
+    # Any other object has the docstring of its class, which says nothing about the object.
+    objects = (item for item in documented if inspect.isroutine(item) or isinstance(item, type))
+    texts = (" ".join(_sections(item)[""].partition("\n\n")[0].split()) for item in objects)
     return next(filter(None, texts), "")
 
 
@@ -203,14 +202,15 @@ def docstring(documented: object) -> str:
         if not title:
             texts.append(text)
         elif title != "Example":
-            texts.append(f"{_TITLES.get(title, title)}:\n\n{_items(text)}")
+            shown_title = {"Args": "Arguments", "Attributes": "Fields"}.get(title, title)
+            texts.append(f"{shown_title}:\n\n{_items(text)}")
     return "\n\n".join(texts)
 
 
 def _sections(documented: object) -> dict[str, str]:
     """The text of a Google-style docstring by section; the text before them is ""."""
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(documented) or "").replace("``", "`")
-    before, *sections = _SECTION.split(text)
+    before, *sections = re.split(r"^(Args|Attributes|Example|Raises|Returns):$", text, flags=re.MULTILINE)
     bodies = [textwrap.dedent(body.strip("\n")) for body in sections[1::2]]
     return {"": before.strip(), **dict(zip(sections[::2], bodies, strict=True))}
 
