@@ -589,7 +589,7 @@ def explain_topic(what: str, program: Any) -> None:
     left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
     left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
     by_name = topics(host.registry, program)
-    width = min(shutil.get_terminal_size().columns, 110)  # wider lines are hard to read
+    width = min(shutil.get_terminal_size().columns, 110)
     try:
         names = find(by_name, what) if what else []
     except ConfigError:
