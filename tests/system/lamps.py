@@ -251,7 +251,7 @@ class Lamps:
         options = [] if keys else ["--plain"]
         process = self.start("serve-devices", "lamps.yaml", "--bind", address, *options, limits=limit)
         try:
-            until(lambda: process.poll() is not None or "Ctrl-C ends it" in self.output)
+            until(lambda: process.poll() is not None or "Ctrl-C stops it" in self.output)
             yield process
         finally:
             process.kill()
