@@ -164,7 +164,7 @@ def scanned_values(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, 
     try:
         if "written" not in scan:  # an adaptive scan in progress: its record has no points yet
             values = [parameters[address] for address in scan["addresses"]]
-            return [written(v, unit) for v, unit in zip(values, scan["units"], strict=True)]
+            return [written(v, unit) for v, unit in zip(values, scan["written_units"], strict=True)]
         return [clean(str(word)) for word in scan["written"][scan["point_of_shot"][shot]]]
     except (KeyError, IndexError, TypeError, ValueError):  # run.json is damaged
         return ["-"] * len(scan.get("addresses", ()))

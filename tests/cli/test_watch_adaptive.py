@@ -59,6 +59,7 @@ def test_each_point_is_reported_with_the_best_so_far(printed: tuple[labseq.Run, 
     assert lines[0].startswith(f"point 0 ({DOP} 2, shot.2.rearrange.window 60 ms): filling_fraction ")
     assert lines[0].endswith("best so far this")
     assert all("; best so far " in line for line in lines)
+    assert printed[1][1].startswith("shot 0  degree_of_parallelism 2, window 60 ms  ")
 
 
 def test_the_table_has_the_points_in_the_order_in_which_they_were_chosen(
