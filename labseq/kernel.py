@@ -210,8 +210,10 @@ class _Kernel:
         return self.function.__qualname__
 
     def load(self) -> None:
-        """Compile it, or load it from the cache, for those that call it: Python, C, or only kernels."""
-        _ = self.c_address if self.for_c else self.dispatcher
+        """Compile it, or load it from the cache, for those that call it."""
+        if self.for_c:
+            _ = self.c_address
+        _ = self.dispatcher  # also of one for C: compiled in the call of a device, it would count as hung
 
     @property
     def dispatcher(self) -> Any:
