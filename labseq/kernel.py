@@ -74,7 +74,8 @@ def kernel(signature: str | Sequence[str], *, fused: bool = False, for_c: bool =
             or several of them.
         fused: Let ``a * b + c`` be rounded once instead of twice, where the processor
             can. That is faster, but the last digit may differ between processors.
-        for_c: Code in C calls it, too, by :func:`c_address`; its only signature takes and returns int64.
+        for_c: Code in C calls it, by :func:`c_address`, and Python does not; its only signature takes and
+            returns int64.
     """
     return _decorator(signature, fused, is_helper=False, for_c=for_c)
 
@@ -210,10 +211,8 @@ class _Kernel:
         return self.function.__qualname__
 
     def load(self) -> None:
-        """Compile it, or load it from the cache, for those that call it."""
-        if self.for_c:
-            _ = self.c_address
-        _ = self.dispatcher  # also of one for C: compiled in the call of a device, it would count as hung
+        """Compile it, or load it from the cache, for those that call it: C, Python, or only kernels."""
+        _ = self.c_address if self.for_c else self.dispatcher
 
     @property
     def dispatcher(self) -> Any:

@@ -356,9 +356,9 @@ def describe(axis: Axis, workspace: Workspace, out: NDArray[np.int16], words: ND
     return out.ctypes.data  # pyright: ignore[reportReturnType]
 
 
-@kernel("int64(int64, int64, int64)", for_c=True)
+@kernel("int64(int64, int64, int64)")
 def render_at(address: int, start: int, out: int) -> int:
-    """:func:`render` with the addresses of all arrays, for Python and for code in C.
+    """:func:`render` with the addresses of all arrays.
 
     Args:
         address: Of the words of an axis, of which N_OUT is the number of samples.
@@ -399,3 +399,9 @@ def render_at(address: int, start: int, out: int) -> int:
     )
     render(axis, start, carray(pointer(out), words[N_OUT], np.int16), workspace)
     return 0
+
+
+@kernel("int64(int64, int64, int64)", for_c=True)
+def render_for_c(address: int, start: int, out: int) -> int:
+    """:func:`render_at`, for code in C."""
+    return render_at(address, start, out)

@@ -300,9 +300,9 @@ def render_address() -> int:
     The address of a row of :meth:`Renderer.words`, whose first word is the number of samples, the first
     sample, and where to write them, as int16. It takes no lock of Python.
     """
-    from labseq.motion.render_direct_kernels import render_at
+    from labseq.motion.render_direct_kernels import render_for_c
 
-    return c_address(render_at)
+    return c_address(render_for_c)
 
 
 @lru_cache(maxsize=4)
