@@ -80,7 +80,7 @@ class StopFlag:
 
     @property
     def is_urgent(self) -> bool:
-        """Whether it was asked twice: what is not about devices is not waited for."""
+        """Whether it was asked twice: from then on, only work on devices is waited for."""
         return self._n_requests > 1
 
     def check(self) -> None:
@@ -142,17 +142,17 @@ def stop_on_signals(stop: StopFlag) -> Generator[None]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limit:
-    """The time limit of what a thread does within a call, enforced by the thread that waits for the call.
+    """The time limit for one part of a call, enforced by the thread that waits for the call.
 
     Attributes:
         owner: Device or plugin that is called, or "step".
-        what: What has to end in time, for the message.
+        name: The function or the step, for the message, with a space at its end; "" if it has no name.
         timeout_s: The limit.
         deadline_s: When it is reached, on the monotonic clock.
     """
 
     owner: str
-    what: str
+    name: str
     timeout_s: float
     deadline_s: float
 
@@ -164,8 +164,8 @@ class GuardedCall:
         done: Set when it has returned.
         result: What it returned.
         error: What it raised, or None.
-        has_steps: Whether it is the steps of a shot.
-        is_abandoned: Whether nothing waits for it any longer; it must call nothing any more.
+        has_steps: True for the call that runs a whole shot.
+        is_abandoned: True once nothing waits for it any longer; from then on it must make no calls.
     """
 
     def __init__(self, work: partial[Any], *, has_steps: bool = False) -> None:
@@ -179,21 +179,21 @@ class GuardedCall:
         self.is_abandoned = False
 
     def run(self) -> None:
-        """Carry it out, in this thread."""
-        outer, _here.call = current_call(), self
+        """Run the call in the current thread."""
+        outer_call, _this_thread.call = current_call(), self
         try:
             self.result = self._work()
         except BaseException as error:  # noqa: BLE001 - handed to the thread that waits
             self.error = error
-        _here.call = outer
+        _this_thread.call = outer_call
         self.done.set()
 
     def enter(self, limit: Limit) -> None:
-        """Begin something that has a limit, within this call."""
+        """Begin a part of this call that has a time limit."""
         self._limits.append(limit)
 
     def leave(self) -> None:
-        """It has ended."""
+        """End what was begun last."""
         with self._lock:
             self._limits.pop()
 
@@ -201,17 +201,17 @@ class GuardedCall:
         """Abandon the call if a limit is reached, the innermost first; returns that limit."""
         now_s = time.monotonic()
         with self._lock:
-            late = next((one for one in reversed(self._limits) if now_s >= one.deadline_s), None)
+            late = next((limit for limit in reversed(self._limits) if now_s >= limit.deadline_s), None)
             self.is_abandoned = late is not None
         return late
 
 
-_here = threading.local()
+_this_thread = threading.local()
 
 
 def current_call() -> GuardedCall | None:
     """The call that this thread carries out."""
-    return getattr(_here, "call", None)
+    return getattr(_this_thread, "call", None)
 
 
 class _Worker:
@@ -281,13 +281,13 @@ class Guard:
         request is held: a step that wakes up late must not switch anything on after the safe state.
         """
         self.check()
-        return self._named(owner, timeout_s, GRACE_S, partial(function, *args, **kwargs))
+        return self._call(owner, timeout_s, GRACE_S, partial(function, *args, **kwargs))
 
     def call_despite_stop(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """The same, even if the run is asked to stop; for opening, safe states and closing."""
-        return self._named(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
+        return self._call(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
 
     def begin(
         self, owner: str, timeout_s: float, work: partial[T], *, is_patient: bool = True
@@ -298,7 +298,8 @@ class Guard:
             is_patient: False for a call that a second request to stop abandons, such as one of the disk.
 
         Returns:
-            What is set when it has ended; and what waits for that, as :meth:`call_despite_stop` does.
+            An event that is set when the call has ended, and a function that waits for this and returns
+            the result, as :meth:`call_despite_stop` does.
         """
         limit, call = _limit(owner, timeout_s, work), GuardedCall(work)
         is_out = self._submit(owner, call)
@@ -335,15 +336,20 @@ class Guard:
         self._result(_limit("step", math.inf, work), call)
 
     @contextmanager
-    def step(self, what: str, timeout_s: float, owner: str = "step") -> Generator[None]:
-        """A step, within :meth:`run_shot`, or another part of a call; ``what`` names it.
+    def step(self, name: str, timeout_s: float, owner: str = "step") -> Generator[None]:
+        """A step, within :meth:`run_shot`, or another part of a call, with a time limit of its own.
+
+        Args:
+            name: Names it in messages, with a space at its end.
+            timeout_s: Its time limit.
+            owner: The device or plugin that a message names, or "step".
 
         Raises:
             StopRequested: The shot was abandoned meanwhile.
         """
         call = current_call()
         assert call is not None
-        call.enter(Limit(owner, what, timeout_s, time.monotonic() + timeout_s))
+        call.enter(Limit(owner, name, timeout_s, time.monotonic() + timeout_s))
         try:
             yield
         finally:
@@ -367,7 +373,7 @@ class Guard:
             timeout_s: How long it may take.
             work: The call.
             grace_s: How long it may take to return after a stop request.
-            has_steps: Whether it is the steps of a shot.
+            has_steps: True for the call that runs a whole shot.
 
         Returns:
             The call with its result or error; None if it has not returned in time and is abandoned.
@@ -440,8 +446,8 @@ class Guard:
             self._workers[owner] = worker
         return worker
 
-    def _named(self, owner: str, timeout_s: float, grace_s: float, work: partial[T]) -> T:
-        """Run a call; name owner and function in whatever is not one of labseq's own errors."""
+    def _call(self, owner: str, timeout_s: float, grace_s: float, work: partial[T]) -> T:
+        """Run a call; an error that is not one of labseq's own is raised again with owner and function."""
         limit = _limit(owner, timeout_s, work)
         shot = current_call()
         if owner in self.direct and grace_s < math.inf and shot is not None and shot.has_steps:
@@ -458,7 +464,7 @@ class Guard:
             return call.result
         if isinstance(call.error, LabseqError) or call.has_steps:
             raise call.error
-        owner, text = limit.owner, f"{limit.what}raised {format_error(call.error)}"
+        owner, text = limit.owner, f"{limit.name}raised {format_error(call.error)}"
         raise (PlanError(text) if owner == "planner" else DeviceError(owner, text)) from call.error
 
     def _directly(self, shot: GuardedCall, limit: Limit, work: partial[Any]) -> GuardedCall:
@@ -479,8 +485,8 @@ def _limit(owner: str, timeout_s: float, work: partial[Any]) -> Limit:
 
 
 def _hung(limit: Limit) -> LabseqError:
-    """The error for what did not end in time."""
-    text = f"{limit.what}did not answer within {limit.timeout_s:.3g} s and is abandoned"
+    """The error for a call or a step that did not end in time."""
+    text = f"{limit.name}did not answer within {limit.timeout_s:.3g} s and is abandoned"
     if limit.owner == "planner":
         return PlanError(f"{text}; if it is only slow, raise 'timeouts: {{plan: ...}}' in the profile")
     return DeviceHungError(limit.owner, text, limit.timeout_s)

@@ -69,7 +69,9 @@ class Process:
         started = _start_time(self.pid)
         if started is None:
             return False
-        return not (self.started and started) or abs(started - self.started) < _SAME_START_S
+        # on systems other than Linux a correction of the clock may move the start time of a process
+        tolerance_s = 0.02 if sys.platform == "linux" else 2.0
+        return not (self.started and started) or abs(started - self.started) < tolerance_s
 
     def end(self, grace_s: float) -> bool:
         """End it: SIGTERM, and SIGKILL if it has not ended within the grace time.
@@ -88,10 +90,6 @@ class Process:
             while self.is_running and time.monotonic() < deadline_s:
                 time.sleep(0.02)
         return not self.is_running
-
-
-_SAME_START_S: Final = 0.02 if sys.platform == "linux" else 2.0
-"""Elsewhere a correction of the clock may move the start time of a process."""
 
 
 @cache
@@ -133,10 +131,8 @@ def _start_since_boot(pid: int) -> float | None:
         return 0.0
 
 
-_NO_LOCKS: Final = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
-
 HANG_S: Final = 5.0
-"""A process that has given no sign of life for so long hangs; those that use devices give two a second."""
+"""A process hangs if it has given no sign of life for this long; those that use devices give two a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +140,13 @@ class Holder:
     """The process that holds a lock.
 
     Attributes:
-        what: Its purpose, for example "the run data/2026-01-02/0001_compact"; "" if unknown.
+        purpose: For example "the run data/2026-01-02/0001_compact"; "" if unknown.
         process: The process; None if unknown.
         since_utc: Since when, ISO 8601, UTC.
         silent_s: Time since its last sign of life; 0 if it gives none.
     """
 
-    what: str = ""
+    purpose: str = ""
     process: Process | None = None
     since_utc: str = ""
     silent_s: float = 0.0
@@ -169,7 +165,7 @@ class Holder:
         if self.process is None:
             return "an unknown process"
         process = f"process {self.process.pid} on {self.process.host}"
-        return f"{self.what} ({process}, since {_local(self.since_utc)})"
+        return f"{self.purpose} ({process}, since {_local(self.since_utc)})"
 
 
 class Pulse:
@@ -189,7 +185,7 @@ class Pulse:
         self._n += 1
 
     def beat(self) -> None:
-        """Note progress; calls from other threads are none of this one."""
+        """Note progress; calls from other threads do not count."""
         if threading.get_ident() == self._thread:
             self._n += 1
 
@@ -212,14 +208,14 @@ class Lock:
 
     Args:
         path: The file; it and its folder are made if they do not exist, and stay.
-        what: Purpose of the lock, shown to other processes.
+        purpose: Purpose of the lock, shown to other processes.
     """
 
-    def __init__(self, path: Path, what: str) -> None:
+    def __init__(self, path: Path, purpose: str) -> None:
         self.path = path
         self._lock: BaseFileLock | None = None
         self._about = path.with_name(f"{path.name}.holder")
-        self._holder = Holder(what, Process.current(), now_utc("seconds"))
+        self._holder = Holder(purpose, Process.current(), now_utc("seconds"))
 
     def take(self) -> Holder | None:
         """Take the lock if it is free.
@@ -242,13 +238,13 @@ class Lock:
         except NotImplementedError as error:
             raise OSError(errno.ENOSYS, str(error)) from error
         self._lock = lock
-        self.describe(self._holder.what)
+        self.describe(self._holder.purpose)
         return None
 
-    def describe(self, what: str) -> None:
+    def describe(self, purpose: str) -> None:
         """Write the purpose of the lock to the file of its holder, if possible."""
-        self._holder = replace(self._holder, what=what)
-        values = {"what": what, "since_utc": self._holder.since_utc, **asdict(Process.current())}
+        self._holder = replace(self._holder, purpose=purpose)
+        values = {"what": purpose, "since_utc": self._holder.since_utc, **asdict(Process.current())}
         with suppress(OSError):
             write_shared(self._about, json.dumps(values).encode())
         self.beat()
@@ -281,7 +277,7 @@ class Lock:
 
 def knows_no_locks(error: OSError) -> bool:
     """Whether a lock failed because its folder, perhaps on a network, does not support locks."""
-    return error.errno in _NO_LOCKS
+    return error.errno in {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 
 def _local(time_utc: str) -> str:

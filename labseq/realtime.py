@@ -16,12 +16,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-PRIORITY: Final = 20
-"""Above all ordinary programs; below the kernel's own threads, which have 50."""
 SWITCH_S: Final = 0.2e-3
 """How long a thread may keep Python to itself while another waits; Python's own default is 5 ms."""
-LOCK_FLAGS: Final = 1 | 2 | 4
-"""MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT: what is used stays in memory, what is only reserved takes none."""
 LIMITS: Final = "'@GROUP - rtprio 22' and '@GROUP - memlock unlimited' in a file in /etc/security/limits.d"
 LATENCY: Final = Path("/dev/cpu_dma_latency")
 """While it is open, processors sleep only as deeply as they can wake within the time written to it, in us."""
@@ -35,7 +31,8 @@ def raise_priority(above: int = 0) -> bool:
     Args:
         above: How far above the thread of a shot's steps; it must not keep others from feeding a device.
     """
-    return any(_set_scheduler("SCHED_FIFO", PRIORITY + more) for more in dict.fromkeys((above, 0)))
+    # 20 is above all ordinary programs, and below the kernel's own threads, which have 50
+    return any(_set_scheduler("SCHED_FIFO", 20 + more) for more in dict.fromkeys((above, 0)))
 
 
 def restore_priority() -> None:
@@ -76,7 +73,8 @@ def lock_memory() -> bool:
     if os.geteuid() != 0 and resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
         return False  # with a limit, memory that is needed later would be refused
     with suppress(OSError, AttributeError):
-        return ctypes.CDLL(None, use_errno=True).mlockall(LOCK_FLAGS) == 0
+        # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: memory that is only reserved takes none
+        return ctypes.CDLL(None, use_errno=True).mlockall(1 | 2 | 4) == 0
     return False
 
 
@@ -87,8 +85,8 @@ def may_stay_awake() -> bool:
     return True
 
 
-def refused() -> str:
-    """What this computer does not grant, and how to allow it; "" if nothing is missing or can be done."""
+def missing_privileges() -> str:
+    """Privileges that this computer does not grant, and how to allow them; "" if none, or not on Linux."""
     if sys.platform != "linux":
         return ""
     missing = {

@@ -33,10 +33,8 @@ WATCHDOG_LOG: Final = "watchdog.jsonl"
 """Name of its log in the folder of a run."""
 BEAT_S: Final = 0.05
 """Interval between two heartbeats, and between two looks of the watchdog."""
-HUNG_S: Final = 0.6
-"""A run without a heartbeat for so long hangs; no call of a run holds the interpreter nearly as long."""
 WAITS_S: Final = 10.0
-"""The same at most while a thread waits for a disk, for memory that was swapped out, or for the processor."""
+"""How long the heartbeat may be missing while a thread waits for a disk, swapped memory or a processor."""
 STUCK_S: Final = 10.0
 """A run whose thread that takes the shots has neither waited nor got on for so long counts as dead."""
 TERM_S: Final = 0.1
@@ -49,10 +47,6 @@ HANGS_S: Final = 1.0
 """How long after that it counts as hanging."""
 ANSWER_S: Final = 10.0
 """How long a run waits for an answer of the watchdog, which may have to load a vendor's library."""
-SILENT_S: Final = 0.4
-"""A watchdog without a sign of life for so long is replaced."""
-STARTS: Final = 3
-"""Number of watchdogs in a row that do not come to life, after which the run ends."""
 END_S: Final = 1.0
 """How long a run waits for the end of a watchdog that has nothing left to do."""
 MAX_TEXT: Final = 500
@@ -91,7 +85,7 @@ class _Device:
         name = f"labseq_emergency_{order}"
         spec = importlib.util.spec_from_file_location(name, script)
         if spec is None or spec.loader is None:
-            raise ImportError(f"{script} is no Python file")
+            raise ImportError(f"{script} is not a Python file")
         self._module = sys.modules[name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(self._module)
         self._off = self._module.off
@@ -118,7 +112,7 @@ class _Process:
         self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._devices: dict[str, _Device] = {}
         self._log: Path | None = None
-        self._what = "the run"
+        self._run_name = "the run"
         self._may_end = False
         self._parent = os.getppid()
         self._hangs = Hanging(self._parent)
@@ -163,7 +157,7 @@ class _Process:
     def _obey(self, order: dict[str, Any]) -> bool:
         """Carry out a message; returns whether to go on."""
         if "run" in order:
-            self._what, self._log = order["run"], Path(order["log"]) if order["log"] else None
+            self._run_name, self._log = order["run"], Path(order["log"]) if order["log"] else None
             self._may_end = order["may_end"]
             sys.path += [path for path in order["path"] if path not in sys.path]
             self._answer("")
@@ -247,11 +241,13 @@ class _Process:
         if self._log is not None:
             with suppress(OSError), self._log.open("ab", buffering=0) as file:
                 file.write(json.dumps(row).encode() + b"\n")
-        what = (
+        outcome = (
             f"is NOT off: {row['text']}" if failure else f"is off after {1e3 * after_s:.0f} ms: {row['text']}"
         )
         with suppress(OSError):
-            os.write(2, f"labseq-watchdog: {self._what} {cause}; {name} {what}\n".encode("utf-8", "replace"))
+            os.write(
+                2, f"labseq-watchdog: {self._run_name} {cause}; {name} {outcome}\n".encode("utf-8", "replace")
+            )
 
 
 class Hanging:
@@ -259,10 +255,11 @@ class Hanging:
 
     Args:
         pid: The process.
-        hung_s: How long the heartbeat of one that works may be missing.
+        hung_s: How long the heartbeat of a working process may be missing; no call of a run holds the
+            interpreter nearly as long as the default.
     """
 
-    def __init__(self, pid: int, hung_s: float = HUNG_S) -> None:
+    def __init__(self, pid: int, hung_s: float = 0.6) -> None:
         self._pid = pid
         self._hung_s = hung_s
         self._since: dict[str, float] | None = None
@@ -277,7 +274,9 @@ class Hanging:
             self._since = waited_s
         before_s = self._since
         # time in which it could not run does not count, whatever its threads are doing
-        starved_s = max((all_s - before_s.get(one, all_s) for one, all_s in waited_s.items()), default=0.0)
+        starved_s = max(
+            (total_s - before_s.get(thread, total_s) for thread, total_s in waited_s.items()), default=0.0
+        )
         may_be_silent_s = min(self._hung_s + starved_s, WAITS_S)
         if "D" in states and "T" not in states:
             may_be_silent_s = WAITS_S
@@ -317,8 +316,8 @@ def watchdog_lines(run_dir: Path) -> list[str]:
     with suppress(RecordingError):
         for row in read_lines(run_dir / WATCHDOG_LOG)[0]:
             with suppress(ValueError, TypeError, KeyError):
-                what = f"off after {1e3 * row['after_s']:.0f} ms" if row["ok"] else "NOT switched off"
-                lines.append(f"{row['device']} {what}, because the run {row['cause']}: {row['text']}")
+                outcome = f"off after {1e3 * row['after_s']:.0f} ms" if row["ok"] else "NOT switched off"
+                lines.append(f"{row['device']} {outcome}, because the run {row['cause']}: {row['text']}")
     return lines
 
 
@@ -339,7 +338,7 @@ class Watchdog:
 
     def __init__(
         self,
-        what: str = "the run",
+        run_name: str = "the run",
         log: Path | None = None,
         pulse: Pulse | None = None,
         lost: Callable[[str], object] = str,
@@ -348,7 +347,7 @@ class Watchdog:
         from labseq.processes import Pulse  # not in the watchdog itself
 
         log_path = None if log is None else str(log.absolute())
-        self._about = {"run": what, "log": log_path, "path": sys.path, "may_end": may_end}
+        self._about = {"run": run_name, "log": log_path, "path": sys.path, "may_end": may_end}
         self._devices: dict[str, dict[str, Any]] = {}
         self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
@@ -441,7 +440,8 @@ class Watchdog:
         except (OSError, RuntimeError, MemoryError) as error:
             self._note(f"cannot be started: {getattr(error, 'strerror', None) or error}")
             return False
-        self._is_silent = Hanging(self._process.pid, SILENT_S)
+        # a watchdog without a sign of life for this long is replaced
+        self._is_silent = Hanging(self._process.pid, hung_s=0.4)
         answered = [self._tell(message) for message in (self._about, *self._devices.values())]
         return all(answered)
 
@@ -519,7 +519,7 @@ class Watchdog:
                 continue
             if self._replace("does not answer" if is_silent else "has ended"):
                 n_failed = 0
-            elif (n_failed := n_failed + 1) == STARTS:
+            elif (n_failed := n_failed + 1) == 3:  # this many in a row have not come to life
                 self._note("cannot be started again; the run ends")
                 with self._sending:
                     self._kill()  # without a heartbeat it would end the run before the devices are safe
@@ -548,8 +548,8 @@ class Watchdog:
         if self._pulse is not None and (silent_s := self._pulse.silent_s(passed_s)) > STUCK_S:
             self._send({"stuck": silent_s})
 
-    def _note(self, text: str) -> None:
-        self._notes.put(f"the watchdog that switches the outputs off if labseq dies {text}")
+    def _note(self, message: str) -> None:
+        self._notes.put(f"the watchdog that switches the outputs off if labseq dies {message}")
 
 
 if __name__ == "__main__":

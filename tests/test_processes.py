@@ -51,7 +51,7 @@ def test_a_lock_has_one_holder(tmp_path: Path) -> None:
     assert first.take() is None
     holder = second.take()
     assert holder is not None
-    assert (holder.what, holder.process) == ("labseq devices", Process.current())
+    assert (holder.purpose, holder.process) == ("labseq devices", Process.current())
     first.describe("the run data/1")
     assert str(second.take()).startswith(f"the run data/1 (process {os.getpid()} on ")
     second.release()  # it holds nothing
@@ -70,7 +70,7 @@ def test_a_holder_that_is_killed_loses_its_lock(tmp_path: Path) -> None:
         holder = mine.take()
         assert holder is not None
         assert holder.process is not None
-        assert (holder.what, holder.process.pid) == ("the run µ", child.pid)
+        assert (holder.purpose, holder.process.pid) == ("the run µ", child.pid)
         child.kill()
         child.wait()
         assert mine.take() is None

@@ -29,12 +29,12 @@ def test_what_is_refused_is_named_with_the_way_to_allow_it(monkeypatch):
     monkeypatch.setattr(realtime, "raise_priority", lambda: False)
     monkeypatch.setattr(realtime, "lock_memory", lambda: True)
     monkeypatch.setattr(realtime, "may_stay_awake", lambda: True)
-    text = realtime.refused()
+    text = realtime.missing_privileges()
     assert "no priority;" in text
     assert "limits.d" in text
     assert "udev" not in text
     monkeypatch.setattr(realtime, "raise_priority", lambda: True)
-    assert not realtime.refused()
+    assert not realtime.missing_privileges()
 
 
 @pytest.mark.parametrize("is_granted", [True, False])
@@ -53,9 +53,9 @@ def test_processors_stay_awake_for_a_run_in_real_time(monkeypatch, tmp_path, is_
         opened = {os.path.realpath(fd) for fd in Path("/proc/self/fd").iterdir()}
         assert (str(latency) in opened) == is_granted
     assert not is_granted or latency.read_bytes() == bytes(4)
-    assert ("awake processors" in realtime.refused()) != is_granted
+    assert ("awake processors" in realtime.missing_privileges()) != is_granted
     driver.write_text("none\n")
-    assert "awake" not in realtime.refused()
+    assert "awake" not in realtime.missing_privileges()
 
 
 def test_what_a_run_in_real_time_changes_is_given_back():

@@ -108,7 +108,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         devices = check_each_device(
             in_opening_order(made), timeouts_of(hardware.profile), stop, simulation, warnings.append
         )
-    if not hardware.virtual_time and (text := realtime.refused()):
+    if not hardware.virtual_time and (text := realtime.missing_privileges()):
         warnings.append(text)
     warnings += [f"{one.name}: {note}" for one in devices for note in one.described.get("notes", ())]
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
