@@ -34,8 +34,6 @@ _JOIN_S: Final = 30.0
 """Time for a worker to join a cluster without one, in seconds."""
 _COUNT_S: Final = 2.0
 """Interval at which the workers are counted, in seconds."""
-_MAX_PREPARED: Final = 4
-"""Runs that a worker is prepared for at once."""
 
 
 class ClusterWorkers:
@@ -44,17 +42,17 @@ class ClusterWorkers:
     Args:
         address: Address of its scheduler: "tls://lab-pc:8786", or "tcp://127.0.0.1:8786" on this computer.
         keys: Folder of the certificates, as `labseq campaign keys` writes it; only for tls.
-        what: What a task is, in messages: "run".
+        task_name: Names a task in messages: "run".
 
     Raises:
         ConfigError: The address is not allowed, a certificate is missing, the scheduler does not answer, no
             worker joins, or the extra is not installed.
     """
 
-    def __init__(self, address: str, keys: Path | None, what: str) -> None:
+    def __init__(self, address: str, keys: Path | None, task_name: str) -> None:
         check_address(address)
         self._client = connect(address, keys)
-        self._address, self._what = address, what
+        self._address, self._task_name = address, task_name
         self._run = uuid.uuid4().hex
         self._pack = b""
         self._arguments: dict[int, Any] = {}
@@ -101,8 +99,8 @@ class ClusterWorkers:
         future = self._client.submit(_carry_out, *arguments, pure=False, priority=-task)
         self._futures[task] = future
 
-        def note(done: Any) -> None:
-            self._done.put((task, done))
+        def note(finished_future: Any) -> None:
+            self._done.put((task, finished_future))
 
         future.add_done_callback(note)
 
@@ -132,8 +130,8 @@ class ClusterWorkers:
         if isinstance(error, LabseqError):
             return error
         if type(error).__name__ == "KilledWorker":
-            what = f"{self._what} {task} has ended several workers of the cluster"
-            return LabseqError(f"{what}; perhaps the memory was used up: see their logs")
+            cause = f"{self._task_name} {task} has ended several workers of the cluster"
+            return LabseqError(f"{cause}; perhaps the memory was used up: see their logs")
         return LabseqError(f"a worker of the cluster failed, perhaps without labseq: {format_error(error)}")
 
     def close(self) -> None:
@@ -159,26 +157,26 @@ def check_workers(n_workers: int | None, scheduler: str | None) -> None:
     if scheduler is not None:
         check_address(scheduler)
         if n_workers is not None:
-            what = "the work goes to processes here or to a cluster"
-            raise ConfigError(Problem(what, expected="either --workers or --scheduler"))
+            conflict = "the work goes to processes here or to a cluster"
+            raise ConfigError(Problem(conflict, expected="either --workers or --scheduler"))
 
 
 def check_address(address: str) -> None:
-    """Refuse addresses that are none, and those of other computers without encryption.
+    """Refuse text that is not an address, and unencrypted connections to other computers.
 
     Raises:
-        ConfigError: It is one of them.
+        ConfigError: The address is refused.
     """
-    found = _ADDRESS.fullmatch(address)
-    if found is None:
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
         raise _problem(address, "this is not an address of a scheduler", "tls://HOST:PORT")
-    if found[1] == "tcp" and not is_loopback(found[2].strip("[]")):
-        what = "without encryption, anybody on the network could have the workers run code"
-        raise _problem(address, what, "tls://HOST:PORT", "'labseq campaign keys' makes the certificates")
+    if match[1] == "tcp" and not is_loopback(match[2].strip("[]")):
+        danger = "without encryption, anybody on the network could have the workers run code"
+        raise _problem(address, danger, "tls://HOST:PORT", "'labseq campaign keys' makes the certificates")
 
 
-def _problem(address: str, what: str, expected: str = "", hint: str = "") -> ConfigError:
-    return ConfigError(Problem(what, f"--scheduler {clean(address)}", expected=expected, hint=hint))
+def _problem(address: str, message: str, expected: str = "", hint: str = "") -> ConfigError:
+    return ConfigError(Problem(message, f"--scheduler {clean(address)}", expected=expected, hint=hint))
 
 
 def connect(address: str, keys: Path | None) -> Any:
@@ -190,8 +188,8 @@ def connect(address: str, keys: Path | None) -> Any:
     try:
         from distributed import Client, Security
     except ModuleNotFoundError as error:
-        what = f"the Python package '{error.name}' is not installed"
-        raise _problem(address, what, hint=install_hint("campaign")) from error
+        message = f"the Python package '{error.name}' is not installed"
+        raise _problem(address, message, hint=install_hint("campaign")) from error
     security = None
     if address.startswith("tls:"):
         folder = _folder_of(address, keys)
@@ -249,7 +247,7 @@ def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any
             if pack is None:
                 return None
             make, recipe = cast("tuple[Make, Any]", pickle.loads(pack))  # noqa: S301 - from the client
-            while len(_prepared) >= _MAX_PREPARED:
+            while len(_prepared) >= 4:  # a worker stays prepared for 4 runs
                 del _prepared[next(iter(_prepared))]
             _prepared[run] = make(recipe)
         return _prepared[run](argument)

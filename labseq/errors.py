@@ -57,10 +57,10 @@ class Problem:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        where = self.source
+        place = self.source
         if self.line:
-            where += f":{self.line}:{self.column}"
-        text = f"{where}: {self.what}" if where else self.what
+            place += f":{self.line}:{self.column}"
+        text = f"{place}: {self.what}" if place else self.what
         if self.expected:
             text += f"; expected {self.expected}"
         if self.hint:
@@ -90,12 +90,12 @@ class ProblemCollector:
     """Collects the problems of several checks, so that the user sees them all at once.
 
     Example:
-        >>> found = ProblemCollector()
-        >>> with found:
+        >>> problems = ProblemCollector()
+        >>> with problems:
         ...     raise ConfigError("shots is 0")
-        >>> with found:
+        >>> with problems:
         ...     raise ConfigError("name is missing")
-        >>> found.raise_any()
+        >>> problems.raise_any()
         Traceback (most recent call last):
         ...
         labseq.errors.ConfigError: shots is 0
@@ -145,12 +145,12 @@ def collecting(found: ProblemCollector | None) -> Generator[ProblemCollector]:
     if found is not None:
         yield found
         return
-    own = ProblemCollector()
+    collector = ProblemCollector()
     try:
-        yield own
+        yield collector
     except ConfigError as error:
-        raise own.stop(error) from error
-    own.raise_any()
+        raise collector.stop(error) from error
+    collector.raise_any()
 
 
 class PluginLoadError(LabseqError):
@@ -294,10 +294,10 @@ class InvalidPlanError(PlanError):
         self.move = move
         self.detail = detail
         self.site = site
-        where = f"batch {batch}" if batch >= 0 else "plan"
+        place = f"batch {batch}" if batch >= 0 else "plan"
         if move >= 0:
-            where += f", atom move {move}"
-        super().__init__(f"{where} breaks the rule '{rule}': {detail}", planner)
+            place += f", atom move {move}"
+        super().__init__(f"{place} breaks the rule '{rule}': {detail}", planner)
 
 
 class RecordingError(LabseqError):

@@ -112,8 +112,6 @@ def explained(path: Path) -> Generator[None]:
         raise RecordingError(path, f"cannot be written: {reason}", advice) from error
 
 
-MAX_DOCUMENT: Final = 16 << 20
-"""Largest JSON document that is read, in bytes."""
 MAX_LINE: Final = 16 << 20
 """Longest line of a file of JSON lines, in bytes."""
 
@@ -138,7 +136,7 @@ def open_ordinary(path: Path) -> BufferedReader:
     return path.open("rb")
 
 
-def read_file(path: Path, max_bytes: int = MAX_DOCUMENT) -> bytes:
+def read_file(path: Path, max_bytes: int = 16 << 20) -> bytes:
     """Read a whole file of limited size.
 
     Raises:
@@ -182,8 +180,8 @@ def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
             file.seek(start)
             while line := file.readline(MAX_LINE + 1):
                 if len(line) > MAX_LINE:
-                    what = f"has a line longer than {MAX_LINE >> 20} MiB"
-                    raise RecordingError(path, what, "restore it from a backup")
+                    fault = f"has a line longer than {MAX_LINE >> 20} MiB"
+                    raise RecordingError(path, fault, "restore it from a backup")
                 yield line
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}", "check the disk") from error
@@ -233,9 +231,9 @@ class LineLog:
 
 
 def _write_all(file: IO[bytes], data: bytes | memoryview) -> None:
-    rest = memoryview(data)
-    while rest:
-        rest = rest[os.write(file.fileno(), rest) :]
+    remaining = memoryview(data)
+    while remaining:
+        remaining = remaining[os.write(file.fileno(), remaining) :]
 
 
 def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
@@ -250,9 +248,9 @@ def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
     """
     if not path.exists():
         return [], []
-    found = [parse_object(line) for line in lines_in(path) if line.endswith(b"\n")]
-    rows = [row for row in found if row is not None]
-    return rows, [number for number, row in enumerate(found, start=1) if row is None]
+    rows_or_none = [parse_object(line) for line in lines_in(path) if line.endswith(b"\n")]
+    rows = [row for row in rows_or_none if row is not None]
+    return rows, [number for number, row in enumerate(rows_or_none, start=1) if row is None]
 
 
 class NewLines:
@@ -313,9 +311,9 @@ def packaged_dir(folder: str) -> Path:
 
     In a wheel it is in ``labseq/config``, in a checkout at the top.
     """
-    here = Path(__file__).resolve().parent
-    packaged = here / "config" / folder
-    return packaged if packaged.is_dir() else here.parent / folder
+    package = Path(__file__).resolve().parent
+    packaged = package / "config" / folder
+    return packaged if packaged.is_dir() else package.parent / folder
 
 
 def packaged_profiles_dir() -> Path:
@@ -366,8 +364,8 @@ def cache_root() -> Path:
     Raises:
         RuntimeError: The user has no home.
     """
-    if own := os.environ.get("LABSEQ_CACHE"):
-        return Path(own).expanduser()
+    if folder := os.environ.get("LABSEQ_CACHE"):
+        return Path(folder).expanduser()
     if numba_folder := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(numba_folder) / "labseq"
     import platformdirs
@@ -381,8 +379,8 @@ def devices_root() -> Path:
     ``LABSEQ_LOCKS`` if set, else ``/var/tmp/labseq``, which lasts longer than a power cut, or on Windows
     ``labseq`` in ProgramData.
     """
-    if own := os.environ.get("LABSEQ_LOCKS"):
-        return Path(own).expanduser().absolute()
+    if folder := os.environ.get("LABSEQ_LOCKS"):
+        return Path(folder).expanduser().absolute()
     system = os.environ.get("PROGRAMDATA", r"C:\ProgramData") if os.name == "nt" else "/var/tmp"  # noqa: S108
     return Path(system) / "labseq"
 

@@ -10,7 +10,6 @@ from typing import Any, Final
 
 _MAX_LENGTH: Final = 60
 _MAX_LISTED: Final = 50
-_MAX_NAMES: Final = 300
 MAX_ERROR: Final = 2000
 """Maximum number of characters of an error's text that labseq shows, logs and records."""
 
@@ -19,11 +18,11 @@ def install_hint(extra: str, package: str = "labseq") -> str:
     """The command that installs a package here; environments that uv made have no pip of their own.
 
     Args:
-        extra: What of the package, for example "plot"; "" for the package alone.
+        extra: The extra of the package, for example "plot"; "" for the package alone.
         package: Its name.
     """
-    what = f"'{package}[{extra}]'" if extra else package
-    return f"{'pip' if find_spec('pip') else 'uv pip'} install {what}"
+    requirement = f"'{package}[{extra}]'" if extra else package
+    return f"{'pip' if find_spec('pip') else 'uv pip'} install {requirement}"
 
 
 def missing_package(package: str, extra: str = "") -> str:
@@ -103,19 +102,21 @@ def shown(value: Any, raw: str = "") -> str:
 
 def listing(names: Iterable[str]) -> str:
     """The known names: "one of rows, cols"; the first of very many."""
-    known = list(names)
-    more = [f"and {len(known) - _MAX_LISTED} more"] if len(known) > _MAX_LISTED + 1 else []
-    return ("one of " if len(known) > 1 else "") + ", ".join(known[:_MAX_LISTED] + more if more else known)
+    all_names = list(names)
+    more = [f"and {len(all_names) - _MAX_LISTED} more"] if len(all_names) > _MAX_LISTED + 1 else []
+    return ("one of " if len(all_names) > 1 else "") + ", ".join(
+        all_names[:_MAX_LISTED] + more if more else all_names
+    )
 
 
-def closest(name: str, names: Iterable[str], most: int | None = _MAX_NAMES) -> str:
+def closest(name: str, names: Iterable[str], most: int | None = 300) -> str:
     """The known name with the most similar spelling, ignoring case and dashes; "" if none is similar.
 
-    At most so many names are compared, which takes 10 us each; None for all.
+    Comparing takes 10 us for each name, so at most ``most`` are compared; None for all.
     """
-    folded = {known.lower().replace("-", "_"): known for known in islice(names, most)}
-    found = difflib.get_close_matches(name.lower().replace("-", "_")[:_MAX_LENGTH], folded, n=1)
-    return folded[found[0]] if found else ""
+    folded = {candidate.lower().replace("-", "_"): candidate for candidate in islice(names, most)}
+    matches = difflib.get_close_matches(name.lower().replace("-", "_")[:_MAX_LENGTH], folded, n=1)
+    return folded[matches[0]] if matches else ""
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:

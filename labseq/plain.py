@@ -14,7 +14,6 @@ from typing import Any, Final, cast
 
 _MAX_DEPTH: Final = 32
 _MAX_PARTS: Final = 500_000
-_MAX_BITS: Final = 4096  # Python refuses to write much longer integers in decimal
 
 
 def to_plain(value: Any) -> Any:
@@ -68,7 +67,8 @@ def _plain(value: Any, parents: tuple[int, ...]) -> Any:
     if value is None or isinstance(value, (bool, str)):
         return value
     if isinstance(value, int) and not isinstance(value, Enum):
-        return int(value) if value.bit_length() <= _MAX_BITS else hex(value)
+        # Python refuses to write much longer integers in decimal
+        return int(value) if value.bit_length() <= 4096 else hex(value)
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, PurePath):
@@ -147,9 +147,9 @@ def parse_value(data: bytes | str) -> Any:
 def _is_too_deep(value: Any) -> bool:
     level: list[Any] = [value]
     for _ in range(_MAX_DEPTH):
-        level = [one for one in level if isinstance(one, dict | list)]
+        level = [item for item in level if isinstance(item, dict | list)]
         if not level:
             return False
-        inner = [one.values() if isinstance(one, dict) else one for one in level]
-        level = [one for several in inner for one in several]
-    return any(isinstance(one, dict | list) for one in level)
+        inner = [item.values() if isinstance(item, dict) else item for item in level]
+        level = [item for several in inner for item in several]
+    return any(isinstance(item, dict | list) for item in level)

@@ -21,9 +21,6 @@ LOAD_S: Final = 30.0
 """Default for how long a plugin may take to load, and a constructor to return."""
 
 _NAME: Final = re.compile(r"[^\W\d][\w-]{0,63}")
-_NOT_NAMES: Final = {"true", "false", "null"}
-"""Words that YAML does not read as text."""
-_SETTINGS: Final = ("labseq.settings", "Settings")
 
 Factory = Callable[..., Any]
 FactoryOrPlace = Factory | str
@@ -54,10 +51,10 @@ class Owner:
         """The error that names this plugin."""
         return PluginLoadError(self.name, reason, self.source)
 
-    def note(self, text: str) -> None:
+    def note(self, sentence: str) -> None:
         """Keep a sentence about it, once."""
-        if text not in self.notes:
-            self.notes.append(text)
+        if sentence not in self.notes:
+            self.notes.append(sentence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +78,7 @@ class Entry:
             a driver that has them keeps to the session's clock. A place may be that of a function
             that returns them, or a text: why the device cannot be simulated on this computer.
         owner: The plugin that registered it.
-        no_simulator: That text.
+        no_simulator: Why the device cannot be simulated on this computer; "" if it can.
     """
 
     kind: str
@@ -102,7 +99,7 @@ class Entry:
     @property
     def is_place(self) -> bool:
         """Whether its plugin gave places, and nothing was imported yet."""
-        return any(isinstance(one, str) and ":" in one for one in (self.factory, self.settings_model))
+        return any(isinstance(part, str) and ":" in part for part in (self.factory, self.settings_model))
 
 
 class Registry:
@@ -128,16 +125,16 @@ class Registry:
 
         Nothing of the plugin stays if the block fails.
         """
-        own = Registry(self._call)
-        own._owner, own._entries, own.contested = owner, self._entries, self.contested
+        registry = Registry(self._call)
+        registry._owner, registry._entries, registry.contested = owner, self._entries, self.contested
         try:
-            yield own
+            yield registry
         except BaseException:
-            own._is_closed = True
+            registry._is_closed = True
             self.forget(owner.name)
             raise
         finally:
-            own._is_closed = True
+            registry._is_closed = True
 
     def _add(
         self,
@@ -153,16 +150,19 @@ class Registry:
         if not isinstance(name, str) or not name:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise fault(f"a {kind} needs a name, not {name!r}")
         is_key = (kind, name) == ("step", "name")  # a key next to a step in a sequence
-        if _NAME.fullmatch(name) is None or name.lower() in _NOT_NAMES or is_key:
-            text = f"a {kind} cannot be called {name[:80]!r}"
-            raise fault(f"{text}; expected a letter, then letters, digits, '_' and '-', and no word of YAML")
+        # YAML does not read these words as text
+        if _NAME.fullmatch(name) is None or name.lower() in {"true", "false", "null"} or is_key:
+            message = f"a {kind} cannot be called {name[:80]!r}"
+            raise fault(
+                f"{message}; expected a letter, then letters, digits, '_' and '-', and no word of YAML"
+            )
         if self._is_closed:
-            text = f"it registers {kind} '{name}' after its labseq_register has returned"
-            raise fault(f"{text}; register everything there")
+            message = f"it registers {kind} '{name}' after its labseq_register has returned"
+            raise fault(f"{message}; register everything there")
         taken = self._entries.get((kind, name))
         if taken is not None:
-            text = f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them"
-            error = fault(text)
+            message = f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them"
+            error = fault(message)
             if taken.origin != self._owner.name:
                 self.contested[kind, name] = error
             raise error
@@ -173,12 +173,12 @@ class Registry:
         self._entries[kind, name] = entry
 
     def _imported(self, key: tuple[str, str]) -> Entry:
-        """An entry that is given by places no longer."""
+        """The entry, after importing whatever it gives only by its place."""
         entry = self._entries[key]
         if entry.is_place:
             parts = (entry.factory, entry.settings_model, entry.simulated)
-            what = f"the import of {entry.kind} '{entry.name}'"
-            factory, model, simulated = self._call(entry.owner, what, lambda: [*map(_import_place, parts)])
+            work = f"the import of {entry.kind} '{entry.name}'"
+            factory, model, simulated = self._call(entry.owner, work, lambda: [*map(_import_place, parts)])
             simulated = simulated() if callable(simulated) else simulated
             reason, simulated = (simulated, None) if isinstance(simulated, str) else ("", simulated)
             entry = replace(
@@ -283,11 +283,11 @@ class Registry:
         return [self._imported(key) for key in self.offers(origin)]
 
 
-def _import_place(given: Any) -> Any:
+def _import_place(value: Any) -> Any:
     """What ``"package.module:Name"`` names; anything else as it is."""
-    if not isinstance(given, str):
-        return given
-    module, _, name = given.partition(":")
+    if not isinstance(value, str):
+        return value
+    module, _, name = value.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
@@ -298,17 +298,17 @@ def _check(entry: Entry) -> None:
     if not callable(entry.factory):
         raise fault(f"the factory of {label} cannot be called")
     if model is not None and not _is_settings(model):
-        text = f"the settings model of {label} is {model!r:.200}"
-        raise fault(f"{text}; expected a subclass of labseq.plugin.Settings")
+        message = f"the settings model of {label} is {model!r:.200}"
+        raise fault(f"{message}; expected a subclass of labseq.plugin.Settings")
     if simulated is not None:
-        known = {} if model is None else model.model_fields
-        if not isinstance(simulated, Mapping) or not set(simulated) <= set(known):  # pyright: ignore[reportUnnecessaryIsInstance]
-            text = f"'simulated' of {label} is {simulated!r:.200}"
-            raise fault(f"{text}; expected settings of its model")
+        fields = {} if model is None else model.model_fields
+        if not isinstance(simulated, Mapping) or not set(simulated) <= set(fields):  # pyright: ignore[reportUnnecessaryIsInstance]
+            message = f"'simulated' of {label} is {simulated!r:.200}"
+            raise fault(f"{message}; expected settings of its model")
 
 
 def _is_settings(model: object) -> bool:
     """Whether this is a subclass of ``Settings``, recognised by name: that is in a higher layer."""
     return isinstance(model, type) and any(
-        (base.__module__, base.__qualname__) == _SETTINGS for base in model.__mro__
+        (base.__module__, base.__qualname__) == ("labseq.settings", "Settings") for base in model.__mro__
     )

@@ -17,7 +17,6 @@ MAX_BYTES: Final = 1 << 18
 
 YAML_SUFFIXES: Final = (".yaml", ".yml")
 
-_UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF32: Final = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
 
 
@@ -40,8 +39,8 @@ def read_bytes(
     """
     name = visible(str(path))
     try:
-        if what := _other_kind(path.stat().st_mode):  # reading a pipe could block for ever
-            raise ConfigError(Problem(what, name, expected=expected))
+        if message := _other_kind(path.stat().st_mode):  # reading a pipe could block for ever
+            raise ConfigError(Problem(message, name, expected=expected))
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except ConfigError:
@@ -51,11 +50,11 @@ def read_bytes(
         raise ConfigError(Problem("there is no such file", name, hint=hint)) from None
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        what = f"the file cannot be read: {str(reason or error).lower()}"
-        raise ConfigError(Problem(what, name)) from error
+        message = f"the file cannot be read: {str(reason or error).lower()}"
+        raise ConfigError(Problem(message, name)) from error
     if len(data) > max_bytes:
-        what = f"the file is larger than {max_bytes >> 10} KiB"
-        raise ConfigError(Problem(what, name, expected="a few kilobytes"))
+        message = f"the file is larger than {max_bytes >> 10} KiB"
+        raise ConfigError(Problem(message, name, expected="a few kilobytes"))
     return data
 
 
@@ -65,9 +64,9 @@ def decode(data: bytes, name: str) -> str:
     Raises:
         ConfigError: Not UTF-8; with the place of the first wrong byte.
     """
-    if data.startswith((*_UTF16, *_UTF32)):
-        came = "UTF-32" if data.startswith(_UTF32) else "UTF-16"
-        raise ConfigError(Problem(f"the file is {came}", name, 1, 1, "UTF-8", "save it as UTF-8"))
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, *_UTF32)):
+        encoding = "UTF-32" if data.startswith(_UTF32) else "UTF-16"
+        raise ConfigError(Problem(f"the file is {encoding}", name, 1, 1, "UTF-8", "save it as UTF-8"))
     body = data.removeprefix(codecs.BOM_UTF8)
     try:
         return body.decode("utf-8")
@@ -76,10 +75,10 @@ def decode(data: bytes, name: str) -> str:
         latin = bytes([byte]).decode("latin-1")
         likely = f" (in Latin-1 it is '{latin}')" if latin.isprintable() else ""
         offset = error.start + len(data) - len(body)
-        what = f"byte 0x{byte:02X} at offset {offset} is not UTF-8{likely}"
+        message = f"byte 0x{byte:02X} at offset {offset} is not UTF-8{likely}"
         place = line_and_column(before, len(before))
         raise ConfigError(
-            Problem(visible(what), name, *place, "a file in UTF-8", "save the file as UTF-8")
+            Problem(visible(message), name, *place, "a file in UTF-8", "save the file as UTF-8")
         ) from None
 
 
@@ -154,8 +153,8 @@ def check_output(path: Path, kind: str, ending: str) -> None:
     if not is_folder(path.parent):
         folder = visible(str(path.parent))
         raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))
-    if what := something_else(path):
-        raise ConfigError(Problem(what, name, expected=expected))
+    if message := something_else(path):
+        raise ConfigError(Problem(message, name, expected=expected))
     try:
         is_there(path)
     except OSError as error:  # for a name that is too long

@@ -56,8 +56,6 @@ EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Dimension -> an example of a quantity."""
 
-_READABLE: Final = 1e9
-"""Numbers of at least this size are written with an exponent."""
 
 ZERO_CELSIUS_K: Final = 273.15
 """0 degC in kelvins; degC is the only unit with a different zero."""
@@ -92,15 +90,17 @@ def parse_quantity(text: str, dimension: str) -> float:
     if unit == "degC" and dimension == "temperature":
         return float(match[1]) + ZERO_CELSIUS_K
     if unit not in units:
-        other = next((name for name, known in UNITS.items() if unit in known and unit), None)
+        other = next(
+            (name for name, units_of_dimension in UNITS.items() if unit in units_of_dimension and unit), None
+        )
         if not unit:
             hint = f"write {with_units(match[1], dimension)}"
             raise ValueError(f"'{text}' has no unit; expected {expected(dimension)}; {hint}")
         if other is not None:
-            came = f"'{text}' is {_a(other)}, not {_a(dimension)}"
+            fault = f"'{text}' is {_a(other)}, not {_a(dimension)}"
         else:
-            came = f"'{unit}' in '{text}' is not a unit of {dimension}"
-        raise ValueError(f"{came}; expected {expected(dimension)}")
+            fault = f"'{unit}' in '{text}' is not a unit of {dimension}"
+        raise ValueError(f"{fault}; expected {expected(dimension)}")
     return scaled(float(match[1]), units[unit])
 
 
@@ -273,6 +273,6 @@ def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     units, unit = UNITS[dimension], readable_unit(value, dimension)
     amount = value / units[unit]
     number = f"{amount:.{digits}g}"
-    if "e" in number and abs(amount) < _READABLE:
+    if "e" in number and abs(amount) < 1e9:  # larger numbers keep the exponent
         number = f"{amount:.0f}"
     return f"{number} {unit}"

@@ -32,13 +32,13 @@ Make = Callable[[Any], Do]
 POLL_S: Final = 0.1
 """Interval at which waiting for results is interrupted, in seconds: on Windows, Ctrl-C does not end it."""
 QUEUED: Final = 2
-"""Tasks that a worker is given at once, so that it need not wait for the next one."""
+"""Tasks that a worker is given in advance, so that it need not wait for the next one."""
 MAX_LOST: Final = 3
 """Workers that a task may end before the work ends too: perhaps it needs more memory than there is."""
 _START: Final = -1
-"""In place of the number of a task: the preparation of a worker."""
+"""Stands for the preparation of a worker where the number of a task is expected."""
 _FAREWELL_S: Final = 10.0
-"""Time for a worker to end what it does, in seconds: a run makes its devices safe, and writes its end."""
+"""Time for a worker to end, in seconds: a run makes its devices safe and records its end."""
 
 
 class Workers(Protocol):
@@ -133,15 +133,15 @@ class ProcessWorkers:
 
     Args:
         n_workers: Their number.
-        what: What a task is, in messages: "run".
+        task_name: Names a task in messages: "run".
 
     Attributes:
         n_workers: Their number.
     """
 
-    def __init__(self, n_workers: int, what: str) -> None:
+    def __init__(self, n_workers: int, task_name: str) -> None:
         self.n_workers = n_workers
-        self._what = what
+        self._task_name = task_name
         self._n_lost = Counter[int]()
         self._workers: list[_Worker] = []
 
@@ -157,28 +157,28 @@ class ProcessWorkers:
 
     def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
         """See :class:`Workers`."""
-        found: list[tuple[int, Any]] = []
+        results: list[tuple[int, Any]] = []
         ready = wait([worker.connection for worker in self._workers], timeout_s)
         for number, worker in enumerate(self._workers):
             if worker.connection not in ready:
                 continue
             try:
-                what, task, answer = cast("_Answer", worker.connection.recv())
+                event, task, answer = cast("_Answer", worker.connection.recv())
             except (EOFError, OSError):
                 self._workers[number] = self._replacement(worker)
                 continue
-            if what == "failed":
+            if event == "failed":
                 raise answer
-            if what == "begins":
+            if event == "begins":
                 worker.at = task
-            elif what == "ready":
+            elif event == "ready":
                 worker.at = None
                 self._n_lost[_START] = 0
             else:
                 worker.at = None if worker.at == task else worker.at
                 del worker.tasks[task]
-                found.append((task, answer))
-        return found
+                results.append((task, answer))
+        return results
 
     def _replacement(self, lost: _Worker) -> _Worker:
         """A new worker that has the tasks of a lost one.
@@ -190,9 +190,9 @@ class ProcessWorkers:
         if lost.at is not None:
             self._n_lost[lost.at] += 1
             if self._n_lost[lost.at] >= MAX_LOST:
-                what = "a start" if lost.at == _START else f"{self._what} {lost.at}"
+                cause = "a start" if lost.at == _START else f"{self._task_name} {lost.at}"
                 raise LabseqError(
-                    f"{MAX_LOST} worker processes have died of {what} (exit code {lost.process.exitcode}); "
+                    f"{MAX_LOST} worker processes have died of {cause} (exit code {lost.process.exitcode}); "
                     "perhaps the memory was used up: try again with fewer --workers"
                 )
         new = self._start()
