@@ -85,8 +85,8 @@ def read_entry(path: Path) -> CalibrationEntry:
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise damaged(path, str(error)) from error
     if entry.id != content.get("id"):
-        what = f"its id is {content.get('id')}, but the id of its content is {entry.id}"
-        raise damaged(path, f"{what}: it was changed by hand")
+        fault = f"its id is {content.get('id')}, but the id of its content is {entry.id}"
+        raise damaged(path, f"{fault}: it was changed by hand")
     return entry
 
 
@@ -101,7 +101,7 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
     except RecordingError as error:
         raise ConfigError(Problem(f"it {error.what}", str(path))) from error
     if content is None:
-        raise damaged(path, "it is not JSON, or no object")
+        raise damaged(path, "it is not a JSON object")
     if content.get("format") != file_format:
         raise damaged(path, f"its format is not '{file_format}'")
     version = str(content.get("format_version"))
@@ -111,8 +111,8 @@ def read_object(path: Path, file_format: str) -> dict[str, Any]:
     newer = int(major) - int(FORMAT_VERSION.partition(".")[0])
     if newer:
         hint = "update labseq" if newer > 0 else "calibrate again; an earlier labseq wrote it"
-        what = f"its format version is {version}"
-        raise ConfigError(Problem(what, str(path), expected=FORMAT_VERSION, hint=hint))
+        fault = f"its format version is {version}"
+        raise ConfigError(Problem(fault, str(path), expected=FORMAT_VERSION, hint=hint))
     return content
 
 
@@ -146,7 +146,7 @@ class Activation:
 def encode_history(history: list[Activation]) -> bytes:
     """The content of ``active.json``, one line for each activation."""
     head = json.dumps({"format": ACTIVE_FORMAT, "format_version": FORMAT_VERSION})
-    rows = ",\n".join(f"  {json.dumps(asdict(one))}" for one in history)
+    rows = ",\n".join(f"  {json.dumps(asdict(activation))}" for activation in history)
     return f'{head[:-1]},\n "history": [\n{rows}\n ]\n}}\n'.encode()
 
 
@@ -200,13 +200,13 @@ def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
 
     Args:
         new: The new calibration.
-        old: The one in use, or None. One of another grid may always be replaced.
+        old: The one in use, or None. One for another grid may always be replaced.
     """
     old = old if old is not None and same_grid(new.grid, old.grid) else None
     n_one_peak = new.quality.get("n_one_peak", 0.0)
     if n_one_peak > (old.quality.get("n_one_peak", 0.0) if old is not None else 0.0):
-        where = "at 1 site" if n_one_peak == 1 else f"at {n_one_peak:.0f} sites"
-        return f"{where} only one peak was found; the thresholds there would be borrowed from neighbours"
+        sites = "at 1 site" if n_one_peak == 1 else f"at {n_one_peak:.0f} sites"
+        return f"{sites} only one peak was found; the thresholds there would be borrowed from neighbours"
     if old is None:
         return ""
     deciding, now, before = DECIDING[new.kind], figure_of(new), figure_of(old)
@@ -214,9 +214,9 @@ def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
         return f"it has no quality figure ({deciding.figure}), and the one in use has"
     if not math.isnan(before) and now > max(deciding.good_enough, WORSE_FACTOR * before):
         return f"its {deciding.figure} is {now:.3g}, that of the one in use {before:.3g}"
-    found, found_before = (entry.quality.get("n_sites_found", math.nan) for entry in (new, old))
-    if found < found_before:
-        return f"it found {found:.0f} sites, the one in use {found_before:.0f}"
+    n_found, n_found_before = (entry.quality.get("n_sites_found", math.nan) for entry in (new, old))
+    if n_found < n_found_before:
+        return f"it found {n_found:.0f} sites, the one in use {n_found_before:.0f}"
     return ""
 
 
@@ -224,12 +224,12 @@ def check_grid(entry: CalibrationEntry, grid: SiteGrid, source: str) -> None:
     """Raise if an entry, which came from ``source``, is for another grid.
 
     Raises:
-        ConfigError: It is of another grid; the message names both.
+        ConfigError: It is for another grid; the message names both.
     """
     if not entry.is_for(grid):
-        what = f"{entry.kind} {entry.id} is of another grid: {grid_text(entry.grid)}"
+        message = f"{entry.kind} {entry.id} is for another grid: {grid_text(entry.grid)}"
         expected = f"{grid_text(grid_facts(grid))}, as in the profile"
-        raise ConfigError(Problem(what, source, expected=expected))
+        raise ConfigError(Problem(message, source, expected=expected))
 
 
 def grid_text(grid: Mapping[str, Any]) -> str:
@@ -298,29 +298,33 @@ class Store:
         """
         return [self._read(path, name) for path, name in self._files()]
 
-    def find(self, wanted: str, kind: CalibrationKind | None = None) -> Stored:
+    def find(self, id_or_file: str, kind: CalibrationKind | None = None) -> Stored:
         """Find an entry.
 
         Args:
-            wanted: Its id, a unique beginning of the id, or the name of its file.
+            id_or_file: Its id, a unique beginning of the id, or the name of its file.
             kind: Only entries of this kind.
 
         Raises:
             ConfigError: There is none, there are several, or it is damaged.
         """
         files = [(path, name) for path, name in self._files() if kind in (None, name[1])]
-        stem = wanted.removesuffix(SUFFIX)
-        found = [(p, n) for p, n in files if wanted and (n[3].startswith(wanted.lower()) or p.stem == stem)]
-        ids = sorted({name[3] for _, name in found})
+        stem = id_or_file.removesuffix(SUFFIX)
+        matches = [
+            (p, n) for p, n in files if id_or_file and (n[3].startswith(id_or_file.lower()) or p.stem == stem)
+        ]
+        ids = sorted({name[3] for _, name in matches})
         if len(ids) > 1:
-            what = f"several calibrations begin with '{wanted}': {', '.join(ids[:MAX_LISTED])}"
-            raise ConfigError(Problem(what, expected="more of its id"))
+            message = f"several calibrations begin with '{id_or_file}': {', '.join(ids[:MAX_LISTED])}"
+            raise ConfigError(Problem(message, expected="more of its id"))
         if not ids:
             others = list(dict.fromkeys(name[3] for _, name in reversed(files)))
-            near = get_close_matches(wanted.lower(), others, MAX_LISTED, 0.4) or others[:MAX_LISTED]
-            what = f"there is no calibration{f' of {kind}' if kind else ''} '{wanted}' in {self.folder}"
-            raise ConfigError(Problem(what, expected=", ".join(near) or "one that was made before"))
-        read = self._read(*found[-1])
+            near = get_close_matches(id_or_file.lower(), others, MAX_LISTED, 0.4) or others[:MAX_LISTED]
+            message = (
+                f"there is no calibration{f' of {kind}' if kind else ''} '{id_or_file}' in {self.folder}"
+            )
+            raise ConfigError(Problem(message, expected=", ".join(near) or "one that was made before"))
+        read = self._read(*matches[-1])
         if isinstance(read, Damaged):
             raise read.error
         return read
@@ -358,7 +362,7 @@ class Store:
             history = [Activation(*(str(row[key]) for key in Activation.__slots__)) for row in rows]
         except (KeyError, TypeError) as error:
             raise damaged(path, f"its history cannot be read ({error!r})") from error
-        if any(Path(one.file).name != one.file for one in history):
+        if any(Path(activation.file).name != activation.file for activation in history):
             raise damaged(path, "it names files outside of its folder")
         return history
 
@@ -368,8 +372,8 @@ class Store:
         Raises:
             ConfigError: ``active.json`` is damaged, or written by a newer labseq.
         """
-        last = {one.kind: one for one in self.history()}
-        return {kind: one for kind, one in last.items() if one.id}
+        last = {activation.kind: activation for activation in self.history()}
+        return {kind: activation for kind, activation in last.items() if activation.id}
 
     def entry_in_use(self, kind: str) -> Stored | None:
         """The entry of a kind that is in use; None if there is none.
@@ -390,13 +394,13 @@ class Store:
         """Put an entry to use from now on; with ``force`` even if it is worse than the one in use.
 
         Raises:
-            ConfigError: It is of another grid, it is worse, or the folder cannot be written to.
+            ConfigError: It is for another grid, it is worse, or the folder cannot be written to.
         """
         entry = stored.entry
         check_grid(entry, grid, str(stored.path))
         if not force and (reason := self.why_worse(entry)):
-            what = f"{entry.kind} {entry.id} is worse than the one in use: {reason}"
-            raise ConfigError(Problem(what, hint="use it nevertheless with --force"))
+            message = f"{entry.kind} {entry.id} is worse than the one in use: {reason}"
+            raise ConfigError(Problem(message, hint="use it anyway with --force"))
         self._activate(Activation(entry.kind, entry.id, stored.path.name, now_utc("seconds")))
 
     def use_none(self, kind: CalibrationKind) -> None:
@@ -430,9 +434,9 @@ class Store:
                     return
                 except FileExistsError as error:
                     if time.monotonic() >= deadline:
-                        what = "another labseq is writing this file, or was killed while it did"
+                        message = "another labseq is writing this file, or was killed while it did"
                         hint = "if none is running, delete it"
-                        raise ConfigError(Problem(what, str(error.filename), hint=hint)) from error
+                        raise ConfigError(Problem(message, str(error.filename), hint=hint)) from error
                     time.sleep(0.01)
 
     def _write(self, path: Path, entry: CalibrationEntry, picture: bytes | None) -> None:
@@ -449,8 +453,8 @@ class Store:
         try:
             paths = [*self.folder.iterdir()] if self.folder.is_dir() else []
         except OSError as error:
-            what = f"the calibrations cannot be read: {error.strerror}"
-            raise ConfigError(Problem(what, str(self.folder))) from error
+            message = f"the calibrations cannot be read: {error.strerror}"
+            raise ConfigError(Problem(message, str(self.folder))) from error
         named = [(p, match) for p in paths if p.suffix == SUFFIX and (match := _NAME.fullmatch(p.stem))]
         return sorted(named, key=lambda one: (one[1][2], int(one[1][4] or 1), one[1][1], one[1][3]))
 
@@ -468,6 +472,6 @@ class Store:
         try:
             yield
         except OSError as error:
-            what = f"calibrations cannot be stored there: {error.strerror or error}"
+            message = f"calibrations cannot be stored there: {error.strerror or error}"
             hint = "name another folder with the profile's key 'calibrations'"
-            raise ConfigError(Problem(what, str(self.folder), hint=hint)) from error
+            raise ConfigError(Problem(message, str(self.folder), hint=hint)) from error

@@ -65,19 +65,19 @@ class DrawingError(ValueError):
     """An error in a drawing.
 
     Attributes:
-        line: The line of the text that is wrong, from 1; 0 if it is the whole.
+        line: The line of the text that is wrong, from 1; 0 for an error of the whole drawing.
     """
 
-    def __init__(self, what: str, line: int = 0) -> None:
+    def __init__(self, message: str, line: int = 0) -> None:
         self.line = line
-        super().__init__(what)
+        super().__init__(message)
 
 
-def read_bitmap(text: str, fill: str = "#") -> NDArray[np.bool_]:
+def read_bitmap(drawing: str, fill: str = "#") -> NDArray[np.bool_]:
     """Read a drawing, one line per row; empty lines before and after it do not count.
 
     Args:
-        text: The drawing.
+        drawing: The drawing.
         fill: Characters that stand for an atom; all others stand for none.
 
     Returns:
@@ -90,7 +90,7 @@ def read_bitmap(text: str, fill: str = "#") -> NDArray[np.bool_]:
         >>> read_bitmap("#.#").astype(int).tolist()
         [[1, 0, 1]]
     """
-    lines = text.splitlines()
+    lines = drawing.splitlines()
     first = next((i for i, line in enumerate(lines) if line), len(lines))
     drawn = "\n".join(lines[first:]).rstrip("\n").splitlines()
     if not drawn:

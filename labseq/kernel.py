@@ -35,14 +35,8 @@ from labseq.files import cache_root
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-UNUSED_DAYS: Final = 30
-"""Compiled kernels that no process has loaded for this many days are deleted."""
-MAX_WORKERS: Final = 4
-"""Maximum number of processes that compile; each needs about 200 MB."""
 WORTH_A_PROCESS_S: Final = 3.0
-"""What would take less than this is compiled without starting processes."""
-COMPILE_S: Final = 0.0044
-"""Scale of the estimates of the time for compiling, in seconds; measured on two cores."""
+"""Kernels that would compile faster than this are compiled in this process."""
 
 _INTERPRETED = threading.Event()
 _PENDING: dict[_Kernel, None] = {}  # neither compiled nor loaded yet
@@ -126,19 +120,19 @@ def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
     Raises:
         PluginLoadError: A kernel cannot be compiled.
     """
-    wanted = [one for one in list(_PENDING) if one.is_in_use()]
-    if not wanted or _is_interpreted():
+    pending = [item for item in list(_PENDING) if item.is_in_use()]
+    if not pending or _is_interpreted():
         return
-    if not all(one.is_cached() for one in wanted if not one.is_helper):
-        _compile_in_processes([one for one in wanted if not one.is_cached()], poll)
-    for one in [one for one in wanted if not one.is_helper]:
+    if not all(item.is_cached() for item in pending if not item.is_helper):
+        _compile_in_processes([item for item in pending if not item.is_cached()], poll)
+    for item in [item for item in pending if not item.is_helper]:
         poll()
         try:
-            one.load()
+            item.load()
         except Exception as error:
-            _PENDING.pop(one, None)  # the next session may do without it
-            reason = f"kernel '{one.function.__name__}' cannot be compiled: {type(error).__name__}: {error}"
-            raise error if isinstance(error, LabseqError) else PluginLoadError(one.module, reason) from error
+            _PENDING.pop(item, None)  # the next session may do without it
+            reason = f"kernel '{item.function.__name__}' cannot be compiled: {type(error).__name__}: {error}"
+            raise error if isinstance(error, LabseqError) else PluginLoadError(item.module, reason) from error
 
 
 def _decorator(
@@ -305,7 +299,8 @@ class _Kernel:
     @property
     def compile_s(self) -> float:
         """Roughly how long compiling takes, in seconds."""
-        return COMPILE_S * len(self.signatures) * (30 + len(self.function.__code__.co_code) / 10)
+        # measured on two cores
+        return 0.0044 * len(self.signatures) * (30 + len(self.function.__code__.co_code) / 10)
 
     def is_in_use(self) -> bool:
         """Whether its module is the imported one, and not one that was edited and imported again since."""
@@ -319,14 +314,16 @@ class _Kernel:
         """The values of all names in its code that are not its own variables."""
         code, cells = self.function.__code__, self.function.__closure__ or ()
         scope = self.function.__globals__ | dict(zip(code.co_freevars, cells, strict=True))
-        found = {name: scope[name] for name in _names(code) if name in scope}
-        values = {name: getattr(value, "cell_contents", value) for name, value in found.items()}
+        objects = {name: scope[name] for name in _names(code) if name in scope}
+        values = {name: getattr(value, "cell_contents", value) for name, value in objects.items()}
         modules = [value for value in values.values() if isinstance(value, ModuleType)]
         for module in modules:  # and those in them: a.b.SPEED
             of_module = {name: vars(module)[name] for name in _names(code) if name in vars(module)}
             values |= {f"{module.__name__}.{name}": value for name, value in of_module.items()}
             modules += [
-                one for one in of_module.values() if isinstance(one, ModuleType) and one not in modules
+                module_within
+                for module_within in of_module.values()
+                if isinstance(module_within, ModuleType) and module_within not in modules
             ]
         return values
 
@@ -345,9 +342,9 @@ class _Kernel:
     def digest(self) -> str:
         """Digest of everything that it is compiled from."""
         reached = [self]
-        for one in reached:
-            reached += [callee for callee in one.callees if callee not in reached]
-        parts = [_environment(), self.source, *sorted(one.source for one in reached)]
+        for item in reached:
+            reached += [callee for callee in item.callees if callee not in reached]
+        parts = [_environment(), self.source, *sorted(item.source for item in reached)]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -379,7 +376,7 @@ def _constant(name: str, value: object) -> str:
     if isinstance(value, np.ndarray):
         return repr((name, value.dtype.str, value.shape, value.tobytes()))
     if isinstance(value, tuple):
-        return repr([_constant(name, one) for one in cast("tuple[object, ...]", value)])
+        return repr([_constant(name, item) for item in cast("tuple[object, ...]", value)])
     if (function := getattr(value, "py_func", None)) is not None:  # compiled by numba itself
         return repr((name, _code(function.__code__)))
     if isinstance(value, bool | int | float | complex | str | np.generic):
@@ -403,10 +400,11 @@ def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> N
     from labseq.workers import POLL_S, ProcessWorkers
 
     seconds, graph = dict[str, float](), dict[str, set[str]]()
-    for one in kernels:
-        seconds[one.module] = seconds.get(one.module, 0.0) + one.compile_s
-        graph.setdefault(one.module, set()).update(callee.module for callee in one.callees)
-    n_workers = min(MAX_WORKERS, n_cores(), len(seconds))
+    for item in kernels:
+        seconds[item.module] = seconds.get(item.module, 0.0) + item.compile_s
+        graph.setdefault(item.module, set()).update(callee.module for callee in item.callees)
+    # each process needs about 200 MB
+    n_workers = min(4, n_cores(), len(seconds))
     if multiprocessing.current_process().daemon:
         return  # it may not start processes: a worker of a campaign or a cluster
     if n_workers < 2 or sum(seconds.values()) < WORTH_A_PROCESS_S:
@@ -439,8 +437,8 @@ def _make_compiler(_: None) -> Callable[[str], None]:
     def compile_module(name: str) -> None:
         with suppress(Exception):
             importlib.import_module(name)
-            for one in [one for one in _PENDING if one.module == name]:
-                one.load()
+            for item in [item for item in _PENDING if item.module == name]:
+                item.load()
 
     return compile_module
 
@@ -464,7 +462,7 @@ def _delete_unused(root: Path) -> None:
         return
     _CLEANED.add(root)
     used_s = {path: path.stat().st_mtime for path in root.iterdir() if path.is_dir()}
-    too_old = min(time.time(), max(used_s.values(), default=0.0)) - UNUSED_DAYS * 86400
+    too_old = min(time.time(), max(used_s.values(), default=0.0)) - 30 * 86400
     for path, last_s in used_s.items():
         if last_s < too_old:
             shutil.rmtree(path, ignore_errors=True)  # another process may be deleting it too

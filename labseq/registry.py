@@ -154,14 +154,15 @@ class Registry:
         if _NAME.fullmatch(name) is None or name.lower() in {"true", "false", "null"} or is_key:
             message = f"a {kind} cannot be called {name[:80]!r}"
             raise fault(
-                f"{message}; expected a letter, then letters, digits, '_' and '-', and no word of YAML"
+                f"{message}; expected a letter, then letters, digits, '_' and '-', "
+                "and not 'true', 'false' or 'null'"
             )
         if self._is_closed:
             message = f"it registers {kind} '{name}' after its labseq_register has returned"
             raise fault(f"{message}; register everything there")
         taken = self._entries.get((kind, name))
         if taken is not None:
-            message = f"{kind} '{name}' is offered by '{taken.origin}' already; rename one of them"
+            message = f"{kind} '{name}' is already offered by '{taken.origin}'; rename one of them"
             error = fault(message)
             if taken.origin != self._owner.name:
                 self.contested[kind, name] = error

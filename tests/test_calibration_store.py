@@ -104,7 +104,7 @@ def test_a_damaged_file_is_listed_and_refused(store: Store) -> None:
     kinds = [type(one) for one in store.entries()]
     assert kinds == [Stored, Damaged]
     for use in (lambda: store.find(bad.entry.id), lambda: store.entry_in_use("overlay")):
-        with pytest.raises(ConfigError, match="this file is damaged: it is not JSON"):
+        with pytest.raises(ConfigError, match="this file is damaged: it is not a JSON object"):
             use()
     store.use(good, GRID)  # anything is better than what cannot be read
 

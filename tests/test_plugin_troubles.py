@@ -132,7 +132,7 @@ AT_LOADING = [
     (REGISTER, "1 / 0", "ZeroDivisionError: division by zero"),
     ("registry.planner", "registry.planer", "has no attribute 'planer'"),
     ('"mine", Mine', '"mine", "Mine"', "the factory of planner 'mine' cannot be called"),
-    (REGISTER, f"{REGISTER}\n    {REGISTER}", "is offered by 'mine' already"),
+    (REGISTER, f"{REGISTER}\n    {REGISTER}", "is already offered by 'mine'"),
     (
         TOP,
         "class Bad(Settings):\n    size: 'NoSuchType' = None\n    model_config = {'frozen': 3}\nBad(size=1)",
@@ -284,7 +284,7 @@ def test_two_distributions_with_a_plugin_of_one_name(monkeypatch: pytest.MonkeyP
     first, second = host.infos
     assert (first.state, first.source) == ("loaded", "the distribution labseq-ixon 1.2")
     assert (second.name, second.state) == ("ixon (the distribution lab-of-bob 1.2)", "failed")
-    assert "labseq-ixon 1.2) is called 'ixon' already" in second.reason
+    assert "labseq-ixon 1.2) is already called 'ixon'" in second.reason
     assert host.get("planner", "mine").origin == "ixon"
 
 

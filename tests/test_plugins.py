@@ -166,8 +166,8 @@ def test_a_name_taken_twice_names_both_origins(host, tmp_path):
     other.mkdir()
     info = load(host, other, GOOD, "second")
     assert info.state == "failed"
-    assert "planner 'mine' is offered by 'first' already" in info.reason
-    with pytest.raises(PluginLoadError, match="offered by 'first' already"):
+    assert "planner 'mine' is already offered by 'first'" in info.reason
+    with pytest.raises(PluginLoadError, match="already offered by 'first'"):
         host.get("planner", "mine")
 
 

@@ -25,7 +25,7 @@ LOCAL_PACKAGE: Final = "labseq_local"
 """Package of the modules of plugins from folders."""
 
 
-def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
+def call_plugin(owner: Owner, code_name: str, work: Callable[[], T]) -> T:
     """Run code of a plugin, and name the plugin in any error.
 
     The code runs in another thread: if it hangs it is abandoned after ``owner.max_wait_s``, and a
@@ -33,7 +33,7 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     because a program may read JSON from stdout, and is recorded with the owner.
 
     Args:
-        what: Name of the code for messages; "" for the loading of the plugin.
+        code_name: Name of the code for messages; "" for the loading of the plugin.
 
     Returns:
         What the code returned.
@@ -49,15 +49,15 @@ def call_plugin(owner: Owner, what: str, work: Callable[[], T]) -> T:
     finally:
         guard.end()
         if text := printed.end():
-            where = f"in {what}" if what else "while it was loaded"
+            when = f"in {code_name}" if code_name else "while it was loaded"
             advice = "this went to stderr: use 'logging.getLogger(__name__)'"
-            owner.note(f"{where} it printed ('{text[:MAX_PRINTED]}'); {advice}")
+            owner.note(f"{when} it printed ('{text[:MAX_PRINTED]}'); {advice}")
     if call is None:
-        did = f"{what} did not return" if what else "it did not finish loading"
+        fault = f"{code_name} did not return" if code_name else "it did not finish loading"
         remedy = "if it is only slow, raise 'timeouts: {load: ...}' in the profile"
-        raise owner.fault(f"{did} within {owner.max_wait_s:.3g} s and was abandoned; {remedy}")
+        raise owner.fault(f"{fault} within {owner.max_wait_s:.3g} s and was abandoned; {remedy}")
     if call.error is not None:
-        raise _named(owner, what, call.error) from call.error
+        raise _plugin_error(owner, code_name, call.error) from call.error
     return call.result
 
 
@@ -90,15 +90,15 @@ class _PrintsToStderr:
         return getattr(self._stream, name)
 
 
-def _named(owner: Owner, what: str, error: BaseException) -> LabseqError:
-    if isinstance(error, LabseqError) and (what or getattr(error, "plugin", None) == owner.name):
+def _plugin_error(owner: Owner, code_name: str, error: BaseException) -> LabseqError:
+    if isinstance(error, LabseqError) and (code_name or getattr(error, "plugin", None) == owner.name):
         return error
     text = format_error(error)
     if isinstance(error, SyntaxError):
         text = f"{type(error).__name__}: {one_line(error.msg)}"
     if place := error_location(error, owner.home):
         text = f"{text} ({place})"
-    return owner.fault(f"{what} raised {text}" if what else text)
+    return owner.fault(f"{code_name} raised {text}" if code_name else text)
 
 
 def error_location(error: BaseException, home: Path | None) -> str:
@@ -108,11 +108,13 @@ def error_location(error: BaseException, home: Path | None) -> str:
     chain = [error]
     while (cause := chain[0].__cause__ or chain[0].__context__) is not None and cause not in chain:
         chain.insert(0, cause)
-    frames = [frame for one in chain for frame in traceback.extract_tb(one.__traceback__)]
-    own = [f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)]
-    labseqs = (Path(__file__).parent, Path(__file__).parent.parent / "guard.py")
-    foreign = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & {*labseqs}]
-    frame = (own or foreign or [None])[-1]
+    frames = [frame for linked in chain for frame in traceback.extract_tb(linked.__traceback__)]
+    plugin_frames = [
+        f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)
+    ]
+    callers = (Path(__file__).parent, Path(__file__).parent.parent / "guard.py")
+    other_frames = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & {*callers}]
+    frame = (plugin_frames or other_frames or [None])[-1]
     return "" if frame is None else f"{frame.filename}:{frame.lineno}"
 
 

@@ -33,11 +33,6 @@ from labseq.registry import LOAD_S, Entry, Owner, Registry
 
 _MARK: Final = "labseq_impl"  # the attribute that ``hookimpl`` adds to a function
 _HOOKS: Final = [key for key, value in vars(hookspecs).items() if hasattr(value, "labseq_spec")]
-_NO_FUNCTION: Final = (
-    (inspect.iscoroutinefunction, "an 'async' function"),
-    (inspect.isgeneratorfunction, "a generator"),
-    (inspect.isasyncgenfunction, "a generator"),
-)
 
 Hooks = dict[str, Callable[..., object]]
 
@@ -51,17 +46,17 @@ def check_api(module: ModuleType, owner: Owner) -> None:
     written_for: object = getattr(module, "LABSEQ_API", None)
     if type(written_for) is int and written_for == LABSEQ_API:
         return
-    here = f"this labseq has LABSEQ_API = {LABSEQ_API}"
+    this_labseq = f"this labseq has LABSEQ_API = {LABSEQ_API}"
     if written_for is None:
         remedy = f"write 'LABSEQ_API = {LABSEQ_API}' at its top"
-        raise owner.fault(f"it does not state LABSEQ_API; {here}; {remedy}")
-    came = f"it was written for LABSEQ_API {written_for!r:.100}"
+        raise owner.fault(f"it does not state LABSEQ_API; {this_labseq}; {remedy}")
+    fault = f"it was written for LABSEQ_API {written_for!r:.100}"
     if type(written_for) is not int:
-        raise owner.fault(f"{came}, which is not a whole number; {here}")
+        raise owner.fault(f"{fault}, which is not a whole number; {this_labseq}")
     remedy = "update labseq, or take an older version of the plugin"
     if written_for < LABSEQ_API:
         remedy = "take a newer version of the plugin, or adapt it (the changelog says what has changed)"
-    raise owner.fault(f"{came}; {here}; {remedy}")
+    raise owner.fault(f"{fault}; {this_labseq}; {remedy}")
 
 
 def hooks_of(module: ModuleType, owner: Owner) -> Hooks:
@@ -75,10 +70,10 @@ def hooks_of(module: ModuleType, owner: Owner) -> Hooks:
     for attribute, value in vars(module).items():
         options = getattr(value, _MARK, None)
         if isinstance(options, dict):
-            given = cast("dict[str, Any]", options)
-            if given.get("wrapper") or given.get("hookwrapper"):
+            hook_options = cast("dict[str, Any]", options)
+            if hook_options.get("wrapper") or hook_options.get("hookwrapper"):
                 raise owner.fault(f"its {attribute} is a wrapper; write '@hookimpl' without options")
-            hooks[given.get("specname") or attribute] = value
+            hooks[hook_options.get("specname") or attribute] = value
         elif attribute in _HOOKS and inspect.isfunction(value):
             unmarked.append(attribute)
     if not hooks:
@@ -93,15 +88,21 @@ def hooks_of(module: ModuleType, owner: Owner) -> Hooks:
 def _check_hook(key: str, function: Callable[..., object], owner: Owner) -> None:
     if key not in _HOOKS:
         raise owner.fault(f"it implements the unknown hook '{key}'; expected {one_of(_HOOKS)}")
-    for is_it, called in _NO_FUNCTION:
-        if is_it(function):
-            raise owner.fault(f"its {key} is {called} and would never run; expected a plain function")
-    known = signature(getattr(hookspecs, key)).parameters
-    given = signature(function).parameters
-    if unknown := [argument for argument in given if argument not in known]:
-        raise owner.fault(f"its {key} has an argument '{unknown[0]}'; expected {one_of(list(known))}")
-    if key == "labseq_register" and not given:
-        raise owner.fault(f"its {key} has no argument; expected {one_of(list(known))}")
+    for has_kind, kind in (
+        (inspect.iscoroutinefunction, "an 'async' function"),
+        (inspect.isgeneratorfunction, "a generator"),
+        (inspect.isasyncgenfunction, "a generator"),
+    ):
+        if has_kind(function):
+            raise owner.fault(f"its {key} is {kind} and would never run; expected a plain function")
+    hook_arguments = signature(getattr(hookspecs, key)).parameters
+    arguments = signature(function).parameters
+    if unknown := [argument for argument in arguments if argument not in hook_arguments]:
+        raise owner.fault(
+            f"its {key} has an argument '{unknown[0]}'; expected {one_of(list(hook_arguments))}"
+        )
+    if key == "labseq_register" and not arguments:
+        raise owner.fault(f"its {key} has no argument; expected {one_of(list(hook_arguments))}")
 
 
 ENTRY_POINT_GROUP: Final = "labseq"
@@ -166,7 +167,7 @@ class PluginInfo:
 
 
 class _HookManager(pluggy.PluginManager):
-    """Looks for hooks only among what bears their mark; to examine all of a module takes longer."""
+    """Looks for hooks only among functions with their mark, which is faster than examining a whole module."""
 
     def parse_hookimpl_opts(self, plugin: object, name: str) -> pluggy.HookimplOpts | None:
         if getattr(vars(plugin).get(name), _MARK, None) is None:
@@ -240,10 +241,10 @@ class PluginHost:
             try:
                 paths = plugin_files(folder)
             except OSError as error:
-                what = f"plugin folder {folder}{origin} cannot be read: {error.strerror}"
+                message = f"plugin folder {folder}{origin} cannot be read: {error.strerror}"
                 if isinstance(error, FileNotFoundError):
-                    what = f"plugin folder {folder}{origin} does not exist"
-                raise ConfigError(Problem(what, expected="a folder with plugins")) from error
+                    message = f"plugin folder {folder}{origin} does not exist"
+                raise ConfigError(Problem(message, expected="a folder with plugins")) from error
             for path in paths:
                 self._load_path(path)
 
@@ -273,10 +274,10 @@ class PluginHost:
         """Load a plugin; whether it failed, and why, is in the report."""
         if info.name in self._infos:
             taken = self._infos[info.name]
-            where = f"the plugin in {taken.origin}"
+            other_plugin = f"the plugin in {taken.origin}"
             if taken.origin == "installed":
-                where = f"an installed plugin (of {taken.source})"
-            reason = f"{where} is called '{info.name}' already; rename one of them"
+                other_plugin = f"an installed plugin (of {taken.source})"
+            reason = f"{other_plugin} is already called '{info.name}'; rename one of them"
             failed = replace(info, name=f"{info.name} ({info.source})", state="failed", reason=reason)
             self._infos[failed.name] = failed
             return True  # the modules of that name belong to the other plugin
@@ -293,16 +294,16 @@ class PluginHost:
         """Whether a file is neither a plugin that was found already nor an installed library."""
         files = {getattr(plugin, "__file__", None) for plugin in self._pluggy.get_plugins()}
         files |= {info.source for info in self._infos.values()}
-        own = path.resolve()
-        if any(file and Path(file).resolve() == own for file in files):
+        resolved = path.resolve()
+        if any(file and Path(file).resolve() == resolved for file in files):
             return False
         return module_location(plugin_name(path)) != plugin_location(path) or _states_api(path)
 
     def _register(
         self, info: PluginInfo, home: Callable[[], Path | None] | None, importing: Callable[[], ModuleType]
     ) -> None:
-        where = None if home is None else home()
-        owner = Owner(info.name, info.source, where, self._patience_s, info.notes)
+        location = None if home is None else home()
+        owner = Owner(info.name, info.source, location, self._patience_s, info.notes)
         with self.registry.opened_for(owner) as registry:
             module = call_plugin(owner, "", partial(_prepare, importing, owner, registry))
             self._pluggy.register(module, info.name)
@@ -342,8 +343,11 @@ class PluginHost:
     def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
         """Name of each plugin that implements an observer hook, and the call of the hook."""
         return [
-            (found.plugin_name, partial(found.function, **{name: values[name] for name in found.argnames}))
-            for found in getattr(self._pluggy.hook, hook).get_hookimpls()
+            (
+                implementation.plugin_name,
+                partial(implementation.function, **{name: values[name] for name in implementation.argnames}),
+            )
+            for implementation in getattr(self._pluggy.hook, hook).get_hookimpls()
         ]
 
 
@@ -362,8 +366,8 @@ def _states_api(path: Path) -> bool:
 
 
 def name_and_version(distribution: importlib.metadata.Distribution) -> tuple[str, str]:
-    """Name and version of an installed package, or ""; to parse all its metadata takes long."""
+    """Name and version of an installed package, or ""; parsing all of its metadata would take long."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     head = text.partition("\n\n")[0]
-    found = dict(re.findall(r"^(Name|Version): *(.*?) *$", head, re.MULTILINE))
-    return found.get("Name", ""), found.get("Version", "")
+    fields = dict(re.findall(r"^(Name|Version): *(.*?) *$", head, re.MULTILINE))
+    return fields.get("Name", ""), fields.get("Version", "")

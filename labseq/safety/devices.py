@@ -103,16 +103,16 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
             )
             warnings.append(text)
         stack.enter_context(stop_on_signals(stop))
-        made, refused = construct_hardware(hardware, clock)
-        simulation = made.pop("simulation", None)
+        constructed, refused = construct_hardware(hardware, clock)
+        simulation = constructed.pop("simulation", None)
         devices = check_each_device(
-            in_opening_order(made), timeouts_of(hardware.profile), stop, simulation, warnings.append
+            in_opening_order(constructed), timeouts_of(hardware.profile), stop, simulation, warnings.append
         )
     if not hardware.virtual_time and (text := realtime.missing_privileges()):
         warnings.append(text)
-    warnings += [f"{one.name}: {note}" for one in devices for note in one.described.get("notes", ())]
+    warnings += [f"{device.name}: {note}" for device in devices for note in device.described.get("notes", ())]
     devices += [CheckedDevice(name, constructed=False, failure=error) for name, error in refused.items()]
-    plugins = {name: chosen.entry.name for name, chosen in hardware.chosen.items()}
+    plugins = {name: plugin_choice.entry.name for name, plugin_choice in hardware.chosen.items()}
     stopped = StopRequested(stop.signal_number) if stop.is_set else None
     return DevicesReport(devices, plugins, [*warnings, *hardware.host.notes], stopped)
 
@@ -146,18 +146,18 @@ def check_each_device(
             if stop.is_set:
                 break
             try:
-                found = _examined(guard, name, device, timeouts, watchdog)
+                checked = _examined(guard, name, device, timeouts, watchdog)
             finally:
                 with stop.held():
                     unsafe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
                     unclosed = attempt(guard, name, timeouts.safe_state_s, device.close)
                     if unsafe is None:
                         watchdog.forget([name])
-            tried.append(replace(found, unsafe=unsafe, unclosed=unclosed))
+            tried.append(replace(checked, unsafe=unsafe, unclosed=unclosed))
     finally:
         watchdog.end()
-        for text in watchdog.notes():
-            warn(text)
+        for note in watchdog.notes():
+            warn(note)
         if simulation is not None and tried:
             with stop.held():
                 unclosed = attempt(guard, "simulation", timeouts.safe_state_s, simulation.close)
@@ -182,7 +182,7 @@ def _examined(
     guard: Guard, name: str, device: Hardware, timeouts: Timeouts, watchdog: Watchdog
 ) -> CheckedDevice:
     """Open, identify and test a device; stops at the first failure."""
-    found = CheckedDevice(name)
+    checked = CheckedDevice(name)
     try:
         guard.call(name, WARM_S, device.warm)
         load_kernels()  # else a self test might have to compile within its timeout
@@ -191,28 +191,28 @@ def _examined(
         if not isinstance(described, Mapping):
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
-        found = replace(found, described=described)
-        found = _versions_read(guard, found, device, timeouts.call_s)
+        checked = replace(checked, described=described)
+        checked = _versions_read(guard, checked, device, timeouts.call_s)
         guard.call(name, timeouts.call_s, device.self_test)
-        found = replace(found, tested=overrides(device, Hardware.self_test))
+        checked = replace(checked, tested=overrides(device, Hardware.self_test))
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
-        return replace(found, latency_s=statistics.median(readings_s))
+        return replace(checked, latency_s=statistics.median(readings_s))
     except LabseqError as failure:
-        return replace(found, failure=failure)
+        return replace(checked, failure=failure)
 
 
-def _versions_read(guard: Guard, found: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
+def _versions_read(guard: Guard, checked: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
     """Read the versions of a device; that this fails says nothing about whether the device works."""
 
     def versions() -> dict[str, tuple[str, str]]:
         return {name: (str(here), str(tried)) for name, (here, tried) in device.versions().items()}
 
     try:
-        return replace(found, versions=guard.call(found.name, timeout_s, versions))
+        return replace(checked, versions=guard.call(checked.name, timeout_s, versions))
     except StopRequested:
         raise
     except LabseqError as failure:
-        return replace(found, unversioned=failure)
+        return replace(checked, unversioned=failure)
 
 
 def _reading_s(guard: Guard, name: str, device: Hardware | Simulation, timeout_s: float) -> float:

@@ -25,7 +25,7 @@ HUNG_END_S: Final = 0.5
 @contextmanager
 def lock_devices(
     hardware: ResolvedProfile,
-    what: str,
+    purpose: str,
     warn: Callable[[str], object],
     *,
     blocked: Callable[[str, Holder], bool] | None = None,
@@ -35,7 +35,7 @@ def lock_devices(
     A lock ends with its process, also if that is killed. Simulated devices are not locked.
 
     Args:
-        what: The use of the devices, shown to other users while they are locked.
+        purpose: The use of the devices, shown to other users while they are locked.
         warn: Receives a warning if nothing keeps others from a device.
         blocked: Called with device and holder if another process has locked it; returns whether to try
             again. Without it that is an error.
@@ -50,7 +50,7 @@ def lock_devices(
     with ExitStack() as stack:
         for identity, role in hardware.identities.items():
             device = named(role, identity)
-            lock = Lock(lock_file(identity), what)
+            lock = Lock(lock_file(identity), purpose)
             while True:
                 try:
                     make_shared(lock.path.parent)
@@ -80,7 +80,7 @@ def lock_devices(
 
 @contextmanager
 def _beating(locks: Sequence[Lock]) -> Generator[None]:
-    """Give signs of life in a thread: it stands still only with the interpreter."""
+    """Give signs of life from a thread of its own, which stops only if the whole interpreter does."""
     ended = threading.Event()
 
     def beat() -> None:
@@ -111,13 +111,13 @@ def end_holders(
         warn: Receives what is done.
         may_end: Asked whether to end a process that does not hang; receives which device it uses.
     """
-    seen = set[Process | None]()
+    tried = set[Process | None]()
 
     def has_ended(device: str, holder: Holder) -> bool:
         process, text = holder.process, f"{device} is in use by {holder}"
-        if process in seen:
+        if process in tried:
             return False
-        seen.add(process)
+        tried.add(process)
         is_other = process is not None and process.is_here and process.pid != os.getpid()
         if process is None or not is_other or not (holder.hangs or may_end(text)):
             hint = f"; 'labseq safe {profile} --end' ends that process first" if is_other else ""

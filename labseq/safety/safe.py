@@ -121,11 +121,11 @@ def construct_hardware(
     Returns:
         Role or device name -> object; and name -> why it could not be constructed, with its place.
     """
-    chosen = {role: c for role, c in hardware.chosen.items() if c.entry.role.has_twin}
+    plugin_choices = {role: c for role, c in hardware.chosen.items() if c.entry.role.has_twin}
     failures: dict[str, LabseqError] = {}
     truth = hardware.profile.grid_model(), hardware.profile.motion
-    made, _ = construct(chosen, hardware.context(clock), 0, truth=truth, refused=failures)
-    return made, {role: chosen[role].placed(error) for role, error in failures.items()}
+    devices, _ = construct(plugin_choices, hardware.context(clock), 0, truth=truth, refused=failures)
+    return devices, {role: plugin_choices[role].placed(error) for role, error in failures.items()}
 
 
 def make_profile_devices_safe(
@@ -139,10 +139,12 @@ def make_profile_devices_safe(
         stop: The request to stop; not obeyed here.
     """
     clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
-    made, failures = construct_hardware(hardware, clock)
-    simulation = made.pop("simulation", None)
+    devices, failures = construct_hardware(hardware, clock)
+    simulation = devices.pop("simulation", None)
     with stop.held():
-        attempted = make_each_safe(in_safe_order(made), timeouts_of(hardware.profile), simulation, observer)
+        attempted = make_each_safe(
+            in_safe_order(devices), timeouts_of(hardware.profile), simulation, observer
+        )
     refused: dict[str, LabseqError] = {role: e for role, e in hardware.refused.items() if role != "detector"}
     refused |= failures
     for role, error in refused.items():
@@ -193,22 +195,22 @@ def make_profile_safe(
     need not make them safe, however the last one ended.
 
     Args:
-        may_end: Asked whether to end a process that does not hang; receives which device it uses. If not, the
-            devices are made safe beside it, as far as that is possible.
+        may_end: Asked whether to end a process that does not hang; receives which device it uses. If it must
+            not be ended, the devices are made safe anyway, as far as that is possible.
 
     Raises:
         ConfigError: The profile cannot be read, or does not exist; no device was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    found, stop, to_user = ProblemCollector(), StopFlag(), partial(warn, observer)
-    hardware = read_devices(profile, overrides, found)
+    problems, stop, to_user = ProblemCollector(), StopFlag(), partial(warn, observer)
+    hardware = read_devices(profile, overrides, problems)
     with ExitStack() as stack:
         blocked = end_holders(profile, to_user, may_end)
         stack.enter_context(lock_devices(hardware, "labseq safe", to_user, blocked=blocked))
         stack.enter_context(stop_on_signals(stop))
         secured = make_profile_devices_safe(hardware, stop, observer)
     refused = [problem for error in hardware.refused.values() for problem in error.problems]
-    others = [problem for problem in found.problems if problem not in refused]
+    others = [problem for problem in problems.problems if problem not in refused]
     # a problem or an override may have left out or replaced a device
     if not (secured.failures or others or overrides):
         try:
@@ -233,10 +235,8 @@ def read_devices(profile: str, overrides: Sequence[str], found: ProblemCollector
     return choose_plugins(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)
 
 
-LOOK_S: Final = 0.1
-"""How often :func:`stand_by` looks."""
 FIRST_S: Final = 0.5
-"""Head start of the watchdog of a run, which is faster and may still be there."""
+"""Head start for the watchdog of a run, which is faster and may still be there."""
 
 
 def stand_by(
@@ -255,30 +255,30 @@ def stand_by(
     Raises:
         ConfigError: The profile has an error, or names no device that is locked while it is in use.
     """
-    found, stop = ProblemCollector(), StopFlag()
-    hardware = read_devices(profile, overrides, found)
-    if found.problems:
-        raise ConfigError(found.problems)
+    problems, stop = ProblemCollector(), StopFlag()
+    hardware = read_devices(profile, overrides, problems)
+    if problems.problems:
+        raise ConfigError(problems.problems)
     identities = hardware.identities
     if not identities:
         text = "all of its devices are simulated, and those are not locked; there is nothing to stand by for"
         raise ConfigError(f"{hardware.document.path}: {text}")
     devices = ", ".join(named(role, identity) for identity, role in identities.items())
-    look = _Look(identities)
+    watch = _DeviceWatch(identities)
     with stop_on_signals(stop), suppress(StopRequested):
         tell(f"standing by for {devices}; Ctrl-C ends this")
         while True:
-            stop.wait(LOOK_S)
-            for holder, roles in look.new_troubles():
+            stop.wait(0.1)
+            for holder, roles in watch.new_troubles():
                 why = f"has not answered for {holder.silent_s:.0f} s" if holder.is_running else "died"
                 tell(f"{now().astimezone():%Y-%m-%d %H:%M:%S} {holder} {why}")
                 stop.wait(FIRST_S)
                 for role in roles:
-                    _secure(hardware, role, stop, look, observer)
+                    _secure(hardware, role, stop, watch, observer)
 
 
 def _secure(
-    profile: ResolvedProfile, role: str, stop: StopFlag, look: _Look, observer: RunObserver | None
+    profile: ResolvedProfile, role: str, stop: StopFlag, watch: _DeviceWatch, observer: RunObserver | None
 ) -> None:
     """Make one device safe, and try again for a while, unless a process that works has begun to use it."""
     hardware = replace(profile, chosen={role: profile.chosen[role]})
@@ -286,7 +286,7 @@ def _secure(
     ends = end_holders(str(profile.document.path), to_user, lambda _: False)
 
     def blocked(device: str, holder: Holder) -> bool:
-        if not look.is_in_trouble(holder):
+        if not watch.is_in_trouble(holder):
             raise DeviceError(role, f"in use by {holder}, and left alone")
         return ends(device, holder)
 
@@ -303,8 +303,8 @@ def _secure(
         to_user(str(error))
 
 
-class _Look:
-    """Looks for processes that died or hang while they use devices.
+class _DeviceWatch:
+    """Finds processes that died or hang while they use devices.
 
     Args:
         identities: What identifies each device -> its role.
@@ -317,14 +317,17 @@ class _Look:
 
     def new_troubles(self) -> list[tuple[Holder, list[str]]]:
         """Each such process, once, and its devices in the order of the safe state."""
-        found: dict[Holder, dict[str, None]] = {}
+        troubles: dict[Holder, dict[str, None]] = {}
         for identity, role in self._identities.items():
             holder = Lock(lock_file(identity), "").holder()
             if holder is not None and holder.process not in self._seen and self.is_in_trouble(holder):
-                known = next((one for one in found if one.process == holder.process), holder)
-                found.setdefault(known, {})[role] = None
-        self._seen |= {holder.process for holder in found}
-        return [(holder, [role for role, _ in in_safe_order(roles)]) for holder, roles in found.items()]
+                entry = next(
+                    (known_holder for known_holder in troubles if known_holder.process == holder.process),
+                    holder,
+                )
+                troubles.setdefault(entry, {})[role] = None
+        self._seen |= {holder.process for holder in troubles}
+        return [(holder, [role for role, _ in in_safe_order(roles)]) for holder, roles in troubles.items()]
 
     def is_in_trouble(self, holder: Holder) -> bool:
         """Whether the process died, or hangs."""

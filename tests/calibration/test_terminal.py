@@ -82,7 +82,7 @@ def test_a_row_for_each_calibration_with_a_mark_at_those_in_use(
     assert lines[1].startswith(f"overlay  {one.entry.id}  2026-11-20 08:00 UTC  ")
     assert lines[1].split("  ")[-3:] == ["error 20 nm", "in use", "data/2026-11-20/0001_calibrate-overlay"]
     assert lines[2].split()[:5] == ["overlay", other.entry.id, "-", "-", "damaged"]
-    assert f"{other.path}: this file is damaged: it is not JSON" in lines[4]
+    assert f"{other.path}: this file is damaged: it is not a JSON object" in lines[4]
 
 
 def test_a_damaged_note_of_what_is_in_use_does_not_hide_the_list(
@@ -164,7 +164,7 @@ def test_a_calibration_is_put_to_use_and_none(store: Store, capsys: pytest.Captu
     )
     code, _, err = call(capsys, "use", worse.entry.id)
     assert code == 2
-    assert "its error_m is 1e-06, that of the one in use 2e-08; use it nevertheless with --force" in err
+    assert "its error_m is 1e-06, that of the one in use 2e-08; use it anyway with --force" in err
     assert call(capsys, "use", worse.entry.id, "--force")[0] == 0
     assert call(capsys, "use", "overlay=off")[:2] == (
         0,

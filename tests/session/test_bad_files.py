@@ -271,7 +271,7 @@ def labseq_register(registry):
             '"mine"',
             '"psca"',
             "psca",
-            "planner 'psca' is offered by 'labseq_psca' already; rename one of them",
+            "planner 'psca' is already offered by 'labseq_psca'; rename one of them",
         ),
     ],
 )

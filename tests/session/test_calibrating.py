@@ -165,7 +165,7 @@ def test_a_dry_run_of_a_real_lab_has_a_store_of_its_own(bench: Bench) -> None:
 
 def test_one_of_another_grid_is_refused(bench: Bench) -> None:
     bench.use("overlay", SiteGrid(6, 7))
-    with pytest.raises(ConfigError, match=r"is of another grid: 6 x 7 sites.*; expected 6 x 6 sites"):
+    with pytest.raises(ConfigError, match=r"is for another grid: 6 x 7 sites.*; expected 6 x 6 sites"):
         bench.session()
 
 

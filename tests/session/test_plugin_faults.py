@@ -155,7 +155,7 @@ def test_a_dry_run_does_not_choose_between_two_plugins_of_one_name() -> None:
     register = "import labseq\nLABSEQ_API = 1\n@labseq.plugin.hookimpl\ndef labseq_register(registry):\n"
     for name in ("one", "two"):
         Path(f"plugins/{name}.py").write_text(f"{register}    registry.camera('ixon', print)\n", "utf-8")
-    with pytest.raises((ConfigError, PluginLoadError), match="is offered by 'one' already"):
+    with pytest.raises((ConfigError, PluginLoadError), match="is already offered by 'one'"):
         warnings_of_a_dry_run("ixon")
 
 
