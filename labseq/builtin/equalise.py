@@ -52,9 +52,9 @@ class Factors:
     @property
     def residual_spread(self) -> float:
         """The standard deviation of the rest, relative."""
-        known = self.residual[np.isfinite(self.residual)]
-        n_free = len(known) - len(self.row) - len(self.column) + 1
-        return float(np.sqrt((known**2).sum() / max(1, n_free)))
+        measured = self.residual[np.isfinite(self.residual)]
+        n_free = len(measured) - len(self.row) - len(self.column) + 1
+        return float(np.sqrt((measured**2).sum() / max(1, n_free)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,23 +85,23 @@ def factors(power: Floats) -> Factors:
         DeviceError: A row or column has no light.
 
     Example:
-        >>> found = factors(np.outer([1.0, 4.0], [1.0, 1.0, 1.0]))
-        >>> np.exp(found.row).round(9).tolist(), found.residual_spread < 1e-12
+        >>> separated = factors(np.outer([1.0, 4.0], [1.0, 1.0, 1.0]))
+        >>> np.exp(separated.row).round(9).tolist(), separated.residual_spread < 1e-12
         ([0.5, 2.0], True)
     """
     power = np.asarray(power, np.float64)
-    known = np.isfinite(power) & (power > 0)
-    _refuse_dead(power, known)
+    measured = np.isfinite(power) & (power > 0)
+    _refuse_dead(power, measured)
     n_rows, n_cols = power.shape
-    row, col = np.nonzero(known)
+    row, col = np.nonzero(measured)
     design = np.zeros((len(row) + 2, 1 + n_rows + n_cols))
     design[:-2, 0] = 1.0
     design[np.arange(len(row)), 1 + row] = design[np.arange(len(row)), 1 + n_rows + col] = 1.0
     design[-2, 1 : 1 + n_rows] = design[-1, 1 + n_rows :] = 1.0  # the means are 0
-    logarithm = np.log(power[known])
+    logarithm = np.log(power[measured])
     fit = np.asarray(np.linalg.lstsq(design, np.append(logarithm, [0.0, 0.0]))[0], np.float64)
     residual = np.full(power.shape, np.nan)
-    residual[known] = logarithm - design[:-2] @ fit
+    residual[measured] = logarithm - design[:-2] @ fit
     return Factors(fit[1 : 1 + n_rows], fit[1 + n_rows :], residual)
 
 
@@ -130,12 +130,12 @@ def equalise(
     shape = (len(row_amplitudes), len(column_amplitudes))
     if np.shape(power) != shape:
         raise ValueError(f"powers of shape {np.shape(power)}; expected {shape}")
-    found = factors(power)
+    separated = factors(power)
     return Equalised(
-        _corrected(row_amplitudes, found.row, gain, max_sum),
-        _corrected(column_amplitudes, found.column, gain, max_sum),
-        found.separable_spread,
-        found.residual_spread,
+        _corrected(row_amplitudes, separated.row, gain, max_sum),
+        _corrected(column_amplitudes, separated.column, gain, max_sum),
+        separated.separable_spread,
+        separated.residual_spread,
     )
 
 
@@ -148,26 +148,23 @@ def _corrected(amplitudes: Floats, logarithm: Floats, gain: float, max_sum: floa
     return np.minimum(after, 1.0)
 
 
-def _refuse_dead(power: Floats, known: NDArray[np.bool_]) -> None:
-    light = np.where(known, power, 0.0)
-    asked = np.isfinite(power)
+def _refuse_dead(power: Floats, measured: NDArray[np.bool_]) -> None:
+    light = np.where(measured, power, 0.0)
+    expected = np.isfinite(power)
     for axis, name in ((1, "row"), (0, "column")):
-        n_asked = asked.sum(axis=axis)
-        mean = np.divide(light.sum(axis=axis), n_asked, out=np.zeros(len(n_asked)), where=n_asked > 0)
+        n_expected = expected.sum(axis=axis)
+        mean = np.divide(
+            light.sum(axis=axis), n_expected, out=np.zeros(len(n_expected)), where=n_expected > 0
+        )
         dead = np.flatnonzero(mean <= DEAD * np.median(mean))
         if len(dead):
-            which = ", ".join(str(one) for one in dead[:5]) + (", ..." if len(dead) > 5 else "")
-            text = f"no light on {name} {which}: is its tone on, and are its spots where the camera looks?"
-            raise DeviceError("static_tweezers", text)
+            lines = ", ".join(str(line) for line in dead[:5]) + (", ..." if len(dead) > 5 else "")
+            message = f"no light on {name} {lines}: is its tone on, and are its spots where the camera looks?"
+            raise DeviceError("static_tweezers", message)
 
 
-QUIET: Final = 1 / 3
-"""Noise of the separable part, relative to the target spread, at which averaging ends."""
-ROUGH: Final = 0.3
-"""Fraction of the spread that is expected to remain after a round."""
-MIN_PROGRESS: Final = 0.9
-"""Factor by which the spread must fall in :data:`PATIENCE` rounds."""
 PATIENCE: Final = 4
+"""Rounds within which the spread must fall by a tenth."""
 
 
 class EqualiseSettings(PowerMeterSettings):
@@ -239,27 +236,30 @@ def equalise_loop(
     n_measured = 0
     while len(spreads) < limits.max_rounds:
         apply(rows, cols)
-        wanted = QUIET * max(limits.spread, ROUGH * spreads[-1] if spreads else 0.0)
-        power, noise, n = _average(measure, wanted, limits.max_averages)
+        # 0.3 is the part of the spread that is expected to remain after a round
+        noise_limit = 1 / 3 * max(limits.spread, 0.3 * spreads[-1] if spreads else 0.0)
+        power, noise, n = _average(measure, noise_limit, limits.max_averages)
         n_measured += n
-        found = equalise(power, rows, cols, limits.gain, limits.max_sum)
-        spreads.append(found.separable_spread)
-        if found.separable_spread <= limits.spread:
-            here = Equalised(rows, cols, found.separable_spread, found.residual_spread)
-            return LoopResult(here, noise, tuple(spreads), n_measured)
+        corrected = equalise(power, rows, cols, limits.gain, limits.max_sum)
+        spreads.append(corrected.separable_spread)
+        if corrected.separable_spread <= limits.spread:
+            measured = Equalised(rows, cols, corrected.separable_spread, corrected.residual_spread)
+            return LoopResult(measured, noise, tuple(spreads), n_measured)
         _refuse_standstill(spreads, power, rows, cols)
-        rows, cols = found.row_amplitudes, found.column_amplitudes
+        rows, cols = corrected.row_amplitudes, corrected.column_amplitudes
     return _refuse(f"the separable spread is {spreads[-1]:.2%} after {len(spreads)} rounds")
 
 
-def _average(measure: Callable[[], Floats], wanted: float, max_averages: int) -> tuple[Floats, float, int]:
+def _average(
+    measure: Callable[[], Floats], noise_limit: float, max_averages: int
+) -> tuple[Floats, float, int]:
     """The mean of enough measurements, the noise of its separable part, and how many there were."""
     mean = np.asarray(measure(), np.float64)
     shares, noise = [_shares(mean)], math.inf
-    while noise > wanted:
+    while noise > noise_limit:
         n = len(shares)
         if n >= max_averages:
-            needed = math.ceil(n * (noise / wanted) ** 2)
+            needed = math.ceil(n * (noise / noise_limit) ** 2)
             _refuse(
                 f"too much noise: {n} averages leave {noise:.2%} of the separable part unknown; "
                 f"about {needed} averages are needed"
@@ -291,11 +291,12 @@ def _noise(shares: Floats, n_rows: int) -> float:
 
 
 def _refuse_standstill(spreads: list[float], power: Floats, rows: Floats, cols: Floats) -> None:
-    if len(spreads) <= PATIENCE or spreads[-1] < MIN_PROGRESS * spreads[-1 - PATIENCE]:
+    if len(spreads) <= PATIENCE or spreads[-1] < 0.9 * spreads[-1 - PATIENCE]:
         return
-    found = factors(power)
+    separated = factors(power)
     name, off, amplitudes = max(
-        (("row", found.row, rows), ("column", found.column, cols)), key=lambda one: np.abs(one[1]).max()
+        (("row", separated.row, rows), ("column", separated.column, cols)),
+        key=lambda axis: np.abs(axis[1]).max(),
     )
     worst = int(np.abs(off).argmax())
     _refuse(
@@ -349,16 +350,16 @@ class EqualiseStep(Step):
 
         rows, cols = _mobile_in_force(shot) if is_mobile else _in_force(shot)
         with shot.stage("equalise"):
-            found = equalise_loop(measure, meter.apply, rows, cols, settings)
+            result = equalise_loop(measure, meter.apply, rows, cols, settings)
             after = meter.measure()
-        equalised = found.equalised
+        equalised = result.equalised
         shot.note(READINGS + "row_amplitudes", equalised.row_amplitudes.tolist())
         shot.note(READINGS + "column_amplitudes", equalised.column_amplitudes.tolist())
         shot.note(READINGS + "separable_spread", equalised.separable_spread)
         shot.note(READINGS + "residual_spread", equalised.residual_spread)
-        shot.note(READINGS + "noise", found.noise)
-        shot.note(READINGS + "spreads", list(found.spreads))
-        shot.note(READINGS + "n_measured", found.n_measured)
+        shot.note(READINGS + "noise", result.noise)
+        shot.note(READINGS + "spreads", list(result.spreads))
+        shot.note(READINGS + "n_measured", result.n_measured)
         shot.note(READINGS + "power_before", before[0].tolist())
         shot.note(READINGS + "power_after", after.tolist())
 

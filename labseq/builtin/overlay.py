@@ -139,7 +139,11 @@ def covariance(theta: Floats, n_before: Floats, model: Callable[[Floats], Floats
 def slopes(theta: Floats, model: Callable[[Floats], Floats], step: Floats) -> Floats:
     """Derivatives of a model by its parameters, float64 (n_points, n)."""
     return np.stack(
-        [(model(theta + one) - model(theta - one)) / (2 * np.abs(one).sum()) for one in np.diag(step)], axis=1
+        [
+            (model(theta + change) - model(theta - change)) / (2 * np.abs(change).sum())
+            for change in np.diag(step)
+        ],
+        axis=1,
     )
 
 
@@ -158,10 +162,7 @@ def dispersion(n_survived: Floats, n_before: Floats, p: Floats, n_parameters: in
 WORST_ERROR_M: Final = 50e-9
 """Maximum error of the centre."""
 MIN_ATOMS: Final = 100
-MIN_GAIN: Final = 30.0
-"""Minimum decrease of the deviance by a survival peak, relative to the dispersion."""
 ROUNDS: Final = 6
-WIDER: Final = 1.6
 MIN_CONTRAST: Final = 0.2
 UM: Final = 1e-6
 
@@ -242,15 +243,15 @@ def fit_overlay(
             )
     fit = _best_fit(offset / UM, n, k, unit_axes(grid))
     if fit.error_m.max() > worst_error_m:  # a peak in the middle of the scan can look like a narrower one
-        other = _best_fit(offset / UM, n, k, unit_axes(grid), WIDER)
-        fit = min(fit, other, key=lambda one: float(one.error_m.max()))
+        other = _best_fit(offset / UM, n, k, unit_axes(grid), 1.6)
+        fit = min(fit, other, key=lambda candidate: float(candidate.error_m.max()))
     _refuse_open_ends(fit, offset, unit_axes(grid))
     worst = float(fit.error_m.max())
     if worst > worst_error_m:
         more = math.ceil((worst / worst_error_m) ** 2)
-        known, wanted = format_quantity(worst, "length"), format_quantity(worst_error_m, "length")
-        remedy = f"for {wanted} take {more} times as many `repeats`"
-        _refuse(f"too few atoms: the centre is known to {known} only; {remedy}")
+        error, error_limit = format_quantity(worst, "length"), format_quantity(worst_error_m, "length")
+        remedy = f"for {error_limit} take {more} times as many `repeats`"
+        _refuse(f"too few atoms: the centre is known to {error} only; {remedy}")
     return fit
 
 
@@ -284,7 +285,8 @@ def _best_fit(offset: Floats, n: Floats, k: Floats, axes: Floats, wider: float =
     even, p = np.full(len(n), k.sum() / max(1.0, n.sum())), _survival(theta, offset, axes)
     gain = sum(sign * float((deviance_residuals(k, n, q) ** 2).sum()) for sign, q in ((1, even), (-1, p)))
     excess = dispersion(k, n, p, len(theta))
-    if gain < MIN_GAIN * excess or theta[5] - theta[4] < MIN_CONTRAST:
+    # a survival peak must explain the counts better by this much, relative to their scatter
+    if gain < 30.0 * excess or theta[5] - theta[4] < MIN_CONTRAST:
         _refuse(
             f"no survival peak: at no offset do clearly more atoms survive than around it ({share} in all); "
             "scan further, and check whether the mobile tweezers are on"
@@ -343,19 +345,19 @@ def _refuse_open_ends(fit: OverlayFit, offset: Floats, axes: Floats) -> None:
     for axis, direction in enumerate(DIRECTIONS):
         aside = middle[1 - axis] - fit.centre_m[1 - axis]
         squared = fit.shape.half_width_m**2 - aside**2 * (1 - cosine**2)
-        where = " and ".join(
+        centre = " and ".join(
             f"{format_quantity(float(at), 'length')} {name}"
             for at, name in zip(about, DIRECTIONS, strict=True)
         )
         if squared <= 0:
-            _refuse(f"the scan {direction} misses the survival peak; scan about {where}")
+            _refuse(f"the scan {direction} misses the survival peak; scan about {centre}")
         best, half = fit.centre_m[axis] - aside * cosine, math.sqrt(squared)
         low, high = offset[:, axis].min(), offset[:, axis].max()
         if best - half < low or best + half > high:
             end, sign = (low, "-") if best - half < low else (high, "+")
             _refuse(
                 f"only one edge of the survival peak is in range {direction}: survival has not fallen at "
-                f"{format_quantity(float(end), 'length')}; scan on in the direction {sign}, or about {where}"
+                f"{format_quantity(float(end), 'length')}; scan on in the direction {sign}, or about {centre}"
             )
 
 
@@ -365,8 +367,6 @@ def _refuse(why: str) -> NoReturn:
 
 DRIFT: Final = 0.1
 """Relative change of the half-width since it was measured, 1 sigma, for example by temperature."""
-WORST_DEVIANCE: Final = 25.0
-"""With four groups and three parameters, one in a million is larger; common losses increase it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -388,7 +388,8 @@ class FastOffset:
     @property
     def fits(self) -> bool:
         """Whether the counts agree with the survival peak."""
-        return self.deviance < WORST_DEVIANCE
+        # with four groups and three parameters, one in a million is larger; common losses increase it
+        return self.deviance < 25.0
 
     @property
     def length_m(self) -> float:

@@ -24,7 +24,6 @@ MAX_BYTES: Final = 1 << 20
 """Largest file with a drawing, in bytes."""
 
 _HALF: Final = 128
-_SUFFIXES: Final = (".txt", ".png")
 
 
 def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
@@ -42,7 +41,7 @@ def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
     Raises:
         ConfigError: It cannot be read, or it is not a drawing; with the line that is wrong.
     """
-    data = read_bytes(path, "a text file or a PNG", _SUFFIXES, MAX_BYTES)
+    data = read_bytes(path, "a text file or a PNG", (".txt", ".png"), MAX_BYTES)
     name = visible(str(path))
     if path.suffix.lower() == ".png":
         return _picture(data, name)
@@ -65,8 +64,8 @@ def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
             if max(image.size) > MAX_PIXELS:
-                what = f"the picture has {image.height} x {image.width} pixels"
-                raise ConfigError(Problem(what, name, expected="one pixel per site", hint="scale it down"))
+                fault = f"the picture has {image.height} x {image.width} pixels"
+                raise ConfigError(Problem(fault, name, expected="one pixel per site", hint="scale it down"))
             # Grey levels of 16 bits fit into no other mode; the upper 8 are enough.
             grey = np.asarray(image) // 257 if image.mode.startswith("I") else np.asarray(image.convert("L"))
             opacity = np.asarray(cast("Any", image).convert("RGBA"))[..., 3]

@@ -81,10 +81,10 @@ class ProbeStep(Step):
 
     def run(self, shot: Shot) -> None:
         """Hold the atoms that were seen on the last image, or those of all sites."""
-        seen = shot.occupancy
-        if seen is None:
+        occupancy = shot.occupancy
+        if occupancy is None:
             raise ConfigError("probe needs an image before it in the shot")
-        sites = np.ones_like(seen) if self.settings.sites == "all" else seen
+        sites = np.ones_like(occupancy) if self.settings.sites == "all" else occupancy
         hold(shot, sites, self._offsets_m(shot.grid), self.settings)
 
     def _offsets_m(self, grid: SiteGrid) -> NDArray[np.float64]:
@@ -278,47 +278,48 @@ class CheckOverlayStep(Step):
         entry = shot.calibrations.get("overlay")
         calibrated = None if entry is None else SurvivalShape.from_values(entry.values)
         shape = calibrated or SurvivalShape(settings.half_width, settings.edge)
-        found = fast_offset(*group_counts(offsets_m, before, after), shape, shot.grid)
-        if found.n_atoms:
-            along_m, across_m = (float(value) for value in found.offset_m)
+        overlay = fast_offset(*group_counts(offsets_m, before, after), shape, shot.grid)
+        if overlay.n_atoms:
+            along_m, across_m = (float(value) for value in overlay.offset_m)
             shot.note("overlay.along_row_m", along_m)
             shot.note("overlay.row_to_row_m", across_m)
-            shot.note("overlay.error_m", float(found.error_m.max()))
-        self._judge(shot, found)
+            shot.note("overlay.error_m", float(overlay.error_m.max()))
+        self._judge(shot, overlay)
 
-    def _judge(self, shot: Shot, found: FastOffset) -> None:
+    def _judge(self, shot: Shot, overlay: FastOffset) -> None:
         settings = self.settings
-        offset_m, error_m = np.abs(found.offset_m), found.error_m
+        offset_m, error_m = np.abs(overlay.offset_m), overlay.error_m
         parts = " and ".join(
-            f"{format_quantity(float(at), 'length')} {way} (+-{format_quantity(float(error), 'length')})"
-            for at, error, way in zip(
-                found.offset_m, error_m, ("along a row", "from row to row"), strict=True
+            f"{format_quantity(float(at), 'length')} {direction} "
+            f"(+-{format_quantity(float(error), 'length')})"
+            for at, error, direction in zip(
+                overlay.offset_m, error_m, ("along a row", "from row to row"), strict=True
             )
         )
         limit = format_quantity(settings.limit, "length")
-        if not found.fits:
-            text = "the survival of the probed atoms fits no small offset of the mobile tweezers"
+        if not overlay.fits:
+            message = "the survival of the probed atoms fits no small offset of the mobile tweezers"
             _handle_exceeded(
-                shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`"
+                shot, settings.exceeded, "mobile_tweezers", f"{message}: run `labseq calibrate overlay`"
             )
         elif (offset_m > settings.limit + SURE * error_m).any():
-            text = f"the mobile tweezers are {parts} from the sites; the limit is {limit}"
+            message = f"the mobile tweezers are {parts} from the sites; the limit is {limit}"
             _handle_exceeded(
-                shot, settings.exceeded, "mobile_tweezers", f"{text}: run `labseq calibrate overlay`"
+                shot, settings.exceeded, "mobile_tweezers", f"{message}: run `labseq calibrate overlay`"
             )
         elif not (error_m <= settings.limit).all():
-            n_atoms = "1 atom" if found.n_atoms == 1 else f"{found.n_atoms} atoms"
+            n_atoms = "1 atom" if overlay.n_atoms == 1 else f"{overlay.n_atoms} atoms"
             _warn(shot, f"check_overlay cannot measure the overlay to {limit} with {n_atoms} in this shot")
 
     def _offsets_m(self, shape: tuple[int, int]) -> NDArray[np.float64]:
         return cross_offsets_m(shape, (self.settings.offset, self.settings.offset))
 
 
-def _handle_exceeded(shot: Shot, exceeded: Exceeded, device: str, text: str) -> None:
+def _handle_exceeded(shot: Shot, exceeded: Exceeded, device: str, message: str) -> None:
     if exceeded == "stop":
-        raise DeviceError(device, text)
-    _warn(shot, text)
+        raise DeviceError(device, message)
+    _warn(shot, message)
 
 
-def _warn(shot: Shot, text: str) -> None:
-    shot.log("warning", text=f"shot {shot.index}: {text}")
+def _warn(shot: Shot, message: str) -> None:
+    shot.log("warning", text=f"shot {shot.index}: {message}")

@@ -60,8 +60,8 @@ class RearrangeSettings(Settings):
         if isinstance(self.window, tuple) and len(self.window) != self.cycles:
             entries = "1 entry" if len(self.window) == 1 else f"{len(self.window)} entries"
             default = "" if "cycles" in self.model_fields_set else ", its default"
-            what = f"the list has {entries}, but cycles is {self.cycles}{default}"
-            raise setting_error(what, f"{self.cycles}, one per cycle", at=("window",))
+            fault = f"the list has {entries}, but cycles is {self.cycles}{default}"
+            raise setting_error(fault, f"{self.cycles}, one per cycle", at=("window",))
         return self
 
     def window_of(self, cycle: int) -> float:
@@ -168,7 +168,7 @@ class RearrangeStep(Step):
         return n_batches
 
     def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
-        """How many batches end in time if preparing takes as long as before, or as the profile says."""
+        """How many batches end in time, if preparing takes as long as before or as the profile says."""
         fixed_s, part = self._preparing
         left_s = max(0.0, end_s - shot.clock.now() - fixed_s)
         window_s = shot.motion.overhead_per_cycle_s + left_s / (1 + part)

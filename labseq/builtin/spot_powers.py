@@ -21,17 +21,10 @@ from labseq.roles import Shot
 
 Floats = NDArray[np.float64]
 
-MISSING: Final = 0.2
-"""Power of a spot, relative to the median, below which it counts as missing."""
 
 MIN_CONTRAST: Final = 100
 """Counts above the median from which equal counts of several pixels mean that they are saturated."""
 
-OFF_S: Final = 1e-3
-"""Duration of the ramp that turns the static tweezers off, in seconds."""
-
-N_LOST: Final = 3
-"""How often a frame that was lost is taken again."""
 
 NAMED: Final = 5
 """Maximum number of sites that a message names."""
@@ -60,9 +53,9 @@ class SpotPowers:
             DeviceError: A spot is saturated or missing, or the spots are not a lattice such as the grid's.
         """
         self._refuse_saturated(frame.image)
-        known = self._known = self._known or self._find(frame)
-        power = known.fit(without_hot_pixels(frame.image))
-        faint = power < MISSING * np.median(power)
+        spots = self._known = self._known or self._find(frame)
+        power = spots.fit(without_hot_pixels(frame.image))
+        faint = power < 0.2 * np.median(power)  # counts as missing
         if faint.any():
             self._refuse_missing(faint.reshape(self._grid.shape))
         return power.reshape(self._grid.shape)
@@ -79,20 +72,20 @@ class SpotPowers:
 
     def _find(self, frame: Frame) -> KnownSpots:
         try:
-            found = find_lattice(frame.image, self._grid)
+            lattice = find_lattice(frame.image, self._grid)
         except DeviceError as error:
             self._refuse(str(error).partition(": ")[2])
-        if not found.found.all():
-            self._refuse_missing(~found.found)
-        places = found.positions_px + found.residuals_px
-        return KnownSpots(found.frame, places.reshape(-1, 2), found.spot_px)
+        if not lattice.found.all():
+            self._refuse_missing(~lattice.found)
+        places = lattice.positions_px + lattice.residuals_px
+        return KnownSpots(lattice.frame, places.reshape(-1, 2), lattice.spot_px)
 
     def _refuse_missing(self, missing: NDArray[np.bool_]) -> NoReturn:
         sites = [f"({row}, {col})" for row, col in np.argwhere(missing).tolist()]
         more = ", ..." if len(sites) > NAMED else ""
-        what = f"{len(sites)} of {missing.size} spots are missing or not on the lattice of the others"
+        fault = f"{len(sites)} of {missing.size} spots are missing or not on the lattice of the others"
         self._refuse(
-            f"{what}: {', '.join(sites[:NAMED])}{more}; are all tones on, and is nothing in the way?"
+            f"{fault}: {', '.join(sites[:NAMED])}{more}; are all tones on, and is nothing in the way?"
         )
 
     def _refuse(self, why: str) -> NoReturn:
@@ -100,8 +93,8 @@ class SpotPowers:
 
 
 def without_losses(take: Callable[[], Frame]) -> Frame:
-    """Take a frame, and again if it was lost on its way: no atoms have to be loaded again."""
-    for _ in range(N_LOST):
+    """Take a frame, again up to three times if it is lost on its way: no atoms have to be loaded for it."""
+    for _ in range(3):
         try:
             return take()
         except TransientError:
@@ -128,7 +121,7 @@ class MobileTweezerMeter:
             raise ConfigError(f"'{name}' is not a camera; mobile tweezers are measured on frames")
         self._spots = SpotPowers(shot.grid, name)
         self._motion = shot.motion
-        shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.ramp, 0.0, OFF_S)
+        shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.ramp, 0.0, 1e-3)
 
     def apply(self, rows: Floats, cols: Floats) -> None:
         """Use amplitudes of rows and columns from now on, fractions of full scale."""
@@ -240,7 +233,7 @@ class TweezerMeter:
             power = np.array(np.nan)
         is_number = isinstance(answer, int | float | np.number) and np.isfinite(power)
         if not (is_number or power.shape == shape) or (self._is_total and power.ndim):
-            came = power.shape if power.ndim else type(answer).__name__
-            text = f"its value '{value}' is {came}; expected the power of each of {shape} tweezers"
-            raise DeviceError(name, f"{text}, or one number, the power of all")
+            kind = power.shape if power.ndim else type(answer).__name__
+            message = f"its value '{value}' is {kind}; expected the power of each of {shape} tweezers"
+            raise DeviceError(name, f"{message}, or one number, the power of all")
         return power

@@ -143,20 +143,24 @@ class ReleaseStep(Step):
         del devices
         by = context.release_by
         if by is None:
-            what = "nothing on this profile can turn the static tweezers off for a time that hardware keeps"
+            fault = "nothing on this profile can turn the static tweezers off for a time that hardware keeps"
             hint = "wire their switch to the timing box: a line with `on: [release]` and"
             hint += " `turns_off: static_tweezers`, see docs/how-to/release.md"
             return {
-                "": Problem(what, expected="a timing box, or tweezers whose driver can release", hint=hint)
+                "": Problem(fault, expected="a timing box, or tweezers whose driver can release", hint=hint)
             }
         shortest = {
             "lines": context.lines_facts.shortest_s,
             "static_tweezers": context.static_tweezers.shortest_release_s,
         }
         if self.settings.duration < shortest[by.name]:
-            came, least = (format_quantity(t, "time") for t in (self.settings.duration, shortest[by.name]))
+            duration, shortest_text = (
+                format_quantity(t, "time") for t in (self.settings.duration, shortest[by.name])
+            )
             return {
-                "duration": Problem(f"'{by.name}' cannot release for {came}", expected=f"at least {least}")
+                "duration": Problem(
+                    f"'{by.name}' cannot release for {duration}", expected=f"at least {shortest_text}"
+                )
             }
         return {}
 
@@ -207,8 +211,8 @@ class DeviceStep(Step):
             except LabseqError as error:
                 return {"do": str(error)}
             except Exception as error:  # noqa: BLE001 - of the driver, for example an unknown argument
-                what = f"check_command() raised {format_error(error)}"
-                return {"do": f"{self.settings.name}: {what}"}
+                fault = f"check_command() raised {format_error(error)}"
+                return {"do": f"{self.settings.name}: {fault}"}
         return {}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role

@@ -38,12 +38,12 @@ class Series:
 
 
 EDGES: Final = frozenset({"external", "external_start", "bulb"})
-"""Triggers that come by a line."""
+"""Triggers that arrive on a line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExposureResult:
-    """What came of one exposure.
+    """The outcome of one exposure.
 
     Attributes:
         number: Its place in the series as the camera counted it, from 0.
@@ -60,9 +60,6 @@ class ExposureResult:
     exposure_s: float = math.nan
     t_start_s: float = math.nan
     device_time_s: float = math.nan
-
-
-TEST_EXPOSURE_S: Final = 10e-3
 
 
 class CameraDriver(Camera):
@@ -230,7 +227,7 @@ class CameraDriver(Camera):
         if "software" not in facts.triggers:
             return
         # with frame transfer no exposure is shorter than the read-out
-        exposure_s = min(max(TEST_EXPOSURE_S, facts.readout_s), facts.max_exposure_s)
+        exposure_s = min(max(10e-3, facts.readout_s), facts.max_exposure_s)
         self._arm(1, exposure_s, "software", 1.0)
         self.trigger()
         shape, expected = self.read(exposure_s + facts.readout_s + 2.0).image.shape, facts.frame_shape
@@ -351,8 +348,10 @@ def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: st
 
 def _too_late(cooling: Cooling, temperature_k: float) -> str:
     waited = format_quantity(cooling.timeout_s, "time")
-    came, wanted = (f"{kelvin - ZERO_CELSIUS_K:.1f} degC" for kelvin in (temperature_k, cooling.setpoint_k))
-    text = f"the sensor is at {came} after {waited}; expected {wanted} within {cooling.tolerance_k:g} K"
+    reached, setpoint = (
+        f"{kelvin - ZERO_CELSIUS_K:.1f} degC" for kelvin in (temperature_k, cooling.setpoint_k)
+    )
+    text = f"the sensor is at {reached} after {waited}; expected {setpoint} within {cooling.tolerance_k:g} K"
     return f"{text}; look after its cooling water or fan, or choose a higher temperature"
 
 
@@ -515,11 +514,11 @@ def nearest(value: int, low: int, high: int, step: int) -> int:
     return low + step * min(n_steps, (high - low) // step)
 
 
-def check_step(what: str, value: int, bounds: tuple[int, int, int], unit: int = 1) -> None:
+def check_step(name: str, value: int, bounds: tuple[int, int, int], unit: int = 1) -> None:
     """Refuse a number that a camera does not accept.
 
     Args:
-        what: Camera and name of the number, for the error.
+        name: Camera and name of the number, for the error.
         value: The number, in pixels of the sensor.
         bounds: Smallest, largest and increment, in the camera's own pixels.
         unit: Pixels of the sensor per pixel of the camera: the binning.
@@ -531,4 +530,4 @@ def check_step(what: str, value: int, bounds: tuple[int, int, int], unit: int = 
     good = nearest(value, low, high, step)
     if good != value:
         limit = f"{low} to {high}, in steps of {step}, which the camera can do"
-        raise LimitError(what, value, limit, f"the nearest good one is {good}")
+        raise LimitError(name, value, limit, f"the nearest good one is {good}")

@@ -14,7 +14,6 @@ from contextlib import suppress
 from typing import Any, Final
 
 SLICE_S: Final = 0.005
-MAX_SHOWN: Final = 60
 _DIFFERS: Final = "not as commanded: "
 _sent: Final[dict[int, str]] = {}
 """Messages that are not sent again, by index -> why they failed; "" if they did not."""
@@ -47,14 +46,14 @@ def off(
     """
     serial: Any = importlib.import_module("serial")
     failures: list[str] = []
-    done: list[str] = []
+    sent: list[str] = []
     with serial.serial_for_url(port, timeout=SLICE_S, **options) as opened:
         line = _Line(opened, encoding, echo)
         for i, message in enumerate(messages):
             if i not in _sent:
                 failure, is_sent = line.carry_out(message)
                 if is_sent:
-                    done.append(_shown(message["send"]))
+                    sent.append(_shown(message["send"]))
                 if is_sent and not message["repeatable"]:
                     _sent[i] = failure
                 failures.append(failure)
@@ -62,8 +61,8 @@ def off(
                 failures.append(_sent[i])
     if any(failures):
         raise OSError(f"{port}: {'; '.join(filter(None, failures))}")
-    shown = ", ".join(filter(None, done))
-    return f"sent {shown} to {port}" if shown else f"{port}: nothing had to be sent"
+    sent_text = ", ".join(filter(None, sent))
+    return f"sent {sent_text} to {port}" if sent_text else f"{port}: nothing had to be sent"
 
 
 class _Line:
@@ -99,25 +98,25 @@ class _Line:
         if not end:
             time.sleep(within_s)
             return ""
-        came, start = b"", len(sent) if self._echo else 0
+        received, start = b"", len(sent) if self._echo else 0
         deadline = time.monotonic() + within_s
-        while (at := came.find(end, start)) < 0:
+        while (at := received.find(end, start)) < 0:
             if time.monotonic() > deadline:
                 return f"no answer to {shown}"
-            came += self._port.read(max(1, self._port.in_waiting))
-        reply = came[start:at].decode(self._encoding, "replace").strip()
+            received += self._port.read(max(1, self._port.in_waiting))
+        reply = received[start:at].decode(self._encoding, "replace").strip()
         match = re.fullmatch(message["expect"], reply, re.DOTALL)
         if match is None or (message["error"] and re.fullmatch(message["error"], reply, re.DOTALL)):
             return f"{shown} was answered by {_shown(reply)}"
-        if (wanted := message["value"]) is None:
+        if (expected := message["value"]) is None:
             return ""
         value: str | int = match["value"].strip()
         with suppress(ValueError):
-            value = int(value) if isinstance(wanted, int) else value
-        if type(value) is not type(wanted) or value not in (message["choices"] or [value]):
+            value = int(value) if isinstance(expected, int) else value
+        if type(value) is not type(expected) or value not in (message["choices"] or [value]):
             return f"{shown} was answered by {_shown(reply)}"
-        return "" if value == wanted else f"{_DIFFERS}{shown} was answered by {_shown(reply)}"
+        return "" if value == expected else f"{_DIFFERS}{shown} was answered by {_shown(reply)}"
 
 
 def _shown(text: str) -> str:
-    return ascii(text.strip())[:MAX_SHOWN]
+    return ascii(text.strip())[:60]

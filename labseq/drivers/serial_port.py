@@ -25,7 +25,7 @@ SLICE_S: Final = 0.02
 def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) -> T | None:
     """Wait until something comes from a device that runs in real time.
 
-    A wait in vain passes on a virtual clock too, so that it counts there as long as it was.
+    If nothing comes, a virtual clock moves on by the whole wait, too.
 
     Args:
         poll: Waits for at most so many seconds; None if nothing came.
@@ -42,9 +42,9 @@ def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) 
     while True:
         clock.check()
         left_s = max(0.0, deadline_s - time.monotonic())
-        came = poll(min(left_s, SLICE_S))
-        if came is not None:
-            return came
+        received = poll(min(left_s, SLICE_S))
+        if received is not None:
+            return received
         if left_s == 0.0:
             break
     if clock.virtual:
@@ -176,13 +176,13 @@ def serial_emergency(
     name = getattr(port, "port", None)
     if not messages or not isinstance(name, str):
         return None
-    own: Any = port
-    options = {key: getattr(own, key, None) for key in _OPTIONS}
-    given = {key: value for key, value in options.items() if value is not None}
+    serial: Any = port
+    options = {key: getattr(serial, key, None) for key in _OPTIONS}
+    set_options = {key: value for key, value in options.items() if value is not None}
     if "://" not in name:
-        given["write_timeout"] = 1.0
+        set_options["write_timeout"] = 1.0
     values = [asdict(message) for message in messages]
-    arguments = {"port": name, "options": given, "messages": values, "encoding": encoding, "echo": echo}
+    arguments = {"port": name, "options": set_options, "messages": values, "encoding": encoding, "echo": echo}
     return Emergency(Path(__file__).with_name("serial_emergency.py"), arguments)
 
 
@@ -190,7 +190,7 @@ _OPTIONS: Final = ("baudrate", "bytesize", "parity", "stopbits", "rtscts", "dsrd
 
 
 def is_network_port(url: str) -> bool:
-    """Whether a URL names a host and a port; of one that does not, pyserial's own words make no sense."""
+    """Whether a URL names a host and a port; pyserial's own message for one that does not makes no sense."""
     try:
         parts = urlsplit(url)
         return bool(parts.hostname) and bool(parts.port)
@@ -211,27 +211,27 @@ def ports_here() -> list[Any]:
 
 
 def ports_text() -> str:
-    """The ports that there are, for a message."""
-    found = [
+    """The ports of this computer, for a message."""
+    ports = [
         port.device
         if port.vid is None
         else f"{port.device} (usb {port.vid:#06x} {port.pid:#06x} {port.serial_number})"
         for port in ports_here()
     ]
-    return f"one of {', '.join(found)}" if found else "a port, but this computer has none"
+    return f"one of {', '.join(ports)}" if ports else "a port, but this computer has none"
 
 
 def _reason(error: BaseException) -> str:
     """Why a port cannot be opened, and what to do."""
-    text = " ".join(str(error).split())
+    message = " ".join(str(error).split())
     number = getattr(error, "errno", None)
-    if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY) or "PermissionError(13" in text:
+    if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY) or "PermissionError(13" in message:
         return "another program has it open, or another device of this profile; close that"
     if number == errno.EACCES:
         return "permission denied; ask to be added to the group that owns it (often 'dialout')"
-    if number == errno.ENOENT or "FileNotFoundError" in text:
+    if number == errno.ENOENT or "FileNotFoundError" in message:
         return f"there is no such port; expected {ports_text()}; is it plugged in, and switched on?"
-    first = error.__context__  # termios' own, which has its number among its arguments
-    if number == errno.EISDIR or (first is not None and errno.ENOTTY in first.args):
+    cause = error.__context__  # termios' own, which has its number among its arguments
+    if number == errno.EISDIR or (cause is not None and errno.ENOTTY in cause.args):
         return f"it is not a serial port; expected {ports_text()}"
-    return re.sub(r"^(\[Errno \d+\] )?[Cc]ould not [^:]*: ", "", text)
+    return re.sub(r"^(\[Errno \d+\] )?[Cc]ould not [^:]*: ", "", message)

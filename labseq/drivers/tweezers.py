@@ -72,16 +72,16 @@ def _excess(
         if wrong.any():
             tone, end = np.argwhere(wrong)[0]
             segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
-            where = (
+            tone_name = (
                 f"{word} tone {tone - axis.offsets[segment]} in segment {segment} (batch {batch[segment]})"
             )
             value = f"{values[tone, end] / scale:.9g} {unit}"
-            return LimitError(f"{name}: {quantity} of {where}", value, limit)
+            return LimitError(f"{name}: {quantity} of {tone_name}", value, limit)
     running = np.pad(np.cumsum(amplitudes, axis=1), ((0, 0), (1, 0)))
     sums = np.diff(running[:, axis.offsets]).max(axis=0)
     segment = int(sums.argmax())
-    what = f"{name}: sum of the {word} amplitudes in segment {segment} (batch {batch[segment]})"
-    return LimitError(what, f"{sums[segment]:.9g} {full}", f"{most:g}: the output would clip")
+    quantity_name = f"{name}: sum of the {word} amplitudes in segment {segment} (batch {batch[segment]})"
+    return LimitError(quantity_name, f"{sums[segment]:.9g} {full}", f"{most:g}: the output would clip")
 
 
 @kernel(
@@ -108,10 +108,10 @@ def is_within(
 
 def calibrated_amplitudes(context: Context) -> Amplitudes:
     """The amplitudes of the active calibration; without one all are equal and add up to full scale."""
-    found = context.calibrations.get("tweezers")
-    if found is None:
+    calibration = context.calibrations.get("tweezers")
+    if calibration is None:
         return tuple(np.full(n, 1 / n) for n in context.grid.shape)  # pyright: ignore[reportReturnType]
-    return found.values["row_amplitudes"], found.values["column_amplitudes"]
+    return calibration.values["row_amplitudes"], calibration.values["column_amplitudes"]
 
 
 def check_amplitudes(name: str, amplitudes: Amplitudes, shape: tuple[int, int]) -> None:

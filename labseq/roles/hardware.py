@@ -433,33 +433,33 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
     if name in able:
         return name, able[name]
     if name:
-        what = f"no other control system leads through '{name}'"
-        raise ConfigError(Problem(what, expected=one_of(list(able))) if able else what)
+        fault = f"no other control system leads through '{name}'"
+        raise ConfigError(Problem(fault, expected=one_of(list(able))) if able else fault)
     if not able:
-        what = "the profile has no device through which another control system leads"
+        fault = "the profile has no device through which another control system leads"
         hint = (
             "add one to its `devices`: `leader: {use: tcp_leader}`; in a full dry run it says `go` itself, "
             "in a fast one it is missing"
         )
-        raise ConfigError(Problem(what, hint=hint))
+        raise ConfigError(Problem(fault, hint=hint))
     if len(able) > 1:
         raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")
     return next(iter(able.items()))
 
 
-def unknown_name(device: str, what: str, name: str, known: Sequence[str]) -> DeviceError:
+def unknown_name(device: str, kind: str, name: str, names: Sequence[str]) -> DeviceError:
     """The error of a device that has no such command or value.
 
     Args:
         device: Name of the device.
-        what: "command" or "value".
-        name: What it was asked for.
-        known: What it has.
+        kind: "command" or "value".
+        name: The name that it does not know.
+        names: What it has.
 
     Example:
         >>> str(unknown_name("shutter", "command", "opne", ["open", "close"]))
         "shutter: unknown command 'opne'; expected one of 'open', 'close'; did you mean 'open'?"
     """
-    text = f"unknown {what} '{clean(name)}'; expected {one_of(known) if known else 'none: it has none'}"
-    hint = did_you_mean(name, known)
-    return DeviceError(device, f"{text}; {hint}" if hint else text)
+    message = f"unknown {kind} '{clean(name)}'; expected {one_of(names) if names else 'none: it has none'}"
+    hint = did_you_mean(name, names)
+    return DeviceError(device, f"{message}; {hint}" if hint else message)
