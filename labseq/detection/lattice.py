@@ -31,14 +31,9 @@ Centre: TypeAlias = tuple[float, float] | None
 
 SATURATED: Final = 65535.0
 """Counts of a saturated pixel."""
-SHORTEST_PX: Final = 3.5
-LONGEST_PX: Final = 55.0
-ROW_SLANT_RAD: Final = np.deg2rad(17)
 SCALES_PX: Final = (0.7, 1.2, 2.0, 3.3)
 """Widths of the filters that are tried, in pixels."""
 
-ALIKE: Final = 0.4
-"""Minimum height of a peak of the autocorrelation, relative to the highest."""
 
 CLEAR: Final = 4.0
 """Minimum height of the highest peak, in standard deviations of noise."""
@@ -90,28 +85,28 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
             width = scale
     if len(lags) == 0:
         return None
-    lags = lags[heights >= ALIKE * heights.max()]
+    lags = lags[heights >= 0.4 * heights.max()]
     first = int(grid.n_cols == 1)  # the axis that the search begins with
     x, y = grid.axes[first]
     slant = np.arctan2(lags[:, 0] * x - lags[:, 1] * y, lags[:, 1] * x + lags[:, 0] * y)
-    likely = lags[np.abs(slant) < ROW_SLANT_RAD]
+    likely = lags[np.abs(slant) < np.deg2rad(17)]  # a little more than the 15 degrees that users are told
     if len(likely) == 0:
         return None
-    found = likely[np.argmin(np.hypot(*likely.T))]
-    other = _turned(found, grid, first)
+    shortest = likely[np.argmin(np.hypot(*likely.T))]
+    other = _turned(shortest, grid, first)
     if 1 not in grid.shape:
         off = np.hypot(*(lags - other).T)
-        if off.min() > 0.35 * np.hypot(*found):
+        if off.min() > 0.35 * np.hypot(*shortest):
             return None
         other = lags[np.argmin(off)]
-    return Vectors(other, found, width) if first else Vectors(found, other, width)
+    return Vectors(other, shortest, width) if first else Vectors(shortest, other, width)
 
 
 def autocorrelation(flat: Floats) -> Floats:
     """Autocorrelation for lags up to 55 pixels, float64 (2 m + 1, 2 m + 1), 1 without a lag."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
-    reach = int(min(LONGEST_PX, *(n - 1 for n in flat.shape)))
+    reach = int(min(55.0, *(n - 1 for n in flat.shape)))
     shape = tuple(next_fast_len(n + reach, real=True) for n in flat.shape)
     spectrum = np.asarray(rfft2(flat - flat.mean(), s=shape))
     whole = np.asarray(irfft2(np.abs(spectrum) ** 2, s=shape))
@@ -128,7 +123,7 @@ def _peaks(likeness: Floats) -> tuple[Floats, Floats]:
     distance = np.hypot(y, x)
     ring = np.rint(distance).astype(np.int64).ravel()
     profile = np.bincount(ring, likeness.ravel()) / np.bincount(ring)
-    shortest = max(SHORTEST_PX, float(np.argmax(profile < 0)))
+    shortest = max(3.5, float(np.argmax(profile < 0)))
     peaks = (likeness == maximum_filter(likeness, 5)) & (distance >= shortest)
     peaks[[0, -1]] = peaks[:, [0, -1]] = False
     y, x = np.nonzero(peaks)
@@ -137,14 +132,10 @@ def _peaks(likeness: Floats) -> tuple[Floats, Floats]:
 
 def _turned(vector: Floats, grid: SiteGrid, axis: int) -> Floats:
     """The other axis of an undistorted grid whose given axis is ``vector``."""
-    one, other = grid.axes[axis] / grid.spacing_m, grid.axes[1 - axis] / grid.spacing_m
-    cos, sin = one @ other, one[0] * other[1] - one[1] * other[0]
+    first, other = grid.axes[axis] / grid.spacing_m, grid.axes[1 - axis] / grid.spacing_m
+    cosine, sine = first @ other, first[0] * other[1] - first[1] * other[0]
     y, x = vector
-    return np.array([cos * y + sin * x, cos * x - sin * y])
-
-
-TUKEY: Final = 4.685
-"""Cutoff of Tukey's biweight in standard deviations: 95 % efficient for Gaussian errors."""
+    return np.array([cosine * y + sine * x, cosine * x - sine * y])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +194,8 @@ def fit_surface(
         coefficients = np.asarray(np.linalg.lstsq(matrix * root, places * root, rcond=None)[0], np.float64)
         off = np.hypot(*(places - matrix @ coefficients).T)
         width = max(float(np.median(off[base > 0])) / 1.1774, 1e-9)
-        weights = base * np.clip(1 - (off / (TUKEY * width)) ** 2, 0, None) ** 2
+        # 4.685 standard deviations: 95 % efficient for Gaussian errors
+        weights = base * np.clip(1 - (off / (4.685 * width)) ** 2, 0, None) ** 2
         if np.count_nonzero(weights) < len(powers):
             weights = base
     return Surface(powers, centre, scale, coefficients), weights
@@ -294,7 +286,9 @@ def index_spots(
         near &= _in_full_lines(square, near)
         taken, indices = nearest[near], square[near]
         n_lines = [len(np.unique(values)) for values in indices.T]
-        if len(taken) < fewest or any(n < min(2, wanted) for n, wanted in zip(n_lines, shape, strict=True)):
+        if len(taken) < fewest or any(
+            n < min(2, n_wanted) for n, n_wanted in zip(n_lines, shape, strict=True)
+        ):
             return None
         surface, _ = fit_surface(indices, places[taken], 3 if radius >= 4 else 1)
         if radius >= reach:
@@ -366,12 +360,6 @@ def _best_place(places: Floats, tree: KDTree, vectors: Vectors, shortest: float)
 
 MIN_FOUND: Final = 0.5
 """Minimum fraction of bright sites."""
-
-MAX_OTHERS: Final = 0.25
-"""Maximum number of bright spots beside a single row or column, relative to its sites."""
-
-MAX_RESIDUAL: Final = 0.08
-"""Maximum r.m.s. distance of the spots from the smooth lattice, in spacings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -505,14 +493,14 @@ def _indexed(
             f"of {bright} spots only {n_indexed} are on a lattice; {n_sites} are expected; {_DARK}",
         )
     n_others = bright - n_indexed
-    if 1 in grid.shape and centre_px is None and n_others > MAX_OTHERS * n_sites:
+    if 1 in grid.shape and centre_px is None and n_others > 0.25 * n_sites:
         _fail(
             f"the grid has {grid.n_rows} x {grid.n_cols} sites, and {n_others} spots are beside its line; "
             f"{_MORE}"
         )
-    first, seen = find_window(spots, indexed, grid.shape, centre_px)
-    if seen != grid.shape:
-        rows, cols = seen
+    first, lit_shape = find_window(spots, indexed, grid.shape, centre_px)
+    if lit_shape != grid.shape:
+        rows, cols = lit_shape
         _fail(
             f"{rows} x {cols} rows and columns of sites are lit, the grid has {grid.n_rows} x {grid.n_cols}; "
             "a dark row or column at the edge is ambiguous: load it, or set the "
@@ -542,7 +530,7 @@ def _refined(
     positions = surface.at(sites)
     residuals = np.where(lit[:, None], fitted.places - positions, np.nan)
     residual = float(np.sqrt(np.nanmean((residuals**2).sum(axis=1))))
-    if residual > MAX_RESIDUAL * shortest:
+    if residual > 0.08 * shortest:
         _fail(
             f"the spots are {residual:.2f} pixels (r.m.s.) away from a lattice of {shortest:.1f} pixels; "
             "sites of an irregular array come from a file: set `detector.sites`",
@@ -568,10 +556,10 @@ def _described(
         down = _turned(along, grid, 0)
     elif grid.n_cols == 1:
         along = _turned(down, grid, 1)
-    seen = np.stack([along[::-1], down[::-1]], axis=1)  # (x, y) of each, as columns
-    magnification = seen @ np.linalg.inv(grid.axes.T)  # pixels per metre
-    left, strengths, right = np.linalg.svd(magnification)
-    turned = left @ right
+    vectors_xy = np.stack([along[::-1], down[::-1]], axis=1)  # (x, y) of each, as columns
+    magnification = vectors_xy @ np.linalg.inv(grid.axes.T)  # pixels per metre
+    left_vectors, strengths, right_vectors = np.linalg.svd(magnification)
+    rotation = left_vectors @ right_vectors
     steps = [
         float(np.hypot(*step)) if n > 1 else np.nan for step, n in ((along, grid.n_cols), (down, grid.n_rows))
     ]
@@ -583,7 +571,7 @@ def _described(
         frame=(frame[0], frame[1]),
         spot_px=fitted.width_px,
         spacing_px=(steps[0], steps[1]),
-        angle_rad=np.nan if is_one else float(np.arctan2(turned[1, 0], turned[0, 0])),
+        angle_rad=np.nan if is_one else float(np.arctan2(rotation[1, 0], rotation[0, 0])),
         stretch=np.nan if 1 in grid.shape else float(strengths[0] / strengths[1]),
         pixel_size_m=np.nan if is_one else float(1 / np.sqrt(strengths[0] * strengths[1])),
         residual_px=residual,

@@ -13,8 +13,6 @@ from labseq.detection.sites import spot_light
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-TILE_PX: Final = 48
-DARK_QUANTILE: Final = 0.3
 HOT: Final = 6.0
 """A pixel this many times brighter than its second brightest neighbour is hot; spots of 0.45 px are not."""
 
@@ -70,14 +68,14 @@ def stray_light(counts: Floats) -> Floats:
     """The slowly varying part of a frame, float64 (height, width)."""
     from scipy.ndimage import gaussian_filter, zoom
 
-    levels = np.array([[np.quantile(tile, DARK_QUANTILE) for tile in row] for row in _tiles(counts)])
+    levels = np.array([[np.quantile(tile, 0.3) for tile in row] for row in _tiles(counts)])
     factors = np.array(counts.shape) / levels.shape
     levels = gaussian_filter(levels, 0.7, mode="nearest")
     return np.asarray(zoom(levels, factors, order=1, mode="nearest", grid_mode=True), np.float64)
 
 
 def _tiles(counts: Floats) -> list[list[Floats]]:
-    n_rows, n_cols = (max(1, round(n / TILE_PX)) for n in counts.shape)
+    n_rows, n_cols = (max(1, round(n / 48)) for n in counts.shape)
     return [np.array_split(row, n_cols, axis=1) for row in np.array_split(counts, n_rows)]
 
 
@@ -129,8 +127,8 @@ def peak_places(smooth: Floats, y: Ints, x: Ints) -> Floats:
     padded = np.pad(smooth, 1, mode="edge")
     places = np.stack([y, x], axis=1).astype(np.float64)
     for axis, (dy, dx) in enumerate(((1, 0), (0, 1))):
-        before, here, after = (padded[y + 1 + k * dy, x + 1 + k * dx] for k in (-1, 0, 1))
-        bend = np.minimum(before - 2 * here + after, -1e-300)
+        before, at_peak, after = (padded[y + 1 + k * dy, x + 1 + k * dx] for k in (-1, 0, 1))
+        bend = np.minimum(before - 2 * at_peak + after, -1e-300)
         places[:, axis] += np.clip((before - after) / (2 * bend), -0.5, 0.5)
     return places
 
@@ -140,8 +138,6 @@ def usual_light(light: Floats, n_sites: int) -> float:
     return float(np.median(np.sort(light)[::-1][:n_sites])) if len(light) else 0.0
 
 
-MAX_PASSES: Final = 12
-SETTLED: Final = 0.01
 REACH: Final = 2.7
 """Distance from a spot to the last pixel that is fitted, in widths of the spot."""
 
@@ -190,26 +186,26 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
     start, n, edge = places, len(places), np.array(flat.shape) - 1.0
     light, all_light, glow = np.zeros(n), np.zeros(n), np.zeros(flat.shape)
     growth, dark_noise = 0.0, noise
-    for _ in range(MAX_PASSES):
+    for _ in range(12):
         pixels, spots, widening = _spot_columns(flat.shape, places, width_px, light)
-        seen = flat.ravel()[pixels]
+        counts = flat.ravel()[pixels]
         matrix: Any = hstack([spots, csr_array(widening[:, None]), _stray_columns(flat.shape, pixels)], "csr")
-        found = _least_squares(matrix, seen, dark_noise**2 + growth * glow.ravel()[pixels])
-        all_light, moves = found[:n], found[n : 3 * n].reshape(2, n).T
+        solution = _least_squares(matrix, counts, dark_noise**2 + growth * glow.ravel()[pixels])
+        all_light, moves = solution[:n], solution[n : 3 * n].reshape(2, n).T
         usual = max(float(np.median(all_light[all_light >= np.median(all_light)])), 1e-30)
-        wider = float(np.clip(found[3 * n], -0.3 * width_px, 0.4 * width_px))
+        wider = float(np.clip(solution[3 * n], -0.3 * width_px, 0.4 * width_px))
         steps = np.clip(moves / np.maximum(all_light, DIM * usual)[:, None], -1.0, 1.0)
         if not light.any() or abs(wider) > 0.15 * width_px:
             steps *= 0.0  # a wrong width pulls spots towards their neighbours
         before = places
         places = np.clip(start + np.clip(places + steps - start, -furthest_px, furthest_px), 0, edge)
         width_px = float(np.clip(width_px + wider, 0.35, 8.0))
-        settled = light.any() and max(abs(wider), np.median(np.abs(places - before))) < SETTLED * width_px
+        settled = light.any() and max(abs(wider), np.median(np.abs(places - before))) < 0.01 * width_px
         light = np.where(all_light > DIM * usual, all_light, 0.0)
         dark_noise = max(noise, MISSHAPEN * usual / (2 * np.pi * width_px**2))
         glow.ravel()[pixels] = spots[:, :n] @ light
-        left = seen - matrix @ found
-        growth = max(0.0, float((left**2 - noise**2).sum() / max(glow.sum(), 1e-30)))
+        residuals = counts - matrix @ solution
+        growth = max(0.0, float((residuals**2 - noise**2).sum() / max(glow.sum(), 1e-30)))
         if settled:
             break
     return FittedSpots(places, all_light, width_px)
@@ -237,8 +233,8 @@ class KnownSpots:
         Returns:
             The light, float64 (n,), in counts.
         """
-        seen = np.asarray(image.ravel()[self._pixels], np.float64)
-        return _least_squares(self._matrix, seen, np.ones(len(seen)))[: self._n]
+        counts = np.asarray(image.ravel()[self._pixels], np.float64)
+        return _least_squares(self._matrix, counts, np.ones(len(counts)))[: self._n]
 
 
 def _spot_columns(
@@ -278,12 +274,12 @@ def _stray_columns(shape: tuple[int, ...], pixels: Ints) -> Any:
 
     places = np.stack(np.unravel_index(pixels, shape), axis=1) / KNOT_PX
     below = places.astype(np.int64)
-    part = places - below
+    fraction = places - below
     width = shape[1] // KNOT_PX + 2
     weights, knots = list[Floats](), list[Ints]()
     for dy in (0, 1):
         for dx in (0, 1):
-            weights.append(np.abs(1 - dy - part[:, 0]) * np.abs(1 - dx - part[:, 1]))
+            weights.append(np.abs(1 - dy - fraction[:, 0]) * np.abs(1 - dx - fraction[:, 1]))
             knots.append((below[:, 0] + dy) * width + below[:, 1] + dx)
     n_knots = (shape[0] // KNOT_PX + 2) * width
     rows = np.tile(np.arange(len(pixels)), 4)

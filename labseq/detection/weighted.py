@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,6 @@ from labseq.roles import Context
 from labseq.settings import Fraction
 
 Floats = NDArray[np.float64]
-
-N_LIGHTS: Final = 64
-N_COUNTS: Final = 65_536
-SPOT_REACH: Final = 4.0
-"""Distance up to which a spot's light is included, in widths of the spot."""
 
 
 class WeightedSettings(SiteSettings):
@@ -179,29 +174,36 @@ def site_weights(settings: WeightedSettings, known: KnownSites, corners: NDArray
     """Compute the weights of all sites, whose regions have their first pixels at ``corners`` (n_sites, 2)."""
     sites = known.positions_px.reshape(-1, 2)
     spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
-    own = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
-    pairs = pairs_within(sites, (region / 2 + SPOT_REACH * spot_px) * np.sqrt(2))
-    lit = settings.photoelectrons * spot_light(sites[pairs[:, 1]], corners[pairs[:, 0]], region, spot_px)
-    dark = np.full_like(own, settings.background)
-    np.add.at(dark, pairs[:, 0], filling * lit)
-    likelihood = evidence(settings, settings.background, float((dark + own).max() + lit.max(initial=0.0)))
+    own_light = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
+    # light further than 4 widths from a spot is left out
+    pairs = pairs_within(sites, (region / 2 + 4.0 * spot_px) * np.sqrt(2))
+    neighbour_light = settings.photoelectrons * spot_light(
+        sites[pairs[:, 1]], corners[pairs[:, 0]], region, spot_px
+    )
+    dark = np.full_like(own_light, settings.background)
+    np.add.at(dark, pairs[:, 0], filling * neighbour_light)
+    likelihood = evidence(
+        settings, settings.background, float((dark + own_light).max() + neighbour_light.max(initial=0.0))
+    )
 
     def gained(values: Floats, before: Floats, light: Floats) -> Floats:
         return np.interp(before + light, likelihood.light, values) - np.interp(
             before, likelihood.light, values
         )
 
-    pixels = gained(likelihood.weight, dark, own)
+    pixels = gained(likelihood.weight, dark, own_light)
     effects = np.zeros(len(pairs))
-    without = dark[pairs[:, 0]] - filling * lit
-    for before in (without, without + own[pairs[:, 0]]):  # whether the site holds an atom or not
-        effects += (pixels[pairs[:, 0]] * gained(likelihood.mean, before, lit)).sum(axis=(1, 2)) / 2
-    felt = effects > 1e-3
-    pairs, effects = pairs[felt], effects[felt]
+    without = dark[pairs[:, 0]] - filling * neighbour_light
+    for before in (without, without + own_light[pairs[:, 0]]):  # whether the site holds an atom or not
+        effects += (pixels[pairs[:, 0]] * gained(likelihood.mean, before, neighbour_light)).sum(
+            axis=(1, 2)
+        ) / 2
+    is_relevant = effects > 1e-3
+    pairs, effects = pairs[is_relevant], effects[is_relevant]
     return Weights(
         pixels=pixels.astype(np.float32),
         curve=likelihood.curve,
-        constant=gained(likelihood.constant, dark, own).sum(axis=(1, 2)),
+        constant=gained(likelihood.constant, dark, own_light).sum(axis=(1, 2)),
         starts=np.searchsorted(pairs[:, 0], np.arange(len(sites) + 1)),
         neighbours=np.ascontiguousarray(pairs[:, 1]),
         effects=effects,
@@ -246,9 +248,7 @@ def evidence(sensor: WeightedSettings, darkest: float, brightest: float) -> Ligh
         darkest: Minimum mean photoelectrons of a pixel, more than 0.
         brightest: Maximum.
     """
-    light = np.concatenate(
-        [[darkest], darkest + np.geomspace(1e-3, 1.0, N_LIGHTS - 1) * (brightest - darkest)]
-    )
+    light = np.concatenate([[darkest], darkest + np.geomspace(1e-3, 1.0, 64 - 1) * (brightest - darkest)])
     noise = np.hypot(sensor.read_noise, np.sqrt(1 / 12)) / sensor.counts_per_photoelectron  # rounding
     n_most = int(np.ceil(brightest + 8 * np.sqrt(brightest) + 10))
     signal = _signals(sensor.em_register, noise, n_most)
@@ -265,7 +265,7 @@ def evidence(sensor: WeightedSettings, darkest: float, brightest: float) -> Ligh
     zero, one = np.interp([0.0, 1.0], signal, curve)
     constant += weight * zero
     curve, weight = (curve - zero) / (one - zero), weight * (one - zero)
-    counts = (np.arange(N_COUNTS) - sensor.offset) / sensor.counts_per_photoelectron
+    counts = (np.arange(65_536) - sensor.offset) / sensor.counts_per_photoelectron
     table = np.interp(counts, signal, curve).astype(np.float32)
     return LightLikelihood(light, weight, constant, p @ curve, table)
 

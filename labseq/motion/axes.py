@@ -19,9 +19,6 @@ from labseq.model.grid import mean_step_hz
 
 Floats = NDArray[np.float64]
 
-ON_THE_COMB_HZ = 1e-6
-"""Distance from the comb below which frequencies stay as they are, in Hz: rounding."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CombFit:
@@ -61,7 +58,7 @@ def fit_comb(site_hz: Floats, spacing_m: float) -> CombFit:
     step_hz = float(site @ site_hz / (site @ site))
     comb_hz = site_hz.mean() + step_hz * site
     off_hz = comb_hz - site_hz
-    if np.abs(off_hz).max() <= ON_THE_COMB_HZ:
+    if np.abs(off_hz).max() <= 1e-6:  # nothing but rounding
         return CombFit(site_hz, np.zeros(n_sites))
     return CombFit(comb_hz, off_hz / step_hz * spacing_m)
 
@@ -146,16 +143,16 @@ def preassigned_phases(n_rows: int, n_cols: int, seed: int = RfSpec().phase_seed
 
 
 def _amplitudes(rf: RfSpec, axis: AxisIndex, n_sites: int, max_tones: int) -> Floats:
-    given = (rf.row_amplitudes, rf.column_amplitudes)[axis]
-    if not given:
+    preassigned = (rf.row_amplitudes, rf.column_amplitudes)[axis]
+    if not preassigned:
         return np.full(n_sites, 1.0 / max_tones)
-    if len(given) != n_sites:
+    if len(preassigned) != n_sites:
         raise LimitError(
             f"the number of preassigned {AXES[axis]} amplitudes",
-            len(given),
+            len(preassigned),
             f"{n_sites}: one per {AXES[axis]}",
         )
-    return np.array(given)
+    return np.array(preassigned)
 
 
 def _limits(rf: RfSpec, axis: AxisIndex, direction: float) -> Floats:

@@ -96,9 +96,6 @@ _AT_A_SITE: Final = {"INNER_EJECTION", *(name for name, (_, text) in FAULTS.item
 """The faults whose two numbers are a site."""
 
 
-_INTEGERS: Final = (int, np.integer)
-
-
 def check_plan(
     plan: Plan,
     occupancy: ArrayLike,
@@ -168,7 +165,7 @@ def check_plan(
     )
     end_s = np.empty(plan.n_batches, np.float64)
     n_tweezers = np.empty(plan.n_batches, np.int32)
-    fault, *where = check(
+    fault, *fault_place = check(
         plan.moves,
         plan.batch_offsets,
         plan.linked,
@@ -184,7 +181,7 @@ def check_plan(
         n_tweezers,
     )
     if fault:
-        _raise_plan_error(fault, where, plan, grid, max_tweezers, motion, planner)
+        _raise_plan_error(fault, fault_place, plan, grid, max_tweezers, motion, planner)
     n_defects, n_surplus = count_wrong(atoms, target.fill, target.clear)
     for array in (atoms, end_s, n_tweezers):
         array.flags.writeable = False
@@ -193,24 +190,26 @@ def check_plan(
 
 def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, planner: str) -> None:
     """Refuse arguments that a script may mix up, before they are used."""
-    if not isinstance(dop, _INTEGERS):
+    if not isinstance(dop, (int, np.integer)):
         raise LimitError("the degree of parallelism", repr(dop), "a whole number, at least 1")
     if not isinstance(plan, Plan):
-        what, came = "a Plan (labseq.plugin.Plan.from_batches makes one)", plan
+        expected, argument = "a Plan (labseq.plugin.Plan.from_batches makes one)", plan
     elif not isinstance(target, TargetPattern):
-        what, came = "a TargetPattern as target", target
+        expected, argument = "a TargetPattern as target", target
     elif grid is not None and not isinstance(grid, SiteGrid):
-        what, came = "a SiteGrid as grid", grid
+        expected, argument = "a SiteGrid as grid", grid
     elif motion is not None and not isinstance(motion, MotionSpec):
-        what, came = "a MotionSpec as motion", motion
+        expected, argument = "a MotionSpec as motion", motion
     else:
         return
-    raise InvalidPlanError("shape", f"{what} was expected, {type(came).__name__} came", planner=planner)
+    raise InvalidPlanError(
+        "shape", f"{expected} was expected, {type(argument).__name__} came", planner=planner
+    )
 
 
 def _raise_plan_error(
     fault: int,
-    where: list[int],
+    fault_place: list[int],
     plan: Plan,
     grid: SiteGrid,
     max_tweezers: int,
@@ -220,7 +219,7 @@ def _raise_plan_error(
     """Raise the error for a fault."""
     from labseq.motion import check_kernels, path_kernels
 
-    batch, move, a, b = (int(number) for number in where)
+    batch, move, a, b = (int(number) for number in fault_place)
     name = next(name for name in FAULTS if (vars(path_kernels) | vars(check_kernels)).get(name) == fault)
     rule, wording = FAULTS[name]
     row = col = to_row = to_col = -1  # only used in messages about an atom move

@@ -91,12 +91,14 @@ def all_on_program(grid: SiteGrid, motion: MotionSpec, on_s: float) -> ToneProgr
     Raises:
         LimitError: The motion does not allow as many tones at once, or a tone breaks another limit.
     """
-    for name, n, most in zip(AXES, grid.shape, (motion.max_row_tones, motion.max_column_tones), strict=True):
-        if n > most:
-            text = f"{most}, `max_{name}_tones` of the profile"
-            raise LimitError(f"the number of {name} tones at once, to measure all of them", n, text)
-    every = _Batch(np.arange(grid.n_rows), np.arange(grid.n_cols), np.zeros(2))
-    return _program(grid, replace(motion, overhead_per_batch_s=0.0), [every], _segments(motion, on_s))
+    for name, n, max_tones in zip(
+        AXES, grid.shape, (motion.max_row_tones, motion.max_column_tones), strict=True
+    ):
+        if n > max_tones:
+            limit = f"{max_tones}, `max_{name}_tones` of the profile"
+            raise LimitError(f"the number of {name} tones at once, to measure all of them", n, limit)
+    all_tones = _Batch(np.arange(grid.n_rows), np.arange(grid.n_cols), np.zeros(2))
+    return _program(grid, replace(motion, overhead_per_batch_s=0.0), [all_tones], _segments(motion, on_s))
 
 
 def hold_time_s(
@@ -111,10 +113,10 @@ def hold_time_s(
     Raises:
         LimitError: The tone of a site leaves its band at its offset.
     """
-    every = np.ones(grid.shape, np.bool_)
-    _check_band(grid, motion, every, offset_m)
-    n_batches = sum(1 for _ in _batches(grid, motion, every, offset_m))
-    return n_batches * sum(one.time_s for one in _segments(motion, hold_s, drop_off_s))
+    all_sites = np.ones(grid.shape, np.bool_)
+    _check_band(grid, motion, all_sites, offset_m)
+    n_batches = sum(1 for _ in _batches(grid, motion, all_sites, offset_m))
+    return n_batches * sum(segment.time_s for segment in _segments(motion, hold_s, drop_off_s))
 
 
 def cross_offsets_m(shape: tuple[int, int], offset_m: ArrayLike) -> Floats:
@@ -198,14 +200,15 @@ def _segments(motion: MotionSpec, hold_s: float, drop_off_s: float | None = None
         _Segment(SegmentKind.DROP_OFF, down_s, (1.0, 0.0), (down, 0.0)),
     ]
     optional = SegmentKind.IDLE, SegmentKind.TRANSPORT
-    return [one for one in segments if one.time_s > 0 or one.kind not in optional]
+    return [segment for segment in segments if segment.time_s > 0 or segment.kind not in optional]
 
 
 def _program(
     grid: SiteGrid, motion: MotionSpec, batches: list[_Batch], segments: list[_Segment]
 ) -> ToneProgram:
     """The program that plays the same segments for each batch."""
-    kinds, times_s = np.array([one.kind for one in segments], np.int8), [one.time_s for one in segments]
+    kinds = np.array([segment.kind for segment in segments], np.int8)
+    times_s = [segment.time_s for segment in segments]
     batch = np.repeat(np.arange(len(batches), dtype=np.int32), len(segments))
     rows, columns = (
         _axis(axis, drive(grid, motion, axis), motion, grid.spacing_m, batches, segments, batch)
@@ -225,21 +228,21 @@ def _axis(
     batch: NDArray[np.int32],
 ) -> AxisTones:
     """The tones of an axis over all batches, checked against its limits."""
-    sounding = np.array([one.kind != SegmentKind.IDLE for one in segments])
-    times_s = np.array([one.time_s for one in segments])
+    sounding = np.array([segment.kind != SegmentKind.IDLE for segment in segments])
+    times_s = np.array([segment.time_s for segment in segments])
     before_s = np.cumsum(np.where(sounding, times_s, 0.0)) - times_s
     columns: list[Floats] = [np.empty((5, 0))]
     n_tones: list[int] = [0]
-    for one in batches:
-        tones = one.rows if axis == 0 else one.columns
-        shift_hz = driven.step_hz * one.offset_m[1 - axis] / spacing_m  # offsets are along a1, a2
+    for current_batch in batches:
+        tones = current_batch.rows if axis == 0 else current_batch.columns
+        shift_hz = driven.step_hz * current_batch.offset_m[1 - axis] / spacing_m  # offsets are along a1, a2
         hz = driven.site_hz[tones] + shift_hz
         first = _first_phases(tones, driven, motion)
         for i, segment in enumerate(segments):
             n_tones.append(n_tones[-1] + (len(tones) if sounding[i] else 0))
             if sounding[i]:
                 level = segment.column if axis else segment.row
-                start, end = (driven.amplitude[tones] * one for one in level)
+                start, end = (driven.amplitude[tones] * factor for factor in level)
                 columns.append(np.stack([hz, hz, start, end, (first + hz * before_s[i]) % 1.0]))
     values, offsets = np.ascontiguousarray(np.hstack(columns)), np.array(n_tones, np.int32)
     check_limits(axis, driven, motion.rf, batch, offsets, values)
@@ -252,7 +255,7 @@ def _first_phases(tones: Ints, driven: Drive, motion: MotionSpec) -> Floats:
     from labseq.motion.tone_kernels import first_phases
 
     phase = np.empty(len(tones))
-    chosen = np.ascontiguousarray(np.stack([tones, tones]).astype(np.int64))
+    both_ends = np.ascontiguousarray(np.stack([tones, tones]).astype(np.int64))
     low_crest = motion.rf.phases == "low_crest"
-    first_phases(chosen, len(tones), driven.phase, low_crest, driven.amplitude, phase)
+    first_phases(both_ends, len(tones), driven.phase, low_crest, driven.amplitude, phase)
     return phase

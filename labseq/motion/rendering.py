@@ -23,11 +23,6 @@ from labseq.model import SiteGrid, ToneProgram, Waveform
 if TYPE_CHECKING:
     from labseq.motion.render_kernels import Axis, Workspace
 
-CLOCK_STEP_HZ: Final = 8
-"""Sample rates of the AWG are multiples of this (Spectrum M4i.66xx)."""
-
-MAX_PERIOD: Final = 4096
-"""Longest period of a comb that is worth its tables, in samples."""
 
 BLOCK: Final = 1536
 """Smallest size of a block, in samples."""
@@ -41,7 +36,9 @@ BLOCK_AT: Final = 11
 
 _NUMBERS: Final = count()
 
+
 NO_SAMPLES: Final = np.empty(0, np.int16)
+"""Lives as long as the process: programs for kernels hold its address."""
 
 _FREE_SAMPLES: Final[deque[NDArray[np.int16]]] = deque(maxlen=2)
 
@@ -73,7 +70,7 @@ NO_COMB: Final = Comb(0.0, 1.0, np.empty((0, 0)), 1024)
 
 
 def comb_sample_rate(
-    grid: SiteGrid, max_hz: float = 625e6, min_hz: float = 50e6, clock_step_hz: int = CLOCK_STEP_HZ
+    grid: SiteGrid, max_hz: float = 625e6, min_hz: float = 50e6, clock_step_hz: int = 8
 ) -> float:
     """Find the fastest sample rate at which the sites of both axes make a comb of whole samples.
 
@@ -84,7 +81,7 @@ def comb_sample_rate(
         grid: Its row and column frequencies, equally spaced on each axis.
         max_hz: Fastest sample rate allowed.
         min_hz: Slowest sample rate allowed.
-        clock_step_hz: Sample rates are multiples of this.
+        clock_step_hz: Sample rates of the AWG are multiples of this; 8 Hz for the Spectrum M4i.66xx.
 
     Returns:
         The rate in Hz, a whole number of clock steps. If the spacing is not a round number
@@ -146,7 +143,7 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
 @lru_cache(maxsize=64)
 def _ratio(value: float) -> Fraction:
     """The nearest fraction of small numbers; working it out takes 0.04 ms."""
-    return Fraction(value).limit_denominator(MAX_PERIOD)
+    return Fraction(value).limit_denominator(4096)  # tables of a comb with a longer period are not worth it
 
 
 @lru_cache(maxsize=8)
@@ -414,23 +411,23 @@ def _prepare(
 def _refuse_durations(program: ToneProgram, sample_rate_hz: float) -> NoReturn:
     wrong = np.flatnonzero(~((program.duration_s >= 0) & (program.duration_s < np.inf)))
     if len(wrong):
-        which = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]]}"
-        raise LimitError(which, f"{program.duration_s[wrong[0]]} s", "0 or more and finite")
+        quantity = f"the duration of segment {wrong[0]} in batch {program.batch[wrong[0]]}"
+        raise LimitError(quantity, f"{program.duration_s[wrong[0]]} s", "0 or more and finite")
     with np.errstate(over="ignore"):
         n_samples = float(program.duration_s.sum()) * sample_rate_hz
     raise LimitError("the number of samples", f"{n_samples:.3g}", f"less than {MAX_SAMPLES:.3g}")
 
 
-def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:
+def _refuse(fault: int, index: int, program: ToneProgram, channel: int, sample_rate_hz: float) -> NoReturn:
     """Raise the error for a tone that cannot be played."""
     from labseq.motion.render_kernels import SUM
 
     axis, name = ((program.row, "row"), (program.column, "column"))[channel]
     if fault == SUM:
-        tones = slice(axis.offsets[where], axis.offsets[where + 1])
+        tones = slice(axis.offsets[index], axis.offsets[index + 1])
         largest = max(axis.start_amplitude[tones].sum(), axis.end_amplitude[tones].sum())
-        which = f"the sum of the amplitudes of the {name} tones in batch {program.batch[where]}"
-        raise LimitError(which, f"{largest:.9g}", "1, full scale")
+        quantity = f"the sum of the amplitudes of the {name} tones in batch {program.batch[index]}"
+        raise LimitError(quantity, f"{largest:.9g}", "1, full scale")
     field, limit = (
         ("start_hz", f"0 to {sample_rate_hz / 2:.9g}"),
         ("end_hz", f"0 to {sample_rate_hz / 2:.9g}"),
@@ -438,6 +435,6 @@ def _refuse(fault: int, where: int, program: ToneProgram, channel: int, sample_r
         ("end_amplitude", "0 to 1"),
         ("phase_rad", "finite"),
     )[fault]
-    segment = int(np.searchsorted(axis.offsets, where, "right")) - 1
-    which = f"{field} of a {name} tone in batch {program.batch[segment]}"
-    raise LimitError(which, getattr(axis, field)[where], limit)
+    segment = int(np.searchsorted(axis.offsets, index, "right")) - 1
+    quantity = f"{field} of a {name} tone in batch {program.batch[segment]}"
+    raise LimitError(quantity, getattr(axis, field)[index], limit)

@@ -222,7 +222,7 @@ def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
 
 def _landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[int, int]]:
     """Sites of atoms that stand where an empty tweezer of a batch is ramped down."""
-    found: list[tuple[int, int]] = []
+    landings: list[tuple[int, int]] = []
     carried = {(int(i), int(j)) for i, j in paths.tones_of(batch.from_sites)}
     for i, row_off in enumerate(paths.row_off.tolist()):
         for j, column_off in enumerate(paths.column_off.tolist()):
@@ -232,16 +232,12 @@ def _landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[in
             if (i, j) in carried or not inside or row % 1 or col % 1:
                 continue
             if atoms[int(row), int(col)]:
-                found.append((int(row), int(col)))
-    return found
+                landings.append((int(row), int(col)))
+    return landings
 
 
 BESIDE: Final = 0.6
 """A tweezer passes an atom if it comes closer than this part of the grid's spacing: a lane is at most 0.5."""
-LANE_M: Final = 1.944e-6
-"""Distance at which the loss by passing is that of the profile: in a straight lane of the paper's lattice."""
-DECAY_M: Final = 0.15e-6
-"""Additional distance at which it is 1/e of that, about: from the table of passes on the page of ``grid``."""
 
 
 def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats, Floats, int]:
@@ -252,6 +248,8 @@ def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats,
     positions = np.concatenate([paths.row.ravel(), paths.column.ravel()])
     off = np.concatenate([paths.row_off, paths.column_off]).astype(np.int32)
     a1, a2 = grid.axes / grid.spacing_m
-    distances = BESIDE, LANE_M / grid.spacing_m, DECAY_M / grid.spacing_m
+    # The loss by passing is that of the profile at 1.944 um, as in a straight lane of the paper's lattice,
+    # and about 1/e of that 0.15 um further away: from the table of passes on the page of ``grid``.
+    distances = BESIDE, 1.944e-6 / grid.spacing_m, 0.15e-6 / grid.spacing_m
     n = add_passes(positions, off, paths.shape, atoms, float(a1 @ a2), distances, of_site, of_tweezer)
     return of_site, of_tweezer, n

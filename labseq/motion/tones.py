@@ -21,13 +21,6 @@ AXIS_INDICES: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
 SPEED_PROFILES: Final[tuple[SpeedProfile, ...]] = get_args(SpeedProfile)
 """The speed profiles; the index is the :class:`labseq.model.FrequencyCourse`."""
 
-KEYED_S: Final = 2e-6
-"""Time over which the axis that does not move is switched on and off: at once, it would put more than a
-hundred times as much power outside the AOD's band."""
-
-WINDOW_TOLERANCE_S = 1e-9
-"""Excess over the time window that rounding of sums can cause, in seconds."""
-
 
 def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     """Time to move an atom by one site, in seconds.
@@ -44,7 +37,8 @@ def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
 
 def keyed_time_s(ramp_s: float) -> float:
     """Time over which the tones of the parked axis are switched, within a ramp of the other axis."""
-    return min(KEYED_S, 0.5 * ramp_s)
+    # switched on or off at once, it would put more than a hundred times as much power outside the AOD's band
+    return min(2e-6, 0.5 * ramp_s)
 
 
 def fitting_batches(report: PlanReport, plan: Plan, window_s: float) -> int:
@@ -60,7 +54,7 @@ def fitting_batches(report: PlanReport, plan: Plan, window_s: float) -> int:
     Returns:
         How many batches can be played, for :meth:`Plan.first`.
     """
-    in_time = report.batch_end_s <= window_s + WINDOW_TOLERANCE_S
+    in_time = report.batch_end_s <= window_s + 1e-9  # sums may be rounded up
     ends_chain = np.append(~plan.linked[1:], True)
     fitting = np.flatnonzero(in_time & ends_chain[: plan.n_batches])
     return int(fitting[-1]) + 1 if len(fitting) else 0
@@ -223,8 +217,8 @@ def check_limits(
     n_tones = offsets[1:] - offsets[:-1]
     if len(n_tones) and n_tones.max() > drive.max_tones:
         worst = int(n_tones.argmax())
-        what = f"the number of {AXES[axis]} tones in batch {batch[worst]}"
-        raise LimitError(what, n_tones[worst], drive.max_tones)
+        quantity = f"the number of {AXES[axis]} tones in batch {batch[worst]}"
+        raise LimitError(quantity, n_tones[worst], drive.max_tones)
     fault, tone, value = first_excess(offsets, values, drive.limits)
     if fault != WITHIN:
         segment = int(np.searchsorted(offsets, tone, side="right")) - 1
@@ -244,22 +238,29 @@ def _raise_limit_error(
     all_tones = f"{name} tones 0 to {n_tones - 1} {in_batch}" if n_tones > 1 else f"{name} tone 0 {in_batch}"
     if fault == BAND:
         low, high = (f"{hz / 1e6:.6g}" for hz in (rf.row_band_hz, rf.column_band_hz)[axis])
-        what, limit = f"the frequency of {name} tone {tone} {in_batch}", f"the band of {low} to {high} MHz"
-        raise LimitError(what, f"{value / 1e6:.6g} MHz", limit, setting=frequency)
+        quantity = f"the frequency of {name} tone {tone} {in_batch}"
+        limit = f"the band of {low} to {high} MHz"
+        raise LimitError(quantity, f"{value / 1e6:.6g} MHz", limit, setting=frequency)
     if fault == SPACING:
-        what = f"the distance of {name} tones {tone - 1} and {tone} {in_batch}"
+        quantity = f"the distance of {name} tones {tone - 1} and {tone} {in_batch}"
         least = format_quantity(rf.min_spacing_hz, "frequency")
         raise LimitError(
-            what, f"{value / 1e6:.6g} MHz", f"{least} at least, in the order of the sites", setting=frequency
+            quantity,
+            f"{value / 1e6:.6g} MHz",
+            f"{least} at least, in the order of the sites",
+            setting=frequency,
         )
     if fault == AMPLITUDES and rf.full_scale_v > rf.max_peak_v:
-        what, came = f"the peak voltage of {all_tones}", format_quantity(value * rf.full_scale_v, "voltage")
+        quantity = f"the peak voltage of {all_tones}"
+        amount = format_quantity(value * rf.full_scale_v, "voltage")
         limit = f"{format_quantity(rf.max_peak_v, 'voltage')}: more ruins the amplifier"
-        raise LimitError(what, came, limit, setting=rf_settings)
+        raise LimitError(quantity, amount, limit, setting=rf_settings)
     if fault == AMPLITUDES:
-        what = f"the sum of the amplitudes of {all_tones}"
-        raise LimitError(what, f"{value:.6g} of full scale", "1: the output would clip", setting=rf_settings)
+        quantity = f"the sum of the amplitudes of {all_tones}"
+        raise LimitError(
+            quantity, f"{value:.6g} of full scale", "1: the output would clip", setting=rf_settings
+        )
     power_w = value * rf.full_scale_power_w
     limit = f"{format_quantity(rf.max_mean_power_w, 'power')} at the AOD"
-    what = f"the mean RF power of {all_tones}"
-    raise LimitError(what, format_quantity(power_w, "power"), limit, setting=rf_settings)
+    quantity = f"the mean RF power of {all_tones}"
+    raise LimitError(quantity, format_quantity(power_w, "power"), limit, setting=rf_settings)
