@@ -147,7 +147,7 @@ class ClusterWorkers:
 
 
 def check_workers(n_workers: int | None, scheduler: str | None) -> None:
-    """Refuse a number of processes beside a cluster, and an address as :func:`check_address` does.
+    """Refuse a number of processes together with a cluster, and an address as :func:`check_address` does.
 
     Raises:
         ConfigError: It is refused.

@@ -129,7 +129,7 @@ def is_folder(path: Path) -> bool:
 
 
 def something_else(path: Path) -> str:
-    """What is at a path instead of a file: "this is a folder"; "" for a file, and if nothing is there."""
+    """The kind of thing at a path, "this is a folder"; "" for a file, and if nothing is there."""
     try:
         return _other_kind(path.stat().st_mode)
     except (OSError, ValueError):

@@ -36,7 +36,7 @@ BEAT_S: Final = 0.05
 WAITS_S: Final = 10.0
 """How long the heartbeat may be missing while a thread waits for a disk, swapped memory or a processor."""
 STUCK_S: Final = 10.0
-"""A run whose thread that takes the shots has neither waited nor got on for so long counts as dead."""
+"""A run counts as dead if its thread of shots has neither waited nor made progress for this long."""
 TERM_S: Final = 0.1
 """How long a run that hangs may take to end after SIGTERM; then comes SIGKILL."""
 NEXT_S: Final = 0.05
@@ -332,7 +332,7 @@ class Watchdog:
         log: File to which it adds a line for each device that it switches off; None for none.
         pulse: Progress of the thread that adds the first device; without any, the run counts as dead to the
             watchdog. None if there is no such thread.
-        lost: Receives why there is no watchdog any more; it has the run end.
+        lost: Called with the reason if no watchdog is left; it ends the run.
         may_end: Whether it may end this process to switch off a device that it cannot switch off otherwise.
     """
 
@@ -523,7 +523,7 @@ class Watchdog:
                 self._note("cannot be started again; the run ends")
                 with self._sending:
                     self._kill()  # without a heartbeat it would end the run before the devices are safe
-                self._lost("there is no watchdog any more that would switch the outputs off")
+                self._lost("no watchdog is left that would switch the outputs off")
                 return
 
     def _replace(self, why: str) -> bool:

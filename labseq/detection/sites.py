@@ -216,9 +216,11 @@ def _table(path: Path, shape: tuple[int, int]) -> Floats:
             if not np.isnan(positions[row, col, 0]):
                 raise ValueError(f"line {table.line_num} is of site ({row}, {col}), like an earlier line")
             positions[row, col] = place
-    left = np.argwhere(np.isnan(positions[..., 0]))
-    if len(left):
-        raise ValueError(f"{len(left)} sites are missing, ({left[0, 0]}, {left[0, 1]}) among them")
+    unplaced = np.argwhere(np.isnan(positions[..., 0]))
+    if len(unplaced):
+        raise ValueError(
+            f"{len(unplaced)} sites are missing, ({unplaced[0, 0]}, {unplaced[0, 1]}) among them"
+        )
     return positions
 
 

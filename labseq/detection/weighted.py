@@ -255,16 +255,16 @@ def evidence(sensor: WeightedSettings, darkest: float, brightest: float) -> Ligh
     log_p = _log_likelihoods(light, _log_responses(sensor.em_register, noise, n_most, signal))
     p = np.exp(log_p) * np.gradient(signal)
     p /= p.sum(axis=1, keepdims=True)
-    often = p.mean(axis=0)
+    frequency = p.mean(axis=0)
     ratio = log_p - log_p[0]
-    constant = ratio @ often
+    constant = ratio @ frequency
     ratio -= constant[:, None]
-    left, values, _ = np.linalg.svd(ratio * np.sqrt(often), full_matrices=False)
-    weight = left[:, 0] * values[0]
+    left_vectors, values, _ = np.linalg.svd(ratio * np.sqrt(frequency), full_matrices=False)
+    weight = left_vectors[:, 0] * values[0]
     curve = weight @ ratio / (weight @ weight)
-    zero, one = np.interp([0.0, 1.0], signal, curve)
-    constant += weight * zero
-    curve, weight = (curve - zero) / (one - zero), weight * (one - zero)
+    at_zero, at_one = np.interp([0.0, 1.0], signal, curve)
+    constant += weight * at_zero
+    curve, weight = (curve - at_zero) / (at_one - at_zero), weight * (at_one - at_zero)
     counts = (np.arange(65_536) - sensor.offset) / sensor.counts_per_photoelectron
     table = np.interp(counts, signal, curve).astype(np.float32)
     return LightLikelihood(light, weight, constant, p @ curve, table)

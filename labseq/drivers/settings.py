@@ -26,7 +26,7 @@ class RegionSettings(Settings):
 TRIGGERS: Final = ("software", "internal", "external", "external_start", "bulb")
 """All that may start exposures."""
 _ARMING_TIME: Final = (
-    "time from arming for a series until it can be triggered, for budgets; simulated cameras take so long"
+    "time from arming for a series until it can be triggered, for budgets; simulated cameras take this long"
 )
 
 

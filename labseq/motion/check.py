@@ -202,9 +202,7 @@ def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, plann
         expected, argument = "a MotionSpec as motion", motion
     else:
         return
-    raise InvalidPlanError(
-        "shape", f"{expected} was expected, {type(argument).__name__} came", planner=planner
-    )
+    raise InvalidPlanError("shape", f"expected {expected}, not {type(argument).__name__}", planner=planner)
 
 
 def _raise_plan_error(

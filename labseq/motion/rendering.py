@@ -380,7 +380,7 @@ def _prepare(
     axis, (first_sample, delta, length) = (program.row, program.column)[channel], times
     n_tones = len(axis.start_hz)
     tones, comb_hz = np.empty((N_FIELDS, n_tones)), np.zeros(3)
-    fault, where = survey(
+    fault, index = survey(
         axis.start_hz,
         axis.end_hz,
         axis.start_amplitude,
@@ -392,7 +392,7 @@ def _prepare(
         comb_hz,
     )
     if fault != FINE:
-        _refuse(fault, where, program, channel, sample_rate_hz)
+        _refuse(fault, index, program, channel, sample_rate_hz)
     spacing, lowest_hz, span_hz = comb_hz.tolist()
     comb = find_comb(spacing, lowest_hz, span_hz, sample_rate_hz)
     path, group = np.empty(len(length), np.int8), np.zeros(n_tones, np.int8)

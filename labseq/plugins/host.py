@@ -125,7 +125,7 @@ def plugin_name(path: Path) -> str:
 
 
 def advice(kind: str, name: str, file: Path | None) -> str:
-    """What to add so that a plugin in ``./plugins``, or beside the file that names it, is loaded; or "".
+    """The option or key that loads a plugin of ``./plugins``, or of that folder next to ``file``; or "".
 
     The plugin is found in the text of the folder's files; none of them is run.
     """

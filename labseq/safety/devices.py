@@ -140,13 +140,13 @@ def check_each_device(
     guard, watchdog = Guard(stop), Watchdog("labseq devices", pulse=stop.pulse)
     tried: list[CheckedDevice] = []
     if simulation is not None and not stop.is_set:
-        tried.append(_examined_simulation(guard, simulation, timeouts))
+        tried.append(_examine_simulation(guard, simulation, timeouts))
     try:
         for name, device in devices:
             if stop.is_set:
                 break
             try:
-                checked = _examined(guard, name, device, timeouts, watchdog)
+                checked = _examine(guard, name, device, timeouts, watchdog)
             finally:
                 with stop.held():
                     unsafe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
@@ -166,7 +166,7 @@ def check_each_device(
     return tried
 
 
-def _examined_simulation(guard: Guard, simulation: Simulation, timeouts: Timeouts) -> CheckedDevice:
+def _examine_simulation(guard: Guard, simulation: Simulation, timeouts: Timeouts) -> CheckedDevice:
     """Open and identify the simulation."""
     name = "simulation"
     try:
@@ -178,7 +178,7 @@ def _examined_simulation(guard: Guard, simulation: Simulation, timeouts: Timeout
         return CheckedDevice(name, failure=failure)
 
 
-def _examined(
+def _examine(
     guard: Guard, name: str, device: Hardware, timeouts: Timeouts, watchdog: Watchdog
 ) -> CheckedDevice:
     """Open, identify and test a device; stops at the first failure."""
@@ -192,7 +192,7 @@ def _examined(
             text = f"describe() gave a {type(described).__name__}; expected a mapping"
             raise DeviceError(name, text)
         checked = replace(checked, described=described)
-        checked = _versions_read(guard, checked, device, timeouts.call_s)
+        checked = _read_versions(guard, checked, device, timeouts.call_s)
         guard.call(name, timeouts.call_s, device.self_test)
         checked = replace(checked, tested=overrides(device, Hardware.self_test))
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
@@ -201,7 +201,7 @@ def _examined(
         return replace(checked, failure=failure)
 
 
-def _versions_read(guard: Guard, checked: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
+def _read_versions(guard: Guard, checked: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
     """Read the versions of a device; that this fails says nothing about whether the device works."""
 
     def versions() -> dict[str, tuple[str, str]]:

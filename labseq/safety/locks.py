@@ -49,7 +49,7 @@ def lock_devices(
     locks: list[Lock] = []
     with ExitStack() as stack:
         for identity, role in hardware.identities.items():
-            device = named(role, identity)
+            device = device_text(role, identity)
             lock = Lock(lock_file(identity), purpose)
             while True:
                 try:
@@ -96,7 +96,7 @@ def _beating(locks: Sequence[Lock]) -> Generator[None]:
         ended.set()
 
 
-def named(role: str, identity: str) -> str:
+def device_text(role: str, identity: str) -> str:
     """A device with what identifies it, for the user."""
     return role if identity.startswith(f"{role} ") else f"{role} ({identity})"
 

@@ -31,7 +31,7 @@ from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, find_dead_run, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
-from labseq.safety.locks import end_holders, lock_devices, named
+from labseq.safety.locks import device_text, end_holders, lock_devices
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import Timeouts, attempt, failure_of, open_device
 from labseq.watchdog import TRY_AGAIN_S, Hanging, Watchdog, watchdog_lines
@@ -222,17 +222,19 @@ def make_profile_safe(
     return replace(secured, problems=ConfigError(others) if others else None)
 
 
-def read_devices(profile: str, overrides: Sequence[str], found: ProblemCollector) -> ResolvedProfile:
+def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollector) -> ResolvedProfile:
     """Read a profile and choose its devices; errors are tolerated as long as some devices are usable."""
     for_profile = profile_overrides(overrides)
-    document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=found)
-    with found:
+    document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=problems)
+    with problems:
         plugin_paths(document, spec.plugin_folders)
     folders: list[Path] = []
     for folder in spec.plugin_folders:
         with suppress(ConfigError):  # reported already
             folders += plugin_paths(document, [folder])
-    return choose_plugins(document, spec, load_plugins(folders, found, spec.timeouts.load), "off", found)
+    return choose_plugins(
+        document, spec, load_plugins(folders, problems, spec.timeouts.load), "off", problems
+    )
 
 
 FIRST_S: Final = 0.5
@@ -263,7 +265,7 @@ def stand_by(
     if not identities:
         text = "all of its devices are simulated, and those are not locked; there is nothing to stand by for"
         raise ConfigError(f"{hardware.document.path}: {text}")
-    devices = ", ".join(named(role, identity) for identity, role in identities.items())
+    devices = ", ".join(device_text(role, identity) for identity, role in identities.items())
     watch = _DeviceWatch(identities)
     with stop_on_signals(stop), suppress(StopRequested):
         tell(f"standing by for {devices}; Ctrl-C ends this")

@@ -96,7 +96,7 @@ def test_linked_batches_count_as_one() -> None:
     [
         (ValueError("odd"), "plan() raised ValueError: odd"),
         (RuntimeError(), "plan() raised RuntimeError"),
-        (None, "makes one) was expected, NoneType came"),
+        (None, "makes one), not NoneType"),
         (Plan.from_batches([([(0, 0)], [(0, 1)])]), "breaks the rule 'goal'"),
     ],
 )

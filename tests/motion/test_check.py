@@ -208,14 +208,14 @@ class TestShape:
     PLAN = Plan.from_batches([])
 
     def test_what_is_no_plan(self) -> None:
-        with pytest.raises(InvalidPlanError, match=r"'shape': a Plan .* list"):
+        with pytest.raises(InvalidPlanError, match=r"'shape': expected a Plan .* list"):
             check_plan([], grid_of("#."), self.TARGET, 1)  # pyright: ignore[reportArgumentType]
 
     @pytest.mark.parametrize(
         ("given", "message"),
         [
-            ({"target": grid_of("#.")}, "'shape': a TargetPattern as target .* ndarray"),
-            ({"grid": (1, 2)}, "'shape': a SiteGrid as grid .* tuple"),
+            ({"target": grid_of("#.")}, "'shape': expected a TargetPattern as target, not ndarray"),
+            ({"grid": (1, 2)}, "'shape': expected a SiteGrid as grid, not tuple"),
         ],
     )
     def test_arguments_that_were_mixed_up(self, given: dict[str, Any], message: str) -> None:

@@ -60,7 +60,7 @@ def test_a_run_whose_watchdog_cannot_be_replaced_ends_safely(lab: Lamps) -> None
         os.kill(lab.watchdog, signal.SIGKILL)
         assert run.wait(60.0) == 3
         assert not lab.is_on
-    assert "watchdog: there is no watchdog any more" in lab.output
+    assert "watchdog: no watchdog is left" in lab.output
 
 
 def test_a_served_device_whose_safe_state_fails_is_switched_off_and_stays_known(lab: Lamps) -> None:
