@@ -151,9 +151,13 @@ def stripped(text: str) -> str:
 
 
 def without_numbers(text: str) -> str:
-    """Text with ``#`` for each number and each id, and one space for many."""
-    ids_gone = re.sub(r"\b[0-9a-f]{12}\b", "#", stripped(text))
-    return re.sub(r"[ ]+", " ", re.sub(r"-?\d[\d.]*(e-?\d+)?(\(\d+\))?", "#", ids_gone))
+    """Text with ``#`` for each number and each id, and one space for many.
+
+    A time loses its prefix, too: a slow computer answers in ``1.2 ms`` where the page shows ``35 us``.
+    """
+    text = re.sub(r"\b[0-9a-f]{12}\b", "#", stripped(text))
+    text = re.sub(r"-?\d[\d.]*(e-?\d+)?(\(\d+\))?", "#", text)
+    return re.sub(r"[ ]+", " ", re.sub(r"# [mun]s\b", "# s", text))
 
 
 def labseq(arguments: list[str], piped: str = "") -> tuple[int, str, str]:

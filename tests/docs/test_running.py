@@ -60,10 +60,13 @@ def test_python_that_fails_is_named_with_its_place() -> None:
         ("a  -3e-4   b", "numbers differ", True),
         ("a 1.5(2) b\nid 1", "", False),
         ("id 0123456789ab", "numbers differ", True),
+        ("took 35 us", "numbers differ", True),
     ],
 )
 def test_what_is_shown_is_compared(shown: str, how: str, is_right: bool) -> None:
-    code = block("python", "print('first'); print('a 1.5(2) b'); print('id fedcba987654')\n")
+    code = block(
+        "python", "print('first'); print('a 1.5(2) b'); print('id fedcba987654'); print('took 1.2 ms')\n"
+    )
     if is_right:
         read(code, block("text", f"{shown}\n", output=how))
     else:
