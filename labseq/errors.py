@@ -140,10 +140,10 @@ class ProblemCollector:
 
 
 @contextmanager
-def collecting(found: ProblemCollector | None) -> Generator[ProblemCollector]:
-    """Collect problems in ``found``; without it, raise all of the block when it ends."""
-    if found is not None:
-        yield found
+def collecting(problems: ProblemCollector | None) -> Generator[ProblemCollector]:
+    """Collect the problems of a block for the caller; without a collector, raise them all when it ends."""
+    if problems is not None:
+        yield problems
         return
     collector = ProblemCollector()
     try:

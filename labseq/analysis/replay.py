@@ -22,7 +22,7 @@ from labseq.assembly.points import Point
 from labseq.assembly.recorded import calibrations_of, files_of, machine_of
 from labseq.config.addresses import Override, split_overrides
 from labseq.data import Run, Shot
-from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, collecting
 from labseq.guard import Guard
 from labseq.messages import clean, format_error
 from labseq.model import (
@@ -353,7 +353,8 @@ class _Replayer:
         if not options:
             return own
         assert own.document is not None
-        document = own.document.override_all(options, may_add=(kind,))
+        with collecting(None) as problems:
+            document = own.document.override_all(options, problems, may_add=(kind,))
         return resolve(self._host, document, kind, document.validate(Choice, (kind,)).placed(kind))
 
 

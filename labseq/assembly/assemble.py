@@ -191,14 +191,18 @@ def assemble(
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(options.overrides)
     profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
-    found = ProblemCollector()
+    problems = ProblemCollector()
     try:
         document, sequence, scan = load_sequence(
-            sequence_path, [*options.own(), *for_sequence], profile_set=profile_set, found=found, kept=kept
+            sequence_path,
+            [*options.own(), *for_sequence],
+            profile_set=profile_set,
+            problems=problems,
+            kept=kept,
         )
     except ConfigError as error:
-        raise found.stop(error) from None
-    scan = None if found.problems else scan
+        raise problems.stop(error) from None
+    scan = None if problems.problems else scan
     try:
         hardware = resolve_profile(
             sequence.profile if profile is None else profile,
@@ -208,13 +212,13 @@ def assemble(
             named_in=document if profile is None else None,
             plugin_folders=plugin_paths(document, sequence.plugin_folders),
             scan=scan,
-            found=found,
+            problems=problems,
             recorded=recorded,
         )
     except ConfigError as error:
-        _check_alone(document, sequence, found)
-        raise _explained(found.stop(error), scan) from None
-    return _assembled(document, sequence, hardware, scan, found)
+        _check_alone(document, sequence, problems)
+        raise _explained(problems.stop(error), scan) from None
+    return _assembled(document, sequence, hardware, scan, problems)
 
 
 def assemble_recorded(recorded: RecordedFiles, options: Options) -> Assembly:
@@ -228,28 +232,28 @@ def _assembled(
     sequence: SequenceSpec,
     hardware: ResolvedProfile,
     scan: Scan | None,
-    found: ProblemCollector,
+    problems: ProblemCollector,
 ) -> Assembly:
     """Make the target, planner, steps and analyses of a sequence on its profile."""
-    is_whole = not found.problems
+    is_whole = not problems.problems
     made: dict[str, Any] = {}
-    with found:
+    with problems:
         made["target"], made["target_dump"] = make_target(hardware, document, sequence)
-    with found:
+    with problems:
         made["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
-    steps, step_dumps = make_steps(hardware, document, sequence, found)
-    analyses, results = make_analyses(hardware, document, sequence, found)
-    policy = make_policy(document, sequence, steps, results, found)
+    steps, step_dumps = make_steps(hardware, document, sequence, problems)
+    analyses, results = make_analyses(hardware, document, sequence, problems)
+    policy = make_policy(document, sequence, steps, results, problems)
     scanned: ScanPoints | None = None
     search: Search | None = None
     try:
         if scan is not None and is_whole:
             scan = scan.bound(hardware.document)
             scanned = ScanPoints(scan, document, sequence, hardware)
-            scanned.check(found)
-            if isinstance(scan, AdaptiveScan) and not found.problems:
-                search = make_search(scan, scanned, steps, results, found)
-        found.raise_any()
+            scanned.check(problems)
+            if isinstance(scan, AdaptiveScan) and not problems.problems:
+                search = make_search(scan, scanned, steps, results, problems)
+        problems.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
     target, planner = made["target"], made["planner"]
@@ -271,18 +275,19 @@ def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
     return error if scan is None else scan.explained(error)
 
 
-def _check_alone(document: Document, sequence: SequenceSpec, found: ProblemCollector) -> None:
+def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCollector) -> None:
     """Check the settings in a sequence whose profile has errors, except for plugins from plugin folders."""
-    host = load_plugins(found=found)
-    for kind, choice in (("pattern", sequence.target), ("planner", sequence.planner)):
-        if choice is not None and host.registry.find(kind, choice.use) is not None:
-            with found:
-                resolve(host, document, kind, choice)
-    for spec in sequence.shot:
-        entry = host.registry.find("step", spec.kind)
-        if entry is not None:
-            with found:
-                validate(document, entry, spec.loc)
+    with problems:
+        host = load_plugins()
+        for kind, choice in (("pattern", sequence.target), ("planner", sequence.planner)):
+            if choice is not None and host.registry.find(kind, choice.use) is not None:
+                with problems:
+                    resolve(host, document, kind, choice)
+        for spec in sequence.shot:
+            entry = host.registry.find("step", spec.kind)
+            if entry is not None:
+                with problems:
+                    validate(document, entry, spec.loc)
 
 
 def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
@@ -336,7 +341,7 @@ def make_target(
 
 
 def make_steps(
-    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
+    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, problems: ProblemCollector
 ) -> tuple[list[tuple[str, Step]], list[dict[str, Any]]]:
     """Name and step, in order, and the settings of each for the record."""
     steps: list[tuple[str, Step]] = []
@@ -344,7 +349,7 @@ def make_steps(
     image_seen = False
     for spec in sequence.shot:
         step: Step | None = None
-        with found:
+        with problems:
             step, dumped = make_step(hardware, document, spec)
             steps.append((spec.name or spec.kind, step))
             dumps.append({spec.kind: dumped, **({"name": spec.name} if spec.name else {})})
@@ -360,7 +365,7 @@ def make_steps(
 
 
 def make_analyses(
-    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, found: ProblemCollector
+    hardware: ResolvedProfile, document: Document, sequence: SequenceSpec, problems: ProblemCollector
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """The settings of each analysis of the sequence, for the record, and the names of its results.
 
@@ -370,7 +375,7 @@ def make_analyses(
     results: list[str] = []
     for choice in sequence.analysis:
         prefix, made = f"{PREFIX}{choice.use}.", None
-        with found:
+        with problems:
             chosen = resolve(hardware.host, document, "analysis", choice)
             context = Context(choice.use, hardware.grid, hardware.motion, calibrations=hardware.calibrations)
             made = construct_one(chosen, context)

@@ -69,7 +69,7 @@ def open_store(profile: str, dry_run: DryRun = "off") -> tuple[Store, ProfileSpe
 def calibrated(
     document: Document,
     profile: ProfileSpec,
-    found: ProblemCollector,
+    problems: ProblemCollector,
     dry_run: DryRun = "off",
     detector: Mapping[str, Any] | None = None,
     pins: Mapping[str, str] | None = None,
@@ -77,7 +77,7 @@ def calibrated(
     """Read the calibrations that a profile uses, and apply those of the tones.
 
     Args:
-        found: Receives the problems; a calibration that has one is not used.
+        problems: Receives the problems; a calibration that has one is not used.
         detector: Settings of the detector in use, for the record; None if they do not matter.
         pins: Kind -> id of the only calibrations to use; None for those of profile and store.
     """
@@ -87,10 +87,10 @@ def calibrated(
         try:
             store.active()
         except ConfigError as error:  # reported once, not for each kind
-            found.add(error)
+            problems.add(error)
             return ActiveCalibrations(entries, grid)
     for kind in CALIBRATION_KINDS:
-        with found:
+        with problems:
             if pins is None:
                 stored = _chosen(document, profile, store, kind)
             else:
@@ -100,7 +100,7 @@ def calibrated(
                 entries[kind] = stored.entry
     warnings = [*_dropped(entries), *_doubtful(entries, detector or {})]
     tones = grid
-    with found:
+    with problems:
         tones = _with_tones(document, grid, entries)
     return ActiveCalibrations(entries, tones, tuple(warnings))
 
@@ -111,9 +111,9 @@ def calibrated_machine(document: Document, profile: ProfileSpec) -> tuple[SiteGr
     Raises:
         ConfigError: A calibration in use is missing or damaged.
     """
-    found = ProblemCollector()
-    active = calibrated(document, profile, found)
-    found.raise_any()
+    problems = ProblemCollector()
+    active = calibrated(document, profile, problems)
+    problems.raise_any()
     return active.grid, with_calibrations(profile.motion, active.entries)
 
 

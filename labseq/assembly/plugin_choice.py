@@ -19,9 +19,7 @@ from labseq.errors import (
     Loc,
     PluginLoadError,
     Problem,
-    ProblemCollector,
     UnknownPluginError,
-    collecting,
     one_of,
 )
 from labseq.messages import clean
@@ -239,14 +237,11 @@ def _defaults(entry: Entry) -> Settings | None:
     return entry.settings_model() if entry.settings_model is not None else None
 
 
-def load_plugins(
-    folders: Sequence[Path] = (), found: ProblemCollector | None = None, max_wait_s: float = LOAD_S
-) -> PluginHost:
+def load_plugins(folders: Sequence[Path] = (), max_wait_s: float = LOAD_S) -> PluginHost:
     """Load labseq's own, the installed and the folders' plugins; every command finds them by this function.
 
     Args:
         folders: The folders that profile and sequence name; --plugins and LABSEQ_PLUGIN_PATH are added.
-        found: Receives the problem of an unreadable folder; without it, it is raised.
         max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
 
     Raises:
@@ -255,8 +250,7 @@ def load_plugins(
     host = PluginHost(max_wait_s)
     host.load_builtin(builtins)
     host.load_entry_points()
-    with collecting(found) as problems, problems:
-        host.load_folders(folders)
+    host.load_folders(folders)
     return host
 
 

@@ -81,27 +81,27 @@ class ScanPoints:
     hardware: ResolvedProfile
     _known: dict[Any, Any] = field(default_factory=dict[Any, Any], repr=False)
 
-    def check(self, found: ProblemCollector) -> None:
+    def check(self, problems: ProblemCollector) -> None:
         """Validate the settings at every point; of an adaptive scan, at the corners of its ranges.
 
         Args:
-            found: Receives the problems; after :data:`MAX_PROBLEMS` no further point is tried.
+            problems: Receives the problems; after :data:`MAX_PROBLEMS` no further point is tried.
         """
         try:
             self._check_dependents()
         except ConfigError as error:
-            found.add(error)
+            problems.add(error)
             return
-        known = set(self.scan.explained(ConfigError(found.problems)).problems)
-        n_before = len(found.problems)
+        known = set(self.scan.explained(ConfigError(problems.problems)).problems)
+        n_before = len(problems.problems)
         for number in range(math.prod(self.scan.shape)):
             try:
                 self.at(number)
             except ConfigError as error:
                 new = [one for one in self.scan.explained(error).problems if one not in known]
                 known.update(new)
-                found.problems += new
-            if len(found.problems) >= n_before + MAX_PROBLEMS:
+                problems.problems += new
+            if len(problems.problems) >= n_before + MAX_PROBLEMS:
                 return
 
     def at(self, number: int) -> Point:
@@ -118,13 +118,13 @@ class ScanPoints:
         Raises:
             ConfigError: All that plugins refuse of the values.
         """
-        found, hardware, made = ProblemCollector(), self.hardware, dict[Loc, Made[Any]]()
+        problems, hardware, made = ProblemCollector(), self.hardware, dict[Loc, Made[Any]]()
         document = put(values, self.document, profile=False)
-        with found:
+        with problems:
             hardware = self._profile_with(values)
-        with found:
+        with problems:
             made = self._planner_and_steps(document)
-        found.raise_any()
+        problems.raise_any()
         parameters: dict[str, Any] = {}
         for axis, node in values:
             value = _setting(made, hardware, axis.of_profile, axis.loc)
@@ -169,12 +169,12 @@ class ScanPoints:
         Raises:
             ConfigError: All that they refuse.
         """
-        found, made = ProblemCollector(), dict[Loc, Made[Any]]()
+        problems, made = ProblemCollector(), dict[Loc, Made[Any]]()
         for loc in (_PLANNER, *(spec.loc for spec in self.sequence.shot)):
-            with found:
+            with problems:
                 key = loc, json.dumps(document.get(loc))
                 made[loc] = self._once(key, partial(self._make, document, loc))
-        found.raise_any()
+        problems.raise_any()
         return made
 
     def _profile_with(self, values: Sequence[tuple[Axis, Node]]) -> ResolvedProfile:
@@ -209,8 +209,8 @@ class ScanPoints:
     def _dependents(self, axis: Axis) -> list[Loc]:
         """The settings with an expression that depends on an axis."""
         expressions = (self.hardware.document if axis.of_profile else self.document).expressions
-        found = [] if expressions is None else expressions.following(axis.loc)
-        return [loc for loc in found if loc[0] != VARIABLES]
+        locs = [] if expressions is None else expressions.following(axis.loc)
+        return [loc for loc in locs if loc[0] != VARIABLES]
 
     def _check_dependents(self) -> None:
         """Raise for an axis that changes no setting, or a setting that must be the same in the whole run."""

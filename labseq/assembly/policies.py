@@ -83,29 +83,29 @@ def make_policy(
     sequence: SequenceSpec,
     steps: Sequence[tuple[str, Step]],
     results: Collection[str],
-    found: ProblemCollector,
+    problems: ProblemCollector,
 ) -> RunPolicy:
     """The policies of a run and its steps."""
     own = sequence.policy
     otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
     policies = [StepPolicy()] * len(sequence.shot)
     for number, spec in enumerate(sequence.shot):
-        with found:
+        with problems:
             policies[number] = _step_policy(document, spec, otherwise)
     is_whole = len(steps) == len(sequence.shot)
     for number, (spec, policy) in enumerate(zip(sequence.shot, policies, strict=True)):
         if is_whole and policy.retries and not steps[number][1].repeatable:
             what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
             hint = "write 'on_failure: repeat_shot'"
-            found.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
+            problems.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
     for number, check in enumerate(own.checks):
         place = "policy", "checks", number
-        with found:
+        with problems:
             checked = steps if is_whole else None
             check_quantity(document, (*place, "value"), check.value, "to check", checked, results)
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
-            found.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
+            problems.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
     return RunPolicy(sequence.attempts, own.when_exhausted, otherwise, tuple(policies))
 
 
@@ -113,12 +113,12 @@ def with_policies(
     document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """The settings of the steps for the record, each with its policy."""
-    found = [dict(dumped) for dumped in dumps]
-    for spec, dumped in zip(sequence.shot, found, strict=True):
+    steps = [dict(dumped) for dumped in dumps]
+    for spec, dumped in zip(sequence.shot, steps, strict=True):
         if document.root.at(spec.policy_loc) is not None:
             own = document.validate(StepPolicySettings, spec.policy_loc)
             dumped["policy"] = own.model_dump(mode="json", exclude_unset=True)
-    return found
+    return steps
 
 
 def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:

@@ -84,10 +84,10 @@ class ResolvedProfile:
 
     def dump(self, name: str) -> dict[str, Any]:
         """The settings of a role or device for the record, SI, JSON-ready."""
-        found = self.chosen[name].dump()
+        settings = self.chosen[name].dump()
         if name == "mobile_tweezers":
-            found |= self.profile.mobile_tweezers.model_dump(mode="json", exclude={"use"})
-        return found
+            settings |= self.profile.mobile_tweezers.model_dump(mode="json", exclude={"use"})
+        return settings
 
     def changed(self, document: Document) -> ResolvedProfile:
         """The profile with other settings of its plugins; drivers, grid and calibrations stay the same.
@@ -98,12 +98,12 @@ class ResolvedProfile:
         Raises:
             ConfigError: All that is wrong with them.
         """
-        found, chosen, profile = ProblemCollector(), dict(self.chosen), self.profile
+        problems, chosen, profile = ProblemCollector(), dict(self.chosen), self.profile
         for role, choice in {**profile.choices, **profile.devices}.items():
             loc = choice.loc
             if document.get(loc) == self.document.get(loc):
                 continue
-            with found:
+            with problems:
                 own = document.validate(type(choice), loc).placed(*loc)
                 kind = kind_of(role, own)
                 if ROLES[kind].is_hardware and own.use != choice.use:
@@ -116,7 +116,7 @@ class ResolvedProfile:
                 chosen[role] = one
                 if isinstance(own, MobileTweezersChoice):
                     profile = profile.model_copy(update={"mobile_tweezers": own})
-        found.raise_any()
+        problems.raise_any()
         return replace(self, document=document, profile=profile, chosen=chosen)
 
     @property
@@ -138,7 +138,7 @@ class ResolvedProfile:
         return self.dry_run != "off" or all(one.virtual_time for one in hardware)
 
 
-def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: ProblemCollector) -> None:
+def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problems: ProblemCollector) -> None:
     """Find lines that are on during unknown steps."""
     if spec.lines is None:
         return
@@ -149,7 +149,7 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, found: 
             if kind not in known:
                 loc = ("lines", "channels", name, "on", place)
                 hint = did_you_mean(kind, known)
-                found.add(
+                problems.add(
                     document.error(loc, f"there is no kind of step '{clean(kind)}'", one_of(known), hint)
                 )
 
@@ -158,13 +158,13 @@ def _takes_time(host: PluginHost, step: str) -> bool:
     return bool(getattr(host.registry.get("step", step).factory, "takes_time", True))
 
 
-def check_dead_time(document: Document, spec: ProfileSpec, found: ProblemCollector) -> None:
+def check_dead_time(document: Document, spec: ProfileSpec, problems: ProblemCollector) -> None:
     """Find a dead time before each batch of tweezers that are not virtual: they would play it as silence."""
     mobile = spec.mobile_tweezers
     if mobile.motion.overhead_per_batch_s and not mobile.use.startswith(VIRTUAL_TWIN):
         what = f"a dead time before each batch is set for '{clean(mobile.use)}', which would play silence"
         expected = "none: batches follow each other, and only `use: virtual` models a setup that cannot do so"
-        found.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))
+        problems.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))
 
 
 def resolve_profile(
@@ -176,7 +176,7 @@ def resolve_profile(
     named_in: Document | None = None,
     plugin_folders: Sequence[Path] = (),
     scan: Scan | None = None,
-    found: ProblemCollector | None = None,
+    problems: ProblemCollector | None = None,
     recorded: RecordedFiles | None = None,
 ) -> ResolvedProfile:
     """Read a profile, load the plugins and choose the plugin of each role.
@@ -184,7 +184,7 @@ def resolve_profile(
     Args:
         named_in: The sequence that names the profile, for messages.
         plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
-        found: Receives the problems of a readable profile; without it they are raised.
+        problems: Receives those of a readable profile; without it they are raised.
         recorded: The profile's text and calibrations, of a run that began earlier.
 
     Raises:
@@ -197,14 +197,14 @@ def resolve_profile(
         overrides=overrides,
         named_in=named_in,
         scan=scan,
-        found=found,
+        problems=problems,
         kept=None if recorded is None else recorded.profile,
     )
     folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
     host = load_plugins(folders, max_wait_s=spec.timeouts.load)
     pins = None if recorded is None else recorded.calibrations
-    with collecting(found) as problems:
-        return choose_plugins(document, spec, host, dry_run, problems, pins)
+    with collecting(problems) as collector:
+        return choose_plugins(document, spec, host, dry_run, collector, pins)
 
 
 def choose_plugins(
@@ -212,7 +212,7 @@ def choose_plugins(
     spec: ProfileSpec,
     host: PluginHost,
     dry_run: DryRun,
-    found: ProblemCollector,
+    problems: ProblemCollector,
     calibrations: Mapping[str, str] | None = None,
 ) -> ResolvedProfile:
     """Choose the plugin of each role of a profile.
@@ -221,7 +221,7 @@ def choose_plugins(
         spec: Its content, with fallbacks for wrong values.
         calibrations: Kind -> id of the active ones; None for those chosen by profile and store.
     """
-    repaired = bool(found.problems)
+    repaired = bool(problems.problems)
     chosen: dict[str, ChosenPlugin] = {}
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
@@ -234,14 +234,14 @@ def choose_plugins(
             warnings += [f"{role}: {warning}"] if warning else []
         except ConfigError as error:
             refused[role] = error
-            found.add(error)
-    check_kinds(document, spec, host, found)
-    check_dead_time(document, spec, found)
+            problems.add(error)
+    check_kinds(document, spec, host, problems)
+    check_dead_time(document, spec, problems)
     detector = chosen["detector"].dump() if "detector" in chosen else {}
     made = (
         ActiveCalibrations({}, spec.grid_model())
         if repaired
-        else calibrated(document, spec, found, dry_run, detector, calibrations)
+        else calibrated(document, spec, problems, dry_run, detector, calibrations)
     )
     warnings += made.warnings
     return ResolvedProfile(

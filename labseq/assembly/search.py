@@ -154,7 +154,7 @@ def make_search(
     corners: ScanPoints,
     steps: Sequence[tuple[str, Step]],
     results: Collection[str],
-    found: ProblemCollector,
+    problems: ProblemCollector,
 ) -> Search | None:
     """Choose and check the scanner of a scan; None if there is a problem.
 
@@ -165,23 +165,23 @@ def make_search(
         corners: The corners of its ranges, checked.
         results: Names of the results of the analyses, see :func:`labseq.assembly.policies.check_quantity`.
     """
-    n_before, document, choice = len(found.problems), corners.document, scan.choice
-    with found:
+    n_before, document, choice = len(problems.problems), corners.document, scan.choice
+    with problems:
         check_quantity(document, choice.aim, choice.quantity, TO_OPTIMISE, steps, results)
     chosen: ChosenPlugin | None = None
-    with found:
+    with problems:
         chosen = resolve(corners.hardware.host, document, "scanner", choice)
     low = corners.at(0).parameters
     high = corners.at(math.prod(scan.shape) - 1).parameters
     ranges: list[ScanRange] = []
     for axis in scan.ranges:
-        with found:
+        with problems:
             resolved = low[axis.address], high[axis.address]
             ranges.append(_range(axis, resolved, corners.present(axis)))
-    if chosen is None or len(found.problems) > n_before:
+    if chosen is None or len(problems.problems) > n_before:
         return None
     search = Search(scan, corners, chosen, tuple(ranges))
-    with found:
+    with problems:
         search.make_scanner(0)
     return search
 

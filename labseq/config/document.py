@@ -178,30 +178,28 @@ class Document:
         """
         paths = [override.address.split(".") for override in overrides]
         parents = {".".join(path[:n]) for path in paths for n in range(1, len(path))}
-        return cls.parse("{}", called).override_all(overrides, may_add=parents)
+        with collecting(None) as problems:
+            return cls.parse("{}", called).override_all(overrides, problems, may_add=parents)
 
     def override_all(
         self,
         overrides: Iterable[Override | tuple[str, str]],
+        problems: ProblemCollector,
         *,
         may_add: Collection[str] = (),
-        found: ProblemCollector | None = None,
     ) -> Document:
         """A copy with several values replaced, in order; see :meth:`override`.
 
         Args:
+            problems: Receives those of overrides that cannot be applied.
             may_add: Addresses of mappings that are added if the file has none.
-
-        Raises:
-            ConfigError: All the overrides that cannot be applied.
         """
         document = self
-        with collecting(found) as problems:
-            for override in (Override(*pair) for pair in overrides):
-                with problems:
-                    document = document.override(
-                        override.address, override.value, override.source, may_add=may_add
-                    )
+        for override in (Override(*pair) for pair in overrides):
+            with problems:
+                document = document.override(
+                    override.address, override.value, override.source, may_add=may_add
+                )
         return document
 
     def validate(
@@ -281,13 +279,14 @@ class FallbackValues:
 
 
 def load_checked(
-    document: Document, model: type[M], called: str, fallbacks: FallbackValues, found: ProblemCollector | None
+    document: Document, model: type[M], called: str, fallbacks: FallbackValues, problems: ProblemCollector
 ) -> tuple[Document, M]:
-    """Validate a whole file; if problems are collected, continue with fallbacks for wrong values.
+    """Validate a whole file, and continue with fallbacks for wrong values.
 
     Args:
         model: The settings model of the whole file.
         fallbacks: Values that replace invalid ones.
+        problems: Receives those of the file.
 
     Raises:
         ConfigError: The file has errors, and its other values cannot be checked.
@@ -295,14 +294,12 @@ def load_checked(
     try:
         return document, document.validate(model, called=called)
     except ConfigError as error:
-        if found is None:
-            raise
         repaired = _without_wrong_values(document, model, fallbacks)
         # Without these two, plugins would count as unknown, and the target would not match the grid.
         if any(repaired.get((key,)) != document.get((key,)) for key in ("plugin_folders", "profile")):
             raise
         spec = repaired.validate(model, called=called)
-        found.add(error)
+        problems.add(error)
         return repaired, spec
 
 

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 from labseq.config.addresses import MAY_ADD, ROLES, Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
 from labseq.config.find import find_profile
-from labseq.errors import ProblemCollector
+from labseq.errors import ProblemCollector, collecting
 from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, FrequencyComb, MotionSpec, SiteGrid
 from labseq.model.lines import LineSpec
@@ -485,7 +485,7 @@ def load_profile(
     overrides: Sequence[Override | tuple[str, str]] = (),
     named_in: Document | None = None,
     scan: Scan | None = None,
-    found: ProblemCollector | None = None,
+    problems: ProblemCollector | None = None,
     kept: StoredText | None = None,
 ) -> tuple[Document, ProfileSpec]:
     """Find and read a hardware profile.
@@ -505,9 +505,10 @@ def load_profile(
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]
-    document = document.override_all(placed, may_add=MAY_ADD, found=found).evaluated()
-    document = document if scan is None else scan.bound(document).at_first_point(document, profile=True)
-    return load_checked(document, ProfileSpec, "a hardware profile", _FALLBACKS, found)
+    with collecting(problems) as collector:
+        document = document.override_all(placed, collector, may_add=MAY_ADD).evaluated()
+        document = document if scan is None else scan.bound(document).at_first_point(document, profile=True)
+        return load_checked(document, ProfileSpec, "a hardware profile", _FALLBACKS, collector)
 
 
 def _of_profile(override: Override) -> Override:

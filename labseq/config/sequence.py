@@ -245,7 +245,7 @@ def load_sequence(
     overrides: Sequence[Override | tuple[str, str]] = (),
     *,
     profile_set: Sequence[Override] = (),
-    found: ProblemCollector | None = None,
+    problems: ProblemCollector | None = None,
     kept: StoredText | None = None,
 ) -> tuple[Document, SequenceSpec, Scan | None]:
     """Read a sequence file.
@@ -265,23 +265,23 @@ def load_sequence(
     check_kind(document, "sequence")
     if document.data.get("planner") is None:
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
-    with collecting(found) as problems:
-        document = document.override_all(overrides, may_add=("policy",), found=problems).evaluated()
+    with collecting(problems) as collector:
+        document = document.override_all(overrides, collector, may_add=("policy",)).evaluated()
         document, scan = _at_first_point(
-            document, [Override(*pair) for pair in overrides], profile_set, problems
+            document, [Override(*pair) for pair in overrides], profile_set, collector
         )
-    return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, found), scan
+        return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, collector), scan
 
 
 def _at_first_point(
     document: Document,
     overrides: Sequence[Override],
     profile_set: Sequence[Override],
-    found: ProblemCollector,
+    problems: ProblemCollector,
 ) -> tuple[Document, Scan | None]:
     """A copy with the values of the first point and with ``shots`` from the scan; and the scan."""
     scan: Scan | None = None
-    with found:
+    with problems:
         scan = read_scan(document, [*overrides, *profile_set])
     if scan is None:  # there is no scan, or it has an error
         return document if document.data.get("scan") is None else _without_scan(document), None
@@ -293,7 +293,7 @@ def _at_first_point(
         what = f"shots is {shots}, but the scan has {scan.n_points} x {scan.repeats} = {n_shots}"
         expected = f"at most {n_shots}" if is_option else ""
         hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
-        found.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
+        problems.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
     return scan.at_first_point(document, profile=False), scan
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, NoReturn, TypeAlias, cast
@@ -90,14 +90,12 @@ class Node:
             return [child.plain() for child in self.value]
         return self.value
 
-    def leaves(self, loc: Loc = ()) -> Iterator[tuple[Loc, Node]]:
+    def leaves(self, loc: Loc = ()) -> list[tuple[Loc, Node]]:
         """All scalars in it, each with its location."""
-        if isinstance(self.value, dict | list):
-            steps = self.value.items() if isinstance(self.value, dict) else enumerate(self.value)
-            for step, child in steps:
-                yield from child.leaves((*loc, step))
-        else:
-            yield loc, self
+        if not isinstance(self.value, dict | list):
+            return [(loc, self)]
+        steps = self.value.items() if isinstance(self.value, dict) else enumerate(self.value)
+        return [leaf for step, child in steps for leaf in child.leaves((*loc, step))]
 
     def child(self, step: str | int) -> Node | None:
         """The value of a key or of a list index; None if it is missing."""

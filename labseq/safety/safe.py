@@ -225,16 +225,14 @@ def make_profile_safe(
 def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollector) -> ResolvedProfile:
     """Read a profile and choose its devices; errors are tolerated as long as some devices are usable."""
     for_profile = profile_overrides(overrides)
-    document, spec = load_profile(profile, beside=Path(), overrides=for_profile, found=problems)
+    document, spec = load_profile(profile, beside=Path(), overrides=for_profile, problems=problems)
     with problems:
         plugin_paths(document, spec.plugin_folders)
     folders: list[Path] = []
     for folder in spec.plugin_folders:
         with suppress(ConfigError):  # reported already
             folders += plugin_paths(document, [folder])
-    return choose_plugins(
-        document, spec, load_plugins(folders, problems, spec.timeouts.load), "off", problems
-    )
+    return choose_plugins(document, spec, load_plugins(folders, spec.timeouts.load), "off", problems)
 
 
 FIRST_S: Final = 0.5

@@ -126,4 +126,5 @@ def _summary(reports: Sequence[PlanReport]) -> Rehearsal:
     firsts = np.array(
         [float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0 for report in reports]
     )
-    return Rehearsal(len(reports), sum(report.meets_target for report in reports), durations, firsts)
+    n_met = sum(report.meets_target for report in reports)
+    return Rehearsal(len(reports), n_met, durations, firsts)
