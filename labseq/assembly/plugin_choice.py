@@ -258,13 +258,12 @@ def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
     """Construct the object of one role; a scanner receives the ranges that it may choose from.
 
     Raises:
-        ConfigError: Its constructor refuses its settings; with their place.
-        PluginLoadError: Its constructor raised, or made no object of that role; names the plugin.
+        ConfigError: Its constructor refuses its settings, raised, or made no object of that role; with their
+            place, and the name of the plugin.
     """
-    entry = chosen.entry
     try:
-        return construct_role(entry, chosen.settings, context)
-    except (ConfigError, LimitError) as error:
+        return construct_role(chosen.entry, chosen.settings, context)
+    except (ConfigError, LimitError, PluginLoadError) as error:
         raise chosen.placed(error) from error
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.errors import ConfigError, PluginLoadError
+from labseq.errors import ConfigError
 from labseq.session.check import check
 
 ROOT = Path(__file__).parents[2]
@@ -287,11 +287,21 @@ def test_a_plugin_that_does_not_load_is_reported_where_it_is_named(
     assert words in second
 
 
-def test_an_object_without_the_methods_of_its_role_is_named() -> None:
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("def plan(", "def plann(", "planner 'mine' has no method plan; see labseq.plugin.Planner"),
+        ("settings, context)", "settings)", "takes 2 positional arguments but 3 were given; it comes from"),
+    ],
+)
+def test_a_class_that_does_not_suit_its_role_is_reported_where_it_is_named(
+    old: str, new: str, words: str
+) -> None:
     write({"{use: psca, degree_of_parallelism: 7}": "{use: mine}"})
     Path("plugins").mkdir()
-    Path("plugins/mine.py").write_text(PLUGIN.replace("def plan(", "def plann("), encoding="utf-8")
-    with pytest.raises(
-        PluginLoadError, match=r"planner 'mine' has no method plan; see labseq\.plugin\.Planner"
-    ):
+    assert old in PLUGIN
+    Path("plugins/mine.py").write_text(PLUGIN.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
         check(labseq.Session.open("s.yaml", overrides=["plugin_folders=[plugins]"]))
+    assert str(caught.value).startswith("s.yaml:8:10: plugin 'mine' ")
+    assert words in str(caught.value)
