@@ -7,8 +7,8 @@ The tree::
       run/<file>             the files of the run's folder: run.json, sequence.yaml, calibrations, ...
       shots/shot_000000      the content of /entry in the shot's file; also for failed attempts
 
-Settings, devices and target are the same in all shots and are in the file once: the shots have hard links
-to them.
+Settings, devices and target are the same in all shots. The file holds them once, and the shots have hard
+links to them.
 """
 
 from __future__ import annotations
@@ -41,13 +41,6 @@ from labseq.recording.shot_file import content_of, open_finished, opened
 
 FORMAT: Final = "labseq-archive"
 FORMAT_VERSION: Final = "4.0"
-
-MAX_COPY: Final = 1 << 30
-"""Largest file of the run's folder that is copied, in bytes."""
-_SHARED: Final = ("target", "run")
-_WORTH_PACKING: Final = 1024
-"""Arrays of at least this size are compressed, in bytes; smaller ones would grow."""
-_PACKED: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
@@ -98,14 +91,16 @@ def _write_files(group: h5py.Group, run_dir: Path) -> list[str]:
         for path in sorted(folder.iterdir()) if folder.is_dir() else ():
             if path.is_file() and path.suffix != ".part" and not path.name.startswith("."):
                 if not path.resolve().is_relative_to(run_dir.resolve()):
-                    left_out.append(f"{path}: is a link to a file that is not of this run; it was not copied")
+                    left_out.append(f"{path}: is a link to a file outside this run; it was not copied")
                     continue
-                _write_file(goal, plain_text(path.name), read_file(path, MAX_COPY))
+                # no text or picture is that large; a larger file would fill the memory
+                _write_file(goal, plain_text(path.name), read_file(path, 1 << 30))
     return left_out
 
 
 def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
     try:
+        # a text has no zero bytes; other files may be valid UTF-8 by chance
         text = data.decode() if b"\0" not in data else None
     except ValueError:
         text = None
@@ -137,39 +132,39 @@ class _Shots:
             entry: Any = source["entry"]
             for camera in entry.get("camera", {}).values() if self._frames else ():
                 load_filter(shot.file, camera["frames"])
-            made = self._group.create_group(shot.file.stem)
-            copy_attributes(entry, made)
+            copy = self._group.create_group(shot.file.stem)
+            copy_attributes(entry, copy)
             for name in entry:
-                if name in _SHARED:
-                    self._share(entry[name], made, name)
+                if name in ("target", "run"):
+                    self._share(entry[name], copy, name)
                 elif self._frames or name != "images_view":
-                    _copy(entry, made, name, frames=self._frames)
-            if "images_view" not in made:
-                del made.attrs["default"]
-                set_attributes(made, {"default": "detection"})
+                    _copy(entry, copy, name, frames=self._frames)
+            if "images_view" not in copy:
+                del copy.attrs["default"]
+                set_attributes(copy, {"default": "detection"})
 
-    def _share(self, source: Any, made: Any, name: str) -> None:
+    def _share(self, source: Any, copy: Any, name: str) -> None:
         content = {
             key: str(value[()]) if value.ndim == 0 else value[()].tobytes() for key, value in source.items()
         }
         content |= {f"@{key}": repr(value) for key, value in read_attributes(source).items()}
         if self._shared.get(name, (None,))[0] != content:
-            source.file.copy(source, made, name)
-            self._shared[name] = content, made[name]
+            source.file.copy(source, copy, name)
+            self._shared[name] = content, copy[name]
         else:
-            made[name] = self._shared[name][1]
+            copy[name] = self._shared[name][1]
 
 
-def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
+def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
     """Copy one item of a group; large arrays are compressed, and frames left out if not requested."""
     link = source.get(name, getlink=True)
     if isinstance(link, h5py.SoftLink):
-        shot = "/".join(made.name.split("/")[:3])
-        made[name] = h5py.SoftLink(link.path.replace("/entry", shot, 1))
+        shot = "/".join(copy.name.split("/")[:3])
+        copy[name] = h5py.SoftLink(link.path.replace("/entry", shot, 1))
         return
     node = source[name]
     if isinstance(node, h5py.Group):
-        group = made.create_group(name)
+        group = copy.create_group(name)
         copy_attributes(node, group)
         for inner in node.keys():  # noqa: SIM118 - the names in this group, all text
             _copy(node, group, inner, frames=frames)
@@ -178,8 +173,10 @@ def _copy(source: Any, made: Any, name: str, *, frames: bool) -> None:
     if is_image and not frames:
         return
     is_compressed = node.id.get_create_plist().get_nfilters() > 0
-    if node.dtype.kind != "O" and (node.nbytes >= _WORTH_PACKING or is_compressed):
-        chunks = (1, *node.shape[1:]) if is_image else True
-        copy_attributes(node, made.create_dataset(name, data=node[()], chunks=chunks, **_PACKED))
+    # smaller arrays would grow: compression needs chunks, and each chunk an entry in their index
+    if node.dtype.kind != "O" and (node.nbytes >= 1024 or is_compressed):
+        chunks = (1, *node.shape[1:]) if is_image else True  # one frame is read without its neighbours
+        packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+        copy_attributes(node, copy.create_dataset(name, data=node[()], chunks=chunks, **packing))
     else:
-        source.file.copy(node, made, name)
+        source.file.copy(node, copy, name)

@@ -60,25 +60,27 @@ def best_point(run: Run) -> BestPoint | None:
         return None
     with reporting_damage(run.path):
         quantity = quantity_of(run, str(scan["figure"]))
-        ranges = [ScanRange(**one) for one in scan["ranges"]]
+        ranges = [ScanRange(**values) for values in scan["ranges"]]
         units, sign = [str(unit) for unit in scan["written_units"]], 1.0 if scan["maximise"] else -1.0
     pairs = [(point, quantity.over(point.shots)) for point in scan_points(run)]
-    known = [(point, value) for point, value in pairs if not math.isnan(value.value)]
-    if not known:
+    measured = [(point, value) for point, value in pairs if not math.isnan(value.value)]
+    if not measured:
         return None
-    best = max(range(len(known)), key=lambda i: sign * known[i][1].value)
-    places = np.array([[one.fraction(point.parameters[one.address]) for one in ranges] for point, _ in known])
-    scores = np.array([sign * value.value for _, value in known])
-    steps = extremum(places, scores, [value for _, value in known], best)
-    chosen = [
-        one.at(place + step) if step else known[best][0].parameters[one.address]
-        for one, place, step in zip(ranges, places[best].tolist(), steps.tolist(), strict=True)
+    best = max(range(len(measured)), key=lambda i: sign * measured[i][1].value)
+    places = np.array(
+        [[axis.fraction(point.parameters[axis.address]) for axis in ranges] for point, _ in measured]
+    )
+    scores = np.array([sign * value.value for _, value in measured])
+    steps = extremum(places, scores, [value for _, value in measured], best)
+    values = [
+        axis.at(place + step) if step else measured[best][0].parameters[axis.address]
+        for axis, place, step in zip(ranges, places[best].tolist(), steps.tolist(), strict=True)
     ]
-    suggested = {
-        one.address: written(float(f"{value:.4g}") if step and not one.n_steps else value, unit)
-        for one, value, unit, step in zip(ranges, chosen, units, steps.tolist(), strict=True)
+    suggested = {  # a fit is not good to more than four digits; a taken point is given exactly
+        axis.address: written(float(f"{value:.4g}") if step and not axis.n_steps else value, unit)
+        for axis, value, unit, step in zip(ranges, values, units, steps.tolist(), strict=True)
     }
-    return BestPoint(quantity, *known[best], suggested, is_fitted=bool(steps.any()))
+    return BestPoint(quantity, *measured[best], suggested, is_fitted=bool(steps.any()))
 
 
 def extremum(
@@ -101,21 +103,26 @@ def extremum(
         [0.1]
     """
     n_points, n_axes = places.shape
-    n_used = max(2 * n_axes + 2, -(-n_points // 2))
+    n_used = max(2 * n_axes + 2, -(-n_points // 2))  # one more than the parabola's 2 n_axes + 1 coefficients
     if n_points < n_used:
         return np.zeros(n_axes)
-    away = places - places[best]
-    used = np.argsort((away**2).sum(axis=1), kind="stable")[:n_used]
-    away = away[used]
+    offsets = places - places[best]
+    nearest = np.argsort((offsets**2).sum(axis=1), kind="stable")[:n_used]
+    offsets = offsets[nearest]
     errors = np.array(
-        [(high - low) / 2 for low, high in (values[i].interval for i in used)] if values else []
+        [(high - low) / 2 for low, high in (values[i].interval for i in nearest)] if values else []
     )
-    known = errors[np.isfinite(errors) & (errors > 0)]
-    weights = 1 / np.where(np.isfinite(errors) & (errors > 0), errors, known.max()) if len(known) else 1.0
-    terms = np.concatenate([np.ones((n_used, 1)), away, away**2], axis=1)
-    fitted = np.linalg.lstsq((terms.T * weights).T, scores[used] * weights, rcond=None)[0]
-    slope, curvature = fitted[1 : 1 + n_axes], fitted[1 + n_axes :]
+    known_errors = errors[np.isfinite(errors) & (errors > 0)]
+    # a point without an error of its own, such as one of a single shot, counts as the worst of the others
+    weights = (
+        1 / np.where(np.isfinite(errors) & (errors > 0), errors, known_errors.max())
+        if len(known_errors)
+        else 1.0
+    )
+    terms = np.concatenate([np.ones((n_used, 1)), offsets, offsets**2], axis=1)
+    coefficients = np.linalg.lstsq((terms.T * weights).T, scores[nearest] * weights, rcond=None)[0]
+    slope, curvature = coefficients[1 : 1 + n_axes], coefficients[1 + n_axes :]
     with np.errstate(divide="ignore", invalid="ignore"):
         step = -slope / (2 * curvature)
-    inside = (curvature < 0) & (step >= away.min(axis=0)) & (step <= away.max(axis=0))
+    inside = (curvature < 0) & (step >= offsets.min(axis=0)) & (step <= offsets.max(axis=0))
     return np.where(inside, step, 0.0)

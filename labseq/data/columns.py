@@ -97,27 +97,29 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
         shots: The shots of the rows; by default those that count.
     """
     rows = [shot.row for shot in (run.shots if shots is None else shots)]
-    analysed = result_columns(run.path)
+    results = result_columns(run.path)
     fixed = [_fixed(row) for row in rows]
     columns = [
-        make_column(name, [values[name] for values in fixed], unit_of(name), about, text=name in _TEXTS)
-        for name, about in DESCRIPTIONS.items()
+        make_column(name, [values[name] for values in fixed], unit_of(name), description, text=name in _TEXTS)
+        for name, description in DESCRIPTIONS.items()
     ]
-    taken = {*DESCRIPTIONS}
+    names = {*DESCRIPTIONS}
     scanned = (run.record.get("scan") or {}).get("addresses") or ()
     for prefix, values_of in _GROUPS.items():
         groups = [values_of(row) for row in rows]
         for name in dict.fromkeys(name for group in groups for name in group):
             full_name = _column_name(prefix, name)
-            while full_name in taken:
+            # a parameter may be called as a fixed column is
+            while full_name in names:
                 full_name += "_"
-            taken.add(full_name)
+            names.add(full_name)
             units = unit_of(name) if prefix else run.units.get(name, "")
-            about = _description(prefix, name, scanned=name in scanned)
-            columns.append(make_column(full_name, [group.get(name) for group in groups], units, about))
-    for name, values in analysed.items():
-        of_rows = [values.get(row.shot) if row.counts else None for row in rows]
-        columns.append(make_column(name, of_rows, unit_of(name), RESULT))
+            description = _description(prefix, name, scanned=name in scanned)
+            columns.append(make_column(full_name, [group.get(name) for group in groups], units, description))
+    for name, values in results.items():
+        # only attempts that count are analysed: a failed one has the same number of shot
+        row_values = [values.get(row.shot) if row.counts else None for row in rows]
+        columns.append(make_column(name, row_values, unit_of(name), RESULT))
     return columns
 
 
@@ -136,12 +138,12 @@ def quantities_in(row: IndexRow) -> dict[str, float]:
         Name -> value, as :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction",
         "stage.plan_s", "reading.laser.power_w"; without those that are nan.
     """
-    found = {name: value for name, value in _fixed(row).items() if name in QUANTITIES}
+    values = {name: value for name, value in _fixed(row).items() if name in QUANTITIES}
     for prefix in ("stage.", "reading."):
-        found |= {_column_name(prefix, name): value for name, value in _GROUPS[prefix](row).items()}
+        values |= {_column_name(prefix, name): value for name, value in _GROUPS[prefix](row).items()}
     return {
         name: float(value)
-        for name, value in found.items()
+        for name, value in values.items()
         if isinstance(value, bool | int | float) and math.isfinite(value)
     }
 
@@ -174,6 +176,7 @@ def _array(values: Sequence[Any], *, text: bool = False) -> NDArray[Any]:
 
 
 def _fits(value: float | None) -> bool:
+    """Whether a value fits into an array of numbers."""
     return type(value) is not int or -(2**63) <= value < 2**63
 
 

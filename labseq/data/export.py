@@ -43,10 +43,10 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
     if frames and kind != "archive":
         raise ConfigError(Problem(f"a {kind} file holds no frames", "--frames", hint="use --to archive"))
     check_output(path, f"a {kind} file", ENDINGS[kind])
-    there = [one for one in files_of(kind, path) if is_file(one)]
-    if there and not replace:
+    existing = [file for file in files_of(kind, path) if is_file(file)]
+    if existing and not replace:
         hint = "choose another name, or replace it with --force"
-        raise ConfigError(Problem("this file already exists", str(there[0]), hint=hint))
+        raise ConfigError(Problem("this file already exists", str(existing[0]), hint=hint))
     packages = {"parquet": ("pandas", "pyarrow"), "netcdf": ("xarray", "h5netcdf")}
     check_installed(*packages.get(kind, ()))
 
@@ -66,7 +66,8 @@ def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list
             from labseq.data.archive import write_archive  # h5py takes 0.1 s to import
 
             return write_archive(run, path, frames=frames)
-        _WRITERS[kind](run, path)
+        writers = {"csv": _write_csv, "parquet": _write_parquet, "netcdf": _write_netcdf}
+        writers[kind](run, path)
     except (OSError, RuntimeError) as error:  # HDF5 raises either when the disk is full
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ConfigError(Problem(f"it cannot be written: {reason}", str(path))) from error
@@ -80,25 +81,25 @@ def _write_csv(run: Run, path: Path) -> None:
 def write_columns(path: Path, columns: Sequence[Column]) -> None:
     """Write columns to a CSV file, and their units and descriptions to the file next to it."""
     rows = zip(*(map(_cell, column.values.tolist()) for column in columns), strict=True)
-    about = [(column.name, column.units, column.description) for column in columns]
+    descriptions = [(column.name, column.units, column.description) for column in columns]
     table, units = files_of("csv", path)
-    write_rows(units, [("column", "units", "description"), *about])
+    write_rows(units, [("column", "units", "description"), *descriptions])
     write_rows(table, [[column.name for column in columns], *rows])
 
 
 def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
     """Write a CSV file, which appears only when it is complete."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    buffer = io.StringIO(newline="")
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
     with whole_file(path) as file:
-        file.write(text.getvalue().encode("utf-8", "backslashreplace"))
+        file.write(buffer.getvalue().encode("utf-8", "backslashreplace"))
 
 
 def _cell(value: Any) -> str:
     """A value as text that every program can read; empty for nan."""
     if isinstance(value, bool):
         return "true" if value else "false"
-    return "" if value != value else str(value)
+    return "" if value != value else str(value)  # only nan differs from itself
 
 
 def _write_parquet(run: Run, path: Path) -> None:
@@ -106,24 +107,22 @@ def _write_parquet(run: Run, path: Path) -> None:
     from pyarrow import parquet
 
     table: Any = pa.Table.from_pandas(dataframe_of(run))
-    about = {
+    metadata = {
         column.name: {"units": column.units, "description": column.description} for column in columns_of(run)
     }
-    fields = [field.with_metadata(about[field.name]) for field in table.schema]
-    facts = {b"labseq": json.dumps(facts_of(run)).encode()}
-    schema = pa.schema(fields, {**(table.schema.metadata or {}), **facts})
+    fields = [field.with_metadata(metadata[field.name]) for field in table.schema]
+    run_metadata = {b"labseq": json.dumps(facts_of(run)).encode()}
+    schema = pa.schema(fields, {**(table.schema.metadata or {}), **run_metadata})
     with whole_file(path) as file:
         parquet.write_table(table.cast(schema), file)
 
 
 def _write_netcdf(run: Run, path: Path) -> None:
     dataset = dataset_of(run)
+    # in netCDF a "/" separates groups
     names = [str(name) for name in (*dataset.variables, *dataset.dims) if "/" in str(name)]
     dataset = dataset.rename({name: name.replace("/", "_") for name in dict.fromkeys(names)})
-    packed = {"zlib": True, "shuffle": True} if dataset["occupancy"].size else {}
+    packing = {"zlib": True, "shuffle": True} if dataset["occupancy"].size else {}
     with whole_file(path) as file:
-        encoding = {"occupancy": {**packed, "_FillValue": None}}
+        encoding = {"occupancy": {**packing, "_FillValue": None}}
         dataset.to_netcdf(Path(file.name), engine="h5netcdf", format="NETCDF4", encoding=encoding)
-
-
-_WRITERS: Final = {"csv": _write_csv, "parquet": _write_parquet, "netcdf": _write_netcdf}

@@ -1,4 +1,4 @@
-"""Follows a run in progress by its files, as the live view of another process, a page or an analysis does."""
+"""Follows a run in progress by its files, for the live view of another process, a page or an analysis."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Event:
 
     Attributes:
         t_utc: Wall time, ISO 8601, UTC.
-        t_s: Time that the run has taken until then, in seconds, whatever happens to the clock: all parts of a
-            resumed run together, without the time between them.
+        t_s: Time that the run has taken so far, in seconds, independent of the computer's clock: all parts
+            of a resumed run together, without the time between them.
         name: What happened; one of :data:`labseq.roles.EVENTS`.
         values: The details.
     """
@@ -94,7 +94,7 @@ class Follower:
                 yield Event(str(line.get("t_utc", "")), self._time_s, name, values)
 
     def _advance(self, t_s: Any) -> None:
-        """Go on to the time of a line; each part of a resumed run begins at 0."""
-        if type(t_s) in (int, float) and 0 <= t_s < 1e12:
+        """Advance to the time of a line; each part of a resumed run begins at 0."""
+        if type(t_s) in (int, float) and 0 <= t_s < 1e12:  # a damaged line must not move the time
             self._time_s += t_s - self._last_s if t_s >= self._last_s else t_s
             self._last_s = t_s

@@ -33,7 +33,7 @@ def average_frame(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
                 frame = camera["frames"][at[0]].astype(np.float64)
                 total, n = (total + frame if n else frame), n + 1
     if not n:
-        raise _nothing(shots, "frame", image)
+        raise _missing_error(shots, "frame", image)
     return total / n, n
 
 
@@ -47,10 +47,10 @@ def loading_map(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
     Raises:
         RecordingError: No shot has it, or files are damaged.
     """
-    found = [entry["detection/occupancy"][index] for entry, index in _entries(shots, image)]
-    if not found:
-        raise _nothing(shots, "image", image)
-    return np.asarray(np.mean(found, axis=0), np.float64), len(found)
+    occupancies = [entry["detection/occupancy"][index] for entry, index in _entries(shots, image)]
+    if not occupancies:
+        raise _missing_error(shots, "image", image)
+    return np.asarray(np.mean(occupancies, axis=0), np.float64), len(occupancies)
 
 
 def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, str]:
@@ -67,13 +67,13 @@ def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, s
 
     signals, thresholds, unit = list[Any](), list[Any](), ""
     for entry, index in _entries(shots, image):
-        found = entry["detection"]
-        if "signal" in found and "threshold" in found:
-            signals.append(found["signal"][index])
-            thresholds.append(found["threshold"][()])
-            unit = str(read_attribute(found["signal"], "units"))
+        detection = entry["detection"]
+        if "signal" in detection and "threshold" in detection:
+            signals.append(detection["signal"][index])
+            thresholds.append(detection["threshold"][()])
+            unit = str(read_attribute(detection["signal"], "units"))
     if not signals:
-        raise _nothing(shots, "signal of the detector", image)
+        raise _missing_error(shots, "signal of the detector", image)
     return np.array(signals), np.array(thresholds), unit
 
 
@@ -82,12 +82,13 @@ def _entries(shots: Sequence[Shot], image: int) -> Generator[tuple[Any, int]]:
     from labseq.recording.shot_file import opened  # h5py takes 0.1 s to import
 
     for shot in shots:
+        # an average over many shots is still good without the damaged ones
         with suppress(RecordingError), opened(shot.file) as entry:
             n_images = len(entry["detection/occupancy"])
             if -n_images <= image < n_images:
                 yield entry, image % n_images
 
 
-def _nothing(shots: Sequence[Shot], what: str, image: int) -> RecordingError:
-    where = shots[0].file.parent.parent if shots else "the run"
-    return RecordingError(where, f"has no {what} of image {image} in its shots")
+def _missing_error(shots: Sequence[Shot], kind: str, image: int) -> RecordingError:
+    run_dir = shots[0].file.parent.parent if shots else "the run"
+    return RecordingError(run_dir, f"has no {kind} of image {image} in its shots")

@@ -24,7 +24,7 @@ SCANNER: Final = "scanner"
 
 @contextmanager
 def reporting_damage(run_dir: Path) -> Generator[None]:
-    """Report the record of a scan that is not as it was written.
+    """Report errors in the body as a damaged record of a scan.
 
     Raises:
         RecordingError: The body could not read it.
@@ -32,8 +32,8 @@ def reporting_damage(run_dir: Path) -> Generator[None]:
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        what = f"has a damaged scan: {error!r}"
-        raise RecordingError(run_dir / RUN_FILE, what, "restore it from a backup") from error
+        problem = f"has a damaged scan: {error!r}"
+        raise RecordingError(run_dir / RUN_FILE, problem, "restore it from a backup") from error
 
 
 class ChosenPoints:
@@ -74,12 +74,13 @@ def completed(scan: Mapping[str, Any], rows: Iterable[IndexRow]) -> dict[str, An
     Args:
         rows: The lines of the index, in any order; ``point_of_shot`` is -1 for a shot without one.
     """
-    chosen = ChosenPoints(scan)
+    points = ChosenPoints(scan)
     of_shot: dict[int, int] = {}
+    # of several attempts at a shot the last one counts
     for row in sorted(rows, key=lambda row: (row.shot, row.attempt)):
-        of_shot[row.shot] = chosen.number(row.parameters)
+        of_shot[row.shot] = points.number(row.parameters)
     point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
-    return {**scan, "points": chosen.points, "written": chosen.written, "point_of_shot": point_of_shot}
+    return {**scan, "points": points.points, "written": points.written, "point_of_shot": point_of_shot}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

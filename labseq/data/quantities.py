@@ -27,9 +27,9 @@ from labseq.units import parse_any
 if TYPE_CHECKING:
     from labseq.data.reader import Run
 
-NOTHING: Final = (math.nan, 0.0)
+NO_VALUE: Final = (math.nan, 0.0)
 """Events and trials of a shot without a value."""
-MAX_LOOKED_AT: Final = 20
+MAX_SHOTS_READ: Final = 20
 """Maximum number of shots in which the names of images are looked up."""
 
 
@@ -59,7 +59,7 @@ class Quantity:
 
     def over(self, shots: Iterable[Shot]) -> Estimated:
         """The mean over those shots that have a value, with its error."""
-        events = [one for one in map(self._events, shots) if one[1] and not math.isnan(one[0])]
+        events = [(n, n_trials) for n, n_trials in map(self._events, shots) if n_trials and not math.isnan(n)]
         if self.is_rate:
             return Rate(round(sum(n for n, _ in events)), round(sum(n for _, n in events)))
         return mean([n / n_trials for n, n_trials in events])
@@ -68,7 +68,7 @@ class Quantity:
         try:
             return self.events_of(shot)
         except RecordingError:
-            return NOTHING
+            return NO_VALUE
 
 
 def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
@@ -84,7 +84,7 @@ def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
 def _survival(shot: Shot, _: TargetPattern, before: str = "", after: str = "") -> tuple[float, float]:
     first, last = _image(shot, before, 0), _image(shot, after, -1)
     if first is None or last is None or first.t_start_s >= last.t_start_s:
-        return NOTHING
+        return NO_VALUE
     start, end = (first.step, first.cycle), (last.step, last.cycle)
     cycles = (cycle for cycle in shot.cycles if start < (cycle.step, cycle.cycle) <= end)
     expected = np.logical_or(*follow_atoms(first.occupancy, cycles))
@@ -93,7 +93,7 @@ def _survival(shot: Shot, _: TargetPattern, before: str = "", after: str = "") -
 
 def _loading(shot: Shot, _: TargetPattern, name: str = "") -> tuple[float, float]:
     image = _image(shot, name, 0)
-    return NOTHING if image is None else (float(image.occupancy.mean()), 1)
+    return NO_VALUE if image is None else (float(image.occupancy.mean()), 1)
 
 
 def _defects(shot: Shot, target: TargetPattern, name: str) -> tuple[int, int] | None:
@@ -106,17 +106,17 @@ def _defects(shot: Shot, target: TargetPattern, name: str) -> tuple[int, int] | 
 
 
 def _filling(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
-    if not name and not math.isnan(shot.filling_fraction):
+    if not name and not math.isnan(shot.filling_fraction):  # in the index: the shot's file is not read
         return shot.filling_fraction, 1
     defects = _defects(shot, target, name) if target.n_atoms else None
-    return NOTHING if defects is None else (1 - defects[0] / target.n_atoms, 1)
+    return NO_VALUE if defects is None else (1 - defects[0] / target.n_atoms, 1)
 
 
 def _defect_free(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
     if not name and not math.isnan(shot.filling_fraction):
         return shot.success, 1
     defects = None if target.is_none else _defects(shot, target, name)
-    return NOTHING if defects is None else (not any(defects), 1)
+    return NO_VALUE if defects is None else (not any(defects), 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,14 +174,16 @@ def make_quantity(
     """
     kind, images = split_name(name)
     if kind in OF_IMAGES:
-        one = OF_IMAGES[kind]
-        return Quantity(name, "", one.is_rate, True, lambda shot: one.events_of(shot, target, *images))
-    of_shots = (results or {}).get(name)
-    is_rate = name == "success" or (of_shots is not None and {*map(type, of_shots.values())} == {bool})
+        quantity = OF_IMAGES[kind]
+        return Quantity(
+            name, "", quantity.is_rate, True, lambda shot: quantity.events_of(shot, target, *images)
+        )
+    values = (results or {}).get(name)
+    is_rate = name == "success" or (values is not None and {*map(type, values.values())} == {bool})
 
     def events_of(shot: Shot) -> tuple[float, float]:
-        found = quantities_in(shot.row).get(name) if of_shots is None else of_shots.get(shot.index)
-        return NOTHING if found is None else (float(found), 1)
+        value = quantities_in(shot.row).get(name) if values is None else values.get(shot.index)
+        return NO_VALUE if value is None else (float(value), 1)
 
     return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
 
@@ -189,7 +191,7 @@ def make_quantity(
 def quantity_problem(
     name: str, columns: Collection[str], images: Collection[str], open_prefixes: tuple[str, ...] = ()
 ) -> tuple[str, str, str] | None:
-    """What is wrong with the name of a quantity: what, expected and hint; None if it is right.
+    """The problem with the name of a quantity, what was expected and a hint; None if it is right.
 
     Args:
         name: The name.
@@ -197,24 +199,24 @@ def quantity_problem(
         images: The known names of images; none to accept any.
         open_prefixes: Prefixes of names that are not known beforehand.
     """
-    kind, given = split_name(name)
+    kind, named = split_name(name)
     if kind not in OF_IMAGES:
-        if not given and (name in columns or name.startswith(open_prefixes or ("\0",))):
+        if not named and (name in columns or name.startswith(open_prefixes or ("\0",))):
             return None
         near = closest(kind, [*OF_IMAGES, *columns])
         hint = f"did you mean '{near}'?" if near else ""
         forms = ("survival:IMAGE,IMAGE", *(f"{kind}[:IMAGE]" for kind in OF_IMAGES if kind != "survival"))
         names = ", ".join([*forms, *columns, *(f"{prefix}<name>" for prefix in open_prefixes)])
         return f"there is no quantity '{clean(name)}'", f"one of {names}", hint
-    if given and len(given) != OF_IMAGES[kind].n_images:
-        wanted = "two images: survival:IMAGE,IMAGE" if kind == "survival" else f"one image: {kind}:IMAGE"
-        return f"'{clean(name)}' names {len(given)}", wanted, ""
-    for image in given:
-        known = image in images or image.isdecimal() or any(image.startswith(f"{i}_") for i in images)
-        if images and not known:
+    if named and len(named) != OF_IMAGES[kind].n_images:
+        expected = "two images: survival:IMAGE,IMAGE" if kind == "survival" else f"one image: {kind}:IMAGE"
+        return f"'{clean(name)}' names {len(named)}", expected, ""
+    for image in named:
+        is_known = image in images or image.isdecimal() or any(image.startswith(f"{i}_") for i in images)
+        if images and not is_known:
             near = closest(image, images)
-            what = f"there is no image '{clean(image)}' for '{clean(name)}'"
-            return what, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
+            problem = f"there is no image '{clean(image)}' for '{clean(name)}'"
+            return problem, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
     return None
 
 
@@ -229,18 +231,18 @@ def description_of(name: str) -> str:
 
 def image_names(run: Run) -> list[str]:
     """The names of the images of a run's first shots, in order."""
-    found = dict[str, None]()
-    for shot in run.shots[:MAX_LOOKED_AT]:
+    names = dict[str, None]()
+    for shot in run.shots[:MAX_SHOTS_READ]:
         try:
-            found |= dict.fromkeys(image.name for image in shot.images)
+            names |= dict.fromkeys(image.name for image in shot.images)
         except RecordingError:
             continue
-    return [*found]
+    return [*names]
 
 
 def column_names(run: Run) -> list[str]:
     """The names of the quantities of a run that need no image."""
-    names = dict.fromkeys(name for shot in run.shots[:MAX_LOOKED_AT] for name in quantities_in(shot.row))
+    names = dict.fromkeys(name for shot in run.shots[:MAX_SHOTS_READ] for name in quantities_in(shot.row))
     return [*names, *_numbers(run)]
 
 
@@ -262,8 +264,8 @@ def find_quantity(run: Run, name: str) -> Quantity:
     images = image_names(run) if split_name(name)[1] else []
     problem = quantity_problem(name, column_names(run), images)
     if problem is not None:
-        what, expected, hint = problem
-        raise ConfigError(Problem(what, clean(run.path.name), expected=expected, hint=hint))
+        message, expected, hint = problem
+        raise ConfigError(Problem(message, clean(run.path.name), expected=expected, hint=hint))
     _check_no_load(run, name)
     return quantity_of(run, name)
 
@@ -293,14 +295,14 @@ def _check_no_load(run: Run, name: str) -> None:
     except RecordingError:
         return
     if first is not None and last is not None and any(first.step < i < last.step for i in loads):
-        what = f"atoms are loaded between the images of '{clean(name)}'"
+        message = f"atoms are loaded between the images of '{clean(name)}'"
         raise ConfigError(
-            Problem(what, clean(run.path.name), expected="two images without a 'load' between them")
+            Problem(message, clean(run.path.name), expected="two images without a 'load' between them")
         )
 
 
-_CONDITION: Final = re.compile(r"\s*(\S+?)\s*(==|!=|>=|<=|>|<)\s*(\S.*?)\s*\Z")
-_COMPARE: Final[Mapping[str, Callable[[float, float], bool]]] = {
+_COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
+    # a computed value and a typed one differ in their last digits
     "==": lambda a, b: math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12),
     "!=": lambda a, b: not math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12),
     ">=": operator.ge,
@@ -318,11 +320,11 @@ def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
     """
     shots = tuple(run.shots)
     for condition in conditions:
-        match = _CONDITION.match(condition)
+        match = re.match(r"\s*(\S+?)\s*(==|!=|>=|<=|>|<)\s*(\S.*?)\s*\Z", condition)
         if match is None:
-            what = f"this is not a condition: '{clean(condition)}'"
-            raise ConfigError(Problem(what, "--where", expected="for example 'filling:before == 1'"))
-        quantity, compare = find_quantity(run, match[1]), _COMPARE[match[2]]
+            message = f"this is not a condition: '{clean(condition)}'"
+            raise ConfigError(Problem(message, "--where", expected="for example 'filling:before == 1'"))
+        quantity, compare = find_quantity(run, match[1]), _COMPARISONS[match[2]]
         try:
             limit = float(match[3]) if re.fullmatch(r"[-+.\deE]+", match[3]) else parse_any(match[3])[0]
         except ValueError as error:

@@ -63,11 +63,11 @@ def open_run(path: str | Path) -> Run:
 
 
 def _skipped(folder: Path, n_shots: int) -> dict[int, str]:
-    found = dict[int, str]()
+    reasons = dict[int, str]()
     for line in read_lines(folder / folders.SKIPPED_FILE)[0]:
         if is_skip_row(line, n_shots):
-            found |= dict.fromkeys(line["shots"], line["why"])
-    return found
+            reasons |= dict.fromkeys(line["shots"], line["why"])
+    return reasons
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -104,7 +104,7 @@ class Run:
 
     @property
     def n_shots(self) -> int:
-        """Number of shots that the sequence requests."""
+        """Number of shots that the sequence asks for."""
         return int(self.record["n_shots"])
 
     @property
@@ -129,7 +129,7 @@ class Run:
 
     @property
     def changes(self) -> Mapping[str, str]:
-        """What ``--set`` and other options changed: address -> value, as it was typed."""
+        """Settings changed by ``--set`` and other options: address -> value, as it was typed."""
         overrides = dict(self.record.get("overrides") or {})
         return {address: str(change["written"]) for address, change in overrides.items()}
 
@@ -162,7 +162,8 @@ class Run:
     def events(self) -> tuple[dict[str, Any], ...]:
         """The event log, read from the file each time: dicts with ``t_utc``, ``t_s``, ``event``, ``values``.
 
-        ``t_s`` is the time since the process began or resumed the run, in seconds; no clock moves it.
+        ``t_s`` is the time since the process began or resumed the run, in seconds; setting the computer's
+        clock does not change it.
 
         Raises:
             RecordingError: The file cannot be read.

@@ -90,7 +90,9 @@ class Shot:
     @property
     def occupancies(self) -> NDArray[np.bool_]:
         """The detected occupancies, bool (n_images, n_rows, n_cols)."""
-        from labseq.recording.shot_file import read_occupancies  # alone: a seventh of the time of all
+        from labseq.recording.shot_file import (
+            read_occupancies,
+        )  # a seventh of the time that the whole file takes
 
         return read_occupancies(self.file)[1].astype(np.bool_)
 
@@ -98,8 +100,8 @@ class Shot:
     def signals(self) -> NDArray[np.float64]:
         """The detector's signals, float64 (n_images, n_rows, n_cols); nan where it reported none."""
         none = np.full(self._content.target.shape, np.nan)
-        found = [none if image.signal is None else image.signal for image in self.images]
-        return np.array(found, np.float64).reshape(len(found), *none.shape)
+        signals = [none if image.signal is None else image.signal for image in self.images]
+        return np.array(signals, np.float64).reshape(len(signals), *none.shape)
 
     @property
     def thresholds(self) -> NDArray[np.float64] | None:
@@ -171,8 +173,8 @@ class Shot:
         """Seed, versions, texts and settings from the shot's file."""
         run = self._content.run
         texts = {name: run[f"{name}_text"] for name in ("sequence", "profile")}
-        rest = {name: run[name] for name in ("resolved", "overrides", "plugins")}
-        return {**run["provenance"], "seed": self._content.record.seed, **texts, **rest}
+        settings = {name: run[name] for name in ("resolved", "overrides", "plugins")}
+        return {**run["provenance"], "seed": self._content.record.seed, **texts, **settings}
 
     @property
     def devices(self) -> dict[str, Any]:

@@ -36,8 +36,8 @@ def check_installed(*packages: str) -> None:
     """
     for package in packages:
         if find_spec(package) is None:
-            what = f"this needs {package}, which is not installed"
-            raise ConfigError(Problem(what, hint=install_hint("analysis")))
+            problem = f"this needs {package}, which is not installed"
+            raise ConfigError(Problem(problem, hint=install_hint("analysis")))
 
 
 def facts_of(run: Run) -> dict[str, Any]:
@@ -82,14 +82,14 @@ def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
     }
     if occupancies:
         meaning = f"1 where the detector saw an atom, 0 where not, {NO_IMAGE} where there is no such image"
-        about = {"units": "", "description": meaning}
+        attributes = {"units": "", "description": meaning}
         names, stack = _occupancies(run)
-        data["occupancy"] = ((axis, "image", "row", "col"), stack, about)
+        data["occupancy"] = ((axis, "image", "row", "col"), stack, attributes)
         data["image"] = ("image", np.array(names, object), {"units": "", "description": "name of the image"})
     dataset = xr.Dataset(data) if grid is None else _on_grid(xr.Dataset(data), grid)
     for name, meaning in (("fill", "hold an atom"), ("clear", "be empty")):
-        about = {"units": "", "description": f"1 where the target must {meaning}"}
-        dataset[f"target_{name}"] = (("row", "col"), getattr(run.target, name).astype(np.int8), about)
+        attributes = {"units": "", "description": f"1 where the target must {meaning}"}
+        dataset[f"target_{name}"] = (("row", "col"), getattr(run.target, name).astype(np.int8), attributes)
     return dataset.assign_attrs(facts_of(run))
 
 
@@ -97,12 +97,13 @@ def _occupancies(run: Run) -> tuple[list[str], NDArray[np.int8]]:
     """The names of all images, in the order of a shot, and the occupancies at each."""
     from labseq.recording.shot_file import read_occupancies
 
-    found = [read_occupancies(shot.file) for shot in run.shots]
-    known = dict.fromkeys(image for images, _ in found for image in images)
-    names = [name for *_, name in sorted(known, key=itemgetter(0, 1))]
-    stack = np.full((len(found), len(names), *run.target.shape), NO_IMAGE, np.int8)
-    for of_shot, (images, occupancies) in zip(stack, found, strict=True):
-        of_shot[[names.index(name) for *_, name in images]] = occupancies
+    shots = [read_occupancies(shot.file) for shot in run.shots]
+    # a shot may end after fewer cycles than another: all images of all shots, by step and cycle
+    all_images = dict.fromkeys(image for images, _ in shots for image in images)
+    names = [name for *_, name in sorted(all_images, key=itemgetter(0, 1))]
+    stack = np.full((len(shots), len(names), *run.target.shape), NO_IMAGE, np.int8)
+    for shot_stack, (images, occupancies) in zip(stack, shots, strict=True):
+        shot_stack[[names.index(name) for *_, name in images]] = occupancies
     return names, stack
 
 
@@ -124,10 +125,6 @@ class _Grid:
     coords: Mapping[str, tuple[str, NDArray[Any]]]
 
 
-_MISSING: Final[Mapping[str, Any]] = {"O": "", "f": np.nan, "i": 0, "b": False}
-"""Value for a place without a shot, by kind of column; integers and booleans have no such places."""
-
-
 def _on_grid(shots: xr.Dataset, grid: _Grid) -> xr.Dataset:
     """Spread the axis "place" over those of a scan; nan or "" where there is no shot."""
     import pandas as pd
@@ -138,7 +135,9 @@ def _on_grid(shots: xr.Dataset, grid: _Grid) -> xr.Dataset:
     if len(grid.places) < math.prod(grid.shape):  # nan needs a float
         counts = [str(name) for name in columns if name != "occupancy" and columns[name].dtype.kind in "bi"]
         columns = columns.assign({name: columns[name].astype(np.float64) for name in counts})
-    missing = {name: _MISSING[columns[name].dtype.kind] for name in columns}
+    # integers and booleans have no places without a shot: either they are floats now, or no place is empty
+    missing_of_kind: Mapping[str, Any] = {"O": "", "f": np.nan, "i": 0, "b": False}
+    missing = {name: missing_of_kind[columns[name].dtype.kind] for name in columns}
     missing |= {"occupancy": NO_IMAGE} if "occupancy" in columns else {}
     places = pd.MultiIndex.from_tuples(grid.places, names=grid.dims)
     spread = columns.assign_coords(xr.Coordinates.from_pandas_multiindex(places, "place")).unstack(
@@ -184,7 +183,9 @@ def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int
         place_of_point = [(number,) for number in range(len(points))]
         along = list(zip(*points, strict=True))
     axis_of = dims if is_product else ["point"] * len(addresses)
-    coords = {name: (axis, _values(of)) for name, axis, of in zip(addresses, axis_of, along, strict=True)}
+    coords = {
+        name: (axis, _values(values)) for name, axis, values in zip(addresses, axis_of, along, strict=True)
+    }
     places = [(*place_of_point[point], repeat) for point, repeat in zip(point_of_shot, repeats, strict=True)]
     return _Grid((*dims, "repeat"), (*shape, max(counts.values(), default=0)), places, coords)
 
