@@ -41,16 +41,10 @@ from labseq.recording.run_file import (
 )
 
 QUARANTINE: Final = "quarantine"
-LOG_FILE: Final = "doctor.jsonl"
-
 _TO_QUARANTINE: Final = "moved to quarantine"
 _CHECK_PERMISSIONS: Final = "left: check its permissions and the disk"
 _MAX_FINDINGS: Final = 100
 """Damaged lines of a file that are reported one by one."""
-_RUN_NAME: Final = re.compile(r"\d{4,}_.*", re.DOTALL)
-_CLAIM: Final = re.compile(r"\.\d{4,}\.claim")
-_YOUNG_S: Final = 60.0
-"""Minimum age of leftovers, in seconds: younger ones may belong to a run that is just being created."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +94,8 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
         RecordingError: The folder cannot be read.
     """
     root, report = path.absolute(), Report()
-    found = markers()
-    active = {marker.run_dir for marker in found if marker.is_active}
+    all_markers = markers()
+    active = {marker.run_dir for marker in all_markers if marker.is_active}
     for run_dir in _runs(root, report):
         is_being_made = not _may_exist(run_dir / folders.RUN_FILE) and _is_young(run_dir)
         if run_dir.resolve() in active or is_being_made:
@@ -110,7 +104,7 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
             _examine_run(run_dir, report, dry_run=dry_run)
     if not _is_run(root):
         check = _Check(root, dry_run=dry_run)
-        check.check_data_folder([marker for marker in found if not marker.is_active])
+        check.check_data_folder([marker for marker in all_markers if not marker.is_active])
         report.findings += check.findings
     return report
 
@@ -120,7 +114,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
     if _is_in_progress(run_dir):
         report.in_progress.append(run_dir)
         return
-    check = _Check(run_dir, dry_run=True)
+    check = _Check(run_dir, dry_run=True)  # an intact run needs no lock, and may be in a read-only folder
     check.check_run()
     if check.findings and not dry_run:
         lock = Lock(run_dir / folders.LOCK_FILE, "labseq doctor")
@@ -131,7 +125,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
             if is_locked or _is_in_progress(run_dir):
                 report.in_progress.append(run_dir)
                 return
-            check = _Check(run_dir, dry_run=False)
+            check = _Check(run_dir, dry_run=False)  # anew, as the run may have changed before it was locked
             check.check_run()
         finally:
             lock.release()
@@ -264,7 +258,7 @@ class _Check:
         for folder in (self.folder, *days):
             with suppress(RecordingError):  # reported where its runs are looked for
                 for name in names_in(folder):
-                    if _CLAIM.fullmatch(name) and not _is_young(folder / name):
+                    if re.fullmatch(r"\.\d{4,}\.claim", name) and not _is_young(folder / name):
                         self._quarantine("a leftover reservation of a run's number", folder / name, folder)
 
     def report_unreadable(self, error: RecordingError) -> None:
@@ -310,8 +304,10 @@ class _Check:
             file for file, same in of_file.items() if self._check_file({n: rows[n] for n in same}, index)
         }
         self.n_whole += len(whole)
-        known = sorted(number for file in whole for number in of_file[file])
-        file_of = {rows[number].shot: rows[number].file for number in known if rows[number].counts}
+        intact = sorted(number for file in whole for number in of_file[file])
+        # of a shot that was written twice, the last line counts
+        file_of = {rows[number].shot: rows[number].file for number in intact if rows[number].counts}
+        # later takes first: an earlier take of a shot must not get the line
         for name in sorted(names_in(folder), key=lambda name: (len(name), name), reverse=True):
             if SHOT_FILE.fullmatch(file := f"{folder.name}/{name}") and file not in of_file:
                 self._check_stray(folder / name, run_id, file_of, index)
@@ -364,8 +360,8 @@ class _Check:
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
                 index.remove(numbers)
             return False
-        second = [number for number in numbers if number != good[-1]]
-        index.remove(second, f"a second line for {path.name}")
+        superfluous = [number for number in numbers if number != good[-1]]
+        index.remove(superfluous, f"a second line for {path.name}")
         return True
 
     def _row_of_stray(self, path: Path, run_id: str) -> IndexRow | None:
@@ -457,7 +453,7 @@ def _move_away(what: str, path: Path, folder: Path) -> None:
 
 
 def _log_move(folder: Path, what: str, path: Path, goal: Path) -> None:
-    log = LineLog(_quarantine_of(folder) / LOG_FILE)
+    log = LineLog(_quarantine_of(folder) / "doctor.jsonl")
     t_utc = now_utc("seconds")
     log.append({"t_utc": t_utc, "what": what, "from": str(path), "to": str(goal)}, sync=True)
 
@@ -506,8 +502,11 @@ def _runs(root: Path, report: Report) -> Iterator[Path]:
 def _is_run(folder: Path) -> bool:
     if folder.name == QUARANTINE or not folder.is_dir():
         return False
-    own = (folders.RUN_FILE, folders.STATE_FILE, folders.INDEX_FILE, folders.SHOTS_FOLDER)
-    return _RUN_NAME.fullmatch(folder.name) is not None or any(_may_exist(folder / name) for name in own)
+    parts = (folders.RUN_FILE, folders.STATE_FILE, folders.INDEX_FILE, folders.SHOTS_FOLDER)
+    if re.fullmatch(r"\d{4,}_.*", folder.name, re.DOTALL):
+        return True
+    # renamed, or in no day's folder
+    return any(_may_exist(folder / name) for name in parts)
 
 
 def _may_exist(path: Path) -> bool:
@@ -519,7 +518,8 @@ def _may_exist(path: Path) -> bool:
 
 
 def _is_young(path: Path) -> bool:
+    """Whether something may belong to a run that is just being created: it is less than a minute old."""
     try:
-        return abs(time.time() - path.stat().st_mtime) < _YOUNG_S
+        return abs(time.time() - path.stat().st_mtime) < 60.0
     except OSError:
         return False

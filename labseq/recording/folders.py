@@ -30,10 +30,6 @@ NOTES_FILE: Final = "notes.json"
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
 
-_COUNTER = re.compile(r"\.?(\d{4,})[_.]")
-_DAY = re.compile(r"\d{4}-\d\d-\d\d")
-_MAX_SLUG: Final = 60
-
 
 def slug(name: str) -> str:
     """Convert a text to a name that every file system accepts.
@@ -44,8 +40,8 @@ def slug(name: str) -> str:
         >>> slug("../")
         'run'
     """
-    words = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", name))
-    return words[:_MAX_SLUG].strip("._-") or "run"
+    safe = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", name))
+    return safe[:60].strip("._-") or "run"
 
 
 def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1) -> str:
@@ -61,9 +57,9 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
         >>> shot_file_name(17, 0, counts=True, take=2)
         'shots/shot_000017.take_2.h5'
     """
-    kept = "" if counts else f".attempt_{attempt}"
-    kept += "" if take == 1 else f".take_{take}"
-    return f"{SHOTS_FOLDER}/shot_{shot_index:06d}{kept}.h5"
+    suffix = "" if counts else f".attempt_{attempt}"
+    suffix += "" if take == 1 else f".take_{take}"
+    return f"{SHOTS_FOLDER}/shot_{shot_index:06d}{suffix}.h5"
 
 
 def make_run_folder(root: Path, name: str, started: datetime) -> Path:
@@ -90,6 +86,7 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
             except FileExistsError:
                 continue
             try:
+                # another process may have made the folder and given up its claim since the first look
                 if any(n == counter for n in _counters(day, claims=False)):
                     continue
                 folder.mkdir()
@@ -102,23 +99,29 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
 
 def later_day(run_dir: Path) -> str:
     """The last day in the data folder that has runs, if it is after that of this run; else ""."""
-    own, root = run_dir.parent.name, run_dir.parent.parent
+    own_day, root = run_dir.parent.name, run_dir.parent.parent
     with contextlib.suppress(OSError):
-        days = [day.name for day in root.iterdir() if _DAY.fullmatch(day.name) and day.name > own]
+        days = [
+            day.name
+            for day in root.iterdir()
+            if re.fullmatch(r"\d{4}-\d\d-\d\d", day.name) and day.name > own_day
+        ]
         return max((day for day in days if _counters(root / day)), default="")
     return ""
 
 
 def _counters(day: Path, *, claims: bool = True) -> list[int]:
+    """The numbers of a day's runs; with ``claims`` also those that a run is just taking."""
     names = (entry.name for entry in day.iterdir())
-    found = (_COUNTER.match(name) for name in names if claims or not name.startswith("."))
-    return [int(match[1]) for match in found if match]
+    matches = (re.match(r"\.?(\d{4,})[_.]", name) for name in names if claims or not name.startswith("."))
+    return [int(match[1]) for match in matches if match]
 
 
 def runs_in(root: Path) -> list[Path]:
     """The folders of runs in a data folder, damaged ones included, the newest last."""
-    found = [folder for folder in root.glob("*-*-*/*_*") if counter_of(folder) >= 0 and folder.is_dir()]
-    return sorted(found, key=lambda folder: (folder.parent.name, counter_of(folder)))
+    run_dirs = [folder for folder in root.glob("*-*-*/*_*") if counter_of(folder) >= 0 and folder.is_dir()]
+    # by number, not by name: 10000 follows 9999
+    return sorted(run_dirs, key=lambda folder: (folder.parent.name, counter_of(folder)))
 
 
 def counter_of(folder: Path) -> int:
@@ -144,11 +147,11 @@ def find_run(path: Path) -> Path:
     for folder in (path, path.parent, path.parent.parent):
         if (folder / STATE_FILE).is_file():
             raise RecordingError(folder, _without_run_file(folder))
-    runs = sorted(found.parent for depth in ("*", "*/*") for found in path.glob(f"{depth}/{RUN_FILE}"))
+    runs = sorted(file.parent for depth in ("*", "*/*") for file in path.glob(f"{depth}/{RUN_FILE}"))
     if runs:
-        holds = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+        content = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
         raise RecordingError(
-            path, f"contains {holds} but is not a run itself", f"give one of them, for example {runs[-1]}"
+            path, f"contains {content} but is not a run itself", f"give one of them, for example {runs[-1]}"
         )
     raise RecordingError(path, f"is not a run: it has no {RUN_FILE}", "give a run's folder")
 

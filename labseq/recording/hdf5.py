@@ -19,8 +19,7 @@ from labseq.plain import dumps, parse_value, plain_text, to_plain
 from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
 
 _SCALAR: Final = h5s.create(h5s.SCALAR)
-_MAX_ATTRIBUTE: Final = 60_000
-"""Most bytes of an attribute's texts; HDF5 takes 64 KiB. Longer texts are cut."""
+"""Made once, as it takes 8 us and a shot's file has more than a hundred attributes."""
 
 
 def text_array(texts: str | Sequence[str], max_bytes: int = 1 << 31) -> NDArray[Any]:
@@ -29,10 +28,8 @@ def text_array(texts: str | Sequence[str], max_bytes: int = 1 << 31) -> NDArray[
     Texts of variable length would be in a part of the file that HDF5 reads without an end if it is damaged.
     """
     several = [texts] if isinstance(texts, str) else texts
-    data = [plain_text(text).encode() for text in several]
-    data = [
-        one if len(one) <= max_bytes else one[:max_bytes].decode(errors="ignore").encode() for one in data
-    ]
+    # decoded once more after the cut, which may be within a character
+    data = [plain_text(text).encode()[:max_bytes].decode(errors="ignore").encode() for text in several]
     kind = h5py.string_dtype("utf-8", max(map(len, data), default=1) or 1)
     return np.array(data[0] if isinstance(texts, str) else data, kind)
 
@@ -52,7 +49,8 @@ def _add(node: Any, name: str, array: NDArray[Any]) -> None:
 
 
 def _text_attribute(texts: Any) -> NDArray[Any]:
-    return text_array(texts, _MAX_ATTRIBUTE // (1 if isinstance(texts, str) else max(1, len(texts))))
+    # HDF5 takes at most 64 KiB for an attribute
+    return text_array(texts, 60_000 // (1 if isinstance(texts, str) else max(1, len(texts))))
 
 
 def read_attribute(node: Any, name: str, default: Any = None) -> Any:
@@ -118,16 +116,16 @@ def _attribute(field: Field, value: Any) -> Any:
 
 def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
     """Read attributes: attribute of the record -> plain value; those of a newer minor format are ignored."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for field in fields:
-        value = read_attribute(node, field.name, found)
-        if value is found:
+        value = read_attribute(node, field.name, values)
+        if value is values:
             continue
         value = int(value) if field.dtype == "integer" else value
         if not isinstance(value, _KINDS[field.dtype]):
             raise TypeError(f"'{field.name}' is {type(value).__name__}; expected {field.dtype}")
-        found[field.attribute] = value
-    return found
+        values[field.attribute] = value
+    return values
 
 
 _KINDS: Final = {"text": str, "integer": int, "int64": int, "bool": bool, "float64": float}
@@ -151,53 +149,53 @@ def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
     }
 
 
-def write_values(group: Any, values: Mapping[str, Any], units: Mapping[str, str], about: str) -> None:
+def write_values(group: Any, values: Mapping[str, Any], units: Mapping[str, str], description: str) -> None:
     """Add a dataset for each value: numbers and lists of numbers, texts, and JSON for all others."""
     names: list[str] = []
     for key, value in to_plain(values).items():
         names.append(link_name(key, names))
-        facts = {"address": key, "units": units.get(key, ""), "description": about}
+        attributes = {"address": key, "units": units.get(key, ""), "description": description}
         if _is_numeric(value):
             dataset = group.create_dataset(names[-1], data=value)
         else:
             text = value if isinstance(value, str) else dumps(value)
             dataset = group.create_dataset(names[-1], data=text_array(text))
-            facts["content_type"] = "text/plain" if isinstance(value, str) else "application/json"
-        set_attributes(dataset, facts)
+            attributes["content_type"] = "text/plain" if isinstance(value, str) else "application/json"
+        set_attributes(dataset, attributes)
 
 
 def _is_numeric(value: Any) -> bool:
     """Whether an array holds a value as it is: a number, or a list of numbers of one type."""
     several: list[Any] = value if isinstance(value, list) else [value]
     is_one_type = {*map(type, several)} in ({bool}, {int}, {float})
-    return is_one_type and all(type(one) is not int or -(2**63) <= one < 2**63 for one in several)
+    return is_one_type and all(type(item) is not int or -(2**63) <= item < 2**63 for item in several)
 
 
 def read_values(group: Any) -> dict[str, Any]:
     """Read what :func:`write_values` wrote."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for dataset in group.values():
         kind, value = read_attribute(dataset, "content_type"), dataset[()]
         if kind is None:
             value = value.tolist()
         else:
             value = parse_value(value) if kind == "application/json" else value.decode()
-        found[str(read_attribute(dataset, "address"))] = value
-    return found
+        values[str(read_attribute(dataset, "address"))] = value
+    return values
 
 
 def write_array(group: Any, path: str, values: Any, units: str | None = None) -> Any:
     """Add an array of :data:`ARRAYS` under the last part of its path; ``units`` replace the schema's."""
-    what = ARRAYS[path]
-    dataset = group.create_dataset(path.rpartition("/")[2], data=np.asarray(values, what.dtype))
-    describe(dataset, what, units)
+    array = ARRAYS[path]
+    dataset = group.create_dataset(path.rpartition("/")[2], data=np.asarray(values, array.dtype))
+    describe(dataset, array, units)
     return dataset
 
 
-def describe(dataset: Any, what: Dataset, units: str | None = None) -> None:
+def describe(dataset: Any, array: Dataset, units: str | None = None) -> None:
     """Add the attributes for the description, the unit and the axes of a dataset."""
-    units = what.units if units is None else units
-    set_attributes(dataset, {"units": units, "description": what.description, "dimensions": what.axes})
+    units = array.units if units is None else units
+    set_attributes(dataset, {"units": units, "description": array.description, "dimensions": array.axes})
 
 
 def write_table(group: Any, table: Table, rows: NDArray[Any], name: str = "") -> None:
@@ -225,10 +223,10 @@ MAX_OBJECTS: Final = 10_000
 MAX_DEPTH: Final = 8
 """Deepest group in a shot's file."""
 _FILTERS: Final = frozenset({1, 2, 3, 32000, 32001, 32004, 32008, 32015, 32026})
-"""deflate, shuffle, fletcher32, LZF, Blosc, LZ4, bitshuffle, Zstd, Blosc2; others would load libraries."""
-_MAX_RATIO: Final = 64
-"""By how much frames can be compressed."""
-_SMALL: Final = 1 << 24
+"""deflate, shuffle, fletcher32, LZF, Blosc, LZ4, bitshuffle, Zstd, Blosc2.
+
+HDF5 loads a library for any other, which a hostile file could name.
+"""
 
 
 def check_contents(file: Any, n_bytes: int, only: str = "") -> None:
@@ -260,7 +258,7 @@ def check_contents(file: Any, n_bytes: int, only: str = "") -> None:
             if kind != h5l.TYPE_HARD:
                 raise ValueError(f"{place} is a link that leads elsewhere")
             node = h5o.open(group, name)
-            if h5o.get_info(node).rc > 1:
+            if h5o.get_info(node).rc > 1:  # groups that contain each other would have no end
                 raise ValueError(f"{place} is in the file twice")
             if isinstance(node, h5g.GroupID):
                 pending.append((node, place))
@@ -283,12 +281,13 @@ def _declared_bytes(dataset: Any, place: str, n_bytes: int) -> int:
         raise ValueError(f"{place} keeps its data in another file")
     _check_type(kind, place)
     size = math.prod(dataset.get_space().get_simple_extent_dims()) * kind.get_size()
-    if plist.get_layout() == h5d.CHUNKED:
+    if plist.get_layout() == h5d.CHUNKED:  # HDF5 reads a chunk as a whole, however small the dataset
         size = max(size, math.prod(plist.get_chunk()) * kind.get_size())
     filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
     if not filters <= _FILTERS:
         raise ValueError(f"{place} has the filter {min(filters - _FILTERS)}, which labseq does not use")
-    limit = max(_SMALL, _MAX_RATIO * n_bytes) if filters else n_bytes
+    # frames shrink by less than 64; a dataset of up to 16 MiB may be as empty as it likes
+    limit = max(1 << 24, 64 * n_bytes) if filters else n_bytes
     if size > limit:
         raise ValueError(f"{place} declares {size} bytes, and the file has {n_bytes}")
     return 0 if filters else size
@@ -339,5 +338,5 @@ def load_filter(path: Path, dataset: Any) -> None:
     try:
         import hdf5plugin  # noqa: F401  # pyright: ignore[reportUnusedImport] - importing it registers the filter
     except ImportError as error:
-        what = "holds compressed frames, and to read them hdf5plugin is needed"
-        raise RecordingError(path, what, install_hint("compress")) from error
+        problem = "holds compressed frames, and to read them hdf5plugin is needed"
+        raise RecordingError(path, problem, install_hint("compress")) from error

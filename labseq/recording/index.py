@@ -173,7 +173,7 @@ def index_row(shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str
         "sha256": sha256,
         "bytes": n_bytes,
     }
-    row = row_of(to_plain(values))
+    row = row_of(to_plain(values))  # as it is read back: JSON has neither tuples nor infinities
     if row is None:
         raise RecordingError(
             file, f"cannot be listed in {INDEX_FILE}", "a value of the shot has another type"
@@ -220,8 +220,8 @@ def read_index(folder: Path) -> tuple[list[IndexRow], int]:
     """
     lines = NewLines(folder / INDEX_FILE).placed()
     rows = [None if values is None else row_of(values) for _, values in lines]
-    whole = [row for row in rows if row is not None]
-    return whole, len(rows) - len(whole)
+    intact = [row for row in rows if row is not None]
+    return intact, len(rows) - len(intact)
 
 
 def row_of(line: Mapping[str, Any]) -> IndexRow | None:
@@ -243,6 +243,7 @@ def _of_type(*types: type) -> Callable[[Any], Any]:
 
 
 def _integer(value: Any) -> int:
+    """An integer that fits into a column of numpy, and not a bool."""
     if type(value) is not int or not -(2**63) <= value < 2**63:
         raise TypeError(value)
     return value
@@ -286,9 +287,13 @@ def _file(value: Any) -> str:
     return value
 
 
-_BY_TYPE: Final = {"int64": _integer, "bool": _of_type(bool, type(None)), "text": _of_type(str)}
+def _reader_of(dtype: str) -> Callable[[Any], Any]:
+    readers = {"int64": _integer, "bool": _of_type(bool, type(None)), "text": _of_type(str)}
+    return readers.get(dtype, _float)
+
+
 _READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    **{field.name: _BY_TYPE.get(field.dtype, _float) for field in schema.IN_INDEX},
+    **{field.name: _reader_of(field.dtype) for field in schema.IN_INDEX},
     "counts": _of_type(bool),
     "stage_s": _floats_by_name,
     **dict.fromkeys(("parameters", "readings", "calibrations"), _of_type(dict)),
@@ -300,4 +305,4 @@ _READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "bytes": _integer,
 }
 _READ: Final = tuple((field.name, _READERS[field.name]) for field in fields(IndexRow))
-"""How the values of a line are read, in the order of the attributes."""
+"""How the values of a line are read, in the order of the attributes; an index has many thousand lines."""

@@ -1,8 +1,8 @@
 """Devices in use on this computer: the locks of their processes, and the markers of runs in progress.
 
-They follow the hardware (see ``Settings.identities``), not the profile's path or the data's folder: one
+They belong to the hardware (see ``Settings.identities``), not to the profile's path or the data's folder: one
 folder per computer holds them, see :func:`labseq.files.devices_root`. A lock ends with its process. A marker
-is there from before the devices are opened until they are safe: one without a process is of a run that died.
+exists from before the devices are opened until they are safe: if its process is gone, the run died.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from labseq.plain import dumps, parse_object
 from labseq.processes import Process
 from labseq.recording.folders import slug
 
-_MARKER: Final = ".json"
+_SUFFIX: Final = ".json"
 _CLEARED: Final = b"safe\n"
-"""A marker that only its owner may delete."""
+"""Content of a marker that no longer counts, but that only its owner may delete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class Marker:
     Attributes:
         path: The file.
         owner: The process; None if the file cannot be read.
-        run_dir: The run's folder; None likewise.
-        profile: Key of the profile; "" likewise.
+        run_dir: The run's folder; None if the file cannot be read.
+        profile: Key of the profile; "" if the file cannot be read.
         hardware: Identities of the devices that may be on.
     """
 
@@ -66,7 +66,7 @@ def mark_active(profile: str, hardware: Collection[str], run_dir: Path) -> None:
         RecordingError: The marker cannot be written.
     """
     owner = Process.current()
-    marker = devices_root() / f"{_stem(profile)}.{owner.pid}{_MARKER}"
+    marker = devices_root() / f"{_stem(profile)}.{owner.pid}{_SUFFIX}"
     values = {"profile": profile, "hardware": sorted(hardware), "run_dir": str(run_dir.resolve())}
     with explained(marker):
         write_shared(marker, dumps({**values, **asdict(owner)}).encode())
@@ -74,9 +74,9 @@ def mark_active(profile: str, hardware: Collection[str], run_dir: Path) -> None:
 
 
 def clear_active(profile: str, hardware: Collection[str]) -> None:
-    """Remove this process's marker, and from those of runs that died the devices that are safe now.
+    """Remove this process's marker, and the devices that are now safe from the markers of runs that died.
 
-    Markers of other running processes stay, and those of dead runs that have other devices.
+    Markers of other running processes stay, and so do those of dead runs with other devices.
 
     Raises:
         RecordingError: A marker cannot be changed; all others are.
@@ -95,9 +95,10 @@ def clear_active(profile: str, hardware: Collection[str]) -> None:
         raise failures[0]
 
 
-def _remove(marker: Marker, left: frozenset[str]) -> None:
-    if left and marker.owner is not None:
-        values = {"profile": marker.profile, "hardware": sorted(left), "run_dir": str(marker.run_dir)}
+def _remove(marker: Marker, devices: frozenset[str]) -> None:
+    """Remove a marker, or reduce it to the devices that may still be on."""
+    if devices and marker.owner is not None:
+        values = {"profile": marker.profile, "hardware": sorted(devices), "run_dir": str(marker.run_dir)}
         write_shared(marker.path, dumps({**values, **asdict(marker.owner)}).encode())
         return
     try:
@@ -134,7 +135,7 @@ def markers() -> list[Marker]:
     """All markers on this computer, by name."""
     folder = devices_root()
     try:
-        files = sorted(folder / entry.name for entry in folder.iterdir() if entry.name.endswith(_MARKER))
+        files = sorted(folder / entry.name for entry in folder.iterdir() if entry.name.endswith(_SUFFIX))
     except OSError:  # there is no such folder, or it cannot be read
         return []
     return [marker for marker in map(_read, files) if marker is not None]

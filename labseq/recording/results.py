@@ -59,7 +59,9 @@ class ResultsLog:
         values = cast("Mapping[Any, Any]", result)
         for name in values:
             if not isinstance(name, str) or name in (SHOT, ERROR):
-                raise TypeError(f"the result has the name {name!r}; expected text but '{SHOT}' and '{ERROR}'")
+                raise TypeError(
+                    f"the result has the name {name!r}; expected a text other than '{SHOT}' and '{ERROR}'"
+                )
         return values
 
     def write(self, shot: int, result: Mapping[str, Any]) -> None:
@@ -72,7 +74,7 @@ class ResultsLog:
 
 
 class Results:
-    """The results in the file of an analysis, which may grow.
+    """The results in the file of an analysis, which may still be written to.
 
     Attributes:
         rows: Shot -> its row.
@@ -113,7 +115,7 @@ def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     return [results.rows[shot] for shot in sorted(results.rows)], results.about
 
 
-def done(rows: Iterable[Mapping[str, Any]]) -> set[int]:
+def shots_with_result(rows: Iterable[Mapping[str, Any]]) -> set[int]:
     """The shots that have a result."""
     return {row[SHOT] for row in rows if ERROR not in row}
 
@@ -127,9 +129,9 @@ def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
     path = results_file(run_dir, name)
     if not path.is_file():
         names = sorted(file.stem for file in path.parent.glob(f"*{_SUFFIX}"))
-        there = f"there are those of {', '.join(names)}" if names else "there are none at all"
-        hint = f"'labseq analyse {run_dir} --use {name}' makes them"
-        raise RecordingError(path, f"there are no results of the analysis '{name}', {there}", hint)
+        others = f"only of {', '.join(names)}" if names else "nor of any other"
+        hint = f"make them with 'labseq analyse {run_dir} --use {name}'"
+        raise RecordingError(path, f"there are no results of the analysis '{name}', {others}", hint)
     return read_results(path)[0]
 
 
@@ -139,12 +141,12 @@ def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
     Raises:
         RecordingError: They cannot be read.
     """
-    found: dict[str, dict[int, Any]] = {}
+    columns: dict[str, dict[int, Any]] = {}
     for path in sorted((run_dir / folders.RESULTS_FOLDER).glob(f"*{_SUFFIX}")):
         rows, about = read_results(path)
         for row in rows:
             for key, value in row.items():
                 if key not in (SHOT, ERROR) and isinstance(value, bool | int | float | str):
                     name = f"{PREFIX}{about.get('analysis', path.stem)}.{key}"
-                    found.setdefault(name, {})[row[SHOT]] = value
-    return found
+                    columns.setdefault(name, {})[row[SHOT]] = value
+    return columns

@@ -24,30 +24,29 @@ from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STAT
 
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 
-_DEVELOPED: Final = "the development version of labseq 0.2.0 that wrote it"
-_READ_BY: Final = {1: "labseq 0.1.0", 2: _DEVELOPED, 3: _DEVELOPED}
-"""Older major version of the format -> the labseq that reads it."""
-
 
 class OtherFormatError(RecordingError):
     """A file was written in a format that this version of labseq cannot read."""
 
 
-def check_version(path: Path, found: str, known: str) -> None:
-    """Raise for a file whose format has another major version."""
-    found = clean(found)
-    major = found.partition(".")[0]
+def check_version(path: Path, version: str, own_version: str) -> None:
+    """Raise for a file whose format has another major version.
+
+    Args:
+        path: The file.
+        version: The version in the file.
+        own_version: The version that this labseq writes.
+    """
+    version = clean(version)
+    major = version.partition(".")[0]
     if not major.isdecimal():
-        advice = f"expected one like {known}; it is damaged"
-        raise RecordingError(path, f"has the format version '{found}'", advice)
-    if major != known.partition(".")[0]:
-        reader = _READ_BY.get(int(major), "")
+        advice = f"expected one like {own_version}; it is damaged"
+        raise RecordingError(path, f"has the format version '{version}'", advice)
+    if major != own_version.partition(".")[0]:
+        development = "the development version of labseq 0.2.0 that wrote it"
+        reader = {1: "labseq 0.1.0", 2: development, 3: development}.get(int(major), "")
         advice = f"use {reader} to read it" if reader else "update labseq"
-        raise OtherFormatError(path, f"has format version {found}, this labseq reads {known}", advice)
-
-
-_DICTS_IN_RUN: Final = ("units", "overrides", "scan", "devices", "resolved", "provenance")
-_IN_RUN: Final = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
+        raise OtherFormatError(path, f"has format version {version}, this labseq reads {own_version}", advice)
 
 
 def sha256_of_text(text: str) -> str:
@@ -57,6 +56,7 @@ def sha256_of_text(text: str) -> str:
 
 def encode_text(text: str) -> bytes:
     """Encode a text to exactly the bytes that it was decoded from."""
+    # a sequence file may hold bytes that are not UTF-8, for example in a comment
     return text.encode("utf-8", "surrogateescape")
 
 
@@ -86,14 +86,16 @@ def read_run(folder: Path) -> dict[str, Any]:
     path = folder / RUN_FILE
     record = parse_object(read_file(path))
     if record is None or record.get("format") != schema.RUN_FORMAT:
-        raise RecordingError(path, "is damaged, or not labseq's", "restore it from a backup")
+        raise RecordingError(path, "is damaged, or was not written by labseq", "restore it from a backup")
     check_version(path, str(record.get("format_version")), schema.RUN_FORMAT_VERSION)
-    wrong = [name for name, kind in _IN_RUN.items() if not isinstance(record.get(name), kind)]
-    wrong += [name for name in _DICTS_IN_RUN if not isinstance(record.get(name) or {}, dict)]
+    required = {"name": str, "n_shots": int, "seed": int, "simulated": bool, "target": dict}
+    optional = ("units", "overrides", "scan", "devices", "resolved", "provenance")
+    wrong = [name for name, kind in required.items() if not isinstance(record.get(name), kind)]
+    wrong += [name for name in optional if not isinstance(record.get(name) or {}, dict)]
     if not wrong and not 0 <= record["n_shots"] < 2**63:
         wrong = ["n_shots"]
     changes: dict[str, Any] = record.get("overrides") or {}
-    if not wrong and not all(isinstance(one, dict) and "written" in one for one in changes.values()):
+    if not wrong and not all(isinstance(change, dict) and "written" in change for change in changes.values()):
         wrong = ["overrides"]
     if wrong:
         raise RecordingError(path, f"is damaged: it has no valid '{wrong[0]}'", "restore it from a backup")
@@ -101,7 +103,7 @@ def read_run(folder: Path) -> dict[str, Any]:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """The record of a run, from run.json: what :func:`encode_run` has written.
+    """The record of a run, from run.json as :func:`encode_run` writes it.
 
     Raises:
         RecordingError: It is damaged, or of another format.

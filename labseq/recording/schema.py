@@ -39,13 +39,13 @@ from labseq.plain import plain_text
 
 FORMAT: Final = "labseq-shot"
 FORMAT_VERSION: Final = "4.1"
-"""major.minor; a newer minor version only adds things, another major version cannot be read."""
+"""major.minor: a newer minor version only adds values; another major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
 RUN_FORMAT_VERSION: Final = "4.0"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
-"""HDF5 features that files may use; these are read by the most programs."""
+"""Range of HDF5 versions whose features files may use: most programs read these."""
 
 _UNITS: Final = {
     **{unit: unit for unit in ("s", "m", "K", "Hz", "rad", "V", "W", "A", "px")},
@@ -101,8 +101,10 @@ def _fields(text: str, **attributes: str) -> tuple[Field, ...]:
         **attributes: Name -> attribute of the record, where that is another.
     """
     lines = re.sub(r"\n +", " ", textwrap.dedent(text).strip()).splitlines()
-    found = (line.split(None, 2) for line in lines)
-    return tuple(Field(name, dtype, about, attributes.get(name, name)) for name, dtype, about in found)
+    rows = (line.split(None, 2) for line in lines)
+    return tuple(
+        Field(name, dtype, description, attributes.get(name, name)) for name, dtype, description in rows
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +113,8 @@ class Table:
 
     Attributes:
         path: Where it is, below ``/entry``.
-        row: Meaning of a row.
-        description: Meaning of the table.
+        row: What one row describes.
+        description: What the table is.
         columns: Its columns.
         arrays: For a table with several rows of a record: record -> column -> array, or number for all rows.
     """
@@ -129,9 +131,12 @@ class Table:
             dtype = [(column.name, column.dtype) for column in self.columns]
             parts = [_together(dtype, self.arrays(record)) for record in records]
             return np.concatenate([np.empty(0, dtype), *parts])
-        found = list(map(attrgetter(*(column.attribute for column in self.columns)), records))
-        values = zip(*found, strict=True) if found else [()] * len(self.columns)
-        arrays = {c.name: _column(c, list(of)) for c, of in zip(self.columns, values, strict=True)}
+        rows = list(map(attrgetter(*(column.attribute for column in self.columns)), records))
+        columns = zip(*rows, strict=True) if rows else [()] * len(self.columns)
+        arrays = {
+            column.name: _column(column, list(values))
+            for column, values in zip(self.columns, columns, strict=True)
+        }
         return _together([(name, array.dtype) for name, array in arrays.items()], arrays)
 
     def arguments(self, kind: type, table: NDArray[Any]) -> list[dict[str, Any]]:
@@ -139,11 +144,11 @@ class Table:
 
         Values that its constructor does not take are left out, as are columns that an older file lacks.
         """
-        taken = {field.name for field in fields(kind)}
+        parameters = {field.name for field in fields(kind)}
         columns = {
             column.attribute: _plain_values(table[column.name])
             for column in self.columns
-            if column.attribute in taken and column.name in (table.dtype.names or ())
+            if column.attribute in parameters and column.name in (table.dtype.names or ())
         }
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
@@ -469,29 +474,29 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
     batches, moves = tables["batches"], tables["moves"]
     paths = tables.get("paths", np.empty(0, [("position", "f8"), ("knot", "i4"), ("off_knot", "i4")]))
     sites = np.stack([moves[name] for name in _SITES], axis=1)
-    found: list[CycleRecord] = []
-    for row, known, occupancy in zip(
+    cycles: list[CycleRecord] = []
+    for row, values, occupancy in zip(
         tables["cycles"], CYCLES.arguments(CycleRecord, tables["cycles"]), predicted, strict=True
     ):
         if not 0 <= row["n_batches_played"] <= row["n_batches"]:
             raise ValueError(f"{row['n_batches_played']} of {row['n_batches']} batches were played")
-        own, batches = batches[: row["n_batches"]], batches[row["n_batches"] :]
+        own_batches, batches = batches[: row["n_batches"]], batches[row["n_batches"] :]
         own_sites, sites = sites[: row["n_atom_moves"]], sites[row["n_atom_moves"] :]
-        offsets = np.concatenate([[0], np.cumsum(own["n_atom_moves"])])
+        offsets = np.concatenate([[0], np.cumsum(own_batches["n_atom_moves"])])
         report = PlanReport(
             predicted=occupancy.astype(np.bool_),
-            batch_end_s=own["end_s"].copy(),
-            n_tweezers=own["n_tweezers"].copy(),
+            batch_end_s=own_batches["end_s"].copy(),
+            n_tweezers=own_batches["n_tweezers"].copy(),
             n_defects=int(row["n_defects_predicted"]),
             n_surplus=int(row["n_surplus_predicted"]),
         )
-        shapes = _shapes_of(own)
+        shapes = _shapes_of(own_batches)
         n_positions = int((shapes[:, 0] * shapes[:, 1:].sum(axis=1)).sum())
         own_paths, paths = paths[:n_positions], paths[n_positions:]
         off = own_paths["off_knot"][own_paths["knot"] == 0]
-        plan = Plan(own_sites, offsets, own["linked"], shapes, own_paths["position"], off)
-        found.append(CycleRecord(plan=plan, report=report, **known))
-    return found
+        plan = Plan(own_sites, offsets, own_batches["linked"], shapes, own_paths["position"], off)
+        cycles.append(CycleRecord(plan=plan, report=report, **values))
+    return cycles
 
 
 def _shapes_of(batches: NDArray[Any]) -> NDArray[np.int32]:
@@ -567,26 +572,25 @@ ATOM_EVENTS: Final = Table(
 )
 """A simulation names the columns of its tables itself."""
 
-UNDESCRIBED: Final = "as the simulation's plugin describes it"
 
-
-def describe_columns(table: np.dtype[Any], known: Table) -> tuple[list[str], list[str]]:
+def describe_columns(table: np.dtype[Any], schema_table: Table) -> tuple[list[str], list[str]]:
     """Units and descriptions of the columns of a table.
 
     Args:
         table: Its dtype; a simulation describes columns by ``metadata={"descriptions": {column: text}}``.
-        known: The columns in the schema.
+        schema_table: The columns in the schema.
 
     Example:
         >>> jumps = np.dtype([("t_s", "f8")], metadata={"descriptions": {"t_s": "when"}})
         >>> describe_columns(jumps, ATOM_EVENTS)
         (['s'], ['when'])
     """
-    texts = {column.name: column.description for column in known.columns}
+    texts = {column.name: column.description for column in schema_table.columns}
     if not texts:
         texts = (table.metadata or {}).get("descriptions") or {}
     names = table.names or ()
-    return [unit_of(name) for name in names], [str(texts.get(name, UNDESCRIBED)) for name in names]
+    default = "as the simulation's plugin describes it"
+    return [unit_of(name) for name in names], [str(texts.get(name, default)) for name in names]
 
 
 def datasets() -> list[Dataset]:
@@ -605,7 +609,7 @@ _VIEWER: Final = ("text", "for viewers: class, signal, axes or default plot afte
 
 
 def attributes() -> dict[str, dict[str, tuple[str, str]]]:
-    """Every attribute of a shot's file but those of every dataset: path -> name -> type, description."""
+    """Every attribute of a shot's file except those of all datasets: path -> name -> type, description."""
     nexus = {
         "/entry": ("NX_class", "default"),
         "/entry/camera/<name>": ("NX_class",),
@@ -621,13 +625,15 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
         "format_version": ("text", "major.minor; a newer minor version only adds things"),
         "creator": ("text", "labseq and its version"),
     }
-    found = {"/": root | dict.fromkeys(("NX_class", "default"), _VIEWER)}
-    found |= {path: dict.fromkeys(names, _VIEWER) for path, names in nexus.items()}
-    for path, own in (("/entry", SHOT), ("/entry/run", RUN)):
-        found[path] = found.get(path, {}) | {field.name: (_kind(field), field.description) for field in own}
-    found[f"/entry/{PARAMETER.path}"] = {"address": ("text", "address of the setting")}
-    found["/entry/camera/<name>"]["name"] = ("text", "name of the camera")
-    return found
+    by_path = {"/": root | dict.fromkeys(("NX_class", "default"), _VIEWER)}
+    by_path |= {path: dict.fromkeys(names, _VIEWER) for path, names in nexus.items()}
+    for path, record_fields in (("/entry", SHOT), ("/entry/run", RUN)):
+        by_path[path] = by_path.get(path, {}) | {
+            field.name: (_kind(field), field.description) for field in record_fields
+        }
+    by_path[f"/entry/{PARAMETER.path}"] = {"address": ("text", "address of the setting")}
+    by_path["/entry/camera/<name>"]["name"] = ("text", "name of the camera")
+    return by_path
 
 
 EVERYWHERE: Final[Mapping[str, str]] = {

@@ -61,7 +61,9 @@ class ShotEncoder:
             RecordingError: The record contradicts itself, for example occupancies of different shapes.
         """
         try:
-            arrays = [None if one is None else one.tobytes() for one in (shot.thresholds, shot.sites_px)]
+            arrays = [
+                None if array is None else array.tobytes() for array in (shot.thresholds, shot.sites_px)
+            ]
             if (detector := (*arrays, shot.signal_unit)) != self._detector:  # they rarely change in a run
                 self._common, self._detector = _encode_common(self._run, self._run_id, shot), detector
             buffer = io.BytesIO(self._common)
@@ -69,8 +71,8 @@ class ShotEncoder:
                 self._write_shot(file["entry"], shot)
         except Exception as error:  # a plugin's camera or step may put anything into the record
             where = f"shot {shot.shot_index} (attempt {shot.attempt})"
-            what = f"cannot be laid out as a file: {format_error(error)}"
-            raise RecordingError(where, what, "see the plugin that made it") from error
+            problem = f"cannot be laid out as a file: {format_error(error)}"
+            raise RecordingError(where, problem, "see the plugin that made it") from error
         # of the bytes, which are not copied: the buffer's own view would keep it from being closed
         return memoryview(buffer.getvalue())
 
@@ -97,8 +99,8 @@ class ShotEncoder:
     def _frames_to_keep(self, images: Sequence[ImageRecord]) -> list[int]:
         """Indices of the images whose frames are recorded."""
         indices = range(len(images))
-        wanted = {"all": indices, "last": indices[-1:], "none": range(0)}[self._run.record_frames]
-        return [i for i in wanted if images[i].frame is not None]
+        recorded = {"all": indices, "last": indices[-1:], "none": range(0)}[self._run.record_frames]
+        return [i for i in recorded if images[i].frame is not None]
 
     def _write_frames(self, entry: Any, images: Sequence[ImageRecord], kept: Sequence[int]) -> None:
         series: dict[tuple[str, tuple[int, ...]], list[int]] = {}  # frames of one size share a dataset
@@ -251,14 +253,14 @@ def iter_frames(path: Path, only: int | None = None) -> Generator[tuple[int, Fra
         for group in entry["camera"].values() if "camera" in entry else ():
             stack = group["frames"]
             load_filter(path, stack)
-            values = schema.EXPOSURES.arguments(Frame, group["exposures"][()])
+            exposures = schema.EXPOSURES.arguments(Frame, group["exposures"][()])
             camera = str(read_attribute(group, "name"))
-            for i, (index, known) in enumerate(zip(group["image"][()], values, strict=True)):
+            for i, (index, exposure) in enumerate(zip(group["image"][()], exposures, strict=True)):
                 if only not in (None, int(index)):
                     continue
                 image = stack[i]
-                image.flags.writeable = False
-                yield int(index), Frame(image, camera=camera, **known)
+                image.flags.writeable = False  # as a camera's driver delivers it
+                yield int(index), Frame(image, camera=camera, **exposure)
 
 
 def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
@@ -269,7 +271,7 @@ def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
 
 @contextlib.contextmanager
 def opened(path: Path, only: str = "") -> Generator[Any]:
-    """Open a shot's file to read its group ``/entry``; what fails within reports the file as damaged.
+    """Open a shot's file to read its group ``/entry``; an error in the body reports the file as damaged.
 
     Args:
         path: The file.
@@ -278,8 +280,8 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
     Raises:
         RecordingError: It is missing, damaged, or of another format.
     """
-    if what := something_else(path):
-        raise RecordingError(path, f"cannot be read: {what}", "restore it from a backup")
+    if other_kind := something_else(path):
+        raise RecordingError(path, f"cannot be read: {other_kind}", "restore it from a backup")
     if not path.is_file():
         raise RecordingError(
             path, "is missing", "restore it from a backup, or delete its line from the index"
@@ -299,12 +301,12 @@ def open_finished(path: Path) -> h5py.File:
     except OSError as error:
         if "locking flag" not in str(error):
             raise
-        return h5py.File(path, "r")  # this process has opened it by h5py itself, with a lock
+        return h5py.File(path, "r")  # this process has it open with a lock: HDF5 allows no mixture
 
 
 @contextlib.contextmanager
 def damage_reported(path: Path) -> Generator[None]:
-    """Report the file as damaged if anything fails within.
+    """Report the file as damaged if anything in the body fails.
 
     Raises:
         RecordingError: Something failed.
@@ -319,13 +321,13 @@ def damage_reported(path: Path) -> Generator[None]:
 
 def _record(entry: Any) -> ShotRecord:
     values = read_fields(entry, schema.SHOT) | read_texts(entry, schema.SHOT_TEXTS)
-    taken = {field.name for field in fields(ShotRecord)}
+    names = {field.name for field in fields(ShotRecord)}  # a newer minor version may have more
     cycles = entry["rearrangement"]
     events = entry.get("atom_events", {})
     timing = schema.TIMING.arguments(StageTiming, entry["timing"][()])
     steps = schema.STEPS.arguments(StepTiming, entry["steps"][()]) if "steps" in entry else []
     return ShotRecord(
-        **{name: value for name, value in values.items() if name in taken},
+        **{name: value for name, value in values.items() if name in names},
         parameters=read_values(entry["parameters"]),
         images=_images(entry["detection"]),
         **_detector(entry["detection"]),
@@ -333,31 +335,31 @@ def _record(entry: Any) -> ShotRecord:
             {name: cycles[name][()] for name in ("cycles", "batches", "moves", "paths") if name in cycles},
             cycles["predicted"][()],
         ),
-        timing=[StageTiming(**known) for known in timing],
-        steps=[StepTiming(**known) for known in steps],
+        timing=[StageTiming(**stage) for stage in timing],
+        steps=[StepTiming(**step) for step in steps],
         atom_events={name: table[()] for name, table in events.items()},
     )
 
 
 def _images(group: Any) -> list[ImageRecord]:
     occupancies: NDArray[np.bool_] = group["occupancy"][()].astype(np.bool_)
-    known = schema.IMAGES.arguments(ImageRecord, group["images"][()])
-    signals = group["signal"][()] if "signal" in group else [None] * len(known)
+    rows = schema.IMAGES.arguments(ImageRecord, group["images"][()])
+    signals = group["signal"][()] if "signal" in group else [None] * len(rows)
     return [
         ImageRecord(frame=None, occupancy=occupancy, confidence=confidence, signal=signal, **values)
         for occupancy, confidence, signal, values in zip(
-            occupancies, group["confidence"][()], signals, known, strict=True
+            occupancies, group["confidence"][()], signals, rows, strict=True
         )
     ]
 
 
 def _detector(group: Any) -> dict[str, Any]:
     """What the detector reported about itself in a shot: arguments of its record."""
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         argument: group[name][()]
         for argument, name in (("thresholds", "threshold"), ("sites_px", "sites_px"))
         if name in group
     }
-    return found | (
+    return values | (
         {"signal_unit": read_attribute(group["threshold"], "units")} if "threshold" in group else {}
     )

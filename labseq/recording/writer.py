@@ -34,7 +34,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 ANSWER_S: Final = 5.0
-"""How long the disk may take for a file; then nothing more is written, and the run ends."""
+"""Time limit for writing a file; after it nothing more is written, and the run ends."""
 
 
 class RunWriter:
@@ -67,7 +67,7 @@ class RunWriter:
         self._n_events_lost = 0
         self._began_s = time.monotonic()
         self._before: dict[str, Any] | None = None  # run.json, if another process began the run
-        self._kept: frozenset[str] = frozenset()
+        self._existing_files: frozenset[str] = frozenset()
 
     @classmethod
     def create(
@@ -94,6 +94,7 @@ class RunWriter:
         try:
             with explained(run_dir):
                 (run_dir / folders.SHOTS_FOLDER).mkdir()
+            # run.json comes last: without one, a folder holds no shots and may be deleted
             write_file(run_dir / folders.STATE_FILE, encode_state("running"))
             texts = {folders.SEQUENCE_FILE: run.sequence_text, folders.PROFILE_FILE: run.profile_text}
             for name, content in {**texts, **(extra_files or {})}.items():
@@ -124,9 +125,10 @@ class RunWriter:
         before = {**read_run(run_dir), "resumed": run.resumed}
         with explained(run_dir):
             (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
-            kept = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
+            # all files, as one may have been written without its line in the index
+            existing = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
         writer = cls(run_dir, run, stop)
-        writer.n_written, writer._before, writer._kept = n_written, before, kept
+        writer.n_written, writer._before, writer._existing_files = n_written, before, existing
         writer._on_disk(writer._write_run_file)()
         write_file(run_dir / folders.STATE_FILE, encode_state("running"))
         return writer
@@ -178,9 +180,9 @@ class RunWriter:
         file = self._free_name(shot.shot_index, shot.attempt, counts=shot.status == "complete")
         row = index_row(shot, self.run.target, file=file, sha256="", n_bytes=data.nbytes)
         sha256 = SimpleQueue[str]()
-        written = self._on_disk(self._write_shot, row, data, sha256)
+        wait = self._on_disk(self._write_shot, row, data, sha256)
         sha256.put(hashlib.sha256(data).hexdigest())  # while the disk writes
-        self._last_row = row = written()
+        self._last_row = row = wait()
         self.n_written += row.counts
         return row
 
@@ -195,29 +197,30 @@ class RunWriter:
         return row
 
     def _on_disk(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
-        """Begin to write something; returns what waits for its end.
+        """Begin to write something; returns a function that waits until it is written.
 
         Raises:
             RecordingError: The disk does not answer; or as ``work`` raises it.
             StopRequested: The run was asked to stop twice.
         """
-        refused = RecordingError(self.run_dir, "cannot be written: the disk does not answer")
+        no_answer = RecordingError(self.run_dir, "cannot be written: the disk does not answer")
         if self.is_given_up:
-            raise refused
+            raise no_answer
+        # twice the limit, as a shot is two files: its own and the index
         _, result = self._guard.begin("disk", 2 * ANSWER_S, partial(work, *args, **kwargs), is_patient=False)
 
-        def written() -> T:
+        def wait() -> T:
             try:
                 return result()
             except (DeviceHungError, StopRequested) as error:
                 self.is_given_up = True
                 if isinstance(error, StopRequested):
                     raise
-                raise refused from error
+                raise no_answer from error
             except DeviceError as error:
                 raise RecordingError(self.run_dir, f"cannot be written: {error}") from error
 
-        return written
+        return wait
 
     def skip(self, shots: Sequence[int], why: str) -> None:
         """Record that shots will not be taken, even if the run is resumed.
@@ -236,7 +239,7 @@ class RunWriter:
         """The name of a shot's file, different from those that the run had before it was resumed."""
         for take in itertools.count(1):
             file = folders.shot_file_name(shot_index, attempt, counts=counts, take=take)
-            if Path(file).name not in self._kept:
+            if Path(file).name not in self._existing_files:
                 return file
         raise AssertionError
 
@@ -257,7 +260,7 @@ class RunWriter:
             if self._n_events_lost:
                 line["n_lost_before"] = self._n_events_lost
             try:
-                self._events.append(line, sync=False)
+                self._events.append(line, sync=False)  # a lost event is no lost shot: not worth a sync
                 self._n_events_lost = 0
             except RecordingError:
                 self._n_events_lost += 1

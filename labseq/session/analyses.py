@@ -30,7 +30,7 @@ from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import format_error
 from labseq.plain import now_utc
 from labseq.processes import Lock, knows_no_locks
-from labseq.recording.results import AGAIN, ResultsLog, done, read_results, results_file
+from labseq.recording.results import AGAIN, ResultsLog, read_results, results_file, shots_with_result
 from labseq.roles import Analysis, RecordedShot
 from labseq.session.analysis_processes import FAILED, FINISH_WITHIN, USE
 
@@ -127,7 +127,7 @@ def results_of(
     with _alone(path, prepared.name):
         rows, about = read_results(path)
         again = again or about.get("settings") != prepared.about["settings"]
-        yield ResultsLog(path, {**prepared.about, AGAIN: again}), set() if again else done(rows)
+        yield ResultsLog(path, {**prepared.about, AGAIN: again}), set() if again else shots_with_result(rows)
 
 
 def analyse(

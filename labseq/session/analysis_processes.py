@@ -16,7 +16,15 @@ from labseq.errors import DeviceError, LabseqError
 from labseq.files import check_ordinary
 from labseq.guard import StopFlag
 from labseq.messages import clean, did_you_mean, listing
-from labseq.recording.results import ERROR, PREFIX, SHOT, Results, done, read_results, results_file
+from labseq.recording.results import (
+    ERROR,
+    PREFIX,
+    SHOT,
+    Results,
+    read_results,
+    results_file,
+    shots_with_result,
+)
 from labseq.roles import RunObserver
 from labseq.units import format_quantity
 
@@ -158,7 +166,7 @@ class AnalysisProcesses:
         with suppress(LabseqError):
             rows = read_results(results_file(self._run_dir, name))[0]
             shots = {shot.index for shot in open_run(self._run_dir).shots}
-            n_missing, n_failed = len(shots - done(rows)), sum(ERROR in row for row in rows)
+            n_missing, n_failed = len(shots - shots_with_result(rows)), sum(ERROR in row for row in rows)
             if n_missing:
                 failed = f" ({n_failed} failed)" if n_failed else ""
                 text = f"analysis '{name}' has no result of {n_missing} of {len(shots)} shots{failed}"

@@ -256,7 +256,7 @@ def test_pipes_and_devices_are_refused_without_waiting(
         ({"n_shots": 10**30}, "it has no valid 'n_shots'"),
         ({"overrides": [1]}, "it has no valid 'overrides'"),
         ({"scan": "x"}, "it has no valid 'scan'"),
-        ({"format": []}, "is damaged, or not labseq's"),
+        ({"format": []}, "is damaged, or was not written by labseq"),
     ],
 )
 def test_wrong_types_in_run_json_are_damage(run_dir: Path, changes: dict[str, Any], what: str) -> None:

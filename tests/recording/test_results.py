@@ -10,7 +10,7 @@ import pytest
 from labseq.data import open_run
 from labseq.errors import RecordingError
 from labseq.recording import RunWriter
-from labseq.recording.results import ResultsLog, done, read_results, results_file
+from labseq.recording.results import ResultsLog, read_results, results_file, shots_with_result
 
 from .records import make_run
 
@@ -36,10 +36,10 @@ def test_of_several_rows_of_a_shot_the_last_counts(path):
     log = ResultsLog(path, ABOUT)
     log.fail(0, ValueError("too dark"))
     assert read_results(path)[0] == [{"shot": 0, "error": "ValueError: too dark"}]
-    assert done(read_results(path)[0]) == set()
+    assert shots_with_result(read_results(path)[0]) == set()
     log.write(0, {"mean": 1})
     assert read_results(path)[0] == [{"shot": 0, "mean": 1}]
-    assert done(read_results(path)[0]) == {0}
+    assert shots_with_result(read_results(path)[0]) == {0}
 
 
 def test_what_was_before_results_that_are_begun_again_does_not_count(path):
@@ -68,6 +68,8 @@ def test_a_run_finds_its_results(tmp_path):
     writer = RunWriter.create(tmp_path, make_run())
     ResultsLog(results_file(writer.run_dir, "my µ/analysis"), ABOUT).write(0, {"mean": 1})
     assert open_run(writer.run_dir).analysis("my µ/analysis") == [{"shot": 0, "mean": 1}]
-    expected = r"of the analysis 'other', there are those of my_µ_analysis; 'labseq analyse .* --use other'"
+    expected = (
+        r"of the analysis 'other', only of my_µ_analysis; make them with 'labseq analyse .* --use other'"
+    )
     with pytest.raises(RecordingError, match=expected):
         open_run(writer.run_dir).analysis("other")

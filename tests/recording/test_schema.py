@@ -74,9 +74,15 @@ def test_every_column_says_what_it_is_and_in_what_unit(file: Any) -> None:
 
 def test_a_simulation_may_describe_its_columns(file: Any) -> None:
     jumps = file["entry/atom_events/jumps"]
-    assert list(jumps.attrs["descriptions"]) == [b"when it jumped", schema.UNDESCRIBED.encode()]
+    assert list(jumps.attrs["descriptions"]) == [
+        b"when it jumped",
+        b"as the simulation's plugin describes it",
+    ]
     assert list(jumps.attrs["units"]) == [b"s", b""]
-    assert list(file["entry/atom_events/plain"].attrs["descriptions"]) == [schema.UNDESCRIBED.encode()] * 2
+    assert (
+        list(file["entry/atom_events/plain"].attrs["descriptions"])
+        == [b"as the simulation's plugin describes it"] * 2
+    )
 
 
 def test_the_file_holds_the_attributes_of_the_schema(file: Any) -> None:
