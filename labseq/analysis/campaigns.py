@@ -32,8 +32,6 @@ Runs = Mapping[Point, Sequence[Run]]
 
 OF_SHOTS: Final = ("filling_fraction", "success", "n_defects", "n_batches", "n_atom_moves")
 """Columns of the shots that the combined file has for each shot."""
-REPEAT: Final = "repeat"
-_NO_AXES: Final = "'labseq plot' draws each of its runs, 'labseq export' writes their shots to one file"
 
 
 def campaign_in(path: Path | None) -> Path | None:
@@ -71,12 +69,12 @@ def export_campaign(folder: Path, path: Path) -> None:
 def _missing(campaign: Campaign, runs: Runs) -> list[str]:
     """A line about the points whose runs are not complete; none if all are."""
     n_complete = sum(
-        len(of) == campaign.settings.runs and all(run.status == "complete" for run in of)
-        for of in runs.values()
+        len(same_point) == campaign.settings.runs and all(run.status == "complete" for run in same_point)
+        for same_point in runs.values()
     )
     if n_complete == (n_points := len(runs)):
         return []
-    n_without = n_points - sum(any(run.shots for run in of) for of in runs.values())
+    n_without = n_points - sum(any(run.shots for run in same_point) for same_point in runs.values())
     return [f"{n_complete} of {plural(n_points, 'point')} are complete; {n_without} without shots are nan"]
 
 
@@ -93,36 +91,41 @@ def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
     import xarray as xr
 
     shape, names = tuple(map(len, campaign.axes.values())), tuple(campaign.axes)
-    shots = {point: _shots(of) for point, of in runs.items()}
+    shots = {point: _shots(same_point) for point, same_point in runs.items()}
     n_repeats = max(campaign.settings.repeats, *map(len, shots.values()))
     means = {f"{name}{end}": np.full(shape, np.nan) for name in DEFAULT for end in ("", "_low", "_high")}
     of_shots = {name: np.full((*shape, n_repeats), np.nan) for name in OF_SHOTS}
     n_shots = np.zeros(shape, np.int64)
-    for point, of in runs.items():
-        if not of:
+    for point, same_point in runs.items():
+        if not same_point:
             continue
         n_shots[point] = len(shots[point])
         for name in DEFAULT:
-            one = of[0].quantity(name).over(shots[point])
-            for end, value in zip(("", "_low", "_high"), (one.value, *one.interval), strict=True):
+            estimate = same_point[0].quantity(name).over(shots[point])
+            for end, value in zip(("", "_low", "_high"), (estimate.value, *estimate.interval), strict=True):
                 means[name + end][point] = value
         for name, values in of_shots.items():
-            known = [quantities_in(shot.row).get(name, math.nan) for shot in shots[point]]
-            values[point][: len(known)] = known
-    dims, of_shot = (*names, REPEAT), slice(None)
+            taken = [quantities_in(shot.row).get(name, math.nan) for shot in shots[point]]
+            values[point][: len(taken)] = taken  # nan for shots that are still missing
+    dims, repeats = (*names, "repeat"), slice(None)
     if n_repeats == 1:
-        dims, of_shot = names, 0
-    data: dict[str, Any] = {name: (names, of, {"long_name": _about(name)}) for name, of in means.items()}
-    data |= {name: (dims, of[..., of_shot], {"long_name": _about(name)}) for name, of in of_shots.items()}
+        dims, repeats = names, 0
+    data: dict[str, Any] = {
+        name: (names, values, {"long_name": _description(name)}) for name, values in means.items()
+    }
+    data |= {
+        name: (dims, values[..., repeats], {"long_name": _description(name)})
+        for name, values in of_shots.items()
+    }
     data["n_shots"] = (names, n_shots, {"long_name": "shots at the point"})
     coordinates = {
-        address: ((address,), _values(campaign, address, runs), {"units": si_unit_of(words[0])})
-        for address, words in campaign.axes.items()
+        address: ((address,), _values(campaign, address, runs), {"units": si_unit_of(written[0])})
+        for address, written in campaign.axes.items()
     }
     return xr.Dataset(data, coordinates, {"sequence": campaign.settings.sequence})
 
 
-def _about(name: str) -> str:
+def _description(name: str) -> str:
     bare = name.removesuffix("_low").removesuffix("_high")
     if bare == name:
         return description_of(name) if name in OF_SHOTS else f"mean over the shots of: {description_of(name)}"
@@ -131,15 +134,15 @@ def _about(name: str) -> str:
 
 def _values(campaign: Campaign, address: str, runs: Runs) -> list[Any]:
     """The values of an axis, SI; all as written if one of them is not a number."""
-    words, axis = campaign.axes[address], [*campaign.axes].index(address)
-    values: list[Any] = [*words]
-    for i, word in enumerate(words):
+    written, axis = campaign.axes[address], [*campaign.axes].index(address)
+    values: list[Any] = [*written]
+    for i, text in enumerate(written):
         with suppress(ValueError):
-            values[i] = parse_any(word)[0]
-    for point, of in runs.items():  # as the run read it, which knows the setting's type
-        for run in of:
+            values[i] = parse_any(text)[0]
+    for point, same_point in runs.items():  # as the run read it, which knows the setting's type
+        for run in same_point:
             values[point[axis]] = run.record["overrides"][address]["value"]
-    return values if all(type(value) in (int, float) for value in values) else [*words]
+    return values if all(type(value) in (int, float) for value in values) else [*written]
 
 
 def campaign_picture(folder: Path) -> RunPicture:
@@ -151,20 +154,20 @@ def campaign_picture(folder: Path) -> RunPicture:
     """
     campaign, runs = recorded_runs(folder)
     if not campaign.axes:
-        raise ConfigError(Problem("the campaign has no axes to draw", visible(str(folder)), hint=_NO_AXES))
-    varied = [i for i, words in enumerate(campaign.axes.values()) if len(words) > 1] or [0]
+        hint = "'labseq plot' draws each of its runs, 'labseq export' writes their shots to one file"
+        raise ConfigError(Problem("the campaign has no axes to draw", visible(str(folder)), hint=hint))
+    varied = [i for i, values in enumerate(campaign.axes.values()) if len(values) > 1] or [0]
     addresses = [[*campaign.axes][i] for i in varied]
     axes = tuple(
-        make_axis(clean(one), [*map(clean, campaign.axes[one])], _values(campaign, one, runs))
-        for one in addresses
+        make_axis(clean(address), [*map(clean, campaign.axes[address])], _values(campaign, address, runs))
+        for address in addresses
     )
     points = [*campaign.points()]
     shots = [_shots(runs[point]) for point in points]
     places = tuple(tuple(point[i] for i in varied) for point in points)
-    found = Scanned(axes, places, tuple(ScanPoint({}, {}, of) for of in shots))
-    some = _first(runs)
-    names = WITHOUT_TARGET if some.target.is_none else DEFAULT
-    rows = tuple(row for name in names if (row := scan_panels(found, _over_runs(runs, name))))
+    scan = Scanned(axes, places, tuple(ScanPoint({}, {}, point_shots) for point_shots in shots))
+    names = WITHOUT_TARGET if _first(runs).target.is_none else DEFAULT
+    rows = tuple(row for name in names if (row := scan_panels(scan, _over_runs(runs, name))))
     if not rows:
         raise ConfigError(Problem("the campaign has no shots to draw yet", visible(str(folder))))
     note = "; ".join([plural(sum(map(len, shots)), "shot"), *_missing(campaign, runs)])
@@ -173,7 +176,12 @@ def campaign_picture(folder: Path) -> RunPicture:
 
 def _over_runs(runs: Runs, name: str) -> Quantity:
     """A quantity of the shots of several runs, each with the target of its own run."""
-    of_run = {run.shots[0].file.parent: run.quantity(name) for of in runs.values() for run in of if run.shots}
+    of_run = {
+        run.shots[0].file.parent: run.quantity(name)
+        for same_point in runs.values()
+        for run in same_point
+        if run.shots
+    }
 
     def events_of(shot: Shot) -> tuple[float, float]:
         return of_run[shot.file.parent].events_of(shot)
@@ -182,7 +190,7 @@ def _over_runs(runs: Runs, name: str) -> Quantity:
 
 
 def _first(runs: Runs) -> Run:
-    return next(run for of in runs.values() for run in of)
+    return next(run for same_point in runs.values() for run in same_point)
 
 
 def _shots(runs: Sequence[Run]) -> tuple[Shot, ...]:

@@ -35,10 +35,6 @@ Floats = NDArray[np.float64]
 Panel = Callable[["Axes"], None]
 """A function that draws on axes."""
 
-MIN_WINDOW: Final = 10
-"""Minimum number of shots in a running mean."""
-N_WINDOWS: Final = 10
-"""Number of windows of a running mean in a long run."""
 MAX_POINTS: Final = 200
 """Maximum number of points of the line of a running mean."""
 MIN_SHARE: Final = 1e-3
@@ -47,38 +43,14 @@ MAX_BARS: Final = 40
 """Maximum number of bars in the histogram of defects."""
 N_BINS: Final = 80
 """Number of bars in the histogram of signals."""
-BRIGHTEST: Final = 0.999
-"""Quantile of the mean counts that is drawn white."""
 COLOURS: Final = "cividis"
 """Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
 NO_VALUE: Final = "0.94"
-BARS: Final[dict[str, Any]] = {"ecolor": DARK, "capsize": 2, "error_kw": {"elinewidth": 0.9, "capthick": 0.9}}
-ERRORS: Final[dict[str, Any]] = {"color": DARK, "capsize": 2, "elinewidth": 0.9, "capthick": 0.9}
+"""Grey of a cell without a value."""
 MANY_BARS: Final = 15
 """Above this number of bars, the line has no marks, and empty bars have no errors."""
-LEGEND: Final = 0.35
-"""Room for the legend above the histogram of defects, relative to its height."""
-N_LINE: Final = 200
-"""Number of points of a fitted line."""
-CHARACTER: Final = 0.02
-"""Width of a character of a tick's label, relative to the axis."""
-MAX_CHARACTERS: Final = 32
-"""Maximum number of characters below an axis that are not turned."""
-MAX_TURNED: Final = 24
-"""Maximum number of labels below an axis that are turned."""
-MIN_DEFECTS: Final = 4
-"""The histogram of defects has at least this range."""
-MANY: Final = 500
-"""Minimum number of points at which they are drawn smaller."""
-PIXELS: Final = 2000
-"""Minimum number of points at which they are drawn as pixels even in vector graphics."""
 MIN_RANGE_PERCENT: Final = 1.0
-MIN_GAP: Final = 0.09
-"""Minimum distance of values, relative to their range, at which each has a tick."""
-MAX_CELLS_WITH_TEXT: Final = 6
 MAX_TICKS: Final = 10
-HIDDEN_S: Final = 1e-6
-"""Times below this, in seconds, come from models that neglect a stage, and are not drawn."""
 
 
 STYLE: Final[dict[Any, Any]] = {
@@ -134,14 +106,14 @@ def trend(name: str, shots: Floats, values: Floats, *, is_rate: bool) -> Panel |
         values: float64 (n,), a fraction for each; nan if unknown.
         is_rate: Whether each value is 0 or 1; the scale is then 0 to 100 %.
     """
-    known = np.isfinite(values)
-    if not known.any():
+    has_value = np.isfinite(values)
+    if not has_value.any():
         return None
-    shots, values = shots[known], values[known]
+    shots, values = shots[has_value], values[has_value]
     window, running = running_mean(shots, values, is_rate=is_rate)
 
     def draw(axes: Axes) -> None:
-        is_few = len(shots) <= MANY
+        is_few = len(shots) <= 500
         look: dict[str, Any] = {"marker": "o", "markersize": 3 if is_few else 1, "markeredgewidth": 0}
         if is_rate:
             look = {
@@ -149,13 +121,16 @@ def trend(name: str, shots: Floats, values: Floats, *, is_rate: bool) -> Panel |
                 "markersize": 5 if is_few else 3,
                 "markeredgewidth": 0.8 if is_few else 0.3,
             }
-        axes.plot(shots, 100 * values, color=LIGHT, linestyle="none", rasterized=len(shots) > PIXELS, **look)
+        # an SVG or PDF file with more marks than these is slow to open
+        axes.plot(shots, 100 * values, color=LIGHT, linestyle="none", rasterized=len(shots) > 2000, **look)
         x, y, low, high = running
-        sure = np.isfinite(low) & np.isfinite(high)
-        axes.fill_between(x, 100 * low, 100 * high, where=sure, color=DARK, alpha=0.2, linewidth=0, zorder=3)
+        has_error = np.isfinite(low) & np.isfinite(high)
+        axes.fill_between(
+            x, 100 * low, 100 * high, where=has_error, color=DARK, alpha=0.2, linewidth=0, zorder=3
+        )
         axes.plot(x, 100 * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
-        of = "1 shot" if window == 1 else f"{window} shots"
-        axes.set(title=f"{name} by shot; line: mean of {of}", xlabel="shot", ylabel=f"{name} (%)")
+        averaged = "1 shot" if window == 1 else f"{window} shots"
+        axes.set(title=f"{name} by shot; line: mean of {averaged}", xlabel="shot", ylabel=f"{name} (%)")
         axes.set_xlim(shots[0] - 0.5, shots[-1] + 0.5)
         axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(100 * values, 0.1, MIN_RANGE_PERCENT)))
         whole_numbers(axes.xaxis)
@@ -164,8 +139,8 @@ def trend(name: str, shots: Floats, values: Floats, *, is_rate: bool) -> Panel |
 
 
 def running_mean(shots: Floats, values: Floats, *, is_rate: bool) -> tuple[int, Floats]:
-    """The number of shots in a running mean of known values, and the mean, see :func:`points_of`."""
-    window = min(len(values), max(MIN_WINDOW, len(values) // N_WINDOWS))
+    """The number of shots in a running mean, and the mean, see :func:`points_of`."""
+    window = min(len(values), max(10, len(values) // 10))
     starts = np.unique(np.linspace(0, len(values) - window, MAX_POINTS).astype(np.int64))
     parts = [values[start : start + window].tolist() for start in starts]
     means = [Rate(round(math.fsum(part)), window) if is_rate else mean(part) for part in parts]
@@ -204,12 +179,12 @@ def draw_curves(
     all_x, *ends = np.concatenate([*curves.values()], axis=1)
     if line is not None:
         across = np.geomspace if logarithmic else np.linspace
-        x = across(all_x.min(), all_x.max(), N_LINE)
+        x = across(all_x.min(), all_x.max(), 200)
         axes.plot(x, scale * line(x), color=ORANGE, linewidth=1.2, label=line_label, zorder=2)
     if logarithmic:
         _plain_logarithmic(axes)
     elif ticks:
-        set_words(axes.xaxis, ticks)
+        set_labels(axes.xaxis, ticks)
     elif whole:
         whole_numbers(axes.xaxis)
     elif _fit_as_ticks(np.unique(all_x)):
@@ -256,9 +231,9 @@ def draw_map(
     )
     axes.set(title=title, xlabel=x_label, ylabel=y_label)
     axes.grid(visible=False)
-    set_words(axes.xaxis, x_ticks, room=24, most=MAX_TICKS)
-    set_words(axes.yaxis, y_ticks, room=sys.maxsize, most=MAX_TICKS)
-    if max(values.shape) <= MAX_CELLS_WITH_TEXT:
+    set_labels(axes.xaxis, x_ticks, room=24, most=MAX_TICKS)
+    set_labels(axes.yaxis, y_ticks, room=sys.maxsize, most=MAX_TICKS)
+    if max(values.shape) <= 6:  # the numbers fit into the cells
         for (row, col), value in np.ndenumerate(values):
             if np.isfinite(value):
                 colour = "white" if value < (low + high) / 2 else "black"
@@ -283,11 +258,11 @@ def draw_sites(
     colours = colormaps[COLOURS].with_extremes(bad=NO_VALUE, under="black")
     filled = PolyCollection(list(cells), cmap=colours, edgecolors="white", linewidths=0.3)
     filled.set_array(np.ma.masked_invalid(100 * values.ravel()))
-    known = values[np.isfinite(values)]
+    finite = values[np.isfinite(values)]
     low, high = 0.0, 1.0
-    if len(known):  # a site with few atoms must not stretch the range
-        high = float(known.max())
-        low = min(float(np.quantile(known, 0.02)), high - 0.01)
+    if len(finite):  # a site with few atoms must not stretch the range
+        high = float(finite.max())
+        low = min(float(np.quantile(finite, 0.02)), high - 0.01)
     filled.set_clim(100 * low, 100 * high)
     axes.add_collection(filled)
     line: dict[str, Any] = {"colors": RED, "linewidths": 1.0, "capstyle": "round"}
@@ -297,7 +272,7 @@ def draw_sites(
     axes.set_xlim(x.min() - 0.3, x.max() + 0.3)
     axes.set_ylim(y.max() + 0.3, y.min() - 0.3)
     axes.set_axis_off()
-    extend = "min" if (known < low).any() else "neither"
+    extend = "min" if (finite < low).any() else "neither"
     axes.figure.colorbar(filled, ax=axes, pad=0.02, shrink=0.85, extend=extend, label=label)
 
 
@@ -315,32 +290,34 @@ def defects(counts: Sequence[int], n_sites: int, n_all: int, end: str) -> Panel 
         return None
     number = np.arange(len(counts))
     independent = binomial(n_sites, float(np.dot(counts, number)) / n_shots / n_sites, len(counts))
-    padded = np.pad(counts, (0, len(independent) - len(counts)))
-    first = int(np.flatnonzero((padded > 0) | (independent > MIN_SHARE))[0])
+    padded_counts = np.pad(counts, (0, len(independent) - len(counts)))
+    first = int(np.flatnonzero((padded_counts > 0) | (independent > MIN_SHARE))[0])
     width = -(-(len(independent) - first) // MAX_BARS)  # numbers of defects that a bar spans
     first = 0 if width == 1 and first < MAX_BARS // 2 else first
     starts = np.arange(first, len(independent), width)
     expected = np.add.reduceat(independent, starts)
-    seen = np.add.reduceat(padded, starts)[: np.searchsorted(starts, len(counts))]
-    middles = (starts[: len(seen)] + (width - 1) / 2).tolist()
-    x, y, low, high = points_of(middles, [Rate(int(count), n_shots) for count in seen])
+    shots_of_bar = np.add.reduceat(padded_counts, starts)[: np.searchsorted(starts, len(counts))]
+    middles = (starts[: len(shots_of_bar)] + (width - 1) / 2).tolist()
+    x, y, low, high = points_of(middles, [Rate(int(count), n_shots) for count in shots_of_bar])
 
     def draw(axes: Axes) -> None:
         errors = 100 * np.stack([y - low, high - y]).clip(min=0.0)
         shown = y > 0 if len(x) > MANY_BARS else np.ones(len(x), np.bool_)
         axes.bar(x, 100 * y, width=0.8 * width, color=LIGHT, label="shots")
-        axes.errorbar(x[shown], 100 * y[shown], errors[:, shown], linestyle="none", **ERRORS)
+        bars: dict[str, Any] = {"color": DARK, "capsize": 2, "elinewidth": 0.9, "capthick": 0.9}
+        axes.errorbar(x[shown], 100 * y[shown], errors[:, shown], linestyle="none", **bars)
         size = 4 if len(x) <= MANY_BARS else 0
         look: dict[str, Any] = {"marker": "D", "markersize": size, "linewidth": 0.9, "linestyle": "--"}
         at = x[0] + width * np.arange(len(expected))
         axes.plot(at, 100 * expected, color=ORANGE, label="independent sites", zorder=3, **look)
-        each = f", {width} numbers to a bar" if width > 1 else ""
+        bar_note = f", {width} numbers to a bar" if width > 1 else ""
         average = mean(np.repeat(number, counts))
         title = f"{average} defects in a shot, {n_shots} of {n_all} shots"
-        axes.set(title=title, xlabel=f"defects {end}{each}", ylabel="shots (%)")
+        axes.set(title=title, xlabel=f"defects {end}{bar_note}", ylabel="shots (%)")
         least = x[0] - 0.6 * width
-        axes.set_xlim(least, max(least + MIN_DEFECTS + 1.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
-        axes.set_ylim(0.0, (1.0 + LEGEND) * 100 * float(max(np.nanmax(high), expected.max())))
+        # at least five bars wide, as a single one would fill the picture
+        axes.set_xlim(least, max(least + 5.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
+        axes.set_ylim(0.0, 135 * float(max(np.nanmax(high), expected.max())))  # with room for the legend
         whole_numbers(axes.xaxis)
         axes.legend()
 
@@ -359,21 +336,28 @@ def binomial(n: int, p: float, n_least: int) -> Floats:
     from scipy.special import bdtr
 
     terms = np.diff(bdtr(np.arange(n + 1.0), n, p), prepend=0.0)
-    seen = np.flatnonzero(terms > MIN_SHARE)
-    return terms[: max(n_least, int(seen[-1]) + 1)]
+    likely = np.flatnonzero(terms > MIN_SHARE)
+    return terms[: max(n_least, int(likely[-1]) + 1)]
 
 
 def loss_causes(losses: Mapping[str, Estimate]) -> Panel | None:
     """A bar for the atoms lost to each cause in a simulation, the worst first; None if nothing was lost."""
-    worst = sorted(losses.items(), key=lambda item: -item[1].value)
-    bars = [(cause.replace("_", " "), loss.value, loss.error) for cause, loss in worst if loss.value > 0]
-    if not bars:
+    sorted_losses = sorted(losses.items(), key=lambda item: -item[1].value)
+    rows = [
+        (cause.replace("_", " "), loss.value, loss.error) for cause, loss in sorted_losses if loss.value > 0
+    ]
+    if not rows:
         return None
 
     def draw(axes: Axes) -> None:
-        causes, means, errors = zip(*bars, strict=True)
-        at = np.arange(len(bars))
-        axes.barh(at, means, height=0.65, color=LIGHT, xerr=np.nan_to_num(errors), **BARS)
+        causes, means, errors = zip(*rows, strict=True)
+        at = np.arange(len(rows))
+        bars: dict[str, Any] = {
+            "ecolor": DARK,
+            "capsize": 2,
+            "error_kw": {"elinewidth": 0.9, "capthick": 0.9},
+        }
+        axes.barh(at, means, height=0.65, color=LIGHT, xerr=np.nan_to_num(errors), **bars)
         axes.set_yticks(at, causes)
         axes.invert_yaxis()
         axes.set(title="lost in a shot, by cause", xlabel="atoms (known in the simulation)")
@@ -401,7 +385,8 @@ def stages_of_a_shot(title: str, stages: Sequence[StageStatistics], clocks: Mapp
         for number, ((clock, name), colour) in enumerate(zip(clocks.items(), (DARK, ORANGE), strict=False)):
             aside = 0.17 * (2 * number - 1) if len(clocks) > 1 else 0.0
             times = np.array([getattr(stage, clock) for stage in stages], np.float64)
-            y = np.flatnonzero(times[:, 0] > (HIDDEN_S if clock == "session_s" else 0.0))
+            # times below 1 us come from models that neglect a stage
+            y = np.flatnonzero(times[:, 0] > (1e-6 if clock == "session_s" else 0.0))
             p50, p99 = times[y, 0], np.fmax(times[y, 0], times[y, 1])
             axes.hlines(y + aside, p50, p99, color=colour, linewidth=1.6, capstyle="round")
             axes.plot(p50, y + aside, color=colour, marker="o", markersize=5, linestyle="none", label=name)
@@ -432,7 +417,7 @@ def average_frame_of(run: Run, shots: Sequence[Shot]) -> Panel:
     sites_px = next((sites for shot in shots[:1] if (sites := shot.sites_px) is not None), None)
 
     def draw(axes: Axes) -> None:
-        low, high = np.quantile(average, (0.01, BRIGHTEST))
+        low, high = np.quantile(average, (0.01, 0.999))  # a hot pixel must not darken all others
         look: dict[str, Any] = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-9)}
         shown = axes.imshow(average, interpolation="nearest", **look)
         if sites_px is not None:
@@ -466,8 +451,8 @@ def signals_of_sites(shots: Sequence[Shot]) -> Panel:
             label = f"median {label}; thresholds of the sites from {low:.4g} to {high:.4g}"
             axes.axvspan(low, high, color=RED, alpha=0.15, linewidth=0)
         axes.axvline(middle, color=RED, linewidth=1.2, label=label)
-        seen = f"{signals.size} signals on the first image of {len(signals)} shots"
-        title = f"{seen}, {int((signals > thresholds).sum())} above threshold"
+        total = f"{signals.size} signals on the first image of {len(signals)} shots"
+        title = f"{total}, {int((signals > thresholds).sum())} above threshold"
         axes.set(title=title, xlabel=f"signal of a site ({unit})" if unit else "signal of a site")
         axes.set(ylabel="sites", yscale="log")
         axes.yaxis.set_major_formatter("{x:g}")
@@ -496,15 +481,22 @@ def _with_room(values: Floats, room: float, min_range: float) -> tuple[float, fl
 
 def _fit_as_ticks(values: Floats) -> bool:
     """Whether each value can have a tick without overlapping labels."""
-    gap = max(MIN_GAP, CHARACTER * (max(len(f"{value:g}") for value in values) + 1.5))
+    # relative to the axis: a character is 2 % wide, and ticks closer than 9 % look crowded
+    gap = max(0.09, 0.02 * (max(len(f"{value:g}") for value in values) + 1.5))
     return len(values) < 2 or bool(np.diff(values).min() >= gap * np.ptp(values) > 0)
 
 
-def set_words(axis: Axis, words: Sequence[str], room: int = MAX_CHARACTERS, most: int = MAX_TURNED) -> None:
-    """Put words at 0, 1, 2, ..., at most so many, turned if they need more room than so many characters."""
-    turned = len(words) * max(map(len, words)) > room
-    at = range(0, len(words), -(-len(words) // most))
-    axis.set_ticks(at, [words[i] for i in at], rotation=90 if turned else 0)
+def set_labels(axis: Axis, labels: Sequence[str], room: int = 32, most: int = 24) -> None:
+    """Label the ticks at 0, 1, 2, ...
+
+    Args:
+        labels: Their texts.
+        room: They are turned if they have more characters than this altogether.
+        most: Maximum number of labels; if there are more, some are left out.
+    """
+    turned = len(labels) * max(map(len, labels)) > room
+    at = range(0, len(labels), -(-len(labels) // most))
+    axis.set_ticks(at, [labels[i] for i in at], rotation=90 if turned else 0)
 
 
 def _vertical_grid(axes: Axes) -> None:

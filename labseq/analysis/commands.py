@@ -110,8 +110,8 @@ def analyse(
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import analyse_run
 
-    wanted = scan_request(scan, where, fit, fit_set)
-    raise typer.Exit(analyse_run(run, use, overrides or (), wanted, again=again))
+    request = scan_request(scan, where, fit, fit_set)
+    raise typer.Exit(analyse_run(run, use, overrides or (), request, again=again))
 
 
 def plot(

@@ -18,23 +18,17 @@ from labseq.units import UNITS, dimension_of, parse_any, readable_unit
 
 Floats = NDArray[np.float64]
 
-BOLTZMANN: Final = 1.380649e-23
-"""J/K (CODATA 2018)."""
 RB87_U, ATOMIC_MASS_KG = 86.909180531, 1.66053906660e-27
 """Mass of 87Rb (AME2020), and the unit that it is in (CODATA 2018)."""
-N_ATOMS: Final = 20_000
-"""Number of atoms in the model of release and recapture."""
 N_STEPS: Final = 600
 """Points at which their distribution is integrated."""
 FURTHEST: Final = 3.0
-"""Rayleigh lengths from the focus beyond which no atoms are: the light has a tenth there. Without an end, the
-atoms that are barely bound would be infinitely many."""
+"""Largest distance of an atom from the focus in Rayleigh lengths, where the intensity is a tenth. Without an
+end, there would be infinitely many atoms that are barely bound."""
 ROUNDING: Final = 1e-9
 """Relative error below which a value counts as without error."""
 MAX_ERROR: Final = 10.0
 """Largest error of a parameter, relative to its value or to the range of the points."""
-RELATIVE_STEP: Final = 0.02
-"""Relative step of a parameter for the derivatives of that model, large enough to see through its noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +169,9 @@ def _guess_lowering(x: Floats, y: Floats) -> dict[str, float]:
 
 @cache
 def _draws() -> Floats:
-    """Uniform random numbers of atoms, float64 (6, n): the same ones every time."""
-    return np.random.default_rng(0).random((6, N_ATOMS))
+    """Uniform random numbers of atoms, float64 (6, n)."""
+    # the same ones each time: a fit cannot tell noise from the effect of a parameter
+    return np.random.default_rng(0).random((6, 20_000))
 
 
 @lru_cache(maxsize=2)  # a fit comes back to the temperature after a step of another parameter
@@ -245,15 +240,16 @@ def _release_recapture(
     rayleigh = math.pi * waist**2 / wavelength
     places, velocities = _bound_atoms(eta)
     kinetic = (velocities**2).sum(axis=0) / 2  # in kT
-    flight = velocities * math.sqrt(BOLTZMANN * temperature / (mass * ATOMIC_MASS_KG))
+    # Boltzmann constant in J/K (CODATA 2018)
+    flight = velocities * math.sqrt(1.380649e-23 * temperature / (mass * ATOMIC_MASS_KG))
     flight /= np.array([waist, waist, rayleigh])[:, None]
 
-    def kept(t: float) -> float:
+    def recaptured(t: float) -> float:
         at = places + t * flight
         width = 1 + at[2] ** 2
         return float((kinetic < eta / width * np.exp(-2 * (at[0] ** 2 + at[1] ** 2) / width)).mean())
 
-    return amplitude * np.array([kept(t) for t in x])
+    return amplitude * np.array([recaptured(t) for t in x])
 
 
 def _guess_release(x: Floats, y: Floats) -> dict[str, float]:
@@ -327,13 +323,10 @@ MODELS: Final[Mapping[str, FitModel]] = {
         _guess_release,
         {"depth": math.nan, "waist": math.nan, "wavelength": math.nan, "mass": RB87_U},
         {"temperature": 1e-9, "amplitude": 0.0},
-        RELATIVE_STEP,
+        0.02,  # its atoms are counted: smaller steps would see their number jump
     ),
 }
 """The models that ``--fit`` offers. An offset of an exponential is fixed at 0 unless it is freed."""
-
-SETTINGS: Final = {"depth": "static_depth", "waist": "static_waist", "wavelength": "static_wavelength"}
-"""Parameter -> the setting of the profile's simulation that it is read from unless the user gives it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -356,7 +349,7 @@ class Fit:
 
     def at(self, x: Floats) -> Floats:
         """The fitted function at values of x in SI."""
-        return MODELS[self.model].evaluate(x, **{name: one.value for name, one in self.values.items()})
+        return MODELS[self.model].evaluate(x, **{name: value.value for name, value in self.values.items()})
 
     def lines(self) -> list[str]:
         """The result, a line for each parameter."""
@@ -365,8 +358,8 @@ class Fit:
         return [
             f"fit {self.model}: {MODELS[self.model].formula}",
             *(
-                f"  {name.ljust(width)}  {parameter_text(one, self.units[name])}"
-                for name, one in self.values.items()
+                f"  {name.ljust(width)}  {parameter_text(value, self.units[name])}"
+                for name, value in self.values.items()
             ),
             f"  {'chi-square'.ljust(width)}  {chi2} (reduced, {self.n_points} points)",
         ]
@@ -374,9 +367,9 @@ class Fit:
     def short_lines(self) -> list[str]:
         """The result for the legend of a picture: what was fitted, and the reduced chi-square."""
         free = [
-            f"{name} {parameter_text(one, self.units[name])}"
-            for name, one in self.values.items()
-            if one.error
+            f"{name} {parameter_text(value, self.units[name])}"
+            for name, value in self.values.items()
+            if value.error
         ]
         return [
             self.model,
@@ -388,11 +381,11 @@ class Fit:
         """The result, JSON-ready, SI."""
         parameters = {
             name: {
-                "value": one.value,
-                "error": one.error,
+                "value": value.value,
+                "error": value.error,
                 "unit": "" if self.units[name] == "%" else self.units[name],
             }
-            for name, one in self.values.items()
+            for name, value in self.values.items()
         }
         return {
             "model": self.model,
@@ -412,13 +405,13 @@ def parameter_text(value: Estimate, unit: str) -> str:
         ('97(1) %', '-2.0(1) %/s')
     """
     dimension, factor = dimension_of(unit), 1.0
-    if unit.startswith("%"):
+    if unit.startswith("%"):  # also of a slope, "%/s"
         factor = 0.01
     elif dimension:
         unit = readable_unit(value.value, dimension)
         factor = UNITS[dimension][unit]
-    shown = f"{value.scaled(1 / factor)} {unit}".rstrip()
-    return shown if value.error else f"{shown} (fixed)"
+    text = f"{value.scaled(1 / factor)} {unit}".rstrip()
+    return text if value.error else f"{text} (fixed)"
 
 
 def fit_points(
@@ -444,27 +437,32 @@ def fit_points(
     """
     if model not in MODELS:
         raise _problem(f"there is no fit '{clean(model)}'", one_of([*MODELS]), did_you_mean(model, MODELS))
-    chosen = MODELS[model]
+    function = MODELS[model]
     rows = [
-        (at, one.value, _error(one)) for at, one in zip(x, values, strict=True) if not math.isnan(one.value)
+        (at, value.value, _error(value))
+        for at, value in zip(x, values, strict=True)
+        if not math.isnan(value.value)
     ]
     at, y, error = np.array(sorted(rows), np.float64).reshape(-1, 3).T
-    fixed = _fixed(chosen, given or {}, settings or {})
-    free = [name for name in chosen.units if name not in fixed]
+    fixed = _fixed(function, given or {}, settings or {})
+    free = [name for name in function.units if name not in fixed]
     if len(np.unique(at)) <= len(free):
-        what = (
+        problem = (
             f"{len(np.unique(at))} points are too few for a fit of {len(free)} parameters ({', '.join(free)})"
         )
-        raise _problem(what, f"at least {len(free) + 1} different values with a result")
-    known = np.isfinite(error) & (error > ROUNDING * np.abs(y))
-    sigma = np.where(known, error, error[known].max(initial=0.0)) if known.any() else np.ones_like(y)
-    start = {**chosen.guess(at, y), **fixed}
-    values_of, chi2 = _minimise(chosen, at, y, sigma, start, fixed, is_weighted=bool(known.any()))
-    _check_determined(chosen, values_of, at, y)
+        raise _problem(problem, f"at least {len(free) + 1} different values with a result")
+    # a point without an error, such as one of a single shot, counts as the worst of the others
+    has_error = np.isfinite(error) & (error > ROUNDING * np.abs(y))
+    sigma = (
+        np.where(has_error, error, error[has_error].max(initial=0.0)) if has_error.any() else np.ones_like(y)
+    )
+    start = {**function.guess(at, y), **fixed}
+    values_of, chi2 = _minimise(function, at, y, sigma, start, fixed, is_weighted=bool(has_error.any()))
+    _check_determined(function, values_of, at, y)
     x_unit, y_unit = units
-    named = {"x": x_unit, "y": y_unit, "y/x": f"{y_unit}/{x_unit}" if x_unit else y_unit}
-    in_units = {name: named.get(unit, unit) for name, unit in chosen.units.items()}
-    return Fit(model, values_of, in_units, chi2, len(at))
+    unit_of = {"x": x_unit, "y": y_unit, "y/x": f"{y_unit}/{x_unit}" if x_unit else y_unit}
+    parameter_units = {name: unit_of.get(unit, unit) for name, unit in function.units.items()}
+    return Fit(model, values_of, parameter_units, chi2, len(at))
 
 
 def _minimise(
@@ -483,36 +481,36 @@ def _minimise(
     for name in model.units:
         parameters.add(name, start[name], vary=name not in fixed, min=model.at_least.get(name, -math.inf))
 
-    def residual(now: Any) -> Floats:
-        return (model.evaluate(x, **now.valuesdict()) - y) / sigma
+    def residual(trial: Any) -> Floats:
+        return (model.evaluate(x, **trial.valuesdict()) - y) / sigma
 
     options: dict[str, Any] = {"epsfcn": model.relative_step**2} if model.relative_step else {}
     try:
         result: Any = lmfit.minimize(residual, parameters, scale_covar=not is_weighted, **options)
     except (ValueError, FloatingPointError, OverflowError) as error:
         raise _problem(f"the fit failed: {error}", "points that follow the model") from error
-    found = {
-        name: Estimate(float(one.value), float(one.stderr or math.nan) if one.vary else 0.0)
-        for name, one in result.params.items()
+    values = {
+        name: Estimate(float(fitted.value), float(fitted.stderr or math.nan) if fitted.vary else 0.0)
+        for name, fitted in result.params.items()
     }
     if not result.success:
         raise _problem("the fit did not converge", "points that follow the model, over a wider range")
-    return found, float(result.redchi) if is_weighted else math.nan
+    return values, float(result.redchi) if is_weighted else math.nan
 
 
 def _check_determined(model: FitModel, values: Mapping[str, Estimate], x: Floats, y: Floats) -> None:
     """Refuse a fit with an error that is far larger than the range of the points."""
     ranges = {"x": float(np.ptp(x)), "y": float(np.ptp(y)), "y/x": float(np.ptp(y) / np.ptp(x))}
-    unknown = [
+    undetermined = [
         name
-        for name, one in values.items()
-        if not math.isfinite(one.error)
-        or one.error > MAX_ERROR * max(abs(one.value), ranges.get(model.units[name], 0.0))
+        for name, value in values.items()
+        if not math.isfinite(value.error)
+        or value.error > MAX_ERROR * max(abs(value.value), ranges.get(model.units[name], 0.0))
     ]
-    if unknown:
-        what = f"the points do not determine {' and '.join(unknown)}"
+    if undetermined:
+        problem = f"the points do not determine {' and '.join(undetermined)}"
         raise _problem(
-            what, "points that follow the model, over a wider range; or fewer parameters (--fit-set)"
+            problem, "points that follow the model, over a wider range; or fewer parameters (--fit-set)"
         )
 
 
@@ -524,7 +522,8 @@ def _error(value: Estimated) -> float:
 def _fixed(model: FitModel, given: Mapping[str, str], settings: Mapping[str, Any]) -> dict[str, float]:
     """The parameters that are not fitted."""
     fixed = dict(model.fixed)
-    for name, key in SETTINGS.items():
+    keys = {"depth": "static_depth", "waist": "static_waist", "wavelength": "static_wavelength"}
+    for name, key in keys.items():
         if name in fixed and isinstance(settings.get(key), int | float):
             fixed[name] = float(settings[key])
     for name, text in given.items():
@@ -539,8 +538,8 @@ def _fixed(model: FitModel, given: Mapping[str, str], settings: Mapping[str, Any
             fixed[name] = _value(name, text)
     missing = [name for name, value in fixed.items() if math.isnan(value)]
     if missing:
-        what = f"the fit needs {' and '.join(missing)}, which the run's profile does not have"
-        raise _problem(what, " ".join(f"--fit-set {name}=VALUE" for name in missing))
+        problem = f"the fit needs {' and '.join(missing)}, which the run's profile does not have"
+        raise _problem(problem, " ".join(f"--fit-set {name}=VALUE" for name in missing))
     return fixed
 
 
@@ -554,5 +553,5 @@ def _value(name: str, text: str) -> float:
             raise _problem(f"{name}: {error}", "a number with its unit, or 'free'") from error
 
 
-def _problem(what: str, expected: str, hint: str = "") -> ConfigError:
-    return ConfigError(Problem(what, "--fit", expected=expected, hint=hint))
+def _problem(message: str, expected: str, hint: str = "") -> ConfigError:
+    return ConfigError(Problem(message, "--fit", expected=expected, hint=hint))

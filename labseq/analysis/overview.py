@@ -60,8 +60,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Row = tuple[Panel, ...]
 
-OVERVIEW_SHOTS: Final = 60
-"""Maximum number of shot files read for the overview, which takes about half a second."""
 PART_SHOTS: Final = 500
 """Maximum number of shot files read for one part of the overview, or for a table."""
 MAX_MAPS: Final = 6
@@ -70,8 +68,6 @@ MAX_PANELS: Final = 2
 """Maximum number of panels of a scan in a row."""
 PANEL_IN: Final = (3.7, 3.1)
 """Width and height of a panel in inches."""
-SINGLE_IN: Final = (6.4, 4.4)
-"""Width and height of a single panel in inches."""
 TITLE_IN: Final = 0.55
 
 
@@ -100,7 +96,7 @@ class RunPicture:
     def _draw(self) -> Figure:
         n_rows, n_cols = len(self.rows), max(map(len, self.rows))
         is_single = n_rows == n_cols == 1
-        width, height = SINGLE_IN if is_single else (n_cols * PANEL_IN[0], n_rows * PANEL_IN[1])
+        width, height = (6.4, 4.4) if is_single else (n_cols * PANEL_IN[0], n_rows * PANEL_IN[1])
         figure = make_figure(width, height + TITLE_IN, layout="constrained")
         figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # pyright: ignore[reportOptionalMemberAccess, reportCallIssue]
         parts = figure.subfigures(n_rows, 1, squeeze=False)[:, 0]
@@ -126,7 +122,7 @@ def overview(run: Run) -> RunPicture:
         ConfigError: It has no shots yet.
         RecordingError: It is damaged.
     """
-    summary = _Summary(_with_shots(run), OVERVIEW_SHOTS)
+    summary = _Summary(_with_shots(run), 60)  # files of shots, which take half a second to read
     filling, success = (_fraction_row(summary, name) for name in DEFAULT)
     survival, timing = summary.read
     rows = [
@@ -135,7 +131,7 @@ def overview(run: Run) -> RunPicture:
         _present(*survival_panels(run, survival), stages_panel(run, timing)),
     ]
     if summary.scan is not None and len(maps := scan_panels(summary.scan, summary.quantity(DEFAULT[1]))) > 1:
-        rows.insert(2, maps)
+        rows.insert(2, maps)  # a single map is in the row of its quantity
     return _picture(run, f"run {clean(run.name)}", rows)
 
 
@@ -164,14 +160,14 @@ def cycles_panel(quantity: Quantity, statistics: Statistics) -> Panel | None:
     cycles = statistics.cycles
     if not cycles:
         return None
-    means = [one.defect_free if quantity.is_rate else one.filling for one in cycles]
+    means = [cycle.defect_free if quantity.is_rate else cycle.filling for cycle in cycles]
     fewer = cycles[-1].n_shots < cycles[0].n_shots
     return partial(
         draw_curves,
         title=f"{title_of(quantity)} by cycle" + (", of the shots that made it" if fewer else ""),
         x_label="cycle",
         y_label=f"{title_of(quantity)} (%)",
-        curves={"": points_of([one.cycle for one in cycles], means)},
+        curves={"": points_of([cycle.cycle for cycle in cycles], means)},
         whole=True,
         from_zero=quantity.is_rate,
     )
@@ -235,24 +231,24 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
     return stages_of_a_shot(f"stages of a shot{part_text(timing.n_read, run)}", stages, clocks)
 
 
-def scan_panels(found: Scanned, quantity: Quantity, fit: Fit | None = None) -> Row:
+def scan_panels(scan: Scanned, quantity: Quantity, fit: Fit | None = None) -> Row:
     """A quantity against the scanned values: a curve for one axis, maps for more; empty if it is unknown."""
-    means = found.over(quantity)
-    known = [one.value for one in means if not math.isnan(one.value)]
-    if not known:
+    means = scan.over(quantity)
+    values = [mean.value for mean in means if not math.isnan(mean.value)]
+    if not values:
         return ()
-    unit, factor = shown_unit(quantity, known)
+    unit, factor = shown_unit(quantity, values)
     label = f"{title_of(quantity)} ({unit})" if unit else title_of(quantity)
-    if len(found.axes) > 1 and found.is_map:
-        return _scan_maps(found, title_of(quantity), [one.value / factor for one in means], label)
+    if len(scan.axes) > 1 and scan.is_map:
+        return _scan_maps(scan, title_of(quantity), [mean.value / factor for mean in means], label)
     from_zero = quantity.is_rate and (fit is None or quantity.name == "defect_free")
     common: dict[str, Any] = {"y_label": label, "scale": 1 / factor, "from_zero": from_zero}
-    if len(found.axes) == 1:
-        return (_scan_curve(found, title_of(quantity), means, fit, common),)
+    if len(scan.axes) == 1:
+        return (_scan_curve(scan, title_of(quantity), means, fit, common),)
     return (  # few points share a value, for example those of an optimiser
         partial(
             draw_curves,
-            title=f"{title_of(quantity)} by point of {len(found.axes)} values",
+            title=f"{title_of(quantity)} by point of {len(scan.axes)} values",
             x_label="point of the scan",
             curves={"": points_of(range(len(means)), means)},
             whole=True,
@@ -262,14 +258,14 @@ def scan_panels(found: Scanned, quantity: Quantity, fit: Fit | None = None) -> R
 
 
 def _scan_curve(
-    found: Scanned, title: str, means: Sequence[Estimated], fit: Fit | None, common: Mapping[str, Any]
+    scan: Scanned, title: str, means: Sequence[Estimated], fit: Fit | None, common: Mapping[str, Any]
 ) -> Panel:
-    axis, numbers = found.axes[0], found.on_axis(0)
+    axis, numbers = scan.axes[0], scan.on_axis(0)
     title = f"{title} by scanned value"
     if numbers is None:
-        curves = {"": points_of([place[0] for place in found.places], means)}
+        curves = {"": points_of([place[0] for place in scan.places], means)}
         return partial(
-            draw_curves, title=title, x_label=axis.address, curves=curves, ticks=axis.words, **common
+            draw_curves, title=title, x_label=axis.address, curves=curves, ticks=axis.labels, **common
         )
     values, unit = numbers
     rows = sorted(zip(values, means, strict=True), key=lambda row: row[0])
@@ -290,16 +286,16 @@ def _fitted(fit: Fit, factor: float, x: np.ndarray[Any, Any]) -> np.ndarray[Any,
     return fit.at(x * factor)
 
 
-def _scan_maps(found: Scanned, title: str, means: Sequence[float], label: str) -> Row:
+def _scan_maps(scan: Scanned, title: str, means: Sequence[float], label: str) -> Row:
     """A map against the last two axes for each combination of the others."""
-    *others, y, x = found.axes
-    values = np.full([len(axis.words) for axis in found.axes], np.nan)
-    for place, one in zip(found.places, means, strict=True):
-        values[place] = one
-    combinations = list(product(*(range(len(axis.words)) for axis in others)))
+    *others, y, x = scan.axes
+    values = np.full([len(axis.labels) for axis in scan.axes], np.nan)
+    for place, mean in zip(scan.places, means, strict=True):
+        values[place] = mean
+    combinations = list(product(*(range(len(axis.labels)) for axis in others)))
     panels: list[Panel] = []
-    for index, chosen in enumerate(combinations[:MAX_MAPS]):
-        at = ", ".join(f"{axis.address} {axis.words[i]}" for axis, i in zip(others, chosen, strict=True))
+    for index, indices in enumerate(combinations[:MAX_MAPS]):
+        at = ", ".join(f"{axis.address} {axis.labels[i]}" for axis, i in zip(others, indices, strict=True))
         more = f" ({index + 1} of {len(combinations)})" if len(combinations) > MAX_MAPS else ""
         panels.append(
             partial(
@@ -307,9 +303,9 @@ def _scan_maps(found: Scanned, title: str, means: Sequence[float], label: str) -
                 title=(at or f"{title} by scanned values") + more,
                 x_label=x.address,
                 y_label=y.address,
-                x_ticks=x.words,
-                y_ticks=y.words,
-                values=values[chosen],
+                x_ticks=x.labels,
+                y_ticks=y.labels,
+                values=values[indices],
                 label=label,
                 limits=(float(np.nanmin(values)), float(np.nanmax(values))),
             )
@@ -324,13 +320,16 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
         ConfigError: The run has no scan; or see :func:`labseq.analysis.scanned.scan_report`.
     """
     report = scan_report(_with_shots(run), request)
-    if not report.found.axes:
-        wanted = "a run of a sequence with 'scan:'; `labseq show --scan` prints the values of this one"
-        raise cannot_draw(run, "it has no scan", wanted)
+    if not report.scan.axes:
+        expected = "a run of a sequence with 'scan:'; `labseq show --scan` prints the values of this one"
+        raise cannot_draw(run, "it has no scan", expected)
     fits = report.fits or (None,) * len(report.values)
-    rows = [scan_panels(report.found, one, fit) for (one, _), fit in zip(report.values, fits, strict=True)]
-    shown = [panel for row in rows for panel in row]
-    return _picture(run, "the scan", [tuple(shown)] if len(shown) <= MAX_PANELS else rows)
+    rows = [
+        scan_panels(report.scan, quantity, fit)
+        for (quantity, _), fit in zip(report.values, fits, strict=True)
+    ]
+    panels = [panel for row in rows for panel in row]
+    return _picture(run, "the scan", [tuple(panels)] if len(panels) <= MAX_PANELS else rows)
 
 
 class _Summary:
@@ -406,30 +405,27 @@ def _present(*panels: Panel | None) -> Row:
 
 
 def _picture(run: Run, title: str, rows: Sequence[Row]) -> RunPicture:
-    shown = tuple(row for row in rows if row)
-    if not shown:
+    nonempty_rows = tuple(row for row in rows if row)
+    if not nonempty_rows:
         raise cannot_draw(run, "its shots have neither images nor cycles", "shots with an 'image' step")
-    return RunPicture(title, note_of(run), shown)
+    return RunPicture(title, note_of(run), nonempty_rows)
 
 
 def _with_shots(run: Run) -> Run:
     if run.shots:
         return run
-    what = "it has no shots yet" if run.status == "running" else "it has no shots that count"
-    raise cannot_draw(run, what, "at least one complete shot")
+    problem = "it has no shots yet" if run.status == "running" else "it has no shots that count"
+    raise cannot_draw(run, problem, "at least one complete shot")
 
 
-_IMAGES: Final = "shots with an 'image' step or a rearrangement"
-_KEPT: Final = (
-    "shots whose frames were kept: 'record_frames: all' in the sequence, or --set record_frames=all"
-)
+_WITH_IMAGES: Final = "shots with an 'image' step or a rearrangement"
 
 CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] = MappingProxyType(
     {
         "image": (
             "the average image",
             lambda s: _image_rows(s, partial(average_frame_of, s.run)),
-            _KEPT,
+            "shots whose frames were kept: 'record_frames: all' in the sequence, or --set record_frames=all",
         ),
         "loading": (
             "the loading",
@@ -441,8 +437,8 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
             lambda s: _image_rows(s, signals_of_sites),
             "a detector that reports its signals",
         ),
-        "filling": ("filling", lambda s: [_fraction_row(s, "filling")], _IMAGES),
-        "success": ("defect-free shots", lambda s: [_fraction_row(s, "defect_free")], _IMAGES),
+        "filling": ("filling", lambda s: [_fraction_row(s, "filling")], _WITH_IMAGES),
+        "success": ("defect-free shots", lambda s: [_fraction_row(s, "defect_free")], _WITH_IMAGES),
         "survival": (
             "survival by site",
             lambda s: [survival_panels(s.run, s.read[0])],
@@ -451,7 +447,7 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
         "defects": (
             "defects that are left",
             lambda s: [_present(defects_panel(s.run, s.statistics))],
-            _IMAGES,
+            _WITH_IMAGES,
         ),
         "timing": (
             "the stages of a shot",
@@ -495,9 +491,9 @@ def note_of(run: Run) -> str:
     return f"{clean(run.path.parent.name)}/{clean(run.path.name)}{ended}: {atoms}, seed {run.seed}, {kind}"
 
 
-def cannot_draw(run: Run, what: str, expected: str) -> ConfigError:
+def cannot_draw(run: Run, problem: str, expected: str) -> ConfigError:
     """The error for a picture that cannot be drawn from a run."""
-    text = f"the picture cannot be drawn from this run: {what}"
+    text = f"the picture cannot be drawn from this run: {problem}"
     return ConfigError(Problem(text, visible(str(run.path)), expected=expected))
 
 
@@ -506,8 +502,8 @@ def grid_of(run: Run) -> SiteGrid:
     n_rows, n_cols = run.target.shape
     grid = _mapping(_profile(run).get("grid"))
     spacing: Any = run.record.get("grid_spacing_m")
-    known = isinstance(spacing, float | int) and spacing > 0
-    spacing_m = float(spacing) if known else SiteGrid(1, 1).spacing_m
+    is_recorded = isinstance(spacing, float | int) and spacing > 0
+    spacing_m = float(spacing) if is_recorded else SiteGrid(1, 1).spacing_m
     lattice = "square" if run.record.get("lattice") == "square" else "triangular"
     return SiteGrid(n_rows, n_cols, spacing_m, lattice, -1 if grid.get("shear") == -1 else 1)
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,6 @@ from labseq.model.estimate import mean
 from labseq.motion import check_plan
 from labseq.roles import Context, Detector, NeedsWarmUp, Planner
 from labseq.settings import Choice
-
-N_ATOMS_TRUE = "simulation.n_atoms_true"
-"""Reading of a simulated shot: true number of atoms at its end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,19 +102,19 @@ class ReplayedImages:
         Raises:
             RecordingError: The shot cannot be read.
         """
-        images, truth = shot.record().images, shot.readings.get(N_ATOMS_TRUE)
+        images, truth = shot.record().images, shot.readings.get("simulation.n_atoms_true")
         for i, image in enumerate(images):
             if image.frame is None:
                 self.n_without_frame += 1
                 continue
             try:
                 occupancy, confidence, *_ = detector.detect(image.frame)
-                seen = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
-                certainty = float(np.mean(confidence))
+                replayed = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
+                replayed_confidence = float(np.mean(confidence))
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
                 self.failures[shot.index, i] = format_error(error)
                 continue
-            appeared, vanished = seen & ~image.occupancy, image.occupancy & ~seen
+            appeared, vanished = replayed & ~image.occupancy, image.occupancy & ~replayed
             self.appeared += appeared
             self.vanished += vanished
             is_last = i == len(images) - 1
@@ -126,11 +123,11 @@ class ReplayedImages:
                     shot=shot.index,
                     image=i,
                     n_atoms=int(np.count_nonzero(image.occupancy)),
-                    n_atoms_replayed=int(np.count_nonzero(seen)),
+                    n_atoms_replayed=int(np.count_nonzero(replayed)),
                     n_appeared=int(np.count_nonzero(appeared)),
                     n_vanished=int(np.count_nonzero(vanished)),
                     confidence=float(np.mean(image.confidence)),
-                    confidence_replayed=certainty,
+                    confidence_replayed=replayed_confidence,
                     n_atoms_true=int(truth) if is_last and truth is not None else None,
                 )
             )
@@ -196,45 +193,44 @@ def mean_counts(plans: Sequence[PlanCounts]) -> dict[str, Any]:
     """
     names = ("n_batches", "n_atom_moves", "duration_s", "planning_s", "filling")
     values = {name: np.array([getattr(plan, name) for plan in plans], np.float64) for name in names}
-    means = {name: mean(of[~np.isnan(of)]) for name, of in values.items()}
+    means = {name: mean(numbers[~np.isnan(numbers)]) for name, numbers in values.items()}
     return {"n_plans": len(plans), "n_met": sum(plan.meets_target for plan in plans), **means}
 
 
-def _replay_plans(shot: Shot, planner: Planner, made: _Pipeline, grid: SiteGrid) -> list[ReplayedPlan]:
+def _replay_plans(shot: Shot, planner: Planner, pipeline: _Pipeline, grid: SiteGrid) -> list[ReplayedPlan]:
     """Plan again for every image of a shot for which a plan was recorded.
 
     Raises:
         RecordingError: The shot cannot be read.
     """
-    found: list[ReplayedPlan] = []
-    guard, name = Guard(), made.chosen["planner"].entry.name
-    dop = parallelism_of(made.chosen["planner"], planner, made.motion)
+    plans: list[ReplayedPlan] = []
+    guard, name = Guard(), pipeline.choices["planner"].entry.name
+    dop = parallelism_of(pipeline.choices["planner"], planner, pipeline.motion)
     for cycle in shot.cycles:
-        seen = image_before(cycle, shot.images)
-        if seen is None:
+        image = image_before(cycle, shot.images)
+        if image is None:
             continue
         recorded = PlanCounts.of(cycle.plan, cycle.report, shot.target, _planning_s(shot.timing, cycle))
         replayed, same, failure = None, False, ""
         try:
             start_s = perf_counter()
-            plan = call_planner(planner, name, seen.occupancy, shot.target, guard)
+            plan = call_planner(planner, name, image.occupancy, shot.target, guard)
             planning_s = perf_counter() - start_s
-            report = check_plan(plan, seen.occupancy, shot.target, dop, grid, made.motion, name)
+            report = check_plan(plan, image.occupancy, shot.target, dop, grid, pipeline.motion, name)
             replayed, same = PlanCounts.of(plan, report, shot.target, planning_s), plan.is_same(cycle.plan)
         except LabseqError as error:
             failure = str(error)
-        found.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))
+        plans.append(ReplayedPlan(shot.index, cycle.step, cycle.cycle, recorded, replayed, same, failure))
     guard.end()
-    return found
+    return plans
 
 
 def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
     """The planning time on the run's computer, in seconds; nan if not recorded."""
     place = ("plan", cycle.step, cycle.cycle)
-    return next((one.host_s for one in timing if (one.stage, one.step, one.cycle) == place), math.nan)
-
-
-_RANGE: Final = re.compile(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?")
+    return next(
+        (stage.host_s for stage in timing if (stage.stage, stage.step, stage.cycle) == place), math.nan
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,22 +259,22 @@ class ReplayRequest:
         Raises:
             ConfigError: An override changes something else.
         """
-        found: dict[str, list[Override]] = {"planner": [], "detector": []}
+        changes: dict[str, list[Override]] = {"planner": [], "detector": []}
         for kind, name in (("planner", self.planner), ("detector", self.detector)):
             if name is not None:
-                found[kind] += [Override(kind, "{}", f"--{kind} {name}")]
-                found[kind] += [Override(f"{kind}.use", name, f"--{kind} {name}")]
+                changes[kind] += [Override(kind, "{}", f"--{kind} {name}")]
+                changes[kind] += [Override(f"{kind}.use", name, f"--{kind} {name}")]
         if (dop := self.degree_of_parallelism) is not None:
-            found["planner"].append(Override("planner.degree_of_parallelism", str(dop), f"--dop {dop}"))
+            changes["planner"].append(Override("planner.degree_of_parallelism", str(dop), f"--dop {dop}"))
         for_sequence, for_profile = split_overrides(self.overrides)
         for kind, options in (("planner", for_sequence), ("detector", for_profile)):
-            for one in options:
-                if not one.address.startswith(f"{kind}."):
-                    what = "a replay changes nothing but the planner and the detector"
+            for override in options:
+                if not override.address.startswith(f"{kind}."):
+                    problem = "a replay changes nothing but the planner and the detector"
                     expected = "an address that begins with 'planner.' or 'profile.detector.'"
-                    raise ConfigError(Problem(what, one.source, expected=expected))
-                found[kind].append(one._replace(origin=one.source))
-        return {kind: options for kind, options in found.items() if options}
+                    raise ConfigError(Problem(problem, override.source, expected=expected))
+                changes[kind].append(override._replace(origin=override.source))
+        return {kind: options for kind, options in changes.items() if options}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,8 +312,8 @@ class Replay:
 class _Pipeline:
     """The planner and detector for the images of a point of the scan, by role."""
 
-    made: dict[str, Any]
-    chosen: dict[str, ChosenPlugin]
+    plugins: dict[str, Any]
+    choices: dict[str, ChosenPlugin]
     motion: MotionSpec
     streams: tuple[RandomStream, ...]
 
@@ -337,24 +333,28 @@ class _Replayer:
         return self._pipelines[point.lab_key][1]
 
     def _make(self, point: Point) -> _Pipeline:
-        own = {"planner": point.planner, "detector": point.hardware.chosen["detector"]}
-        chosen = {kind: self._changed(kind, own[kind]) for kind in own if kind in (self._changes or own)}
+        recorded = {"planner": point.planner, "detector": point.hardware.chosen["detector"]}
+        choices = {
+            kind: self._changed(kind, recorded[kind])
+            for kind in recorded
+            if kind in (self._changes or recorded)
+        }
         motion = point.hardware.profile.motion
         context = Context(grid=self.grid, motion=motion, calibrations=self._calibrations)
-        made, streams = construct(chosen, context, self._seed)
-        for one in made.values():
-            if isinstance(one, NeedsWarmUp):
-                one.warm()
-        return _Pipeline(made, chosen, motion, streams)
+        plugins, streams = construct(choices, context, self._seed)
+        for plugin in plugins.values():
+            if isinstance(plugin, NeedsWarmUp):  # or the first time to plan would be that of compiling
+                plugin.warm()
+        return _Pipeline(plugins, choices, motion, streams)
 
-    def _changed(self, kind: str, own: ChosenPlugin) -> ChosenPlugin:
+    def _changed(self, kind: str, recorded: ChosenPlugin) -> ChosenPlugin:
         """The run's own planner or detector, or its replacement."""
         options = self._changes.get(kind)
         if not options:
-            return own
-        assert own.document is not None
+            return recorded
+        assert recorded.document is not None
         with collecting(None) as problems:
-            document = own.document.override_all(options, problems, may_add=(kind,))
+            document = recorded.document.override_all(options, problems, may_add=(kind,))
         return resolve(self._host, document, kind, document.validate(Choice, (kind,)).placed(kind))
 
 
@@ -373,7 +373,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
     """
     from labseq.kernel import announcing
 
-    changes, wanted = request.changes(), shots_of(run, request.shots)
+    changes, shots = request.changes(), shots_of(run, request.shots)
     assembly = assembly_of(run)
     point_of_shot = assembly.point_of_shot(run.seed)
     replayer = _Replayer(run, assembly, changes)
@@ -381,24 +381,25 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
     images = ReplayedImages.none(replayer.grid.shape)
     unreadable: dict[int, str] = {}
     with announcing(announce):
-        chosen = replayer.at(assembly.first_point).chosen
-        for shot in wanted:
+        choices = replayer.at(assembly.first_point).choices
+        for shot in shots:
             pipeline = replayer.at(_point_of(shot, assembly, point_of_shot))
+            # a planner that draws random numbers gets those of the run
             for stream in pipeline.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:
-                if "detector" in pipeline.made:
-                    images.add(shot, pipeline.made["detector"])
-                if "planner" in pipeline.made:
-                    plans += _replay_plans(shot, pipeline.made["planner"], pipeline, replayer.grid)
+                if "detector" in pipeline.plugins:
+                    images.add(shot, pipeline.plugins["detector"])
+                if "planner" in pipeline.plugins:
+                    plans += _replay_plans(shot, pipeline.plugins["planner"], pipeline, replayer.grid)
             except RecordingError as error:
                 unreadable[shot.index] = str(error)
     return Replay(
         run=run,
         is_own=not changes,
-        used={kind: one.dump() for kind, one in chosen.items()},
-        changed={kind: changed_settings(one.settings) for kind, one in chosen.items()},
-        n_shots=len(wanted) - len(unreadable),
+        used={kind: choice.dump() for kind, choice in choices.items()},
+        changed={kind: changed_settings(choice.settings) for kind, choice in choices.items()},
+        n_shots=len(shots) - len(unreadable),
         plans=tuple(plans),
         images=images,
         unreadable=unreadable,
@@ -427,7 +428,7 @@ def shots_of(run: Run, text: str | None) -> list[Shot]:
     """The shots of a selection such as "3,5-9", counted from 0.
 
     Raises:
-        ConfigError: The text is no such selection, or a shot does not exist.
+        ConfigError: The text is not such a selection, or a shot does not exist.
     """
     if text is None:
         return list(run.shots)
@@ -435,10 +436,10 @@ def shots_of(run: Run, text: str | None) -> list[Shot]:
     return [by_index[index] for index in sorted({*_indices(text, by_index)})]
 
 
-def _indices(text: str, known: Collection[int]) -> Iterator[int]:
+def _indices(text: str, existing: Collection[int]) -> Iterator[int]:
     source = clean(f"--shots {text}")
     for part in text.split(","):
-        match = _RANGE.fullmatch(part)
+        match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", part)
         if match is None:
             raise ConfigError(
                 Problem(f"'{clean(part)}' is not a shot", source, expected="numbers such as 3,5-9")
@@ -447,7 +448,7 @@ def _indices(text: str, known: Collection[int]) -> Iterator[int]:
         if last < first:
             raise ConfigError(Problem(f"{first}-{last} goes backwards", source, expected=f"{last}-{first}"))
         for index in range(first, last + 1):
-            if index not in known:
-                there_are = f"{min(known)} to {max(known)}" if known else "none: the run has no shots"
-                raise ConfigError(Problem(f"there is no shot {index}", source, expected=there_are))
+            if index not in existing:
+                expected = f"{min(existing)} to {max(existing)}" if existing else "none: the run has no shots"
+                raise ConfigError(Problem(f"there is no shot {index}", source, expected=expected))
             yield index

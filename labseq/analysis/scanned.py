@@ -22,18 +22,10 @@ from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of, split_quantity
 
-MIN_FULL: Final = 0.5
-"""Maps are drawn if at least this fraction of their cells has a point."""
 DEFAULT: Final = ("filling", "defect_free")
 """The quantities at the points of a scan, unless others are named."""
 WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
 """The same for a run without a target."""
-GEOMETRIC_RATIO: Final = 20.0
-"""Minimum ratio of largest to smallest value for a logarithmic axis."""
-EQUAL: Final = 0.25
-"""Maximum relative difference of ratios that count as equal, as those of "1, 2, 5, 10" do."""
-
-_MICRO: Final = re.compile(r"\bu(?=[msVWK]\b)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +34,12 @@ class Axis:
 
     Attributes:
         address: The address, and those that change together with it.
-        words: Its different values as written, in the order of the scan.
+        labels: Its different values as written, in the order of the scan.
         numbers: The same as numbers, and the unit of these; None if they are not numbers of one dimension.
     """
 
     address: str
-    words: tuple[str, ...]
+    labels: tuple[str, ...]
     numbers: tuple[tuple[float, ...], str] | None
 
 
@@ -68,8 +60,8 @@ class Scanned:
     @property
     def is_map(self) -> bool:
         """Whether there are two axes or more, and most combinations of their values have a point."""
-        n_cells = math.prod(len(axis.words) for axis in self.axes)
-        return len(self.axes) > 1 and len({*self.places}) >= MIN_FULL * n_cells
+        n_cells = math.prod(len(axis.labels) for axis in self.axes)
+        return len(self.axes) > 1 and len({*self.places}) >= n_cells / 2
 
     def over(self, quantity: Quantity) -> list[Estimated]:
         """The mean of a quantity at each point."""
@@ -97,14 +89,18 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     """
     points = scan_points(run)
     if conditions:
-        kept = {shot.index for shot in select_shots(run, conditions)}
-        points = [replace(one, shots=tuple(s for s in one.shots if s.index in kept)) for one in points]
+        selected = {shot.index for shot in select_shots(run, conditions)}
+        points = [
+            replace(point, shots=tuple(shot for shot in point.shots if shot.index in selected))
+            for point in points
+        ]
     if not points or not points[0].parameters:  # --set may have replaced every address
         return None
     rows = [tuple(map(clean, row)) for row in run.scan["written"]]
     columns, values = list(zip(*rows, strict=True)), list(zip(*run.scan["points"], strict=True))
-    numbers = [_numbers(*one) for one in zip(values, columns, strict=True)]
+    numbers = [_numbers(*pair) for pair in zip(values, columns, strict=True)]
     addresses = list(map(clean, points[0].written))
+    # an axis at least, even if all points have the same value
     varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]
     together: dict[int, list[str]] = {}
     for i in varied:
@@ -113,15 +109,15 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     axes = tuple(make_axis(" with ".join(names), columns[i], values[i]) for i, names in together.items())
     written = [tuple(map(clean, point.written.values())) for point in points]
     places = tuple(
-        tuple(axis.words.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
+        tuple(axis.labels.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
     )
     return Scanned(axes, places, tuple(points))
 
 
-def make_axis(address: str, words: Sequence[str], values: Sequence[Any]) -> Axis:
-    """An axis from the words and values, SI, of its points, of which some may be equal."""
-    of_word = dict(zip(words, values, strict=True))
-    return Axis(address, tuple(of_word), _numbers([*of_word.values()], [*of_word]))
+def make_axis(address: str, labels: Sequence[str], values: Sequence[Any]) -> Axis:
+    """An axis from the labels and values, SI, of its points, of which some may be equal."""
+    value_of_label = dict(zip(labels, values, strict=True))
+    return Axis(address, tuple(value_of_label), _numbers([*value_of_label.values()], [*value_of_label]))
 
 
 def _follows(
@@ -131,37 +127,39 @@ def _follows(
 
     No two points of an optimiser share a value; numbers must then rise or fall together.
     """
-    others, own, along = columns[k], numbers[i], numbers[k]
-    if len({*zip(columns[i], others, strict=True)}) > len({*others}):
+    leader, own_numbers, leader_numbers = columns[k], numbers[i], numbers[k]
+    if len({*zip(columns[i], leader, strict=True)}) > len({*leader}):
         return False
-    if len({*others}) < len(others) or own is None or along is None:
+    if len({*leader}) < len(leader) or own_numbers is None or leader_numbers is None:
         return True
-    steps = np.diff(np.array(own[0])[np.argsort(along[0], kind="stable")])
+    steps = np.diff(np.array(own_numbers[0])[np.argsort(leader_numbers[0], kind="stable")])
     return bool((steps >= 0).all() or (steps <= 0).all())
 
 
-def _numbers(values: Sequence[Any], words: Sequence[str]) -> tuple[tuple[float, ...], str] | None:
-    """Values in SI as numbers in the unit of the largest, and that; None unless they have one dimension."""
+def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float, ...], str] | None:
+    """Values as numbers in the unit of the largest, and that unit; None unless they have one dimension."""
     if not all(type(value) in (int, float) for value in values):
         return None
-    units = [split_quantity(word)[1] for word in words]
+    units = [split_quantity(text)[1] for text in written]
     if len({dimension_of(unit) for unit in units}) > 1:
         return None
     unit = units[int(np.argmax(np.abs(values)))]
-    return tuple(float(f"{value / factor_of(unit):.12g}") for value in values), _MICRO.sub("µ", unit)
+    return tuple(float(f"{value / factor_of(unit):.12g}") for value in values), re.sub(
+        r"\bu(?=[msVWK]\b)", "µ", unit
+    )
 
 
 def is_geometric(values: Sequence[float]) -> bool:
     """Whether rising values have nearly equal ratios, over a wide range."""
-    if len(values) < 3 or values[0] <= 0 or values[-1] < GEOMETRIC_RATIO * values[0]:
+    if len(values) < 3 or values[0] <= 0 or values[-1] < 20 * values[0]:
         return False
     steps = np.diff(np.log(values))
-    return float(np.ptp(steps)) <= 2 * EQUAL * float(steps.mean())
+    return float(np.ptp(steps)) <= 0.5 * float(steps.mean())  # "1, 2, 5, 10" passes
 
 
 @dataclass(frozen=True, slots=True)
 class ScanRequest:
-    """What to show of the points of a scan.
+    """The quantities to show at the points of a scan, and their fits.
 
     Attributes:
         names: Names of the quantities; none for :data:`DEFAULT`.
@@ -201,53 +199,57 @@ class ScanReport:
     """Quantities at the points of a scan.
 
     Attributes:
-        found: The points.
+        scan: The points.
         values: Each quantity with its mean at each point.
         fits: The fit of each quantity; empty without.
     """
 
-    found: Scanned
+    scan: Scanned
     values: tuple[tuple[Quantity, list[Estimated]], ...]
     fits: tuple[Fit, ...] = ()
 
     def as_text(self) -> list[str]:
         """A map for each quantity if all pairs of two values were scanned, else a table; then the fits."""
-        found = self.found
-        if len(found.axes) == 2 and len({*found.places}) == math.prod(len(axis.words) for axis in found.axes):
+        axes, n_places = self.scan.axes, len({*self.scan.places})
+        if len(axes) == 2 and n_places == math.prod(len(axis.labels) for axis in axes):
             tables = [
                 line for quantity, values in self.values for line in (*self._map(quantity, values), "")
             ][:-1]
         else:
             tables = self.table()
-        if not found.axes:
+        if not axes:
             tables = ["the run has no scan: these are all its shots", "", *tables]
         return [*tables, *(line for fit in self.fits for line in ("", *fit.lines()))]
 
     def table(self, most: int = 0) -> list[str]:
-        """A row for each point, at most so many if given."""
-        written = [tuple(map(clean, point.written.values())) for point in self.found.points]
-        header = (*map(clean, self.found.points[0].written), "shots", *(title_of(q) for q, _ in self.values))
+        """A row for each point.
+
+        Args:
+            most: Maximum number of rows; 0 for all.
+        """
+        written = [tuple(map(clean, point.written.values())) for point in self.scan.points]
+        header = (*map(clean, self.scan.points[0].written), "shots", *(title_of(q) for q, _ in self.values))
         rows = [
             (
-                *words,
+                *point_values,
                 str(len(point.shots)),
                 *(value_text(values[i], quantity) for quantity, values in self.values),
             )
-            for i, (words, point) in enumerate(zip(written, self.found.points, strict=True))
+            for i, (point_values, point) in enumerate(zip(written, self.scan.points, strict=True))
         ]
         return aligned([header, *rows], right=range(len(header)), most=most)
 
     def _map(self, quantity: Quantity, values: Sequence[Estimated]) -> list[str]:
-        down, across = self.found.axes
+        down, across = self.scan.axes
         at = {
-            place: value_text(one, quantity, short=True)
-            for place, one in zip(self.found.places, values, strict=True)
+            place: value_text(value, quantity, short=True)
+            for place, value in zip(self.scan.places, values, strict=True)
         }
         rows = [
-            (word, *(at.get((i, j), "-") for j in range(len(across.words))))
-            for i, word in enumerate(down.words)
+            (label, *(at.get((i, j), "-") for j in range(len(across.labels))))
+            for i, label in enumerate(down.labels)
         ]
-        header = ("", *across.words)
+        header = ("", *across.labels)
         title = [title_of(quantity), f"down: {down.address}", f"across: {across.address}"]
         return [*title, *aligned([header, *rows], right=range(len(header)))]
 
@@ -259,7 +261,7 @@ class ScanReport:
                 "shots": len(point.shots),
                 "values": {quantity.name: values[i] for quantity, values in self.values},
             }
-            for i, point in enumerate(self.found.points)
+            for i, point in enumerate(self.scan.points)
         ]
         names = [quantity.name for quantity, _ in self.values]
         fits = dict(zip(names, self.fits, strict=False))
@@ -271,23 +273,24 @@ class ScanReport:
         Args:
             units: Address -> SI unit.
         """
-        points = self.found.points
-        found = [
+        points = self.scan.points
+        columns = [
             make_column(name, [point.parameters[name] for point in points], units.get(name, ""), "scanned")
             for name in points[0].parameters
         ]
-        found.append(make_column("shots", [len(point.shots) for point in points], "", "shots at the point"))
+        columns.append(make_column("shots", [len(point.shots) for point in points], "", "shots at the point"))
         for quantity, means in self.values:
-            about = description_of(quantity.name)
+            description = description_of(quantity.name)
             parts = (
-                ("", [one.value for one in means], f"mean over the shots of: {about}"),
-                (" low", [one.interval[0] for one in means], "lower end of its 1 sigma interval"),
-                (" high", [one.interval[1] for one in means], "upper end of its 1 sigma interval"),
+                ("", [mean.value for mean in means], f"mean over the shots of: {description}"),
+                (" low", [mean.interval[0] for mean in means], "lower end of its 1 sigma interval"),
+                (" high", [mean.interval[1] for mean in means], "upper end of its 1 sigma interval"),
             )
-            found += [
-                make_column(f"{quantity.name}{end}", of, quantity.unit, text) for end, of, text in parts
+            columns += [
+                make_column(f"{quantity.name}{end}", values, quantity.unit, meaning)
+                for end, values, meaning in parts
             ]
-        return found
+        return columns
 
 
 def scan_report(run: Run, request: ScanRequest) -> ScanReport:
@@ -299,49 +302,56 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     """
     if not run.shots:
         raise ConfigError(Problem("the run has no shots yet", visible(str(run.path))))
-    found = scanned(run, request.where)
-    if found is None:
-        found = Scanned((), ((),), (ScanPoint({}, {}, select_shots(run, request.where)),))
+    scan = scanned(run, request.where)
+    if scan is None:
+        scan = Scanned((), ((),), (ScanPoint({}, {}, select_shots(run, request.where)),))
     names = request.names or (*_aim(run), *(WITHOUT_TARGET if run.target.is_none else DEFAULT))
     quantities = [find_quantity(run, name) for name in names]
-    values = tuple((quantity, found.over(quantity)) for quantity in quantities)
+    values = tuple((quantity, scan.over(quantity)) for quantity in quantities)
     for quantity, means in values if request.names else ():
-        if all(math.isnan(one.value) for one in means):
+        if all(math.isnan(mean.value) for mean in means):
             where = f" that meets {' and '.join(request.where)}" if request.where else ""
             raise ConfigError(
                 Problem(f"no shot{where} has a value of '{quantity.name}'", clean(run.path.name))
             )
-    fits = tuple(_fit(run, found, one, means, request) for one, means in values) if request.fit else ()
-    return ScanReport(found, values, fits)
+    fits = (
+        tuple(_fit(run, scan, quantity, means, request) for quantity, means in values) if request.fit else ()
+    )
+    return ScanReport(scan, values, fits)
 
 
 def _aim(run: Run) -> tuple[str, ...]:
-    """What an adaptive scan optimises, unless it is shown anyway."""
+    """The quantity that an adaptive scan optimises, unless it is shown anyway."""
     name = str(run.scan.get("figure") or "")
     return (name,) if name and name not in {*DEFAULT, "filling_fraction", "success"} else ()
 
 
 def _fit(
-    run: Run, found: Scanned, quantity: Quantity, values: Sequence[Estimated], request: ScanRequest
+    run: Run, scan: Scanned, quantity: Quantity, values: Sequence[Estimated], request: ScanRequest
 ) -> Fit:
-    on_axis = found.on_axis(0) if len(found.axes) == 1 else None
+    on_axis = scan.on_axis(0) if len(scan.axes) == 1 else None
     if on_axis is None:
         raise ConfigError(
             Problem("there is no axis to fit along", "--fit", expected="a scan of one numerical value")
         )
     x, unit = on_axis
-    given: dict[str, str] = {}
+    parameters: dict[str, str] = {}
     for setting in request.fit_settings:
-        name, equals, text = setting.partition("=")
+        name, equals, value = setting.partition("=")
         if not equals:
             raise ConfigError(Problem(f"'{clean(setting)}' has no value", "--fit-set", expected="NAME=VALUE"))
-        given[name.strip()] = text.strip()
+        parameters[name.strip()] = value.strip()
     profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
     units = si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit
     factor = factor_of(unit)
     assert request.fit is not None
     return fit_points(
-        request.fit, [factor * one for one in x], values, units, given, profile.get("simulation") or {}
+        request.fit,
+        [factor * number for number in x],
+        values,
+        units,
+        parameters,
+        profile.get("simulation") or {},
     )
 
 
@@ -365,11 +375,11 @@ def shown_unit(quantity: Quantity, values: Sequence[float]) -> tuple[str, float]
     """A unit in which values of a quantity are readable, and its factor to SI."""
     if quantity.is_fraction:
         return "%", 0.01
-    known = [abs(value) for value in values if math.isfinite(value)]
+    sizes = [abs(value) for value in values if math.isfinite(value)]
     dimension = dimension_of(quantity.unit)
-    if not dimension or not known:
+    if not dimension or not sizes:
         return quantity.unit, 1.0
-    unit = readable_unit(max(known), dimension)
+    unit = readable_unit(max(sizes), dimension)
     return unit, UNITS[dimension][unit]
 
 

@@ -47,8 +47,6 @@ Floats = NDArray[np.float64]
 Moves = NDArray[np.int16]
 
 DPI: Final = 150
-LARGE_IN: Final = 6.5
-"""Width of a panel if there are at most two, in inches."""
 ON_FRAME: Final = (
     MarkerStyle("atom on a target site", "o", 0.86, "none", "#56b4e9"),
     MarkerStyle("empty target site", "o", 0.86, "none", "#ff7f0e"),
@@ -57,13 +55,8 @@ ON_FRAME: Final = (
 )
 """Colours of the rings around sites, from Okabe and Ito, visible on grey for all colour vision."""
 OUTLINE: Final = "#c8102e"
-OUTLINE_LABEL: Final = "border of the target"
 COLOURS: Final = ("plasma", 0.25, 0.95)
 """Colour map of the order of batches, and the part of it that is visible on black and on white."""
-RIM_PT: Final = 6
-"""Width of the white rim that separates frames; half of it is visible."""
-RANGE: Final = (0.01, 0.998)
-"""Quantiles of the pixel values that are drawn black and white."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +112,7 @@ def save_shot(path: Path, drawing: ShotDrawing) -> None:
 def _draw(drawing: ShotDrawing) -> Figure:
     grid, panels = drawing.grid, drawing.panels
     moved = np.concatenate([panel.moves for panel in panels])
-    panel_in = PANEL_IN if len(panels) > 2 else LARGE_IN
+    panel_in = PANEL_IN if len(panels) > 2 else 6.5
     sheet = plan_timelines(extent_of_sites(moved[:, 2:], grid), len(panels), panel_in)
     figure = make_figure(sheet.width_in, sheet.height_in)
     n_rows, n_cols = grid.shape
@@ -153,8 +146,9 @@ def _paint(
     border: dict[str, Any] = {"colors": OUTLINE, "linewidths": 0.8, "capstyle": "round", "zorder": 1.5}
     axes.add_collection(LineCollection(list(outline(target.fill, grid)), **border))
     if len(panel.moves):
-        of_batch = [_colour(i, int(panel.batch[-1]) + 1) for i in range(int(panel.batch[-1]) + 1)]
-        paint_moves(axes, sheet, grid, panel.moves, np.array(of_batch)[panel.batch])
+        n_batches = int(panel.batch[-1]) + 1
+        colours = np.array([_colour(i, n_batches) for i in range(n_batches)])
+        paint_moves(axes, sheet, grid, panel.moves, colours[panel.batch])
     return looks
 
 
@@ -168,32 +162,33 @@ def _lay_under(
     rows, cols = np.indices(grid.shape)
     places = place_sites(np.stack([rows.ravel(), cols.ravel()], axis=1), grid)
     y, x = sites_px.reshape(-1, 2).T
-    onto, *_ = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), places, rcond=None)
+    affine, *_ = np.linalg.lstsq(np.stack([x, y, np.ones_like(x)], axis=1), places, rcond=None)
     matrix = np.eye(3)
-    matrix[:2] = onto.T
+    matrix[:2] = affine.T
     low, high = limits
-    shown = axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest", zorder=0)
-    shown.set_transform(Affine2D(matrix) + axes.transData)
-    rim: dict[str, Any] = {"fill": False, "edgecolor": "white", "linewidth": RIM_PT, "zorder": 5}
+    drawn = axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest", zorder=0)
+    drawn.set_transform(Affine2D(matrix) + axes.transData)
+    # separates the frame from its neighbours; the outer half of its 6 points is not visible
+    rim: dict[str, Any] = {"fill": False, "edgecolor": "white", "linewidth": 6, "zorder": 5}
     axes.add_patch(Rectangle((0.0, 0.0), 1.0, 1.0, transform=axes.transAxes, **rim))
 
 
 def _mark(
     axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern
 ) -> list[MarkerStyle]:
-    here = (
+    sites_of_look = (
         occupancy & target.fill,
         ~occupancy & target.fill,
         occupancy & target.clear,
         occupancy & ~target.fill & ~target.clear,
     )
-    marked: list[MarkerStyle] = []
-    for look, sites in zip(ON_FRAME, here, strict=True):
+    used_looks: list[MarkerStyle] = []
+    for look, sites in zip(ON_FRAME, sites_of_look, strict=True):
         if sites.any():
             x, y = place_sites(np.argwhere(sites), grid).T
             axes.plot(x, y, **look.keywords(sheet.site_in), zorder=1)
-            marked.append(look)
-    return marked
+            used_looks.append(look)
+    return used_looks
 
 
 def _limits(drawing: ShotDrawing) -> tuple[float, float]:
@@ -201,7 +196,8 @@ def _limits(drawing: ShotDrawing) -> tuple[float, float]:
     images = [panel.image for panel in drawing.panels if panel.image is not None]
     if not images:
         return 0.0, 1.0
-    low, high = np.quantile(np.concatenate([image.ravel() for image in images]), RANGE)
+    # without the extremes, as a hot pixel would darken all others
+    low, high = np.quantile(np.concatenate([image.ravel() for image in images]), (0.01, 0.998))
     return float(low), float(max(high, low + 1))
 
 
@@ -222,7 +218,7 @@ def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[
     figure.text(0.2 / across, 1 - 0.36 / down, drawing.note, fontsize=8, color="0.4", **text)
     order = (*ON_FRAME, ATOM_LOOK, DEFECT_LOOK, SURPLUS_LOOK, RESERVOIR_LOOK, EMPTY_LOOK, EJECTED_LOOK)
     handles = [Line2D([], [], label=look.label, **look.keywords(0.16)) for look in order if look in looks]
-    handles.append(Line2D([], [], color=OUTLINE, linewidth=1, label=OUTLINE_LABEL))
+    handles.append(Line2D([], [], color=OUTLINE, linewidth=1, label="border of the target"))
     if any(len(panel.moves) for panel in drawing.panels):
         for index, name in ((0, "first batch"), (1, "last batch")):
             handles.append(Line2D([], [], color=_colour(index, 2), linewidth=2, label=name))
@@ -257,8 +253,8 @@ def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     shot = _shot(run, index)
     record, target = shot.record(), run.target
     if max(target.shape) > MAX_SITES:
-        what = f"{target.shape[0]} x {target.shape[1]} sites are too many to be made out"
-        raise cannot_draw(run, what, f"at most {MAX_SITES} rows and columns")
+        problem = f"{target.shape[0]} x {target.shape[1]} sites are too many to be made out"
+        raise cannot_draw(run, problem, f"at most {MAX_SITES} rows and columns")
     if not record.images:
         raise cannot_draw(run, f"shot {index} has no images", "a shot with an 'image' step")
     panels = _panels(record, target)
@@ -267,13 +263,15 @@ def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     sites = sites_of(run)
     frames = [panel.image for panel in panels if panel.image is not None]
     fits = sites is not None and all(image.shape == sites.frame for image in frames)
-    kept = (
-        "" if frames and fits else "; no frames: " + ("not kept" if not frames else "not of the sites' size")
-    )
+    no_frames = ""
+    if not frames:
+        no_frames = "; no frames: not kept"
+    elif not fits:
+        no_frames = "; no frames: their size is not that of the sites"
     ended = "" if shot.status == "complete" else f", {shot.status}: {clean(record.error)}"
     return ShotDrawing(
         title=f"shot {index}{ended}",
-        note=note_of(run) + kept,
+        note=note_of(run) + no_frames,
         grid=grid_of(run),
         target=target,
         sites_px=sites.positions_px if sites is not None and fits else None,
@@ -284,27 +282,27 @@ def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
 def _shot(run: Run, index: int) -> Shot:
     attempts = [shot for shot in (*run.attempts, *run.shots) if shot.index == index]
     if not attempts:
-        known = sorted({shot.index for shot in (*run.shots, *run.attempts)})
-        expected = f"one from {known[0]} to {known[-1]}" if known else "a run that has shots"
+        indices = sorted({shot.index for shot in (*run.shots, *run.attempts)})
+        expected = f"one from {indices[0]} to {indices[-1]}" if indices else "a run that has shots"
         raise ConfigError(Problem(f"the run has no shot {index}", "--shot", expected=expected))
     return attempts[-1]
 
 
 def _panels(record: ShotRecord, target: TargetPattern) -> list[ShotPanel]:
     """A panel for each image, with the moves of the cycle that was planned on it."""
-    made = iter(record.cycles)
-    ended_by = [next(made, None) if image.cycle >= 0 else None for image in record.images]
-    after = [*ended_by[1:], next(made, None)]  # a shot that was interrupted may lack the last image
+    cycles = iter(record.cycles)
+    ended_by = [next(cycles, None) if image.cycle >= 0 else None for image in record.images]
+    after = [*ended_by[1:], next(cycles, None)]  # a shot that was interrupted may lack the last image
     return [
-        _panel(image, f"{clean(image.name)}: {_seen(image, target)}", cycle)
+        _panel(image, f"{clean(image.name)}: {_contents(image, target)}", cycle)
         for image, cycle in zip(record.images, after, strict=True)
     ]
 
 
-def _seen(image: ImageRecord, target: TargetPattern) -> str:
+def _contents(image: ImageRecord, target: TargetPattern) -> str:
     n_defects, n_surplus = target.n_defects(image.occupancy), target.n_surplus(image.occupancy)
-    seen = f"{int(image.occupancy.sum())} atoms, {n_defects or 'no'} defect{'s' * (n_defects != 1)}"
-    return seen + (f", {n_surplus} surplus" if n_surplus else "")
+    text = f"{int(image.occupancy.sum())} atoms, {n_defects or 'no'} defect{'s' * (n_defects != 1)}"
+    return text + (f", {n_surplus} surplus" if n_surplus else "")
 
 
 def _panel(image: ImageRecord, title: str, cycle: CycleRecord | None) -> ShotPanel:
@@ -327,8 +325,8 @@ def _of_cycle(
 ) -> list[ShotPanel]:
     ends = [i for i, image in enumerate(record.images) if image.cycle >= 0]
     if not 0 <= cycle < len(ends):
-        made = f"one from 0 to {len(ends) - 1}" if ends else "a shot that rearranges"
-        text = f"shot {index} of {clean(run.path.name)} has no cycle {cycle}"
-        raise ConfigError(Problem(text, "--cycle", expected=made))
+        expected = f"one from 0 to {len(ends) - 1}" if ends else "a shot that rearranges"
+        problem = f"shot {index} of {clean(run.path.name)} has no cycle {cycle}"
+        raise ConfigError(Problem(problem, "--cycle", expected=expected))
     after = ends[cycle]
     return panels[max(0, after - 1) : after + 1]

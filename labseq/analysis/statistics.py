@@ -115,7 +115,7 @@ class _ShotCycle:
     period_s: float
 
 
-def _made(row: IndexRow) -> list[_ShotCycle]:
+def _shot_cycles(row: IndexRow) -> list[_ShotCycle]:
     """The cycles of a shot that end with an image."""
     images, cycles = row.images, row.cycles
     ends = [i for i, cycle in enumerate(images.cycle) if cycle >= 0]
@@ -133,32 +133,40 @@ def _made(row: IndexRow) -> list[_ShotCycle]:
 
 
 def _cycles(rows: Sequence[IndexRow], target: TargetPattern) -> tuple[CycleStatistics, ...]:
-    per_shot = list(map(_made, rows))
-    seen = [list(accumulate((one.is_met for one in made), max)) for made in per_shot]
+    per_shot = list(map(_shot_cycles, rows))
+    seen = [list(accumulate((cycle.is_met for cycle in cycles), max)) for cycles in per_shot]
     n_most = max(map(len, per_shot), default=0)
     return tuple(
         _cycle(
-            cycle,
-            [made[cycle] for made in per_shot if len(made) > cycle],
-            Rate(sum(any(of[: cycle + 1][-1:]) for of in seen), len(seen)),
+            i,
+            [cycles[i] for cycles in per_shot if len(cycles) > i],
+            # a shot that ended after fewer cycles stays as it was
+            Rate(sum(any(met[: i + 1][-1:]) for met in seen), len(seen)),
             target.n_atoms,
         )
-        for cycle in range(n_most)
+        for i in range(n_most)
     )
 
 
-def _cycle(cycle: int, made: Sequence[_ShotCycle], seen: Rate, n_atoms: int) -> CycleStatistics:
-    defects = np.array([one.n_defects for one in made])
+def _cycle(i: int, cycles: Sequence[_ShotCycle], seen: Rate, n_atoms: int) -> CycleStatistics:
+    """Statistics of the cycle of index i.
+
+    Args:
+        cycles: It in each shot that made it.
+        seen: See :class:`CycleStatistics`.
+        n_atoms: Atoms of the target.
+    """
+    defects = np.array([cycle.n_defects for cycle in cycles])
     return CycleStatistics(
-        cycle=cycle,
-        n_shots=len(made),
-        defect_free=Rate(sum(one.is_met for one in made), len(made)),
+        cycle=i,
+        n_shots=len(cycles),
+        defect_free=Rate(sum(cycle.is_met for cycle in cycles), len(cycles)),
         seen=seen,
-        filling=mean(1.0 - defects / n_atoms if n_atoms else np.ones(len(made))),
-        n_atom_moves=mean([one.n_atom_moves for one in made]),
-        n_batches=mean([one.n_batches for one in made]),
-        n_left_out=mean([one.n_left_out for one in made]),
-        period_s=mean([one.period_s for one in made]),
+        filling=mean(1.0 - defects / n_atoms if n_atoms else np.ones(len(cycles))),
+        n_atom_moves=mean([cycle.n_atom_moves for cycle in cycles]),
+        n_batches=mean([cycle.n_batches for cycle in cycles]),
+        n_left_out=mean([cycle.n_left_out for cycle in cycles]),
+        period_s=mean([cycle.period_s for cycle in cycles]),
         defects=_histogram(defects.tolist()),
     )
 
@@ -228,7 +236,7 @@ class Survival:
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> Survival:
         """Empty counts for a grid of this shape."""
-        return cls(_nothing(shape), _nothing(shape))
+        return cls(_no_counts(shape), _no_counts(shape))
 
     def add(self, shot: Shot, loads: frozenset[int]) -> None:
         """Count the atoms of a shot.
@@ -245,15 +253,15 @@ class Survival:
             raise RecordingError(
                 shot.file, "has other images than the index says", "restore it from a backup"
             )
-        last = -1
-        for i, ended in enumerate(images.cycle):
-            made = next(cycles, None) if ended >= 0 else None
-            last += made is not None
+        number = -1  # of the cycle, over all rearrangements of the shot
+        for i, ended_cycle in enumerate(images.cycle):
+            cycle = next(cycles, None) if ended_cycle >= 0 else None
+            number += cycle is not None
             start_s, end_s = images.t_start_s[i - 1] if i else -1.0, images.t_start_s[i]
             if not i or any(start_s <= t_s < end_s for t_s in loaded_s):
                 continue
-            moved, kept = follow_atoms(occupancies[i - 1], () if made is None else (made,))
-            self._count(moved, kept, occupancies[i], last if made is not None else -1)
+            moved, kept = follow_atoms(occupancies[i - 1], () if cycle is None else (cycle,))
+            self._count(moved, kept, occupancies[i], number if cycle is not None else -1)
         self.n_read += 1
 
     def _count(self, moved: Occupancy, kept: Occupancy, seen: Occupancy, cycle: int) -> None:
@@ -261,10 +269,10 @@ class Survival:
         self.kept.add(kept, seen)
         if cycle >= 0:
             while len(self.by_cycle) <= cycle:
-                self.by_cycle.append((_nothing(seen.shape), _nothing(seen.shape)))
+                self.by_cycle.append((_no_counts(seen.shape), _no_counts(seen.shape)))
             self.by_cycle[cycle][0].add(moved, seen)
             self.by_cycle[cycle][1].add(kept, seen)
 
 
-def _nothing(shape: tuple[int, ...]) -> SurvivalCounts:
+def _no_counts(shape: tuple[int, ...]) -> SurvivalCounts:
     return SurvivalCounts(np.zeros(shape, np.int64), np.zeros(shape, np.int64))

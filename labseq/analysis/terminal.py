@@ -40,8 +40,6 @@ from labseq.session.analysis_processes import USE
 
 MAX_REPORTED: Final = 5
 """Maximum number of failures that are printed one by one."""
-WIDEST: Final = 64
-"""Maximum width of an array whose differing sites are drawn."""
 
 
 def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *, as_json: bool) -> int:
@@ -56,9 +54,9 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
         report = ReplayReport(replay(run, request, announce=report_compiling))
         write(report)
         show(report)
-    found = report.replay
-    say(*_failure_lines(found), stream=sys.stderr)
-    return 1 if found.is_own and not found.is_reproduced else 0
+    result = report.replay
+    say(*_failure_lines(result), stream=sys.stderr)
+    return 1 if result.is_own and not result.is_reproduced else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,41 +71,41 @@ class ReplayReport:
 
     def as_json(self) -> dict[str, Any]:
         """The comparison, and each plan and image."""
-        found = self.replay
+        result = self.replay
         return {
-            "run_dir": found.run.path,
-            "shots": found.n_shots,
-            "used": found.used,
-            "reproduced": found.is_reproduced if found.is_own else None,
-            "planner": _plan_values(found.plans) if "planner" in found.used else None,
-            "detector": _image_values(found.images) if "detector" in found.used else None,
-            "unreadable": found.unreadable,
+            "run_dir": result.run.path,
+            "shots": result.n_shots,
+            "used": result.used,
+            "reproduced": result.is_reproduced if result.is_own else None,
+            "planner": _plan_values(result.plans) if "planner" in result.used else None,
+            "detector": _image_values(result.images) if "detector" in result.used else None,
+            "unreadable": result.unreadable,
         }
 
 
-def report_lines(found: Replay) -> list[str]:
+def report_lines(result: Replay) -> list[str]:
     """The comparison, in tables."""
-    lines = [f"{found.run.path}: {plural(found.n_shots, 'shot')}"]
-    if found.plans:
-        lines += ["", *_plan_lines(found)]
-    elif "planner" in found.used:
+    lines = [f"{result.run.path}: {plural(result.n_shots, 'shot')}"]
+    if result.plans:
+        lines += ["", *_plan_lines(result)]
+    elif "planner" in result.used:
         lines += ["", "planner: these shots have no plans"]
-    if "detector" in found.used:
-        lines += ["", *_image_lines(found)]
-    if found.is_own:
-        lines += ["", _verdict(found)]
+    if "detector" in result.used:
+        lines += ["", *_image_lines(result)]
+    if result.is_own:
+        lines += ["", _verdict(result)]
     return lines
 
 
-def _verdict(found: Replay) -> str:
-    if not found.is_reproduced:
+def _verdict(result: Replay) -> str:
+    if not result.is_reproduced:
         return (
             "NOT REPRODUCED: the results of the run's own planner or detector differ from the recorded ones"
         )
-    n_images = len(found.images.images)
-    if not found.plans and not n_images:
+    n_images = len(result.images.images)
+    if not result.plans and not n_images:
         return "nothing to reproduce: no plans, and no frames were kept"
-    parts = [plural(n, what) for n, what in ((len(found.plans), "plan"), (n_images, "image")) if n]
+    parts = [plural(n, kind) for n, kind in ((len(result.plans), "plan"), (n_images, "image")) if n]
     return f"reproduced: {' and '.join(parts)}, all as recorded"
 
 
@@ -128,16 +126,16 @@ PLANS: Final[Sequence[Column[tuple[str, Mapping[str, Any]]]]] = (
 )
 
 
-def _plan_lines(found: Replay) -> list[str]:
+def _plan_lines(result: Replay) -> list[str]:
     rows: list[tuple[str, Mapping[str, Any]]] = []
-    for label, plans in _groups(found.plans):
+    for label, plans in _groups(result.plans):
         rows.append((f"{label}, recorded", mean_counts([plan.recorded for plan in plans])))
-        rows.append((f"{label}, replayed", mean_counts(_made(plans))))
-    n_same, n_failed = sum(plan.same for plan in found.plans), sum(bool(p.failure) for p in found.plans)
-    lines = [_title("planner", found.used["planner"], found.changed["planner"]), *table(rows, PLANS)]
+        rows.append((f"{label}, replayed", mean_counts(_replayed_counts(plans))))
+    n_same, n_failed = sum(plan.same for plan in result.plans), sum(bool(p.failure) for p in result.plans)
+    lines = [_title("planner", result.used["planner"], result.changed["planner"]), *table(rows, PLANS)]
     lines.append("means per plan; filling and target as predicted if no atom is lost")
-    lines.append(f"the same as recorded: {count_of(n_same, len(found.plans))}")
-    return [*lines, f"INVALID: {count_of(n_failed, len(found.plans))}"] if n_failed else lines
+    lines.append(f"the same as recorded: {count_of(n_same, len(result.plans))}")
+    return [*lines, f"INVALID: {count_of(n_failed, len(result.plans))}"] if n_failed else lines
 
 
 def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedPlan]]]:
@@ -153,20 +151,20 @@ def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedP
         yield "all", list(plans)
 
 
-def _made(plans: Sequence[ReplayedPlan]) -> list[PlanCounts]:
+def _replayed_counts(plans: Sequence[ReplayedPlan]) -> list[PlanCounts]:
     return [plan.replayed for plan in plans if plan.replayed is not None]
 
 
-def _image_lines(found: Replay) -> list[str]:
-    images, lines = found.images, [_title("detector", found.used["detector"], found.changed["detector"])]
+def _image_lines(result: Replay) -> list[str]:
+    images, lines = result.images, [_title("detector", result.used["detector"], result.changed["detector"])]
     if not images.images:
-        kept = (
+        reason = (
             "no frames were kept in these shots" if images.n_without_frame else "these shots have no images"
         )
-        return [*lines, kept]
+        return [*lines, reason]
     n_sites = len(images.images) * images.appeared.size
     appeared, vanished = int(images.appeared.sum()), int(images.vanished.sum())
-    differing = sum(1 for one in images.images if one.n_appeared or one.n_vanished)
+    differing = sum(1 for image in images.images if image.n_appeared or image.n_vanished)
     rows = [
         ("images", str(len(images.images)) + _without(images)),
         ("sites that differ", f"{images.n_differing} of {n_sites}, on {plural(differing, 'image')}"),
@@ -174,14 +172,17 @@ def _image_lines(found: Replay) -> list[str]:
         ("  no atom, one before", str(vanished)),
         (
             "atoms on an image",
-            f"recorded {_mean(images, 'n_atoms')}, now {_mean(images, 'n_atoms_replayed')}",
+            f"recorded {_mean_text(images, 'n_atoms')}, now {_mean_text(images, 'n_atoms_replayed')}",
         ),
-        ("confidence", f"recorded {_mean(images, 'confidence')}, now {_mean(images, 'confidence_replayed')}"),
+        (
+            "confidence",
+            f"recorded {_mean_text(images, 'confidence')}, now {_mean_text(images, 'confidence_replayed')}",
+        ),
     ]
-    known = [one for one in images.images if one.n_atoms_true is not None]
-    if known:
+    with_truth = [image for image in images.images if image.n_atoms_true is not None]
+    if with_truth:
         means = (
-            (name, str(mean([getattr(one, key) for one in known])))
+            (name, str(mean([getattr(image, key) for image in with_truth])))
             for name, key in (("recorded", "n_atoms"), ("now", "n_atoms_replayed"), ("truth", "n_atoms_true"))
         )
         rows.append(("on a last image", ", ".join(f"{name} {value}" for name, value in means)))
@@ -192,23 +193,23 @@ def _without(images: ReplayedImages) -> str:
     return f", and {images.n_without_frame} without a frame" if images.n_without_frame else ""
 
 
-def _mean(images: ReplayedImages, name: str) -> str:
-    return str(mean([getattr(one, name) for one in images.images]))
+def _mean_text(images: ReplayedImages, name: str) -> str:
+    return str(mean([getattr(image, name) for image in images.images]))
 
 
 def _map(images: ReplayedImages) -> list[str]:
     """Draw the differing sites: + a new atom, - a missing atom, * both."""
-    if not images.n_differing or images.appeared.shape[1] > WIDEST:
+    if not images.n_differing or images.appeared.shape[1] > 64:  # two characters a site
         return []
     kinds = np.array([".", "+", "-", "*"])[(images.appeared > 0) + 2 * (images.vanished > 0)]
     rows = [" ".join(row) for row in kinds.tolist()]
     return ["", "+ atom, none before; - no atom, one before; * both", *rows]
 
 
-def _failure_lines(found: Replay) -> list[str]:
-    lines = [f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in found.plans if plan.failure]
-    lines += [f"shot {s}, image {i}: {text}" for (s, i), text in found.images.failures.items()]
-    lines += [f"shot {shot} is left out: {text}" for shot, text in found.unreadable.items()]
+def _failure_lines(result: Replay) -> list[str]:
+    lines = [f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in result.plans if plan.failure]
+    lines += [f"shot {s}, image {i}: {text}" for (s, i), text in result.images.failures.items()]
+    lines += [f"shot {shot} is left out: {text}" for shot, text in result.unreadable.items()]
     return _first(lines, "more; all of them with --output FILE")
 
 
@@ -221,7 +222,7 @@ def _first(failures: Sequence[str], rest: str) -> list[str]:
 def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:
     return {
         "recorded": mean_counts([plan.recorded for plan in plans]),
-        "replayed": mean_counts(_made(plans)),
+        "replayed": mean_counts(_replayed_counts(plans)),
         "n_same": sum(plan.same for plan in plans),
         "n_invalid": sum(bool(plan.failure) for plan in plans),
         "plans": plans,
@@ -256,52 +257,52 @@ def analyse_run(
         The exit code: 1 if the analysis of a shot failed.
     """
     run = chosen_run(path)
-    wanted, failed = _wanted(run, use, overrides, may_be_none=request is not None), False
-    for settings in wanted:
-        done = analyse_missing(run, settings, again=again)
-        _report(done)
-        failed = failed or bool(done.failures)
+    analyses, failed = _analyses_to_run(run, use, overrides, may_be_none=request is not None), False
+    for settings in analyses:
+        outcome = analyse_missing(run, settings, again=again)
+        _report(outcome)
+        failed = failed or bool(outcome.failures)
     if request is not None:
-        say(*([""] if wanted else []), *scan_report(run, request).as_text())
+        say(*([""] if analyses else []), *scan_report(run, request).as_text())
     return int(failed)
 
 
-def _wanted(
+def _analyses_to_run(
     run: Run, use: str | None, overrides: Sequence[str], *, may_be_none: bool
 ) -> list[dict[str, Any]]:
     """The settings of each analysis to run."""
-    own = analyses_of(run)
+    analyses = analyses_of(run)
     if use is not None:
-        settings = next((one for one in own if one[USE] == use), {USE: use})
+        settings = next((analysis for analysis in analyses if analysis[USE] == use), {USE: use})
         return [{**settings, **_changes(overrides)}]
     if overrides:
-        what, hint = "it does not say which analysis has this setting", "name it with --use"
-        raise ConfigError(Problem(what, clean(f"--set {overrides[0]}"), hint=hint))
-    if not own and not may_be_none:
-        what, hint = "the run's sequence has no analysis", "name one with --use"
-        raise ConfigError(Problem(what, visible(str(run.path)), hint=hint))
-    return own
+        problem, hint = "it does not say which analysis has this setting", "name it with --use"
+        raise ConfigError(Problem(problem, clean(f"--set {overrides[0]}"), hint=hint))
+    if not analyses and not may_be_none:
+        problem, hint = "the run's sequence has no analysis", "name one with --use"
+        raise ConfigError(Problem(problem, visible(str(run.path)), hint=hint))
+    return analyses
 
 
 def _changes(overrides: Sequence[str]) -> dict[str, Any]:
     """The values of ``--set``."""
     for_sequence, for_profile = split_overrides(overrides)
     if for_profile:
-        what = "an analysis has no settings in the profile"
-        raise ConfigError(Problem(what, for_profile[0].source, expected="key=value"))
+        problem = "an analysis has no settings in the profile"
+        raise ConfigError(Problem(problem, for_profile[0].source, expected="key=value"))
     return Document.of_options(for_sequence, "the command line").data
 
 
-def _report(done: AnalysisOutcome) -> None:
-    before = f", {done.n_before} had a result already" if done.n_before else ""
-    say(f"{done.name}: {plural(done.n_done, 'shot')} analysed{before}; see {done.path}")
-    failed = [f"{done.name}: shot {shot} failed: {text}" for shot, text in done.failures.items()]
-    say(*_first(failed, "more shots failed"), stream=sys.stderr)
+def _report(outcome: AnalysisOutcome) -> None:
+    before = f", {outcome.n_before} had a result already" if outcome.n_before else ""
+    say(f"{outcome.name}: {plural(outcome.n_done, 'shot')} analysed{before}; see {outcome.path}")
+    failures = [f"{outcome.name}: shot {shot} failed: {text}" for shot, text in outcome.failures.items()]
+    say(*_first(failures, "more shots failed"), stream=sys.stderr)
 
 
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """What of a run to draw; at most one of ``what``, ``scan`` and ``shot`` is given.
+    """The part of a run to draw; at most one of ``what``, ``scan`` and ``shot`` is given.
 
     Attributes:
         what: A part of the overview; None for all of it.
@@ -321,11 +322,11 @@ class PlotRequest:
         Raises:
             ConfigError: Options conflict, or there is no such picture.
         """
-        chosen = {"--what": self.what, "--shot": self.shot, "--scan": self.scan}
-        options = [option for option, value in chosen.items() if value is not None]
+        pictures = {"--what": self.what, "--shot": self.shot, "--scan": self.scan}
+        options = [option for option, value in pictures.items() if value is not None]
         if len(options) > 1:
-            what = "these are different pictures"
-            raise ConfigError(Problem(what, " and ".join(options), expected="one of them"))
+            problem = "these are different pictures"
+            raise ConfigError(Problem(problem, " and ".join(options), expected="one of them"))
         if self.cycle is not None and self.shot is None:
             raise ConfigError(Problem("a cycle belongs to a shot", "--cycle", expected="--shot as well"))
 
@@ -347,8 +348,10 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
     request.check()
     folder = campaign_in(run)
     if folder is not None and request != PlotRequest():
-        what = "a campaign has one picture; these options are for one of its runs"
-        raise ConfigError(Problem(what, visible(str(folder)), expected="no option but --output and --force"))
+        problem = "a campaign has one picture; these options are for one of its runs"
+        raise ConfigError(
+            Problem(problem, visible(str(folder)), expected="no option but --output and --force")
+        )
     path = _free_name(request.name if folder is None else "campaign") if output is None else output
     check_place(path)
     if path.exists() and not replace:
@@ -360,13 +363,13 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
         campaign_picture(folder).save(path)
         say(f"written: {path}")
         return
-    chosen = chosen_run(run)
+    opened_run = chosen_run(run)
     if request.shot is not None:
-        save_shot(path, shot_picture(chosen, request.shot, request.cycle))
+        save_shot(path, shot_picture(opened_run, request.shot, request.cycle))
     elif request.scan is not None:
-        scan_picture(chosen, request.scan).save(path)
+        scan_picture(opened_run, request.scan).save(path)
     else:
-        (overview(chosen) if request.what is None else picture_of(chosen, request.what)).save(path)
+        (overview(opened_run) if request.what is None else picture_of(opened_run, request.what)).save(path)
     say(f"written: {path}")
 
 

@@ -22,7 +22,7 @@ ORDER: Final = (
 )
 """The stages of a shot in order; unknown ones come last."""
 WRITE: Final = "write"
-"""Name of the stage of writing: encoding a shot, and writing its file and its line in the index."""
+"""Stage of encoding a shot, and of writing its file and its line in the index."""
 
 Quantiles = tuple[float, float]
 
@@ -71,7 +71,7 @@ class RunTiming:
 class StageTotals:
     """Adds up the stages of shots."""
 
-    _found: dict[str, list[StageTiming]] = field(default_factory=dict[str, list[StageTiming]])
+    _timings: dict[str, list[StageTiming]] = field(default_factory=dict[str, list[StageTiming]])
     _shot_s: list[float] = field(default_factory=list[float])
 
     def add(self, shot: Shot) -> None:
@@ -84,32 +84,33 @@ class StageTotals:
 
     def add_timing(self, timing: Sequence[StageTiming]) -> None:
         """Add the stages of a shot that has been read."""
-        for one in timing:
-            self._found.setdefault(one.stage, []).append(one)
-        self._shot_s.append(math.fsum(one.duration_s for one in timing if one.stage.startswith(STEP)))
+        for stage in timing:
+            self._timings.setdefault(stage.stage, []).append(stage)
+        # whole steps only: stages are within steps, and some at the same time as others
+        self._shot_s.append(math.fsum(stage.duration_s for stage in timing if stage.stage.startswith(STEP)))
 
     def stages(self) -> list[StageStatistics]:
         """The statistics of all stages added so far, without that of writing."""
         n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
-        names = sorted(self._found, key=_place)
-        return [_sum_up(name, self._found[name], n_read, total_s) for name in names]
+        names = sorted(self._timings, key=_place)
+        return [_sum_up(name, self._timings[name], n_read, total_s) for name in names]
 
     def sum_up(self, run: Run) -> RunTiming:
         """The statistics of all stages added so far."""
         n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
         stages = self.stages()
-        written = _writing(run, total_s / n_read if n_read else math.nan)
-        before = sum(not one.stage.startswith(STEP) for one in stages)
-        return RunTiming(n_read, quantiles(self._shot_s), (*stages[:before], *written, *stages[before:]))
+        writing = _writing(run, total_s / n_read if n_read else math.nan)
+        n_stages = sum(not stage.stage.startswith(STEP) for stage in stages)
+        return RunTiming(n_read, quantiles(self._shot_s), (*stages[:n_stages], *writing, *stages[n_stages:]))
 
 
 def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
     """Durations of the stages of the given shots; those whose files cannot be read are left out."""
-    watch = StageTotals()
+    totals = StageTotals()
     for shot in shots:
         with suppress(RecordingError):
-            watch.add(shot)
-    return watch.sum_up(run)
+            totals.add(shot)
+    return totals.sum_up(run)
 
 
 def _place(name: str) -> tuple[bool, int, str]:
@@ -118,17 +119,17 @@ def _place(name: str) -> tuple[bool, int, str]:
 
 
 def _sum_up(name: str, timings: Sequence[StageTiming], n_shots: int, total_s: float) -> StageStatistics:
-    session_s = [one.duration_s for one in timings]
-    budgets_s = [one.budget_s for one in timings if not math.isnan(one.budget_s)]
+    session_s = [timing.duration_s for timing in timings]
+    budgets_s = [timing.budget_s for timing in timings if not math.isnan(timing.budget_s)]
     return StageStatistics(
         stage=name,
         n=len(timings),
         n_per_shot=len(timings) / n_shots,
         budget_s=float(np.median(budgets_s)) if budgets_s else math.nan,
         session_s=quantiles(session_s),
-        host_s=quantiles([one.host_s for one in timings]),
+        host_s=quantiles([timing.host_s for timing in timings]),
         share=math.fsum(session_s) / total_s if total_s else math.nan,
-        n_over=sum(one.over_budget for one in timings),
+        n_over=sum(timing.over_budget for timing in timings),
     )
 
 
@@ -140,7 +141,7 @@ def _writing(run: Run, shot_s: float) -> list[StageStatistics]:
     session_s = (math.nan, math.nan) if run.simulated else host_s  # models have no disk
     share = float(np.mean(times_s)) / shot_s if shot_s and not run.simulated else math.nan
     budget_s = _writing_budget_s(run)
-    n_over = 0 if run.simulated else sum(one > budget_s + OVERSHOOT_S for one in times_s)
+    n_over = 0 if run.simulated else sum(time_s > budget_s + OVERSHOOT_S for time_s in times_s)
     return [StageStatistics(WRITE, len(times_s), 1.0, budget_s, session_s, host_s, share, n_over)]
 
 
@@ -153,11 +154,11 @@ def _writing_budget_s(run: Run) -> float:
 
 def writing_s(run: Run) -> list[float]:
     """The time to write each attempt at a shot that is in the event log, in seconds."""
-    found: list[float] = []
+    times_s: list[float] = []
     for event in run.events:
         with suppress(KeyError, TypeError, ValueError, OverflowError):  # another event, or a damaged line
-            found.append(float(event["values"]["write_s"]))
-    return found
+            times_s.append(float(event["values"]["write_s"]))
+    return times_s
 
 
 def quantiles(values: Sequence[float] | NDArray[np.float64]) -> Quantiles:

@@ -372,7 +372,7 @@ def _axis(scan: Scanned, index: int) -> dict[str, Any]:
     numbers = axis.numbers
     return {
         "address": text_of(axis.address, 200),
-        "words": [text_of(word, 60) for word in axis.words],
+        "words": [text_of(word, 60) for word in axis.labels],
         "numbers": None if numbers is None else [finite(number) for number in numbers[0]],
         "unit": "" if numbers is None else numbers[1],
     }

@@ -71,7 +71,7 @@ def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:
 def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> None:
     drawing = shot_picture(write([make_shot(0, kept=True)]), 0)
     assert drawing.sites_px is None
-    assert drawing.note.endswith("no frames: not of the sites' size")
+    assert drawing.note.endswith("no frames: their size is not that of the sites")
 
 
 def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write) -> None:
