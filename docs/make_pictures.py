@@ -43,7 +43,8 @@ class Picture:
     made: str
 
 
-_KAGOME = "labseq plan random:10x10@0.75 --seed 4 --target kagome:7x7"
+_KAGOME = 'labseq plan random:10x10@0.75 --seed 4 --target "{pattern: kagome, rows: 7, cols: 7}"'
+_COMPACT = 'labseq plan random:20x20@0.75 --seed 1 --target "{pattern: compact, rows: 15, cols: 15}"'
 _SCAN = "labseq run sequences/scan_dop.yaml --seed 1 --set repeats=50 --set record_frames=all"
 _KINDS = ("tweezers", "sites", "thresholds", "frequencies", "overlay")
 _MORNING = tuple(f"labseq calibrate {kind} --profile practice --seed 1" for kind in _KINDS)
@@ -72,7 +73,7 @@ PICTURES: Final = {
     "grid_waveform.png": Picture(
         "explanation/grid-planner.md",
         (
-            "labseq plan random:20x20@0.75 --seed 1 --target compact:15x15 --planner grid --json plan.json",
+            f"{_COMPACT} --planner grid --json plan.json",
             "labseq waveform plan.json --batches 1 --png grid_waveform.png",
         ),
         "grid_waveform.png",

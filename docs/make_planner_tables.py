@@ -90,12 +90,12 @@ def sizes(n_loadings: int) -> list[str]:
     """PSCA in growing arrays."""
     rows: list[list[str]] = []
     for grid, side in SIZES:
-        target = f"compact:{side}x{side}"
+        target = f"{{pattern: compact, rows: {side}, cols: {side}}}"
         comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop="15", loadings=n_loadings)
         (row,) = compare(comparison, Where(1)).rows
         times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
         rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])
-    command = "labseq bench planners --dop 15 --grid 64x64 --target compact:48x48"
+    command = 'labseq bench planners --dop 15 --grid 64x64 --target "{pattern: compact, rows: 48, cols: 48}"'
     return [
         *shown(f"{command} --loadings {n_loadings} --workers 1"),
         *markdown(("size", "batches", "planning, median", "99 %"), rows),
@@ -192,7 +192,7 @@ EBADI: Final = (("speed", "75 um/ms"), ("pick_up", "15 us"), ("drop_off", "15 us
 def _compact(side: int) -> Condition:
     """A centred square, four sites of the grid for three of the target along each side, as 20 for 15."""
     grid = round(side * 4 / 3)
-    return Condition((grid, grid), f"compact:{side}x{side}", 0.75, 15)
+    return Condition((grid, grid), f"{{pattern: compact, rows: {side}, cols: {side}}}", 0.75, 15)
 
 
 def _interleaved(side: int) -> Condition:
@@ -204,7 +204,9 @@ def _interleaved(side: int) -> Condition:
     rows, cols = 2 * side, round(1.2 * side)
     limits = ("max_tweezers", "max_row_tones", "max_column_tones")
     motion = (*BARE_MOTION, *EBADI, *((limit, str(rows)) for limit in limits))
-    return Condition((rows, cols), f"interleaved:{side}x{side}", 0.55, rows, motion)
+    return Condition(
+        (rows, cols), f"{{pattern: interleaved, rows: {side}, cols: {side}}}", 0.55, rows, motion
+    )
 
 
 _COMPACT: Final = tuple(_compact(side) for side in (6, 9, 12, 15))
@@ -231,7 +233,10 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 x="degree_of_parallelism",
                 y="n_batches",
                 planner_entries=(PSCA, PSCA_OF_THE_PAPER, ROWS_X_COLUMNS),
-                conditions=tuple(Condition((20, 20), "compact:15x15", 0.75, dop) for dop in range(2, 16)),
+                conditions=tuple(
+                    Condition((20, 20), "{pattern: compact, rows: 15, cols: 15}", 0.75, dop)
+                    for dop in range(2, 16)
+                ),
                 fitted=False,
                 paper="PSCA 160.0(2) batches at 2, 29.61(3) at 15",
                 paper_points=((2, 160.0), (15, 29.61)),

@@ -41,8 +41,8 @@ class Problem:
     Attributes:
         what: The error, naming the offending key or value.
         source: File name, or the option it came from (``--set a.b=c``).
-        line: Line in ``source``, counted from 1; 0 if the source has no lines.
-        column: Column in ``source``, counted from 1; 0 if there is none.
+        line: Line in ``source``, counted from 1; 0 if that has none, as an option.
+        column: Column in the line, or in the option as ``source`` has it, counted from 1; 0 if there is none.
         expected: The expected value, or "".
         hint: A remedy, for example "did you mean 'rows'?", or "".
         notes: Other places to look at: the value that this one conflicts with, or a default.

@@ -193,8 +193,8 @@ show 2 --scan survival:before,after --fit exponential
 export 1 --output shots.csv
 replay 1
 doctor
-waveform random:10x10@0.75 --target compact:7x7
-plan random:20x20@0.75 --target compact:15x15
+waveform random:20x20@0.75 --target compact_225
+plan random:20x20@0.75 --target compact_225
 bench planners --loadings 2
 devices virtual
 safe virtual

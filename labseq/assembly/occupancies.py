@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, did_you_mean, shown, visible
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
-from labseq.text_files import decode, files_in, is_file, something_else
+from labseq.text_files import YAML_SUFFIXES, decode, files_in, is_file, something_else
 from labseq.units import parse_quantity
 
 MAX_SITES: Final = 1000
@@ -77,6 +77,9 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
         return _random(text, seed)
     if not text:
         raise ConfigError(Problem("the occupancy is an empty text", expected=FORMS))
+    if text.lower().endswith(YAML_SUFFIXES):
+        hint = "to plan for its target, write: labseq plan random:20x20@0.75 --target " + clean(text)
+        raise ConfigError(Problem("a sequence holds no occupancy", clean(text), expected=FORMS, hint=hint))
     match = _SHOT.fullmatch(text)
     path = Path(match[1] if match else text)
     if not is_file(path):

@@ -26,6 +26,7 @@ from labseq.assembly.plugin_choice import (
 from labseq.assembly.recorded import Machine, recorded_machine
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.document import Document, plugin_paths
+from labseq.config.find import find_sequence
 from labseq.config.profile import load_profile
 from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
@@ -37,15 +38,12 @@ from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
 from labseq.roles import Planner
 from labseq.settings import Choice, PatternChoice
-from labseq.text_files import YAML_SUFFIXES
 
-_TARGET: Final = re.compile(r"([^\W\d][\w-]*)(?::(.*))?", re.DOTALL)
 _NAME: Final = re.compile(r"[^\W\d][\w.-]*")
-_SIZE: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
 _ORIGIN: Final = re.compile(r"\s*(-?\d{1,6})\s*,\s*(-?\d{1,6})\s*")
-_NEXT_SETTING: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
 _TARGET_FORMS: Final = (
-    "a pattern such as kagome:15x15 or ring:radius=4, or a sequence file, whose target is taken"
+    "a pattern as in a sequence file, '{pattern: kagome, rows: 15, cols: 15}', or a sequence whose target "
+    "is used"
 )
 
 
@@ -55,8 +53,7 @@ class PlanRequest:
 
     Attributes:
         occupancy: See :func:`labseq.assembly.occupancies.read_source`.
-        target: "kagome:15x15", "kagome:rows=15,cols=15" or a sequence file; None
-            for the target that a shot was taken with.
+        target: See :func:`read_target`; None for the target that a shot was taken with.
         planner: Its name.
         degree_of_parallelism: The planner's setting of that name; None for its default.
         overrides: ``"key=value"`` each: further settings of the planner, with or
@@ -93,10 +90,12 @@ def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
     """
     for_planner, for_profile = split_overrides(request.overrides)
     machine, folders = read_machine(request, for_profile, source)
-    document, choice, more_folders = _target_choice(request, source)
-    host = load_plugins([*folders, *more_folders])
-    target = source.target if choice is None else _make_target(host, document, choice, machine.grid)
-    assert target is not None  # see _target_choice
+    if request.target is None:
+        target, host = _recorded_target(request, source), load_plugins(folders)
+    else:
+        choice = read_target(request.target, _origin(request.origin))
+        host = load_plugins([*folders, *choice.plugin_folders])
+        target = choice.make(host, machine.grid)
     return PlanInputs(machine, target, _planner(host, request, for_planner))
 
 
@@ -135,59 +134,68 @@ def _default_machine(source: Source) -> Machine:
     return recorded_machine(source.machine, "the profile in the shot's file")
 
 
-def _target_choice(request: PlanRequest, source: Source) -> tuple[Document, PatternChoice | None, list[Path]]:
-    """The target's pattern, the document that names it, and that document's plugin folders.
+def _recorded_target(request: PlanRequest, source: Source) -> TargetPattern:
+    """The target of the shot that the occupancy is from."""
+    if source.target is None:
+        raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
+    if request.origin is not None:
+        raise ConfigError(Problem("there is no --target to move", clean(f"--origin {request.origin}")))
+    return source.target
 
-    The pattern is None if the target is that of a recorded shot.
+
+class TargetChoice(NamedTuple):
+    """A target that a command names, not made yet.
+
+    Attributes:
+        document: The sequence or the option that names its pattern.
+        choice: The pattern, and the location of its settings.
+        plugin_folders: The folders of plugins that the sequence names.
     """
-    text, origin = request.target, _origin(request.origin)
-    if text is None:
-        if source.target is None:
-            raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
-        if origin:
-            raise ConfigError(Problem("there is no --target to move", origin[0].source))
-        return Document.of_options([], "the command line"), None, []
-    if text.lower().endswith(YAML_SUFFIXES):
-        document, sequence, _ = load_sequence(Path(text), origin)
-        if sequence.target is None:
-            raise ConfigError(Problem("this sequence has no target", visible(text), expected=_TARGET_FORMS))
-        return document, sequence.target, plugin_paths(document, sequence.plugin_folders)
-    name, settings = parse_target(text)
-    option = f"--target {text}"
-    overrides = [Override(f"target.{key}", value, option) for key, value in settings.items()]
-    overrides = [Override("target.pattern", name, option), *overrides, *origin]
-    document = Document.of_options(overrides, "the command line")
-    return document, PatternChoice(pattern=name).placed("target"), []
+
+    document: Document
+    choice: PatternChoice
+    plugin_folders: list[Path]
+
+    def make(self, host: PluginHost, grid: SiteGrid) -> TargetPattern:
+        """The target on a grid.
+
+        Raises:
+            ConfigError: The pattern or a setting is wrong, or the target does not fit on the grid.
+            PluginLoadError: The pattern's plugin failed; names it.
+        """
+        pattern = resolve(host, self.document, "pattern", self.choice)
+        try:
+            return construct_target(pattern, grid)
+        except LimitError as error:
+            raise self.document.error(self.choice.loc, str(error)) from error
 
 
-def parse_target(text: str) -> tuple[str, dict[str, str]]:
-    """Split "pattern:settings" into the name of the pattern and its settings as text.
+def read_target(text: str, overrides: Sequence[Override] = ()) -> TargetChoice:
+    """Read ``--target``: a pattern as in a sequence file, or a sequence whose target is used.
+
+    Args:
+        text: A mapping such as "{pattern: kagome, rows: 15, cols: 15}", or the name or file of a sequence.
+        overrides: Further settings of the target.
 
     Raises:
-        ConfigError: It is not of this form.
-
-    Example:
-        >>> parse_target("kagome:15x15")
-        ('kagome', {'rows': '15', 'cols': '15'})
-        >>> parse_target("ring:radius=4, origin=[2, 3]")
-        ('ring', {'radius': '4', 'origin': '[2, 3]'})
+        ConfigError: There is no such sequence, it has an error or no target, or the mapping is invalid.
     """
-    match = _TARGET.fullmatch(text)
-    wrong = Problem("this is not a target", clean(f"--target {text}"), expected=_TARGET_FORMS)
-    if match is None:
-        raise ConfigError(wrong)
-    settings: dict[str, str] = {}
-    parts = _NEXT_SETTING.split(match[2]) if match[2] is not None else []
-    for i, part in enumerate(parts):
-        size = _SIZE.fullmatch(part) if i == 0 else None
-        key, equals, value = part.partition("=")
-        if size is not None:
-            settings |= {"rows": size[1], "cols": size[2]}
-        elif equals and key.strip().isidentifier():
-            settings[key.strip()] = value.strip()
-        else:
-            raise ConfigError(wrong)
-    return match[1], settings
+    option = f"--target {text}"
+    if not text:
+        raise ConfigError(Problem("--target is empty", expected=_TARGET_FORMS))
+    if text.lstrip().startswith("{"):
+        document = Document.of_options([Override("target", text, option), *overrides], "the command line")
+        choice = document.validate(PatternChoice, ("target",)).placed("target")
+        return TargetChoice(document, choice, [])
+    try:
+        path = find_sequence(Path(text))
+    except ConfigError as error:
+        what, hint = f"there is no sequence '{clean(text)}'", error.problems[0].hint
+        raise ConfigError(Problem(what, clean(option), expected=_TARGET_FORMS, hint=hint)) from None
+    document, sequence, _ = load_sequence(path, overrides)
+    if sequence.target is None:
+        raise ConfigError(Problem("this sequence has no target", visible(text), expected=_TARGET_FORMS))
+    return TargetChoice(document, sequence.target, plugin_paths(document, sequence.plugin_folders))
 
 
 def _origin(text: str | None) -> list[Override]:
@@ -198,16 +206,6 @@ def _origin(text: str | None) -> list[Override]:
         what, expected = "this is not a site", "row and column of the target's top left site, for example 2,3"
         raise ConfigError(Problem(what, clean(f"--origin {text}"), expected=expected))
     return [Override("target.origin", f"[{match[1]}, {match[2]}]", f"--origin {text}")]
-
-
-def _make_target(
-    host: PluginHost, document: Document, choice: PatternChoice, grid: SiteGrid
-) -> TargetPattern:
-    chosen = resolve(host, document, "pattern", choice)
-    try:
-        return construct_target(chosen, grid)
-    except LimitError as error:
-        raise document.error(choice.loc, str(error)) from error
 
 
 def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override]) -> ChosenPlugin:

@@ -26,7 +26,8 @@ bench = typer.Typer(
 PLANNERS_EXAMPLES = """\b
 Examples:
   labseq bench planners --planners psca,lsap --dop 15 --loadings 10000
-  labseq bench planners --planners psca,psca:variant=paper --grid 30x30 --target kagome:20x20 --loading "60 %"
+  labseq bench planners --grid 30x30 --target "{pattern: kagome, rows: 20, cols: 20}" --loading "60 %"
+  labseq bench planners --planners psca,psca:variant=paper --dop 15
   labseq bench planners --planners psca --dop 15 --json - | jq .rows[0].n_batches
   labseq bench planners --planners psca,grid --dop 7,15,20
   labseq bench planners --planners psca,mta1 --set profile.mobile_tweezers.speed="130 um/ms"
@@ -80,8 +81,8 @@ def planners(
     ] = "psca",
     grid: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="Sites of the grid.")] = "20x20",
     target: Annotated[
-        str, typer.Option(metavar="PATTERN", help="A pattern such as kagome:15x15.")
-    ] = "compact:15x15",
+        str, typer.Option(metavar="PATTERN|SEQUENCE", help="The target, as for labseq plan.")
+    ] = "{pattern: compact, rows: 15, cols: 15}",
     loading: Annotated[str, typer.Option(metavar="P", help="Probability that a site is loaded.")] = "75 %",
     dop: Annotated[
         str | None,

@@ -49,7 +49,7 @@ class Condition:
 
     Attributes:
         shape: Rows and columns of the grid.
-        target: A pattern, as after ``--target``.
+        target: A pattern or a sequence, as after ``--target``.
         loading: Probability that a site is loaded.
         degree_of_parallelism: For every planner with such a setting; None for the planner's default.
         motion: Settings of the motion that differ from the defaults, as typed.
@@ -194,7 +194,7 @@ def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
 def read_comparison(
     planners: str = "psca",
     grid: str = "20x20",
-    target: str = "compact:15x15",
+    target: str = "{pattern: compact, rows: 15, cols: 15}",
     loading: str = "75 %",
     dop: str | None = None,
     loadings: int = 1000,

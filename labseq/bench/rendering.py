@@ -29,7 +29,7 @@ SITES: Final = 5
 """Distance of each transport, in sites, about the mean of a plan."""
 
 
-PLAN: Final = PlanRequest("random:20x20@75%", "compact:15x15", "psca", 7, seed=1)
+PLAN: Final = PlanRequest("random:20x20@75%", "{pattern: compact, rows: 15, cols: 15}", "psca", 7, seed=1)
 """A typical plan: 225 atoms in 20 x 20 sites, moved seven at a time."""
 
 

@@ -198,6 +198,7 @@ def _identity(
         "degree_of_parallelism": runner.degree_of_parallelism,
         "grid": dict(zip(("rows", "cols"), condition.shape, strict=True)),
         "target": condition.target,
+        "target_name": prepared.target.name,
         "n_target_atoms": prepared.target.n_atoms,
         "loading": condition.loading,
     }
@@ -266,7 +267,7 @@ def notes(report: Report) -> list[str]:
     for row in report.rows[:1]:
         if row["n_short"]:
             few = f"{row['n_short']} of {row['n_loadings']} loadings hold fewer atoms"
-            lines.append(f"{few} than {row['target']} has sites")
+            lines.append(f"{few} than {row['target_name']} has sites")
     for row in report.rows:
         if row.first_failure is not None:
             lines += _failure(comparison, row, row.first_failure)
@@ -302,6 +303,10 @@ def _again(comparison: Comparison, row: Row, loading: int) -> str:
 def save_histogram(path: Path, report: Report) -> None:
     """Draw how many batches the planners need, with conditions that differ in parallelism alone, as a PNG.
 
+    Args:
+        path: The file.
+        report: The comparison, with at least one row.
+
     Raises:
         ConfigError: The file cannot be written.
     """
@@ -322,7 +327,8 @@ def save_histogram(path: Path, report: Report) -> None:
         given = f"{100 * condition.loading:g} % loading"
         if condition.degree_of_parallelism is not None and not more:
             given += f", degree of parallelism {condition.degree_of_parallelism}"
-        title = f"{condition.target} out of {rows} x {cols}, {given}\n{report.extent_text}"
+        target = report.rows[0]["target_name"]
+        title = f"{target} out of {rows} x {cols}, {given}\n{report.extent_text}"
         figure.suptitle(title, fontsize=9)
         return figure
 

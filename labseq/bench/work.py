@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.assembly.lab import construct_planner
-from labseq.assembly.planning import parse_target
-from labseq.assembly.plugin_choice import ChosenPlugin, construct_target, dump, load_plugins, resolve
+from labseq.assembly.planning import TargetChoice, read_target
+from labseq.assembly.plugin_choice import ChosenPlugin, dump, load_plugins, resolve
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.config.addresses import Override
 from labseq.config.document import Document
-from labseq.errors import ConfigError, LimitError, PlanError, Problem, ProblemCollector
+from labseq.errors import ConfigError, PlanError, Problem, ProblemCollector
 from labseq.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.roles import NeedsWarmUp, Planner
-from labseq.settings import Choice, PatternChoice, settings_at
+from labseq.settings import Choice, settings_at
 
 _DOP: Final = "degree_of_parallelism"
 _MOTION_ADDRESS: Final = "profile.mobile_tweezers"
@@ -58,8 +58,12 @@ class PreparedCondition:
 
 def set_up(comparison: Comparison) -> list[PreparedCondition]:
     """Load the plugins, and validate and prepare every condition."""
-    host = load_plugins()
-    return [_prepare(host, comparison, condition) for condition in comparison.conditions]
+    targets = [read_target(condition.target) for condition in comparison.conditions]
+    host = load_plugins([folder for target in targets for folder in target.plugin_folders])
+    return [
+        _prepare(host, comparison, condition, target)
+        for condition, target in zip(comparison.conditions, targets, strict=True)
+    ]
 
 
 def warm(prepared: list[PreparedCondition]) -> None:
@@ -74,11 +78,13 @@ def warm(prepared: list[PreparedCondition]) -> None:
     load_kernels()
 
 
-def _prepare(host: PluginHost, comparison: Comparison, condition: Condition) -> PreparedCondition:
+def _prepare(
+    host: PluginHost, comparison: Comparison, condition: Condition, choice: TargetChoice
+) -> PreparedCondition:
     found = ProblemCollector()
     grid, motion, target = SiteGrid(*condition.shape), _motion(condition), None
     with found:
-        target = _target(host, condition, grid)
+        target = choice.make(host, grid)
     runners: list[Runner] = []
     for planner_entry in comparison.planner_entries:
         with found:
@@ -109,16 +115,6 @@ def _motion(condition: Condition) -> MotionSpec:
     return motion
 
 
-def _target(host: PluginHost, condition: Condition, grid: SiteGrid) -> TargetPattern:
-    option = f"--target {condition.target}"
-    name, settings = parse_target(condition.target)
-    overrides = [Override(f"pattern.{key}", value, option) for key, value in settings.items()]
-    try:
-        return construct_target(_choose(host, PatternChoice(pattern=name), overrides, option), grid)
-    except LimitError as error:
-        raise ConfigError(Problem(str(error), option)) from error
-
-
 def _planner(
     host: PluginHost, comparison: Comparison, condition: Condition, planner_entry: PlannerEntry
 ) -> ChosenPlugin:
@@ -128,15 +124,9 @@ def _planner(
     entry = host.registry.find("planner", name)
     if entry is not None and dop is not None and settings_at(entry.settings_model, (_DOP,)):
         overrides.insert(0, Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
-    return _choose(host, Choice(use=name), overrides, comparison.called)
-
-
-def _choose(host: PluginHost, choice: Choice, overrides: list[Override], option: str) -> ChosenPlugin:
-    """Resolve a plugin that was named in an option."""
-    kind = "pattern" if choice.key == "pattern" else "planner"
-    named = Override(f"{kind}.{choice.key}", choice.use, option)
-    document = Document.of_options([named, *overrides], option)
-    return resolve(host, document, kind, choice.placed(kind))
+    overrides.insert(0, Override("planner.use", name, comparison.called))
+    document = Document.of_options(overrides, comparison.called)
+    return resolve(host, document, "planner", Choice(use=name).placed("planner"))
 
 
 def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:

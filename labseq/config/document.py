@@ -122,7 +122,7 @@ class Document:
     def locate(self, loc: Loc, key: bool = False) -> tuple[int, int]:
         """Line and column, counted from 1, of the value at a location, or of its key.
 
-        If it does not exist, those of its nearest parent; (0, 0) for the value of an option.
+        If it does not exist, those of its nearest parent; line 0 for the value of an option.
         """
         mark = self.root.mark_at(loc, key)
         return mark.line, mark.column

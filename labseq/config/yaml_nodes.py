@@ -42,7 +42,7 @@ class Mark(NamedTuple):
     Attributes:
         source: Name of the file in messages, or an option such as ``--set shots=5``.
         line: Line, from 1; 0 in an option.
-        column: Column, from 1; 0 in an option.
+        column: Column, from 1; in an option that of the name, which ends with its text, or 0 for all of it.
     """
 
     source: str
@@ -174,8 +174,7 @@ def compose(text: str, source: str, *, is_option: bool = False) -> Node | None:
         # A stray closing bracket makes the level negative.
         opened = composer.marks[-1] if composer.flow_level > 0 else None
         found = explain_syntax_error(error, text, composer.last, opened)
-        mark = Mark(source) if is_option else Mark(source, found.line, found.column)
-        composer.stop(mark, found.what, found.expected, found.hint)
+        composer.stop(composer.place(found.line, found.column), found.what, found.expected, found.hint)
     except ConfigError:
         raise
     except ValueError:  # PyYAML passes the escape of a character that does not exist to chr()
@@ -200,7 +199,7 @@ class _Composer(yaml.SafeLoader):
         super().__init__(text)
         self.problems: list[Problem] = []
         self.last: Event | None = None
-        self._source, self._is_option = source, is_option
+        self._text, self._source, self._is_option = text, source, is_option
         self._depth = self._n_values = 0
         self._sizes: dict[str, int] = {}  # number of values behind an anchor that is complete
         self._keys: dict[int, dict[str, YamlMark]] = {}  # of each mapping
@@ -248,10 +247,16 @@ class _Composer(yaml.SafeLoader):
         values = {text: self.converted(value, depth + 1, via) for text, _, value in pairs}
         return Node(values, self._mark(mark), {text: self._mark(key.start_mark) for text, key, _ in pairs})
 
+    def place(self, line: int, column: int) -> Mark:
+        """The place of a line and a column of the text, from 1."""
+        if not self._is_option:
+            return Mark(self._source, line, column)
+        # The name of an option ends with its text, unless that is too long for it.
+        is_within = line == 1 < column and self._source.endswith(self._text)
+        return Mark(self._source, 0, len(self._source) - len(self._text) + column if is_within else 0)
+
     def _mark(self, mark: Mark | YamlMark) -> Mark:
-        if isinstance(mark, Mark):
-            return mark
-        return Mark(self._source) if self._is_option else Mark(self._source, mark.line + 1, mark.column + 1)
+        return mark if isinstance(mark, Mark) else self.place(mark.line + 1, mark.column + 1)
 
     def _count(self, event: Any, n: int) -> None:
         self._n_values += n

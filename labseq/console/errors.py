@@ -24,11 +24,11 @@ _WORD: Final = re.compile(rf"\"[^\"]*\"?|'[^']*'?|{_PLAIN}(?: (?!#){_PLAIN})*")
 
 
 def excerpt(problem: Problem) -> list[str]:
-    """Show the line of a problem as compilers do.
+    """Show the line, or the option, of a problem as compilers do.
 
     Returns:
         The line with its number, and a line with carets below the offending word; nothing if the problem
-        has no line, or its file cannot be read.
+        has no column, or its file cannot be read.
     """
     from rich.cells import cell_len
 
@@ -48,12 +48,14 @@ def excerpt(problem: Problem) -> list[str]:
     # a tab is as wide in both lines
     pad = "".join("\t" if char == "\t" else " " * cell_len(char) for char in line[shift:start])
     carets = "^" * max(1, min(cell_len(line[start:end]), widest - cell_len(line[shift:start])))
-    return [f"{problem.line:>5} | {shown}", " " * 5 + " | " + pad + carets]
+    return [f"{problem.line or '':>5} | {shown}", " " * 5 + " | " + pad + carets]
 
 
 def _line_of(problem: Problem) -> str | None:
-    if not problem.line or not problem.column:
+    if not problem.column:
         return None
+    if not problem.line:  # an option, which is its own line
+        return problem.source
     try:
         data = Path(problem.source).read_bytes()
     except (OSError, ValueError):

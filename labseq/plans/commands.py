@@ -9,24 +9,24 @@ from labseq.console.options import JsonFile, Plugins, profile_option
 
 PLAN_EXAMPLES: Final = """\b
 Examples:
-  labseq plan random:20x20@0.75 --seed 1 --target kagome:15x15 --dop 7
-  labseq plan random:20x20@0.75 --seed 1 --target sierpinski:16x16 --step
+  labseq plan random:20x20@0.75 --seed 1 --target "{pattern: kagome, rows: 15, cols: 15}" --dop 7
+  labseq plan random:20x20@0.75 --seed 1 --target "{pattern: sierpinski, rows: 16, cols: 16}" --step
   labseq plan data/2026-11-20/0001_compact-225/shots/shot_000003.h5#1 --png second_cycle.png
-  labseq plan occupancy.npy --target ring:radius=4 --origin 2,3 --json - | jq .n_batches
+  labseq plan occupancy.npy --target "{pattern: ring, radius: 4}" --origin 2,3 --json - | jq .n_batches
 """
 WAVEFORM_EXAMPLES: Final = """\b
 Examples:
-  labseq waveform random:20x20@0.75 --seed 1 --target kagome:15x15 --png waveform.png
+  labseq waveform random:20x20@0.75 --target "{pattern: kagome, rows: 15, cols: 15}" --png waveform.png
   labseq waveform plan.json --profile lab --batches 1-3 --png begin.png --npz begin.npz
-  labseq plan occupancy.npy --target ring:radius=4 --json - | labseq waveform - --json - | jq .row.peak_v
+  labseq plan occupancy.npy --target kagome --json - | labseq waveform - --json - | jq .row.peak_v
 """
 
 Target = Annotated[
     str | None,
     typer.Option(
-        metavar="PATTERN:ROWSxCOLS",
-        help="The target, for example kagome:15x15 or ring:radius=4,width=2, or a sequence file whose "
-        "target is used. Default: the target that the shot was taken with.",
+        metavar="PATTERN|SEQUENCE",
+        help="The target: a pattern as in a sequence file, '{pattern: kagome, rows: 15, cols: 15}', or the "
+        "file or name of a sequence whose target is used. Default: the target that the shot was taken with.",
     ),
 ]
 Planner = Annotated[str, typer.Option(metavar="NAME", help="The planner.")]

@@ -19,7 +19,9 @@ from labseq.bench.work import draw, set_up
 from labseq.errors import ConfigError, PlanError
 from labseq.plain import to_plain
 
-SMALL = Comparison((PlannerEntry("psca"),), (Condition((8, 8), "compact:5x5", 0.75, 4),), 60, 5)
+SMALL = Comparison(
+    (PlannerEntry("psca"),), (Condition((8, 8), "{pattern: compact, rows: 5, cols: 5}", 0.75, 4),), 60, 5
+)
 TIMES = {"planning_s", "duration_s"}
 TWICE = (PlannerEntry("psca"), PlannerEntry("psca", (("degree_of_parallelism", "2"),)))
 
@@ -81,7 +83,7 @@ def test_several_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(bench, "ALONE_S", 0.0)
     monkeypatch.setattr(bench, "n_cores", lambda: 2)
     entries = (PlannerEntry("moody"), PlannerEntry("psca"))
-    conditions = (*SMALL.conditions, Condition((6, 7), "compact:3x3", 0.5))
+    conditions = (*SMALL.conditions, Condition((6, 7), "{pattern: compact, rows: 3, cols: 3}", 0.5))
     comparison = replace(SMALL, planner_entries=entries, conditions=conditions)
     alone, together = compare(comparison, ALONE), compare(comparison)
     assert alone.ended_by is together.ended_by is None
@@ -122,7 +124,9 @@ def test_losses_are_predicted_by_those_of_the_profile(report: Report) -> None:
     """Without spread, vacuum and image, each atom moved is lost with the loss of a move."""
     losses = {"move": "1 %", "spread": "0", "image": "0", "lifetime": "700 h"}
     overrides = [f"profile.mobile_tweezers.losses.{key}={value}" for key, value in losses.items()]
-    asked = read_comparison("psca", "8x8", "compact:4x4", "75 %", "2,4", 20, 1, overrides)
+    asked = read_comparison(
+        "psca", "8x8", "{pattern: compact, rows: 4, cols: 4}", "75 %", "2,4", 20, 1, overrides
+    )
     two, four = compare(asked, ALONE).rows
     assert (two["degree_of_parallelism"], four["degree_of_parallelism"]) == (2, 4)
     for row in (two, four):
@@ -149,7 +153,9 @@ def test_overheads_count_only_where_they_are_set(report: Report) -> None:
 
 
 def test_too_few_atoms_show_in_the_filling() -> None:
-    row = compare(replace(SMALL, conditions=(Condition((8, 8), "compact:8x8", 0.5, 4),)), ALONE).rows[0]
+    row = compare(
+        replace(SMALL, conditions=(Condition((8, 8), "{pattern: compact, rows: 8, cols: 8}", 0.5, 4),)), ALONE
+    ).rows[0]
     assert row["n_short"] == row["n_loadings"] == 60
     assert row["n_failed"] == 0
     assert row["target_met"].value == 0.0
@@ -159,7 +165,7 @@ def test_too_few_atoms_show_in_the_filling() -> None:
 
 def test_empty_and_full_loadings() -> None:
     for loading in (0.0, 1.0):
-        conditions = (Condition((5, 5), "compact:3x3", loading, 4),)
+        conditions = (Condition((5, 5), "{pattern: compact, rows: 3, cols: 3}", loading, 4),)
         row = compare(replace(SMALL, conditions=conditions), ALONE).rows[0]
         assert row["n_failed"] == 0
         assert row["n_batches"].value == 0.0
@@ -178,7 +184,10 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
     ("request_", "words"),
     [
         ({"planners": "psac"}, "unknown planner 'psac'; expected .*; did you mean 'psca'?"),
-        ({"target": "compact:30x30"}, "--target compact:30x30: the size of the target is 30 rows"),
+        (
+            {"target": "{pattern: compact, rows: 30, cols: 30}"},
+            "--target {pattern: compact, rows: 30, cols: 30}: the size of the target is 30 rows",
+        ),
         ({"dop": "21"}, "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
         (
             {
@@ -200,5 +209,5 @@ def test_wrong_requests_are_refused(request_: dict[str, Any], words: str) -> Non
 
 def test_the_tweezers_speed_can_be_set() -> None:
     speed = "profile.mobile_tweezers.speed=130 um/ms"
-    (course,) = set_up(read_comparison(target="compact:2x2", overrides=[speed]))
+    (course,) = set_up(read_comparison(target="{pattern: compact, rows: 2, cols: 2}", overrides=[speed]))
     assert course.motion.speed_m_s == 0.13

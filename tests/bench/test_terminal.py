@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,16 @@ import pytest
 from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.cli import main
 
-SMALL = ("--grid", "8x8", "--target", "compact:5x5", "--loadings", "20", "--workers", "1")
+SMALL = (
+    "--grid",
+    "8x8",
+    "--target",
+    "{pattern: compact, rows: 5, cols: 5}",
+    "--loadings",
+    "20",
+    "--workers",
+    "1",
+)
 
 MOODY = """
 import labseq
@@ -79,7 +89,7 @@ def test_wrong_plans_are_reported_with_a_way_to_see_one(
     assert "breaks the rule 'straight'" in out
     assert err.splitlines()[-1].startswith("error: ")
     assert "plans of 'moody' are wrong" in err
-    command = next(line for line in out.splitlines() if "see it with" in line).split()
+    command = shlex.split(next(line for line in out.splitlines() if "see it with" in line))
     words = {key: command[command.index(key) + 1] for key in ("plan", "--seed", "--target", "--planner")}
     request = PlanRequest(words["plan"], words["--target"], words["--planner"], seed=int(words["--seed"]))
     with pytest.raises(Exception, match="breaks the rule 'straight'"):
@@ -88,7 +98,7 @@ def test_wrong_plans_are_reported_with_a_way_to_see_one(
 
 def test_too_few_atoms_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(*SMALL, "--loading", "30 %") == 0
-    assert "fewer atoms than compact:5x5" in capsys.readouterr().out
+    assert "fewer atoms than compact 5 x 5" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,9 @@ class Scripted:
 
 
 def course_with(planner: Any) -> PreparedCondition:
-    condition = Condition((4, 4), "compact:2x2", loading=1.0, degree_of_parallelism=1)
+    condition = Condition(
+        (4, 4), "{pattern: compact, rows: 2, cols: 2}", loading=1.0, degree_of_parallelism=1
+    )
     (course,) = set_up(Comparison((PlannerEntry("psca"),), (condition,), 3, 1))
     return replace(course, runners=(replace(course.runners[0], planner=planner),))
 

@@ -47,8 +47,8 @@ COMMANDS = (
     ("check", "sequences/s.yaml", *OVERRIDE),
     ("run", "sequences/s.yaml", "--dry-run=fast", *OVERRIDE),
     ("queue", "add", "sequences/s.yaml", *OVERRIDE),
-    ("plan", "random:4x4@0.7", "--target=compact:2x2", "--planner=lazy"),
-    ("waveform", "random:4x4@0.7", "--target=compact:2x2", "--planner=lazy"),
+    ("plan", "random:4x4@0.7", "--target={pattern: compact, rows: 2, cols: 2}", "--planner=lazy"),
+    ("waveform", "random:4x4@0.7", "--target={pattern: compact, rows: 2, cols: 2}", "--planner=lazy"),
     ("bench", "planners", "--planners=lazy", "--loadings=2", "--workers=1"),
 )
 

@@ -4,6 +4,8 @@ import pytest
 from hypothesis import given, strategies as st
 from rich.cells import cell_len
 
+from labseq.config.addresses import Override
+from labseq.config.document import Document
 from labseq.console.errors import excerpt
 from labseq.errors import Problem
 
@@ -48,13 +50,27 @@ def test_a_narrow_terminal_gets_a_narrow_excerpt(
     assert cell_len(line[: line.index("wrong")]) == carets.index("^")
 
 
+@pytest.mark.parametrize(
+    ("value", "carets"),
+    [
+        ("{b: 1, c: x}", f"      | {' ' * 18}^"),
+        ("x", None),  # all of the value is wrong
+        (f"{{b: 1, c: {'x' * 80}}}", None),  # its name is abbreviated
+    ],
+)
+def test_an_option_is_shown_with_its_wrong_part(value: str, carets: str | None):
+    option = Override("a", value)
+    document = Document.of_options([option], "the command line")
+    lines = excerpt(document.problem(("a", "c"), "wrong"))
+    assert lines == ([] if carets is None else [f"      | --set a={value}", carets])
+
+
 def test_a_file_in_utf_16_is_not_shown(tmp_path: Path):
     assert shown(tmp_path, "a: 1\n".encode("utf-16"), 1, 1) == []
 
 
 def test_what_cannot_be_shown_is_left_out(tmp_path: Path):
     assert excerpt(Problem("wrong", str(tmp_path / "gone.yaml"), 1, 1)) == []
-    assert excerpt(Problem("wrong", "--set a=b")) == []
     assert shown(tmp_path, "a: 1\n", 9, 1) == []
     assert shown(tmp_path, "", 1, 1) == []
     assert shown(tmp_path, b"a: \xff\xfe\x1b[31m\n", 1, 4)[0].isprintable()

@@ -12,7 +12,7 @@ from labseq.console.report import aligned
 from labseq.errors import RecordingError
 
 FULL = Path("/dev/full")
-PLAN = "plan random:8x8@0.75 --target compact:4x4 --step"
+PLAN = "plan random:20x20@0.75 --target compact_225 --step"
 COMMANDS = [("runs", False), (f"{PLAN} --json -", True)]
 """Each with whether Python buffers what it prints."""
 

@@ -17,7 +17,7 @@ from labseq.plans.plan import PlanOutput, moves_text, plan_once, print_plan, tot
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 
-REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
+REQUEST = PlanRequest("random:6x6@0.7", "{pattern: checkerboard, rows: 4, cols: 4}", seed=3)
 
 
 class Terminal(io.StringIO):
@@ -101,7 +101,9 @@ def test_move_words_name_every_line() -> None:
 
 
 def test_what_falls_short_is_reported() -> None:
-    short = PlanRequest("random:6x6@0.2", "compact:4x4", seed=3, degree_of_parallelism=30)
+    short = PlanRequest(
+        "random:6x6@0.2", "{pattern: compact, rows: 4, cols: 4}", seed=3, degree_of_parallelism=30
+    )
     moves = plan_moves(short)
     n_atoms = int(moves.occupancy.sum())
     too_parallel, too_few = warnings(moves, short)
@@ -133,7 +135,7 @@ def test_a_planner_that_leaves_defects_and_surplus_is_reported(
 ) -> None:
     (tmp_path / "lazy.py").write_text(LAZY, "utf-8")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
-    request = PlanRequest("random:6x6@0.7", "checkerboard:4x4", "lazy", seed=3)
+    request = PlanRequest("random:6x6@0.7", "{pattern: checkerboard, rows: 4, cols: 4}", "lazy", seed=3)
     moves = plan_moves(request)
     defects, surplus = warnings(moves, request)
     assert f"{moves.report.n_defects} target sites empty" in defects
@@ -191,7 +193,13 @@ def test_a_refused_plan_is_shown_up_to_its_mistake(
     (tmp_path / "broken.py").write_text(BROKEN, "utf-8")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
     png, saved = tmp_path / "a.png", tmp_path / "a.json"
-    command = ["plan", "random:6x6@0.6", "--seed=1", "--target=compact:3x3", "--planner=broken"]
+    command = [
+        "plan",
+        "random:6x6@0.6",
+        "--seed=1",
+        "--target={pattern: compact, rows: 3, cols: 3}",
+        "--planner=broken",
+    ]
     code, out, err = call(*command, f"--set=kind={kind}", f"--json={saved}", f"--png={png}")
     assert code == 1
     assert why in err
@@ -214,7 +222,7 @@ def test_a_planner_that_fails_or_hangs_is_named(
     path = tmp_path / "broken.py"
     path.write_text(BROKEN, "utf-8")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
-    command = ["plan", "random:6x6@0.6", "--target=compact:3x3", "--planner=broken"]
+    command = ["plan", "random:6x6@0.6", "--target={pattern: compact, rows: 3, cols: 3}", "--planner=broken"]
     code, _, err = call(*command)
     line = BROKEN.splitlines().index(
         "        batches = [([(1, 1)], [(1, 0)]), SECOND[self.kind], ([(1, 0)], [(1, 1)])]"
@@ -246,9 +254,9 @@ def test_json_in_a_file_is_printed_with_the_report(
 def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, call: Any) -> None:
     got: list[Any] = []
     monkeypatch.setattr("labseq.plans.plan.plan_once", lambda *arguments: got.extend(arguments))
-    target = ["--target", "a:3x3", "--origin", "-1,2"]
+    target = ["--target", "{pattern: a, rows: 3, cols: 3}", "--origin", "-1,2"]
     planner = ["--planner", "p", "--dop", "4", "--set", "a=1", "--set", "b=2"]
     output = ["--step", "--json", "-", "--png", "x.png"]
     assert call("plan", "-", *target, *planner, "--seed", "5", "-p", "lab", *output)[0] == 0
-    request = PlanRequest("-", "a:3x3", "p", 4, ("a=1", "b=2"), 5, "-1,2", "lab")
+    request = PlanRequest("-", "{pattern: a, rows: 3, cols: 3}", "p", 4, ("a=1", "b=2"), 5, "-1,2", "lab")
     assert got == [request, PlanOutput(step=True, json="-", png=Path("x.png"))]

@@ -12,7 +12,7 @@ import pytest
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 
 RANDOM = "random:20x20@0.75"
-COMPACT = ("--target", "compact:15x15")
+COMPACT = ("--target", "{pattern: compact, rows: 15, cols: 15}")
 
 BAD = [
     (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a .npy file, a text file"),
@@ -28,10 +28,16 @@ BAD = [
     ),
     (["random:20x@0.75", *COMPACT], "random:20x@0.75: this is not an occupancy; expected random:ROWSxCOLS@P"),
     (["text.h5#1", *COMPACT], "text.h5: "),
-    ([RANDOM], "--target is missing; expected a pattern such as kagome:15x15"),
-    ([RANDOM, "--target", "compact:21x21"], "the limit is the grid of 20 rows x 20 columns"),
-    ([RANDOM, "--target", "kagomee:5x5"], "did you mean 'kagome'?"),
-    ([RANDOM, "--target", "compact:5x5,orgin=[0, 0]"], "did you mean 'origin'?"),
+    (
+        [RANDOM],
+        "--target is missing; expected a pattern as in a sequence file, '{pattern: kagome, ",
+    ),
+    (
+        [RANDOM, "--target", "{pattern: compact, rows: 21, cols: 21}"],
+        "the limit is the grid of 20 rows x 20 columns",
+    ),
+    ([RANDOM, "--target", "{pattern: kagomee, rows: 5, cols: 5}"], "did you mean 'kagome'?"),
+    ([RANDOM, "--target", "{pattern: compact, rows: 5, cols: 5, orgin: [0, 0]}"], "did you mean 'origin'?"),
     ([RANDOM, *COMPACT, "--planner", "pcsa"], "unknown planner 'pcsa'; expected"),
     ([RANDOM, *COMPACT, "--dop", "0"], "--dop 0: degree_of_parallelism is 0; expected at least 1"),
     ([RANDOM, *COMPACT, "--origin", "9,9"], "row 9, column 9; the limit is rows 0 to 5 and columns 0 to 5"),

@@ -13,7 +13,9 @@ from labseq.plans.plan_file import read_plan
 
 
 def planned(**options: Any) -> dict[str, Any]:
-    return plan_moves(PlanRequest("random:8x9@0.7", "compact:4x4", **options)).as_dict()
+    return plan_moves(
+        PlanRequest("random:8x9@0.7", "{pattern: compact, rows: 4, cols: 4}", **options)
+    ).as_dict()
 
 
 def read(document: dict[str, Any], **options: Any) -> dict[str, Any]:
@@ -24,7 +26,15 @@ def read(document: dict[str, Any], **options: Any) -> dict[str, Any]:
 
 @settings(max_examples=8)
 @given(
-    st.integers(0, 1000), st.sampled_from(["compact:4x4", "kagome:5x5", "ring:radius=3"]), st.integers(1, 9)
+    st.integers(0, 1000),
+    st.sampled_from(
+        [
+            "{pattern: compact, rows: 4, cols: 4}",
+            "{pattern: kagome, rows: 5, cols: 5}",
+            "{pattern: ring, radius: 3}",
+        ]
+    ),
+    st.integers(1, 9),
 )
 def test_a_plan_reads_back_as_it_was_written(seed: int, target: str, dop: int) -> None:
     request = PlanRequest("random:8x9@0.7", target, degree_of_parallelism=dop, seed=seed)
@@ -53,7 +63,9 @@ def test_more_tweezers_than_the_plan_allows_are_refused() -> None:
 
 
 def test_a_profile_brings_motion_and_tones() -> None:
-    document = plan_moves(PlanRequest("random:20x20@0.75", "compact:6x6", seed=1)).as_dict()
+    document = plan_moves(
+        PlanRequest("random:20x20@0.75", "{pattern: compact, rows: 6, cols: 6}", seed=1)
+    ).as_dict()
     data = json.dumps(document).encode()
     slow = PlanRequest("plan.json", profile="virtual", overrides=["profile.mobile_tweezers.speed=65 um/ms"])
     fast, slower = read_plan(data, "plan.json", PlanRequest("plan.json")), read_plan(data, "plan.json", slow)
@@ -69,7 +81,7 @@ def test_a_plan_for_another_grid_than_the_profiles_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "option"),
     [
-        ({"target": "compact:3x3"}, "--target"),
+        ({"target": "{pattern: compact, rows: 3, cols: 3}"}, "--target"),
         ({"degree_of_parallelism": 3}, "--dop"),
         ({"seed": 3}, "--seed"),
         ({"overrides": ["degree_of_parallelism=3"]}, "--set degree_of_parallelism=3"),

@@ -18,7 +18,7 @@ from labseq.plans.waveform import (
     save_samples,
 )
 
-REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
+REQUEST = PlanRequest("random:6x6@0.7", "{pattern: checkerboard, rows: 4, cols: 4}", seed=3)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ ONE_ATOM = json.dumps(
         "batches": [{"from": [[0, 0]], "to": [[0, 2]]}],
     }
 ).encode()
-REQUEST = PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3)
+REQUEST = PlanRequest("random:6x6@0.7", "{pattern: checkerboard, rows: 4, cols: 4}", seed=3)
 
 
 def waveform(
@@ -70,7 +70,7 @@ def test_standard_input_holds_a_plan_or_an_occupancy(
 ) -> None:
     rows = whole.moves.occupancy.astype(int).tolist()
     text = json.dumps(whole.moves.as_dict()) if as_plan else "\n".join(str(row)[1:-1] for row in rows)
-    request = PlanRequest("-") if as_plan else PlanRequest("-", "checkerboard:4x4")
+    request = PlanRequest("-") if as_plan else PlanRequest("-", "{pattern: checkerboard, rows: 4, cols: 4}")
     made = plan_waveform(WaveformRequest(request, None, RATE), io.BytesIO((mark + text).encode()))
     assert made.moves.source == "standard input"
     assert np.array_equal(made.program.column.phase_rad, whole.program.column.phase_rad)
@@ -146,14 +146,24 @@ SLOW = ("profile.mobile_tweezers.speed=0.5 um/s",)
 @pytest.mark.parametrize(
     ("request_", "error", "message"),
     [
-        (PlanRequest("random:3x3@1", "compact:3x3", seed=1), ConfigError, "nothing to play: the plan has no"),
         (
-            PlanRequest("random:20x20@0.75", "compact:6x6", seed=1, profile="virtual", overrides=SLOW),
+            PlanRequest("random:3x3@1", "{pattern: compact, rows: 3, cols: 3}", seed=1),
+            ConfigError,
+            "nothing to play: the plan has no",
+        ),
+        (
+            PlanRequest(
+                "random:20x20@0.75",
+                "{pattern: compact, rows: 6, cols: 6}",
+                seed=1,
+                profile="virtual",
+                overrides=SLOW,
+            ),
             ConfigError,
             r"the waveform is .* s long; expected at most 60 s; look",
         ),
         (
-            PlanRequest("random:30x30@0.6", "compact:20x20", seed=1),
+            PlanRequest("random:30x30@0.6", "{pattern: compact, rows: 20, cols: 20}", seed=1),
             LimitError,
             r"the limit is the band of 82 to 118 MHz; name the machine with --profile",
         ),

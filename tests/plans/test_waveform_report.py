@@ -15,8 +15,18 @@ from labseq.plans.waveform_report import WaveformOutput, note, report, show_wave
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
 
-REQUEST = WaveformRequest(PlanRequest("random:6x6@0.7", "checkerboard:4x4", seed=3), None, "250 MHz")
-WORDS = ["random:6x6@0.7", "--seed", "3", "--target", "checkerboard:4x4", "--sample-rate", "250 MHz"]
+REQUEST = WaveformRequest(
+    PlanRequest("random:6x6@0.7", "{pattern: checkerboard, rows: 4, cols: 4}", seed=3), None, "250 MHz"
+)
+WORDS = [
+    "random:6x6@0.7",
+    "--seed",
+    "3",
+    "--target",
+    "{pattern: checkerboard, rows: 4, cols: 4}",
+    "--sample-rate",
+    "250 MHz",
+]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +55,13 @@ def test_some_batches_are_named_in_report_and_title() -> None:
 
 def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
     faint = [f"profile.mobile_tweezers.rf.row_amplitudes={[1e-9] * 20}"]
-    plan = PlanRequest("random:20x20@0.75", "compact:3x3", seed=1, profile="virtual", overrides=faint)
+    plan = PlanRequest(
+        "random:20x20@0.75",
+        "{pattern: compact, rows: 3, cols: 3}",
+        seed=1,
+        profile="virtual",
+        overrides=faint,
+    )
     request = WaveformRequest(plan, "0", "250 MHz")
     made = plan_waveform(request)
     row, column = made.statistics()
@@ -76,11 +92,22 @@ def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, cal
     monkeypatch.setattr(
         "labseq.plans.waveform_report.show_waveform", lambda *arguments: got.extend(arguments)
     )
-    planned = ["--target", "a:3x3", "--origin", "-1,2", "--planner", "p", "--dop", "4", "--set", "a=1"]
+    planned = [
+        "--target",
+        "{pattern: a, rows: 3, cols: 3}",
+        "--origin",
+        "-1,2",
+        "--planner",
+        "p",
+        "--dop",
+        "4",
+        "--set",
+        "a=1",
+    ]
     rest = ["--seed", "5", "-p", "lab", "--batches", "1-3", "--sample-rate", "5 MHz"]
     files = ["--json", "-", "--png", "x.png", "--npz", "x.npz"]
     assert call("waveform", "-", *planned, *rest, *files)[0] == 0
-    request = PlanRequest("-", "a:3x3", "p", 4, ("a=1",), 5, "-1,2", "lab")
+    request = PlanRequest("-", "{pattern: a, rows: 3, cols: 3}", "p", 4, ("a=1",), 5, "-1,2", "lab")
     output = WaveformOutput(json="-", png=Path("x.png"), npz=Path("x.npz"))
     assert got == [WaveformRequest(request, "1-3", "5 MHz"), output]
 
@@ -97,7 +124,10 @@ BAD = [
     ([*WORDS, "--npz", "a.npy"], "a.npy: this is not the name of an NPZ file"),
     (["one.json", "--json", "one.json"], "one.json: this file is named twice, and one would replace the"),
     ([*WORDS, "--json", "folder.json", "--npz", "a.npz"], "folder.json: it cannot be written: Is a"),
-    (["random:3x3@1", "--seed", "1", "--target", "compact:3x3"], "there is nothing to play"),
+    (
+        ["random:3x3@1", "--seed", "1", "--target", "{pattern: compact, rows: 3, cols: 3}"],
+        "there is nothing to play",
+    ),
 ]
 
 

@@ -68,7 +68,9 @@ def labseq_register(registry):
 '''
 
 
-def planned(occupancy: str, target: str = "compact:3x3", **options: Any) -> PlannedMoves:
+def planned(
+    occupancy: str, target: str = "{pattern: compact, rows: 3, cols: 3}", **options: Any
+) -> PlannedMoves:
     return plan_moves(PlanRequest(occupancy, target, **options))
 
 
@@ -81,7 +83,15 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @settings(max_examples=10)
 @given(
     st.integers(0, 10_000),
-    st.sampled_from(["compact:6x6", "kagome:7x7", "sierpinski:8x8", "checkerboard:5x6", "ring:radius=3"]),
+    st.sampled_from(
+        [
+            "{pattern: compact, rows: 6, cols: 6}",
+            "{pattern: kagome, rows: 7, cols: 7}",
+            "{pattern: sierpinski, rows: 8, cols: 8}",
+            "{pattern: checkerboard, rows: 5, cols: 6}",
+            "{pattern: ring, radius: 3}",
+        ]
+    ),
     st.integers(1, 20),
 )
 def test_the_json_is_enough_to_replay_a_plan(seed: int, target: str, dop: int) -> None:
@@ -105,7 +115,7 @@ def test_without_atoms_or_defects_nothing_is_moved(occupancy: str) -> None:
 
 
 def test_too_few_atoms_fill_the_sites_nearest_to_the_centre() -> None:
-    moves = planned("random:6x6@0.2", "compact:4x4", seed=3)
+    moves = planned("random:6x6@0.2", "{pattern: compact, rows: 4, cols: 4}", seed=3)
     fill, sites_m = moves.target.fill, SiteGrid(6, 6).positions_m
     from_centre_m = np.linalg.norm(sites_m - sites_m[fill].mean(axis=0), axis=-1)
     filled = fill & moves.report.predicted

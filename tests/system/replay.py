@@ -1,6 +1,6 @@
 """Replay of plans, one site at a time, from the rules alone: nothing of labseq is used here.
 
-labseq plan random:20x20@0.75 --seed 1 --target kagome:15x15 --json - | python tests/system/replay.py
+labseq plan random:20x20@0.75 --seed 1 --target kagome --json - | python tests/system/replay.py
 
 Reads one plan as JSON per line and says what is wrong with each.
 """

@@ -56,7 +56,7 @@ COMMAND = [
     "--grid",
     "6x6",
     "--target",
-    "compact:3x3",
+    "{pattern: compact, rows: 3, cols: 3}",
     "--loadings",
     "200",
     "--planners",

@@ -31,10 +31,23 @@ def call(*command: str, cwd: Path, stdin: str = "", **environment: str) -> subpr
 
 def test_the_plan_for_an_occupancy_from_a_pipe_is_that_of_a_run(tmp_path: Path) -> None:
     """The command interprets the kernels; a run, like this process, compiles them."""
-    request = PlanRequest("random:20x20@0.75", "kagome:15x15", degree_of_parallelism=7, seed=11)
+    request = PlanRequest(
+        "random:20x20@0.75", "{pattern: kagome, rows: 15, cols: 15}", degree_of_parallelism=7, seed=11
+    )
     expected = plan_moves(request).as_dict()
     rows = "\n".join("".join(map(str, row)) for row in expected["occupancy"])
-    command = ("-m", "labseq", "plan", "-", "--target", "kagome:15x15", "--dop", "7", "--json", "-")
+    command = (
+        "-m",
+        "labseq",
+        "plan",
+        "-",
+        "--target",
+        "{pattern: kagome, rows: 15, cols: 15}",
+        "--dop",
+        "7",
+        "--json",
+        "-",
+    )
     done = call(*command, cwd=tmp_path, stdin=rows)
     assert (done.returncode, done.stdout.count("\n")) == (0, 1), done.stderr
     assert json.loads(done.stdout) == {**expected, "seed": None}
@@ -43,7 +56,17 @@ def test_the_plan_for_an_occupancy_from_a_pipe_is_that_of_a_run(tmp_path: Path) 
 
 
 def test_a_poor_terminal_gets_poor_characters(tmp_path: Path) -> None:
-    command = ("-m", "labseq", "plan", "random:6x6@0.7", "--seed", "3", "--target", "kagome:4x4", "--step")
+    command = (
+        "-m",
+        "labseq",
+        "plan",
+        "random:6x6@0.7",
+        "--seed",
+        "3",
+        "--target",
+        "{pattern: kagome, rows: 4, cols: 4}",
+        "--step",
+    )
     done = call(*command, cwd=tmp_path, PYTHONUTF8="0", PYTHONIOENCODING="ascii")
     assert (done.returncode, done.stderr) == (0, "")
     assert "@ atom on a target site" in done.stdout

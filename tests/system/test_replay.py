@@ -17,6 +17,7 @@ from typing import Any
 
 import numba
 import pytest
+import yaml
 
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.cli import main
@@ -28,14 +29,14 @@ pytestmark = pytest.mark.system
 ROOT = Path(__file__).parents[2]
 N_PLANS = int(os.environ.get("LABSEQ_PLANS", "1"))
 TARGETS = (
-    "compact:15x15",
-    "kagome:15x15",
-    "honeycomb:15x15",
-    "link_kagome:15x15",
-    "checkerboard:15x15",
-    "sierpinski:15x15",
-    "ring:15x15",
-    "interleaved:8x15",
+    "{pattern: compact, rows: 15, cols: 15}",
+    "{pattern: kagome, rows: 15, cols: 15}",
+    "{pattern: honeycomb, rows: 15, cols: 15}",
+    "{pattern: link_kagome, rows: 15, cols: 15}",
+    "{pattern: checkerboard, rows: 15, cols: 15}",
+    "{pattern: sierpinski, rows: 15, cols: 15}",
+    "{pattern: ring, rows: 15, cols: 15}",
+    "{pattern: interleaved, rows: 8, cols: 15}",
     "sequences/lion_head.yaml",
 )
 
@@ -69,7 +70,7 @@ def test_every_pattern_ends_full_and_clear(plan: Planning, target: str, seed: in
 
 
 def test_no_pattern_is_left_out() -> None:
-    named = {target.partition(":")[0] for target in TARGETS if ":" in target}
+    named = {yaml.safe_load(target)["pattern"] for target in TARGETS if target.startswith("{")}
     entries = load_plugins().registry.entries()
     shipped = {e.name for e in entries if e.kind == "pattern" and e.origin.startswith("labseq")}
     assert named | {"bitmap"} == shipped
@@ -77,7 +78,7 @@ def test_no_pattern_is_left_out() -> None:
 
 @pytest.mark.parametrize("dop", ["1", "20"])
 def test_a_full_array_ends_full_and_clear(plan: Planning, dop: str) -> None:
-    replay(plan("sierpinski:16x16", "--dop", dop, occupancy="random:20x20@1"))
+    replay(plan("{pattern: sierpinski, rows: 16, cols: 16}", "--dop", dop, occupancy="random:20x20@1"))
 
 
 def a_document(**changes: Any) -> dict[str, Any]:
