@@ -9,14 +9,17 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+from pydantic.dataclasses import dataclass as settings
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, TransientError, one_of
 from labseq.model import CameraFacts, Frame, Orientation, SensorMode
 from labseq.roles import Camera, Clock, Context, Simulation, Trigger
+from labseq.settings import IN_SI, Duration, PositiveDuration, Temperature, setting_error
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 
@@ -301,21 +304,27 @@ LOOK_S: Final = 1.0
 """How often the temperature is read, in seconds."""
 
 
-@dataclass(frozen=True, slots=True)
+def _is_temperature_of_sensors(kelvin: float) -> float:
+    if not 150.0 <= kelvin <= 323.0:
+        given = f"{format_quantity(kelvin, 'temperature')} ({kelvin - ZERO_CELSIUS_K:.0f} degC)"
+        raise setting_error(f"temperature is {given}", "-123 to 50 degC, as '-70 degC'")
+    return kelvin
+
+
+@settings(frozen=True, slots=True, config=IN_SI)
 class Cooling:
-    """The temperature of a cooled sensor.
+    """The temperature of a cooled sensor."""
 
-    Attributes:
-        setpoint_k: Temperature, in kelvins.
-        tolerance_k: How far from it the sensor may be, in kelvins.
-        steady_s: How long it must have been within that, in seconds.
-        timeout_s: How long it may take, in seconds.
-    """
-
-    setpoint_k: float
-    tolerance_k: float = 1.0
-    steady_s: float = 5.0
-    timeout_s: float = 900.0
+    temperature_k: Annotated[
+        Temperature,
+        AfterValidator(_is_temperature_of_sensors),
+        Field(description='of the sensor, "-70 degC"'),
+    ]
+    tolerance_k: Annotated[
+        float, Field(gt=0, le=20, description="how far from it the sensor may be, in kelvins")
+    ] = 1.0
+    steady_s: Annotated[Duration, Field(description="how long it must have been within that")] = 5.0
+    timeout_s: Annotated[PositiveDuration, Field(description="how long it may take")] = 900.0
 
 
 def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: str) -> None:
@@ -335,7 +344,7 @@ def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: st
     within_since_s: float | None = None
     while True:
         now_s, temperature_k = clock.now(), read_k()
-        if abs(temperature_k - cooling.setpoint_k) > cooling.tolerance_k:
+        if abs(temperature_k - cooling.temperature_k) > cooling.tolerance_k:
             within_since_s = None
         elif within_since_s is None:
             within_since_s = now_s
@@ -349,7 +358,7 @@ def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: st
 def _too_late(cooling: Cooling, temperature_k: float) -> str:
     waited = format_quantity(cooling.timeout_s, "time")
     reached, setpoint = (
-        f"{kelvin - ZERO_CELSIUS_K:.1f} degC" for kelvin in (temperature_k, cooling.setpoint_k)
+        f"{kelvin - ZERO_CELSIUS_K:.1f} degC" for kelvin in (temperature_k, cooling.temperature_k)
     )
     text = f"the sensor is at {reached} after {waited}; expected {setpoint} within {cooling.tolerance_k:g} K"
     return f"{text}; look after its cooling water or fan, or choose a higher temperature"

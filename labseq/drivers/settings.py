@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal, Self
+from typing import Final, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_validator
 
-from labseq.drivers import Cooling
 from labseq.errors import ConfigError, LimitError
 from labseq.model import CameraFacts, Flip, Orientation, SensorMode
 from labseq.roles import Context, Simulation
-from labseq.settings import Duration, PositiveDuration, Settings, Temperature
-from labseq.units import ZERO_CELSIUS_K, format_quantity
+from labseq.settings import Duration, PositiveDuration, Settings
 
 
 class RegionSettings(Settings):
@@ -196,29 +194,6 @@ class IndustrialCameraSettings(CameraSettings):
             hint = "choose a smaller or another one"
             raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
         return y, x, height, width
-
-
-class CoolingSettings(Settings):
-    """The temperature of the sensor."""
-
-    temperature: Temperature = Field(description='of the sensor, "-70 degC"')
-    tolerance: Annotated[float, Field(gt=0, le=20)] = Field(
-        default=1.0, description="how far from it the sensor may be, in kelvins"
-    )
-    steady: Duration = Field(default=5.0, description="how long it must have been within that")
-    timeout: PositiveDuration = Field(default=900.0, description="how long it may take")
-
-    def spec(self) -> Cooling:
-        """The same for drivers."""
-        return Cooling(self.temperature, self.tolerance, self.steady, self.timeout)
-
-    @model_validator(mode="after")
-    def _is_a_temperature_of_sensors(self) -> Self:
-        if not 150.0 <= self.temperature <= 323.0:
-            came = format_quantity(self.temperature, "temperature")
-            celsius = f"{self.temperature - ZERO_CELSIUS_K:.0f} degC"
-            raise ValueError(f"temperature is {came} ({celsius}); expected -123 to 50 degC, as '-70 degC'")
-        return self
 
 
 def _unbinnable(height: int, width: int, binning: int) -> str:

@@ -6,7 +6,6 @@ from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, Simula
 from labseq.drivers.camera import check_step, nearest
 from labseq.drivers.settings import (
     CameraSettings,
-    CoolingSettings,
     IndustrialCameraSettings,
     OrientationSettings,
 )
@@ -15,7 +14,6 @@ __all__ = [
     "CameraDriver",
     "CameraSettings",
     "Cooling",
-    "CoolingSettings",
     "ExposureResult",
     "IndustrialCameraSettings",
     "OrientationSettings",

@@ -76,7 +76,7 @@ class AndorCamera(CameraDriver):
     def __init__(self, settings: AndorSettings, context: Context) -> None:
         super().__init__(context, settings.orientation)
         self._settings = settings
-        self._cooling = None if settings.cooling is None else settings.cooling.spec()
+        self._cooling = settings.cooling
         self.library = library_for(settings, context)
         self._sensor_shape: tuple[int, int] | None = self.library.sensor_shape
         if self._sensor_shape is not None and (conflict := settings.sensor_conflict(self._sensor_shape)):

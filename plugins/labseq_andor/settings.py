@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from labseq.plugin import Duration, Frequency, PositiveDuration
-from labseq.plugin.camera import CameraSettings, CoolingSettings
+from labseq.plugin.camera import CameraSettings, Cooling
 from labseq_andor.heads import IXON_897, Head, known_head, readout_s
 
 SIMULATED: Final = "simulated"
@@ -86,7 +86,7 @@ class AndorSettings(CameraSettings):
     fan: Literal["full", "low", "off"] = Field(
         default="full", description="the fan; off only with cooling water"
     )
-    cooling: CoolingSettings | None = Field(
+    cooling: Cooling | None = Field(
         default=None, description="temperature of the sensor; none: the cooler is left as it is"
     )
     cooler_after_close: Literal["keep", "off"] = Field(

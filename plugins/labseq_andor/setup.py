@@ -103,7 +103,7 @@ def _set_cooler(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
         return {}
     if not sdk.capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
         raise DeviceError(name, "this camera has no cooler; leave `cooling` out")
-    wanted_c = round(settings.cooling.temperature - ZERO_CELSIUS_K)
+    wanted_c = round(settings.cooling.temperature_k - ZERO_CELSIUS_K)
     low_c, high_c = sdk.camera.get_temperature_range()
     if not low_c <= wanted_c <= high_c:
         text = f"cooling: temperature is {wanted_c} degC; this camera takes {low_c} to {high_c} degC"

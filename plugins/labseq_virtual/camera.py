@@ -91,9 +91,8 @@ class VirtualCamera(CameraDriver):
                 raise ConfigError(setting_error)
             self._readout_s *= self._simulation.readout_fraction(self._mode)
             self._frame_shape = settings.frame_shape(sensor_shape)
-        cooling = settings.cooling
-        self._cooling = None if cooling is None else cooling.spec()
-        self._cooler = None if cooling is None else Cooler(cooling.temperature, context.clock)
+        self._cooling = cooling = settings.cooling
+        self._cooler = None if cooling is None else Cooler(cooling.temperature_k, context.clock)
         self._opened_s = 0.0
         self._pending: deque[tuple[int, bool]] = deque()
         self._n_seen = 0

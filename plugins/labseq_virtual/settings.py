@@ -24,7 +24,7 @@ from labseq.plugin import (
     camera,
     format_quantity,
 )
-from labseq.plugin.camera import CoolingSettings
+from labseq.plugin.camera import Cooling
 
 PositiveLength = Annotated[Length, Field(gt=0)]
 
@@ -494,7 +494,7 @@ class CameraSettings(camera.CameraSettings):
         description="mean gain of the EM register in a series, 1 between them; none: the simulation's "
         "`image.em_gain` at all times",
     )
-    cooling: CoolingSettings | None = Field(
+    cooling: Cooling | None = Field(
         default=None, description="target temperature before the first shot; none: no cooling"
     )
     faults: CameraFaults = Field(default=CameraFaults(), description="simulated failures")

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 from pydantic import BaseModel, create_model
-from pydantic.fields import FieldInfo
 
 import labseq
 from labseq import errors, plugin, roles, testing
@@ -23,7 +22,7 @@ from labseq.registry import Registry
 from labseq.roles import ROLES
 from labseq.scaffold import reference
 from labseq.scaffold.reference import Table, settings
-from labseq.settings import Choice, PatternChoice, models_at, settings_at, settings_of
+from labseq.settings import Choice, PatternChoice, settings_at, settings_of
 
 from .scripts import load_script
 
@@ -130,19 +129,17 @@ def test_a_default_may_be_written_as_the_reference_writes_it(subject: str) -> No
         *loc, name = key.replace(".NAME", "").split(".")
         default = row[2].strip("`")
         if model is not None and default not in ("required", "none", "as below"):
-            (owner,) = models_at(model, tuple(loc))
-            (setting,) = settings_at(owner, (name,))
+            (setting,) = settings_at(model, (*loc, name))
             node = compose(default, "the reference")
             assert node is not None
-            read = read_as(owner.model_fields[setting.name], node.plain())
+            read = read_as(setting.annotation, node.plain())
             assert read == (pytest.approx(setting.default) if isinstance(read, float) else setting.default)
 
 
-def read_as(field: FieldInfo, value: object) -> object:
-    """The value of a field for what stands in a file."""
-    kind: Any = field.annotation
-    one: Any = create_model("One", it=(kind, field))
-    return one.model_validate({"it": value}, by_name=True).it
+def read_as(kind: Any, value: object) -> object:
+    """The value of a setting for what stands in a file."""
+    one: Any = create_model("One", it=(kind, ...))
+    return one.model_validate({"it": value}).it
 
 
 def test_the_reference_says_which_keys_of_a_sequence_may_be_left_out(tmp_path: Path) -> None:
