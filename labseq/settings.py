@@ -36,6 +36,7 @@ from pydantic import (
     model_validator,
 )
 from pydantic.fields import FieldInfo
+from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
 from labseq.errors import Loc
@@ -220,7 +221,9 @@ class Setting:
 @cache
 def settings_of(model: SettingsType | None) -> tuple[Setting, ...]:
     """The settings of a model, in the order of its declaration; none for a plugin that takes none."""
-    return tuple(_setting(name, field) for name, field in getattr(model, "__pydantic_fields__", {}).items())
+    fields: Mapping[str, FieldInfo] = getattr(model, "__pydantic_fields__", {})
+    settings = [_setting(name, field) for name, field in fields.items()]
+    return tuple(setting for setting in settings if setting.key != _OWN_NAME)
 
 
 def _setting(name: str, field: FieldInfo) -> Setting:
@@ -387,6 +390,26 @@ def with_settings_of(spec: SettingsType) -> Callable[[type[_C]], type[_C]]:
         return create_model(name, __base__=choice, __module__=module, __doc__=choice.__doc__, **fields)
 
     return extend
+
+
+_OWN_NAME: Final = ""
+"""The key that :data:`named_by_key` adds; no file has it."""
+OwnName: TypeAlias = Annotated[SkipJsonSchema[str], Field(validation_alias=_OWN_NAME, exclude=True)]
+"""The name of one of several mappings with names of their own: in a file, the key that it stands under."""
+
+
+def _named_by_key(mappings: Any) -> Any:
+    if not isinstance(mappings, dict):
+        return mappings
+    by_name = cast("dict[str, Any]", mappings)
+    return {
+        name: {**value, _OWN_NAME: name} if isinstance(value, dict) else value
+        for name, value in by_name.items()
+    }
+
+
+named_by_key: Final = BeforeValidator(_named_by_key)
+"""For a mapping of names to mappings of settings: each has its name as its :data:`OwnName`."""
 
 
 def _placed_by_field(choice: _C, info: ValidationInfo) -> _C:

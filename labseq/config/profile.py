@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, cast
 
-from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from labseq.config.addresses import MAY_ADD, ROLES, Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
@@ -33,6 +33,7 @@ from labseq.settings import (
     Text,
     Variables,
     empty_is,
+    named_by_key,
     placed_by_field,
     setting_error,
     with_settings_of,
@@ -180,86 +181,7 @@ class CalibrationSettings(Settings):
         return {"folder": value} if isinstance(value, str) else value
 
 
-_TRIGGERED: Final = {"camera": "image", "mobile_tweezers": "rearrange"}
-"""Role -> the kind of step that begins with its trigger."""
-
-
-class ChannelSettings(Settings):
-    """One line: its output on the timing box, and when it is on."""
-
-    channel: NonNegativeInt = Field(description="output of the timing box")
-    on: tuple[Text, ...] = Field(
-        default=(),
-        description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, `release`, "
-        "`wait`; `idle`: between steps, and before and after a shot",
-    )
-    lead: Duration = Field(default=0.0, description="how long before such a step it is turned on")
-    lag: Duration = Field(default=0.0, description="how long after such a step it is turned off")
-    pulse: Annotated[Duration, Field(le=1.0)] = Field(
-        default=0.0,
-        description="a pulse of this length at the beginning of such a step, instead of being on throughout",
-    )
-    triggers: Literal["", "camera", "mobile_tweezers"] = Field(
-        default="",
-        description="the role whose trigger input it is wired to: its exposures or moves begin with the line",
-    )
-    blinding: bool = Field(
-        default=False, description="its light would harm a camera with EM gain: never on during an exposure"
-    )
-    active_low: bool = Field(default=False, description="the output is low while the line is on")
-    turns_off: Literal["", "static_tweezers"] = Field(
-        default="",
-        description="the role whose light is off while the line is on; with `static_tweezers` the step "
-        "`release` is timed by the box, and the line is on in no other",
-    )
-
-    @model_validator(mode="after")
-    def _check_timing(self) -> Self:
-        if self.turns_off and set(self.on) != {"release"}:
-            raise setting_error(
-                "a line that turns the static tweezers off is on at other times",
-                "`on: [release]`",
-                at=("on",),
-            )
-        if self.turns_off and (
-            extra := next((key for key in ("lead", "lag", "pulse") if getattr(self, key)), None)
-        ):
-            what = f"{extra} is set for a line that turns the static tweezers off"
-            raise setting_error(what, "none: it is on as long as the release", at=(extra,), key=True)
-        if self.pulse and self.lag:
-            raise setting_error(
-                "lag is set beside pulse", "one of the two: a pulse ends by itself", at=("lag",), key=True
-            )
-        if self.pulse and "idle" in self.on:
-            raise setting_error(
-                "a pulse has 'idle' among its steps", "kinds of step, which have a beginning", at=("on",)
-            )
-        if self.triggers and set(self.on) != {kind := _TRIGGERED[self.triggers]}:
-            what = f"a line that triggers the {self.triggers.replace('_', ' ')} is on at other times"
-            raise setting_error(what, f"`on: [{kind}]`", at=("on",))
-        if self.triggers and self.lead:
-            raise setting_error(
-                "lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True
-            )
-        return self
-
-    def spec(self, name: str) -> LineSpec:
-        """Convert the settings to the core's type."""
-        return LineSpec(
-            name=name,
-            channel=self.channel,
-            on=frozenset(self.on),
-            lead_s=self.lead,
-            lag_s=self.lag,
-            pulse_s=self.pulse,
-            triggers=self.triggers,
-            blinding=self.blinding,
-            active_low=self.active_low,
-            turns_off=self.turns_off,
-        )
-
-
-def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings]:
+def _distinct(channels: dict[str, LineSpec]) -> dict[str, LineSpec]:
     for (first, a), (second, b) in combinations(channels.items(), 2):
         if a.channel == b.channel:
             what = f"'{first}' and '{second}' are both on channel {a.channel}"
@@ -276,7 +198,7 @@ def _distinct(channels: dict[str, ChannelSettings]) -> dict[str, ChannelSettings
 class LinesChoice(Choice):
     """The timing box and its lines."""
 
-    channels: Annotated[dict[str, ChannelSettings], AfterValidator(_distinct)] = Field(
+    channels: Annotated[dict[str, LineSpec], named_by_key, AfterValidator(_distinct)] = Field(
         default={}, description="name of each line -> its channel, and when it is on"
     )
     mutually_exclusive: tuple[tuple[Text, Text], ...] = Field(
@@ -301,9 +223,8 @@ class LinesChoice(Choice):
         return self
 
     def specs(self) -> tuple[LineSpec, ...]:
-        """The lines for the core, in the order of their channels."""
-        specs = [channel.spec(name) for name, channel in self.channels.items()]
-        return tuple(sorted(specs, key=lambda spec: spec.channel))
+        """The lines, in the order of their channels."""
+        return tuple(sorted(self.channels.values(), key=lambda spec: spec.channel))
 
 
 @with_settings_of(MotionSpec)

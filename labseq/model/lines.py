@@ -4,45 +4,91 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, NonNegativeInt, model_validator
+from pydantic.dataclasses import dataclass as settings
 
 from labseq.model.grid import read_only
+from labseq.settings import IN_SI, Duration, OwnName, Text, setting_error
 
 IDLE: Final = "idle"
 """The kind of the time between steps, and before and after a shot."""
 
 
-@dataclass(frozen=True, slots=True)
+_TRIGGERED: Final = {"camera": "image", "mobile_tweezers": "rearrange"}
+"""Role -> the kind of step that begins with its trigger."""
+
+
+@settings(frozen=True, slots=True, config=IN_SI)
 class LineSpec:
-    """A line, and when it is on.
+    """A line: its output on the timing box, and when it is on."""
 
-    Attributes:
-        name: Its name, "cooling".
-        channel: Its output on the timing box.
-        on: Kinds of step during which it is on; :data:`IDLE` among them for the time between.
-        lead_s: How long before such a step it is turned on, in seconds.
-        lag_s: How long after it it is turned off, in seconds.
-        pulse_s: Length of a pulse at the beginning of such a step, in seconds, in the place of a line
-            that is on throughout; 0 for none.
-        triggers: The role whose trigger input it is wired to, "camera", "mobile_tweezers"; "" for none.
-        blinding: Whether its light would harm a camera with EM gain.
-        active_low: Whether the output is low while the line is on.
-        turns_off: The role whose light is off while the line is on, "static_tweezers"; "" for none.
-    """
+    name: OwnName
+    channel: Annotated[NonNegativeInt, Field(description="output of the timing box")]
+    on: Annotated[
+        tuple[Text, ...],
+        Field(
+            description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, "
+            "`release`, `wait`; `idle`: between steps, and before and after a shot"
+        ),
+    ] = ()
+    lead_s: Annotated[Duration, Field(description="how long before such a step it is turned on")] = 0.0
+    lag_s: Annotated[Duration, Field(description="how long after such a step it is turned off")] = 0.0
+    pulse_s: Annotated[
+        Duration,
+        Field(
+            le=1.0,
+            description="a pulse of this length at the beginning of such a step, instead of being on "
+            "throughout",
+        ),
+    ] = 0.0
+    triggers: Annotated[
+        Literal["", "camera", "mobile_tweezers"],
+        Field(
+            description="the role whose trigger input it is wired to: its exposures or moves begin with the "
+            "line"
+        ),
+    ] = ""
+    blinding: Annotated[
+        bool, Field(description="its light would harm a camera with EM gain: never on during an exposure")
+    ] = False
+    active_low: Annotated[bool, Field(description="the output is low while the line is on")] = False
+    turns_off: Annotated[
+        Literal["", "static_tweezers"],
+        Field(
+            description="the role whose light is off while the line is on; with `static_tweezers` the step "
+            "`release` is timed by the box, and the line is on in no other"
+        ),
+    ] = ""
 
-    name: str
-    channel: int
-    on: frozenset[str]
-    lead_s: float = 0.0
-    lag_s: float = 0.0
-    pulse_s: float = 0.0
-    triggers: str = ""
-    blinding: bool = False
-    active_low: bool = False
-    turns_off: str = ""
+    @model_validator(mode="after")
+    def _check_timing(self) -> Self:
+        if self.turns_off and set(self.on) != {"release"}:
+            what = "a line that turns the static tweezers off is on at other times"
+            raise setting_error(what, "`on: [release]`", at=("on",))
+        extra = next((key for key in ("lead", "lag", "pulse") if getattr(self, f"{key}_s")), "")
+        if self.turns_off and extra:
+            what = f"{extra} is set for a line that turns the static tweezers off"
+            raise setting_error(what, "none: it is on as long as the release", at=(extra,), key=True)
+        if self.pulse_s and self.lag_s:
+            raise setting_error(
+                "lag is set beside pulse", "one of the two: a pulse ends by itself", at=("lag",), key=True
+            )
+        if self.pulse_s and IDLE in self.on:
+            raise setting_error(
+                "a pulse has 'idle' among its steps", "kinds of step, which have a beginning", at=("on",)
+            )
+        if self.triggers and set(self.on) != {kind := _TRIGGERED[self.triggers]}:
+            what = f"a line that triggers the {self.triggers.replace('_', ' ')} is on at other times"
+            raise setting_error(what, f"`on: [{kind}]`", at=("on",))
+        if self.triggers and self.lead_s:
+            raise setting_error(
+                "lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True
+            )
+        return self
 
 
 def lines_of(specs: Iterable[LineSpec], kind: str) -> list[LineSpec]:

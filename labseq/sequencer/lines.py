@@ -26,7 +26,7 @@ def line_program(specs: Sequence[LineSpec], kind: str, duration_s: float) -> Lin
         duration_s: Duration of the step itself, in seconds.
 
     Example:
-        >>> light = LineSpec("imaging", 4, frozenset({"image"}), lead_s=1e-3, lag_s=2e-3)
+        >>> light = LineSpec("imaging", 4, ("image",), lead_s=1e-3, lag_s=2e-3)
         >>> program = line_program([light], "image", 45e-3)
         >>> program.t_s.tolist(), program.on[:, 0].tolist(), program.begin_s
         ([0.0, 0.048], [True, False], 0.001)

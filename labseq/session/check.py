@@ -484,7 +484,8 @@ def _light_warnings(assembly: Assembly, lab: Lab) -> Iterator[Problem]:
         yield document.problem(("camera", "use"), what, hint=hint)
     for name, channel in {} if lines is None or gain <= 1 else lines.channels.items():
         is_light = not (channel.triggers or channel.turns_off or "image" in channel.on)
-        if is_light and channel.on and "blinding" not in channel.model_fields_set:
+        is_declared = document.get(("lines", "channels", name, "blinding")) is not None
+        if is_light and channel.on and not is_declared:
             kinds = ", ".join(f"`{kind}`" for kind in channel.on)
             what = f"'{name}' is on during {kinds}, and the camera has an EM gain of {gain:g}"
             expected = "`blinding: true` if its light could reach the camera, else `blinding: false`"

@@ -94,7 +94,7 @@ def test_atoms_load_at_the_present_depth() -> None:
 
 
 def test_lines_are_played_with_a_ramp() -> None:
-    cooling = LineSpec("cooling", 2, frozenset({"ramp"}), lead_s=1e-3, lag_s=2e-3)
+    cooling = LineSpec("cooling", 2, ("ramp",), lead_s=1e-3, lag_s=2e-3)
     rig = Rig((LOWER,), line_specs=[cooling])
     (bar,) = LOWER[1].plan_timeline(rig.lab.step_context)
     assert (bar.label, bar.kind, bar.duration_s) == ("ramp to 0.5", "ramp", pytest.approx(8e-3))
@@ -109,7 +109,7 @@ def test_lines_are_played_with_a_ramp() -> None:
 
 
 RELEASE = ("release", ReleaseStep(given(duration=10e-6)))
-TRAPS_OFF = LineSpec("traps_off", 7, frozenset({"release"}), turns_off="static_tweezers")
+TRAPS_OFF = LineSpec("traps_off", 7, ("release",), turns_off="static_tweezers")
 
 
 def test_a_release_by_a_line_is_one_program_that_ends_with_the_light_on() -> None:

@@ -14,7 +14,6 @@ from labseq.config.document import Document
 from labseq.config.profile import (
     BudgetSettings,
     CalibrationSettings,
-    ChannelSettings,
     GridSettings,
     LinesChoice,
     ProfileSpec,
@@ -22,7 +21,7 @@ from labseq.config.profile import (
     load_profile,
 )
 from labseq.errors import ConfigError
-from labseq.model import CALIBRATION_KINDS, MotionSpec, SiteGrid
+from labseq.model import CALIBRATION_KINDS, LineSpec, MotionSpec, SiteGrid
 from labseq.settings import Settings, settings_of
 from tests.config.wrong_files import wrong_files
 
@@ -59,16 +58,10 @@ def test_motion(loaded: tuple[Document, ProfileSpec]) -> None:
     assert loaded[1].motion == MotionSpec(pick_up_s=60e-6, speed_m_s=0.13, max_tweezers=16)
 
 
-def test_every_key_of_a_line_reaches_the_core() -> None:
-    channel = ChannelSettings.model_validate(
-        {"channel": 3, "on": ["image"], "lead": "2 ms", "lag": "1 ms", "blinding": True, "active_low": True}
-    )
-    spec = channel.spec("probe")
-    assert (spec.name, spec.channel, spec.on, spec.blinding, spec.active_low) == (
-        *("probe", 3, frozenset({"image"})),
-        *(True, True),
-    )
-    assert (spec.lead_s, spec.lag_s) == (2e-3, 1e-3)
+def test_lines_have_the_names_that_they_stand_under_and_the_order_of_their_channels() -> None:
+    text = "use: box\nchannels: {probe: {channel: 3, on: [image], lead: 2 ms}, mot: {channel: 1}}\n"
+    lines = Document.parse(text, "p.yaml").validate(LinesChoice)
+    assert lines.specs() == (LineSpec("mot", 1), LineSpec("probe", 3, ("image",), lead_s=2e-3))
 
 
 def test_motion_keys_and_the_plugin_s_share_a_mapping(loaded: tuple[Document, ProfileSpec]) -> None:

@@ -76,7 +76,7 @@ class Rig:
         make, model = DRIVERS[driver]
         self.clock: Any = clock or FakeClock()
         self.world = NoisyWorld(self.clock, sensor_shape)
-        lines = (LineSpec("shutter", 0, frozenset({"image"}), triggers="camera"),) if is_wired else ()
+        lines = (LineSpec("shutter", 0, ("image",), triggers="camera"),) if is_wired else ()
         context = Context("camera", SiteGrid(), clock=self.clock, simulation=self.world, lines=lines)
         given = settings if camera is None else {"camera": camera, "arming_time": "0 s", **settings}
         self.camera: Any = make(model.model_validate(given), context)

@@ -68,7 +68,7 @@ def two_edges_apart(apart_s: float) -> LineProgram:
     return LineProgram("image", ("a", "b"), np.array([0.0, 1e-3, 1e-3 + apart_s]), on, 0.0, 1.0)
 
 
-TWO = (LineSpec("a", 2, frozenset()), LineSpec("b", 9, frozenset()))
+TWO = (LineSpec("a", 2), LineSpec("b", 9))
 
 
 def test_edges_too_near_and_pauses_too_long_are_refused() -> None:
@@ -82,7 +82,7 @@ def test_edges_too_near_and_pauses_too_long_are_refused() -> None:
 
 @given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(SHORTEST, 10**7), st.integers(1, 2**10 - 1))))
 def test_programs_come_back_from_their_edges(seed: int, steps: list[tuple[int, int]]) -> None:
-    specs = tuple(LineSpec(f"line {c}", c, frozenset(), active_low=c % 2 == 0) for c in CHANNELS)
+    specs = tuple(LineSpec(f"line {c}", c, active_low=c % 2 == 0) for c in CHANNELS)
     rng, state = np.random.default_rng(seed), np.zeros(10, np.bool_)
     t_s, on = [0.0], [state]
     for ticks, change in steps[: MAX_EDGES - 1]:
@@ -105,7 +105,7 @@ def test_no_bytes_make_the_reader_of_lines_fail(line: bytes) -> None:
 
 def test_a_step_with_every_line_of_the_box_fits_its_edges() -> None:
     specs = [
-        LineSpec(f"line_{i}", channel, frozenset({"image"}), lead_s=1e-3 * (i + 1), lag_s=2e-3 * (i + 1))
+        LineSpec(f"line_{i}", channel, ("image",), lead_s=1e-3 * (i + 1), lag_s=2e-3 * (i + 1))
         for i, channel in enumerate(CHANNELS)
     ]
     program = line_program(specs, "image", 45e-3)
@@ -115,7 +115,7 @@ def test_a_step_with_every_line_of_the_box_fits_its_edges() -> None:
 
 def test_a_line_on_a_channel_that_the_box_does_not_have_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"no channel 13 for 'mot'; .*'2', .*'12'"):
-        make_rig((LineSpec("mot", 13, frozenset()),)).lines.open()
+        make_rig((LineSpec("mot", 13),)).lines.open()
 
 
 def test_a_simulated_box_has_no_external_start() -> None:

@@ -322,7 +322,7 @@ def test_wrong_outputs_are_refused(go: dict[str, Any], message: str) -> None:
 
 def test_outputs_that_are_lines_are_refused() -> None:
     with pytest.raises(ConfigError, match=rf"on channel {READY}, which is 'ready' of the leader"):
-        make_rig((LineSpec("mot", READY, frozenset({"load"})),), go=GO)
+        make_rig((LineSpec("mot", READY, ("load",)),), go=GO)
 
 
 def test_outputs_may_be_active_low() -> None:

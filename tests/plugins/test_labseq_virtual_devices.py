@@ -280,11 +280,11 @@ def test_no_kernel_is_left_to_be_compiled_by_the_first_image(
 
 ROOT = Path(__file__).parents[2]
 SPECS = (
-    LineSpec("cooling", 2, frozenset({"load", "rearrange", "idle"})),
-    LineSpec("mot", 3, frozenset({"load"})),
-    LineSpec("imaging", 4, frozenset({"image"}), lead_s=1e-3),
-    LineSpec("repump", 5, frozenset({"image"})),
-    LineSpec("camera_trigger", 6, frozenset({"image"}), pulse_s=1e-3, triggers="camera"),
+    LineSpec("cooling", 2, ("load", "rearrange", "idle")),
+    LineSpec("mot", 3, ("load",)),
+    LineSpec("imaging", 4, ("image",), lead_s=1e-3),
+    LineSpec("repump", 5, ("image",)),
+    LineSpec("camera_trigger", 6, ("image",), pulse_s=1e-3, triggers="camera"),
 )
 
 NEEDS = LightSettings(loading=("mot",), cooling=("cooling",), imaging=("imaging", "repump"))

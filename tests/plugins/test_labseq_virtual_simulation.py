@@ -345,7 +345,7 @@ def test_atoms_are_lost_in_a_dark_moment_between_two_reads_of_the_outputs() -> N
 
 
 def test_a_line_that_stays_on_after_a_release_loses_the_atoms_and_lets_none_load() -> None:
-    line = LineSpec("off", 7, frozenset({"release"}), turns_off="static_tweezers")
+    line = LineSpec("off", 7, ("release",), turns_off="static_tweezers")
     context = Context("simulation", ARRAY_GRID, lines=(line,))
     simulation = VirtualSimulation(SimulationSettings(loading=1.0, temperature=1e-6), context)
     simulation.open()
@@ -509,7 +509,7 @@ NOISY = {
 
 def without_cooling() -> VirtualSimulation:
     """Cold atoms at 1.5 s, which the noise of the intensity heats from then on."""
-    line = LineSpec("molasses", 3, frozenset({"load"}))
+    line = LineSpec("molasses", 3, ("load",))
     context = Context("simulation", ARRAY_GRID, lines=(line,))
     simulation = VirtualSimulation(SimulationSettings.model_validate(NOISY), context)
     simulation.open()

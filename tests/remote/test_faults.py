@@ -484,7 +484,7 @@ def test_a_stop_request_aborts_the_call_at_the_server(server: Served) -> None:
 
 
 def test_a_simulated_device_refuses_a_line_that_nothing_can_switch_there(server: Served) -> None:
-    line = LineSpec("trigger", 0, frozenset({"image"}), triggers="camera")
+    line = LineSpec("trigger", 0, ("image",), triggers="camera")
     context = Context("camera", SiteGrid(6, 7), clock=RealClock(StopFlag()), lines=(line,))
     with pytest.raises(ConfigError, match=r"'camera' is simulated at its server.*--dry-run"):
         RemoteCamera(server.settings("camera"), context).open()

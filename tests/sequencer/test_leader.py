@@ -228,7 +228,7 @@ def test_signals_and_answers_are_in_the_log() -> None:
 
 
 def test_lines_stay_idle_while_it_waits() -> None:
-    made = rig(line_specs=[LineSpec("mot", 3, frozenset({"wait", "image"}))])
+    made = rig(line_specs=[LineSpec("mot", 3, ("wait", "image"))])
     made.run()
     programs: Any = made.lab.lines
     assert [program.kind for program in programs.programs] == ["image"]

@@ -23,7 +23,7 @@ times = st.sampled_from([0.0, 0.5e-3, 1e-3, 7e-3])
 def specs(draw: st.DrawFn) -> tuple[LineSpec, ...]:
     lines: list[LineSpec] = []
     for channel in range(draw(st.integers(0, 5))):
-        on = frozenset(draw(st.sets(st.sampled_from(KINDS))))
+        on = tuple(draw(st.lists(st.sampled_from(KINDS), unique=True)))
         pulse_s = draw(st.sampled_from([0.0, 0.0, 0.2e-3, 30e-3])) if "idle" not in on else 0.0
         lag_s = 0.0 if pulse_s else draw(times)
         lines.append(LineSpec(f"line{channel}", channel, on, draw(times), lag_s, pulse_s))
@@ -82,8 +82,8 @@ def test_edges_that_do_not_rise_from_zero_are_refused(t_s: list[float]) -> None:
 
 def test_the_spans_of_a_shot_are_those_of_its_steps() -> None:
     lines = (
-        LineSpec("cooling", 0, frozenset({"load", "idle"})),
-        LineSpec("imaging", 1, frozenset({"image"}), lead_s=0.01),
+        LineSpec("cooling", 0, ("load", "idle")),
+        LineSpec("imaging", 1, ("image",), lead_s=0.01),
     )
     bars = [
         TimelineEntry("load", 0.5, 0.5, kind="load"),
@@ -95,9 +95,9 @@ def test_the_spans_of_a_shot_are_those_of_its_steps() -> None:
     assert spans["imaging"] == [(pytest.approx(0.5), pytest.approx(0.555))]
 
 
-IMAGING = LineSpec("imaging", 4, frozenset({"image"}), lead_s=2e-3, lag_s=1e-3)
-MOT = LineSpec("mot", 3, frozenset({"load"}), lag_s=5e-3)
-COOLING = LineSpec("cooling", 2, frozenset({"load", "rearrange", "idle"}), lead_s=0.5e-3)
+IMAGING = LineSpec("imaging", 4, ("image",), lead_s=2e-3, lag_s=1e-3)
+MOT = LineSpec("mot", 3, ("load",), lag_s=5e-3)
+COOLING = LineSpec("cooling", 2, ("load", "rearrange", "idle"), lead_s=0.5e-3)
 WAIT = ("wait", WaitStep(given(duration=0.1)))
 
 
@@ -172,7 +172,7 @@ def with_camera(made: Rig, camera: RecordingCamera) -> Rig:
 
 
 def test_a_line_that_triggers_the_camera_takes_the_place_of_the_software() -> None:
-    wire = LineSpec("camera_trigger", 5, frozenset({"image"}), pulse_s=1e-3, triggers="camera")
+    wire = LineSpec("camera_trigger", 5, ("image",), pulse_s=1e-3, triggers="camera")
     camera = EdgeCamera()
     made = with_camera(Rig((IMAGE,), line_specs=[wire]), camera)
     made.run()
@@ -182,7 +182,7 @@ def test_a_line_that_triggers_the_camera_takes_the_place_of_the_software() -> No
 
 
 def test_a_blinding_line_refuses_an_exposure_with_em_gain() -> None:
-    blinding = LineSpec("mot", 3, frozenset({"image"}), blinding=True)
+    blinding = LineSpec("mot", 3, ("image",), blinding=True)
 
     class Multiplying(RecordingCamera):
         @property

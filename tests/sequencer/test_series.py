@@ -17,7 +17,7 @@ SHORT_IMAGE = ("image", ImageStep(given(exposure=0.02)))
 CYCLES: dict[str, Any] = {"stop_when": "never", "window_mode": "early", "window_of": lambda _: 1.0}
 REARRANGE = ("rearrange", RearrangeStep(given(cycles=3, exposure=0.045, **CYCLES)))
 COMMAND = ("device", DeviceStep(given(name="shutter", do="on", arguments={}, timeout=1.0)))
-TRIGGERED = LineSpec("camera_trigger", 5, frozenset({"image"}), pulse_s=1e-3, triggers="camera")
+TRIGGERED = LineSpec("camera_trigger", 5, ("image",), pulse_s=1e-3, triggers="camera")
 
 
 class EmCamera(RecordingCamera):
@@ -89,7 +89,7 @@ def test_once_for_all_that_have_the_same_exposure(steps: Any, series: Any) -> No
     ],
 )
 def test_with_em_gain_not_while_light_may_be_on_that_harms_it(steps: Any, lines: Any, series: Any) -> None:
-    made = rig(EmCamera(), *steps, line_specs=[LineSpec("mot", 3, frozenset(lines), blinding=True)])
+    made = rig(EmCamera(), *steps, line_specs=[LineSpec("mot", 3, tuple(lines), blinding=True)])
     made.run()
     assert armed(made) == series
 

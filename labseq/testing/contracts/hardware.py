@@ -127,7 +127,7 @@ class HardwareContract(Generic[D]):
         """
         context = self.context()
         simulation = RecordingSimulation(Calls(context.clock))
-        line = LineSpec("trigger", 0, frozenset({kind}), triggers=self.role)
+        line = LineSpec("trigger", 0, (kind,), triggers="camera" if kind == "image" else "mobile_tweezers")
         context = replace(context, simulation=simulation, lines=(line,))
 
         def pulse(width_s: float) -> None:

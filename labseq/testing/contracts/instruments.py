@@ -86,11 +86,11 @@ def _read(name: str) -> Action[Device]:
 
 
 SPECS: Final = (
-    LineSpec("cooling", 2, frozenset({"load", "rearrange", "idle"})),
-    LineSpec("mot", 3, frozenset({"load"}), lag_s=2e-3, blinding=True),
-    LineSpec("imaging", 4, frozenset({"image"}), lead_s=1e-3, lag_s=0.5e-3),
-    LineSpec("camera", 5, frozenset({"image"}), pulse_s=0.2e-3, triggers="camera"),
-    LineSpec("shutter", 6, frozenset({"image"}), lead_s=2e-3, active_low=True),
+    LineSpec("cooling", 2, ("load", "rearrange", "idle")),
+    LineSpec("mot", 3, ("load",), lag_s=2e-3, blinding=True),
+    LineSpec("imaging", 4, ("image",), lead_s=1e-3, lag_s=0.5e-3),
+    LineSpec("camera", 5, ("image",), pulse_s=0.2e-3, triggers="camera"),
+    LineSpec("shutter", 6, ("image",), lead_s=2e-3, active_low=True),
 )
 
 
