@@ -26,8 +26,8 @@ import typer
 import labseq
 from labseq import builtin
 from labseq.cli.app import app
-from labseq.config.sequence import StepPolicySettings
 from labseq.errors import LabseqError, Problem
+from labseq.model.rules import StepPolicy
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import Registry
 from labseq.roles import ROLES
@@ -126,7 +126,7 @@ def file_settings(kind: str, *names: str, top: bool = False) -> Block:
     Raises:
         LookupError: There is no such key, or it has no keys of its own.
     """
-    found = [StepPolicySettings] if names == ("shot", "policy") else models_at(reference.FILES[kind], names)
+    found = [StepPolicy] if names == ("shot", "policy") else models_at(reference.FILES[kind], names)
     if len(found) != 1 or (names and found == [reference.FILES[kind]]):
         raise LookupError(f"'{' '.join((kind, *names))}' has no keys of its own")
     return reference.settings(found[0], top=top)

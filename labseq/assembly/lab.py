@@ -11,7 +11,6 @@ from labseq import motion
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
 from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.wiring import wrong_wiring
-from labseq.config.profile import ProfileSpec
 from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
 from labseq.kernel import announcing, load_kernels
@@ -19,7 +18,7 @@ from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
-from labseq.sequencer.lab import Blinding, Lab, Timeouts
+from labseq.sequencer.lab import Lab
 
 if TYPE_CHECKING:
     from labseq.assembly.points import Point
@@ -62,9 +61,9 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         devices={name: made[name] for name in profile.devices},
         simulation=made.get("simulation"),
         random_streams=streams,
-        timeouts=timeouts_of(profile),
+        timeouts=profile.timeouts,
         calibrations=hardware.calibrations,
-        blinding=_blinding(profile),
+        blinding=profile.blinding,
         lines=made.get("lines"),
         line_specs=profile.line_specs,
         budgets=profile.budgets.model_dump(),
@@ -202,11 +201,6 @@ def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tu
     return (*(stream for stream in old if stream.name not in names), *new)
 
 
-def _blinding(profile: ProfileSpec) -> dict[str, Blinding]:
-    marks = {name: device.blinding for name, device in profile.devices.items()}
-    return {name: Blinding(mark.value, mark.when) for name, mark in marks.items() if mark is not None}
-
-
 def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
     """Maximum number of mobile tweezers in a batch: the planner's own limit, else that of the motion."""
     dop = call_plugin(
@@ -215,12 +209,6 @@ def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
         lambda: getattr(made, "degree_of_parallelism", motion.max_tweezers),
     )
     return dop if isinstance(dop, int) else motion.max_tweezers
-
-
-def timeouts_of(profile: ProfileSpec) -> Timeouts:
-    """The profile's timeouts."""
-    timeouts = profile.timeouts
-    return Timeouts(timeouts.call, timeouts.safe_state, timeouts.plan)
 
 
 WARM_S: Final = 300.0

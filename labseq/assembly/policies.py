@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from labseq.config.document import Document
-from labseq.config.sequence import SequenceSpec, StepPolicySettings, StepSpec
+from labseq.config.sequence import SequenceSpec, StepSpec
 from labseq.data.columns import QUANTITIES
 from labseq.data.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model.records import unique_names
+from labseq.model.rules import StepPolicy
 from labseq.recording.results import PREFIX
 from labseq.roles import Step
-from labseq.sequencer.policies import RunPolicy, StepPolicy
+from labseq.sequencer.policies import RunPolicy
+from labseq.settings import settings_of
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
@@ -116,16 +118,17 @@ def with_policies(
     steps = [dict(dumped) for dumped in dumps]
     for spec, dumped in zip(sequence.shot, steps, strict=True):
         if document.root.at(spec.policy_loc) is not None:
-            own = document.validate(StepPolicySettings, spec.policy_loc)
-            dumped["policy"] = own.model_dump(mode="json", exclude_unset=True)
+            policy = document.validate(StepPolicy, spec.policy_loc)
+            written = document.get(spec.policy_loc) or {}
+            settings = [setting for setting in settings_of(StepPolicy) if setting.key in written]
+            dumped["policy"] = {setting.key: getattr(policy, setting.name) for setting in settings}
     return steps
 
 
 def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:
-    own = document.validate(StepPolicySettings, spec.policy_loc, called=f"the policy of '{spec.kind}'")
-    return StepPolicy(
-        math.inf if own.timeout is None else own.timeout,
-        own.retries,
-        own.on_failure or otherwise.on_failure,
-        own.over_budget or otherwise.over_budget,
+    own = document.validate(StepPolicy, spec.policy_loc, called=f"the policy of '{spec.kind}'")
+    return replace(
+        own,
+        on_failure=own.on_failure or otherwise.on_failure,
+        over_budget=own.over_budget or otherwise.over_budget,
     )

@@ -201,7 +201,7 @@ def resolve_profile(
         kept=None if recorded is None else recorded.profile,
     )
     folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
-    host = load_plugins(folders, max_wait_s=spec.timeouts.load)
+    host = load_plugins(folders, max_wait_s=spec.timeouts.load_s)
     pins = None if recorded is None else recorded.calibrations
     with collecting(problems) as collector:
         return choose_plugins(document, spec, host, dry_run, collector, pins)

@@ -102,7 +102,7 @@ class Search:
             DeviceTimeoutError: It did not answer in time.
             StopRequested: The operator asked to stop.
         """
-        guard, timeout_s = Guard(stop), self.corners.hardware.profile.timeouts.call
+        guard, timeout_s = Guard(stop), self.corners.hardware.profile.timeouts.call_s
 
         def next_point() -> dict[str, float] | None:  # the guard's messages have its name
             try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -24,8 +23,8 @@ from labseq.console.text import age_text, clock_time, encodes, plural, settings_
 from labseq.errors import Problem
 from labseq.messages import clean
 from labseq.model import CalibrationEntry, TimelineEntry
+from labseq.model.rules import StepPolicy
 from labseq.recording import data_root
-from labseq.sequencer.policies import StepPolicy
 from labseq.session.check import CheckReport, check
 from labseq.session.rehearsal import Rehearsal
 from labseq.session.session import Session
@@ -86,7 +85,7 @@ _THEN = {"repeat_shot": "repeats the shot", "skip_point": "skips its point", "st
 def policy_texts(assembly: Assembly) -> list[str]:
     """The policies that differ from the defaults: a line for the run, each step and each check."""
     policy, spec = assembly.policy, assembly.sequence
-    texts = [text for text in [_differing(policy.otherwise, StepPolicy())] if text]
+    texts = [text for text in [_differing(policy.otherwise, StepPolicy(over_budget="record"))] if text]
     if policy.when_exhausted == "skip_point":
         texts.append("if all attempts at a shot fail, its point is skipped")
     for number, (step, own) in enumerate(zip(spec.shot, policy.steps, strict=True)):
@@ -97,13 +96,13 @@ def policy_texts(assembly: Assembly) -> list[str]:
 
 def _differing(own: StepPolicy, otherwise: StepPolicy) -> str:
     parts: list[str] = []
-    if own.timeout_s < math.inf:
+    if own.timeout_s is not None:
         parts.append(f"{format_quantity(own.timeout_s, 'time')} at most")
     if own.retries:
         parts.append("retried once" if own.retries == 1 else f"retried {own.retries} times")
     if own.on_failure and own.on_failure != otherwise.on_failure:
         parts.append(f"a failure {_THEN[own.on_failure]}")
-    if own.over_budget != otherwise.over_budget:
+    if own.over_budget and own.over_budget != otherwise.over_budget:
         then = {"record": "is only recorded", "warn": "is a warning"} | _THEN
         parts.append(f"a stage over its budget {then[own.over_budget]}")
     return ", ".join(parts)
@@ -338,7 +337,11 @@ def _limits(assembly: Assembly) -> Facts:
     uses = f"; the planner uses {min(dop, motion.max_tweezers)}" if dop else ""
     hardware = assembly.hardware.chosen.items()
     real = [role for role, one in hardware if one.entry.role.is_hardware and not one.virtual_time]
-    waits = (("device call", timeouts.call), ("safe state", timeouts.safe_state), ("plan", timeouts.plan))
+    waits = (
+        ("device call", timeouts.call_s),
+        ("safe state", timeouts.safe_state_s),
+        ("plan", timeouts.plan_s),
+    )
     return [
         *(("window", text) for text in _windows(assembly.resolved)),
         ("mobile tweezers", f"{motion.max_tweezers} on at once, {tones}{uses}"),

@@ -257,6 +257,6 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
             host = load_plugins()
         else:
             document, spec = load_profile(profile, beside=Path())  # the plugins that it names need not exist
-            host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load)
+            host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load_s)
         host.import_all()
         show(Plugins.of(host))

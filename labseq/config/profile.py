@@ -19,6 +19,7 @@ from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, FrequencyComb, MotionSpec, SiteGrid
 from labseq.model.lines import LineSpec
 from labseq.model.motion import Sites
+from labseq.model.rules import Blinding, Timeouts
 from labseq.settings import (
     FORMAT,
     Choice,
@@ -44,17 +45,6 @@ if TYPE_CHECKING:
     from labseq.config.scan import Scan
 
 
-class BlindingSettings(Settings):
-    """When a device's light would damage a camera with EM gain."""
-
-    value: Text = Field(
-        default="state", description="the reading of the device that says whether its light is on"
-    )
-    when: Annotated[tuple[bool | int | float | str, ...], Field(min_length=1)] = Field(
-        default=("on",), description="readings while the light is on"
-    )
-
-
 class DeviceChoice(Choice):
     """The plugin of an instrument or further camera, and the core's settings for it."""
 
@@ -63,7 +53,7 @@ class DeviceChoice(Choice):
         description="kind of plugin: `camera` for a further camera, such as one that "
         "looks at the light of the tweezers",
     )
-    blinding: BlindingSettings | None = Field(
+    blinding: Blinding | None = Field(
         default=None,
         description="no exposure with EM gain while its light is on: `{value: state, when: [on]}`",
     )
@@ -237,21 +227,6 @@ class MobileTweezersChoice(Choice):
         return MotionSpec(**{field.name: getattr(self, field.name) for field in fields(MotionSpec)})
 
 
-class TimeoutSettings(Settings):
-    """How long calls into plugins may take before they count as hung."""
-
-    call: PositiveDuration = Field(
-        default=10.0, description="longest device call, in addition to the duration of its action"
-    )
-    safe_state: PositiveDuration = Field(
-        default=5.0, description="longest time for a device to reach its safe state"
-    )
-    plan: PositiveDuration = Field(default=5.0, description="longest planning of a cycle")
-    load: PositiveDuration = Field(
-        default=30.0, description="longest loading of a plugin, and longest call of a constructor"
-    )
-
-
 class GridSettings(Settings):
     """The grid of static tweezer sites, and the mobile tweezers' tones at them."""
 
@@ -341,8 +316,8 @@ class ProfileSpec(Settings):
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
-    timeouts: Annotated[TimeoutSettings, empty_is({})] = Field(
-        default=TimeoutSettings(), description="how long plugins may take"
+    timeouts: Annotated[Timeouts, empty_is({})] = Field(
+        default=Timeouts(), description="how long plugins may take"
     )
     budgets: Annotated[BudgetSettings, empty_is({})] = Field(
         default=BudgetSettings(), description="time budgets of the computer for its part of a shot"
@@ -366,6 +341,12 @@ class ProfileSpec(Settings):
     def motion(self) -> MotionSpec:
         """How the mobile tweezers move."""
         return self.mobile_tweezers.motion
+
+    @property
+    def blinding(self) -> dict[str, Blinding]:
+        """The devices whose light would damage a camera with EM gain, and when it is on."""
+        marks = {name: device.blinding for name, device in self.devices.items()}
+        return {name: mark for name, mark in marks.items() if mark is not None}
 
     @property
     def line_specs(self) -> tuple[LineSpec, ...]:

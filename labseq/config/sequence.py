@@ -15,6 +15,7 @@ from labseq.config.document import Document, FallbackValues, StoredText, check_k
 from labseq.config.scan import Scan, ScanOrder, read_scan
 from labseq.errors import Loc, ProblemCollector, collecting
 from labseq.messages import clean, shown
+from labseq.model.rules import OverBudget, Then, WhenExhausted
 from labseq.settings import (
     FORMAT,
     Choice,
@@ -23,7 +24,6 @@ from labseq.settings import (
     FormatVersion,
     Name,
     PatternChoice,
-    PositiveDuration,
     Settings,
     Text,
     Variables,
@@ -31,30 +31,6 @@ from labseq.settings import (
     placed_by_field,
     setting_error,
 )
-
-
-class StepPolicySettings(Settings):
-    """``policy`` of a step, in place of the run's policy."""
-
-    timeout: PositiveDuration | None = Field(
-        default=None, description="longest duration of an attempt at the step; a longer one has failed"
-    )
-    retries: int = Field(
-        default=0,
-        ge=0,
-        le=100,
-        description="how often the step is repeated, in the same shot, before it counts as failed; for "
-        "steps that do not move atoms",
-    )
-    on_failure: Literal["repeat_shot", "skip_point", "stop"] | None = Field(
-        default=None,
-        description="reaction to its failure; none: that of the run's policy",
-    )
-    over_budget: Literal["record", "warn", "repeat_shot", "skip_point", "stop"] | None = Field(
-        default=None,
-        description="reaction to a stage of it that takes longer than its budget; none: that of the run's "
-        "policy",
-    )
 
 
 class CheckSettings(Settings):
@@ -86,14 +62,14 @@ class CheckSettings(Settings):
 class PolicySettings(Settings):
     """``policy`` of a sequence: reactions to failures, for the run and every step without its own policy."""
 
-    on_failure: Literal["repeat_shot", "skip_point", "stop"] | None = Field(
+    on_failure: Then | None = Field(
         default=None,
         description="reaction to a failure; none: a transient one repeats the shot, any other stops the run",
     )
-    when_exhausted: Literal["skip_point", "stop"] = Field(
+    when_exhausted: WhenExhausted = Field(
         default="stop", description="reaction when a shot has failed `attempts` times"
     )
-    over_budget: Literal["record", "warn", "repeat_shot", "skip_point", "stop"] = Field(
+    over_budget: OverBudget = Field(
         default="record", description="reaction to a stage that takes longer than its budget"
     )
     checks: Annotated[tuple[CheckSettings, ...], empty_is(())] = Field(

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import labseq
-from labseq.assembly.lab import timeouts_of
 from labseq.assembly.plugin_choice import ChosenPlugin
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import profile_overrides
@@ -168,7 +167,7 @@ def _test(
     device_simulation = devices.pop("simulation", None)
     failures: list[LabseqError] = [*errors.values()]
     for device in check_each_device(
-        devices.items(), timeouts_of(hardware.profile), stop, device_simulation, report
+        devices.items(), hardware.profile.timeouts, stop, device_simulation, report
     ):
         failures += filter(None, (device.failure, device.unsafe, device.unclosed))
     for failure in failures[1:]:

@@ -10,19 +10,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from labseq import realtime
-from labseq.assembly.lab import WARM_S, timeouts_of
+from labseq.assembly.lab import WARM_S
 from labseq.assembly.plugin_choice import DryRun, check_dry_run
 from labseq.assembly.profile import resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
+from labseq.model.rules import Timeouts
 from labseq.recording import find_dead_run
 from labseq.roles import Hardware, Simulation, in_opening_order, overrides
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import construct_hardware
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.sequencer.lab import Timeouts, attempt, open_device
+from labseq.sequencer.lab import attempt, open_device
 from labseq.watchdog import Watchdog
 
 N_READINGS: Final = 5
@@ -106,7 +107,7 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         constructed, refused = construct_hardware(hardware, clock)
         simulation = constructed.pop("simulation", None)
         devices = check_each_device(
-            in_opening_order(constructed), timeouts_of(hardware.profile), stop, simulation, warnings.append
+            in_opening_order(constructed), hardware.profile.timeouts, stop, simulation, warnings.append
         )
     if not hardware.virtual_time and (text := realtime.missing_privileges()):
         warnings.append(text)

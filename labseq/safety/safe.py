@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.assembly.lab import construct, timeouts_of
+from labseq.assembly.lab import construct
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.assembly.profile import ResolvedProfile, choose_plugins
 from labseq.config.addresses import profile_overrides
@@ -27,13 +27,14 @@ from labseq.errors import (
 )
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.messages import clean
+from labseq.model.rules import Timeouts
 from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, find_dead_run, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
 from labseq.safety.locks import device_text, end_holders, lock_devices
 from labseq.sequencer.clock import RealClock, VirtualClock
-from labseq.sequencer.lab import Timeouts, attempt, failure_of, open_device
+from labseq.sequencer.lab import attempt, failure_of, open_device
 from labseq.watchdog import TRY_AGAIN_S, Hanging, Watchdog, watchdog_lines
 
 
@@ -142,9 +143,7 @@ def make_profile_devices_safe(
     devices, failures = construct_hardware(hardware, clock)
     simulation = devices.pop("simulation", None)
     with stop.held():
-        attempted = make_each_safe(
-            in_safe_order(devices), timeouts_of(hardware.profile), simulation, observer
-        )
+        attempted = make_each_safe(in_safe_order(devices), hardware.profile.timeouts, simulation, observer)
     refused: dict[str, LabseqError] = {role: e for role, e in hardware.refused.items() if role != "detector"}
     refused |= failures
     for role, error in refused.items():
@@ -232,7 +231,7 @@ def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollec
     for folder in spec.plugin_folders:
         with suppress(ConfigError):  # reported already
             folders += plugin_paths(document, [folder])
-    return choose_plugins(document, spec, load_plugins(folders, spec.timeouts.load), "off", problems)
+    return choose_plugins(document, spec, load_plugins(folders, spec.timeouts.load_s), "off", problems)
 
 
 FIRST_S: Final = 0.5

@@ -22,12 +22,13 @@ from labseq import builtin, errors, hookspecs, roles
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.profile import ProfileSpec
 from labseq.config.scan import AdaptiveChoice
-from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec, StepPolicySettings
+from labseq.config.sequence import DEFAULT_PLANNER, SequenceSpec
 from labseq.console.errors import EXIT_CODES, exit_code_of
 from labseq.console.output import say
 from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
 from labseq.files import PLUGINS
 from labseq.messages import clean, closest
+from labseq.model.rules import StepPolicy
 from labseq.registry import Entry, Registry
 from labseq.roles import EVENTS, ROLES
 from labseq.scaffold.words import default_of, docstring, summary, value_of
@@ -520,7 +521,7 @@ def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
         by_name[f"{kind} {key}"] = Topic(
             setting.description, lambda a=(key, owner, setting), more=further: _key_blocks(*a, more())
         )
-    return by_name | _key_topics((kind, "shot", "policy"), StepPolicySettings if kind == "sequence" else None)
+    return by_name | _key_topics((kind, "shot", "policy"), StepPolicy if kind == "sequence" else None)
 
 
 def _choice_blocks(models: Sequence[SettingsType], entries: Sequence[Entry]) -> list[Block]:

@@ -12,17 +12,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias, cast
 
-from pydantic import BaseModel
+from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from labseq.config.profile import DeviceChoice, LinesChoice, MobileTweezersChoice, ProfileSpec
 from labseq.config.scan import FORMS, AdaptiveChoice
-from labseq.config.sequence import AnalysisChoice, SequenceSpec, StepPolicySettings
+from labseq.config.sequence import AnalysisChoice, SequenceSpec
 from labseq.files import whole_file
+from labseq.model.rules import StepPolicy
 from labseq.registry import Entry, Registry
 from labseq.scaffold.words import summary
-from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings, si_of
+from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings, SettingsType, si_of
 from labseq.units import EXAMPLES, UNITS, expected, format_quantity, parse_quantity
 
 JsonSchema: TypeAlias = dict[str, Any]
@@ -171,7 +172,7 @@ def or_empty(schema: JsonSchema) -> JsonSchema:
 
 
 def model_schema(
-    model: type[BaseModel] | None, prefix: str, definitions: JsonSchema, *, expressions: bool = True
+    model: SettingsType | None, prefix: str, definitions: JsonSchema, *, expressions: bool = True
 ) -> JsonSchema:
     """The schema of a mapping of settings.
 
@@ -182,7 +183,7 @@ def model_schema(
         return {"type": "object", "properties": {}, "additionalProperties": False}
     generator = _ExpressionGenerator if expressions else _Generator
     reference = f"#/{DEFINITIONS}/{prefix}{{model}}"
-    made = model.model_json_schema(schema_generator=generator, ref_template=reference)
+    made = TypeAdapter(model).json_schema(schema_generator=generator, ref_template=reference)
     inner = {f"{prefix}{name}": _tidy(one) for name, one in made.get("$defs", {}).items()}
     definitions.update(inner)
     found = _tidy(made)
@@ -343,7 +344,7 @@ class _FileSchema:
             about = {"description": _about(entry)}
             kinds[entry.name] = {**about, **({"allOf": [settings]} if is_needed else or_empty(settings))}
         name = {"type": "string", "minLength": 1, "description": "name of the step, for addresses"}
-        policy = model_schema(StepPolicySettings, "step.", self._definitions)
+        policy = model_schema(StepPolicy, "step.", self._definitions)
         failing = "what follows its failures and exceeded budgets, instead of the run's policy"
         return {
             "type": "object",

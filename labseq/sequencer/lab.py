@@ -20,6 +20,7 @@ from labseq.model import (
     SiteGrid,
     TargetPattern,
 )
+from labseq.model.rules import Blinding, Timeouts
 from labseq.roles import (
     Camera,
     Clock,
@@ -37,19 +38,6 @@ from labseq.roles import (
 )
 from labseq.sequencer.lines import blinding_lines
 from labseq.watchdog import Watchdog
-
-
-@dataclass(frozen=True, slots=True)
-class Blinding:
-    """Condition under which a device's light would damage a camera with EM gain.
-
-    Attributes:
-        value: Name of the device's value, as passed to ``Device.read``.
-        when: The readings that mean that the light is on.
-    """
-
-    value: str
-    when: tuple[Any, ...]
 
 
 def check_blinding(lab: Lab, guard: Guard) -> None:
@@ -78,21 +66,6 @@ def _on(lab: Lab, marks: Mapping[str, Blinding], guard: Guard) -> dict[str, Any]
         for name, mark in marks.items()
     }
     return {name: value for name, value in values.items() if value in marks[name].when}
-
-
-@dataclass(frozen=True, slots=True)
-class Timeouts:
-    """Times after which a device or plugin counts as hung, in seconds.
-
-    Attributes:
-        call_s: Longest time a call may take beyond its own duration.
-        safe_state_s: Longest time for one device's safe state.
-        plan_s: Longest time for one plan.
-    """
-
-    call_s: float = 10.0
-    safe_state_s: float = 5.0
-    plan_s: float = 5.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, field
+from typing import Final
 
 from labseq.errors import (
     ConfigError,
@@ -20,13 +19,7 @@ from labseq.errors import (
     TransientError,
     UnknownPluginError,
 )
-
-Then = Literal["repeat_shot", "skip_point", "stop"]
-"""Reaction to a failure."""
-OverBudget = Literal["record", "warn", "repeat_shot", "skip_point", "stop"]
-"""Reaction to a stage that took longer than its budget."""
-WhenExhausted = Literal["skip_point", "stop"]
-"""Reaction to a shot that has failed in its last attempt."""
+from labseq.model.rules import StepPolicy, Then, WhenExhausted
 
 _ENDING: Final = (
     StopRequested,
@@ -42,23 +35,6 @@ machine, or a repetition would fail again."""
 
 
 @dataclass(frozen=True, slots=True)
-class StepPolicy:
-    """The policy of a step.
-
-    Attributes:
-        timeout_s: Maximum time of an attempt, on the session's clock; a longer one fails.
-        retries: Number of retries before the step counts as failed.
-        on_failure: Reaction to its failure; None: a transient failure repeats the shot, others stop the run.
-        over_budget: Reaction to a stage of the step that exceeds its budget.
-    """
-
-    timeout_s: float = math.inf
-    retries: int = 0
-    on_failure: Then | None = None
-    over_budget: OverBudget = "record"
-
-
-@dataclass(frozen=True, slots=True)
 class RunPolicy:
     """The policies of a run.
 
@@ -71,7 +47,7 @@ class RunPolicy:
 
     attempts: int = 3
     when_exhausted: WhenExhausted = "stop"
-    otherwise: StepPolicy = StepPolicy()
+    otherwise: StepPolicy = field(default_factory=StepPolicy)
     steps: Sequence[StepPolicy] = ()
 
     def of_step(self, number: int | None) -> StepPolicy:

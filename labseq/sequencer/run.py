@@ -18,6 +18,7 @@ from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.records import ShotStatus, unique_names
+from labseq.model.rules import StepPolicy, Then
 from labseq.plain import now_utc
 from labseq.roles import RunObserver, Step
 from labseq.sequencer.images import with_waits
@@ -30,7 +31,7 @@ from labseq.sequencer.lab import (
     open_device,
 )
 from labseq.sequencer.leader import Emit, LeaderAnswers
-from labseq.sequencer.policies import RunPolicy, StepPolicy, Then, may_be_retried
+from labseq.sequencer.policies import RunPolicy, may_be_retried
 from labseq.sequencer.shot import Events, RunningShot, Stages
 from labseq.watchdog import Watchdog
 
@@ -388,7 +389,7 @@ class Sequencer:
             OverBudgetError: It took longer than its budget, and the run's policy is to stop.
         """
         then = self._policy.otherwise.over_budget
-        stages.policy = StepPolicy(over_budget=then if then in ("record", "stop") else "warn")
+        stages.policy = StepPolicy(over_budget=then if then in (None, "record", "stop") else "warn")
         stages.done("write", 0.0 if self.lab.clock.virtual else host_s, host_s, math.nan, 0)
 
     def _perform(self, shot: RunningShot) -> None:
@@ -420,7 +421,7 @@ class Sequencer:
         for left in range(policy.retries, -1, -1):
             shot.stages.begin_attempt()
             try:
-                longest_s = policy.timeout_s + self.lab.timeouts.call_s
+                longest_s = policy.limit_s + self.lab.timeouts.call_s
                 with self.guard.step(f"step {number} ({name}) ", longest_s), _named(number, name, step):
                     step.run(shot)
                 shot.stages.check_timeout()

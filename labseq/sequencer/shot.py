@@ -33,13 +33,13 @@ from labseq.model import (
     TimelineEntry,
 )
 from labseq.model.records import OVERSHOOT_S, STEP
+from labseq.model.rules import StepPolicy
 from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
 from labseq.sequencer.images import CameraSeries, take_frame
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
-from labseq.sequencer.policies import StepPolicy
 from labseq.units import format_quantity
 
 
@@ -129,7 +129,7 @@ class Stages:
         Raises:
             StepTimeoutError: The timeout has passed.
         """
-        limit_s = self.policy.timeout_s
+        limit_s = self.policy.limit_s
         if self._clock.now() - self._attempt_start_s > limit_s + OVERSHOOT_S:
             text = f"step {self.step} ({self._name}) is not done after its timeout of "
             raise StepTimeoutError(text + format_quantity(limit_s, "time"), limit_s)
@@ -172,7 +172,7 @@ class Stages:
     def _check_budget(self, timing: StageTiming) -> None:
         """Apply the step's policy to a stage over its budget."""
         then = self.policy.over_budget
-        if then == "record" or not timing.over_budget or self._is_warned:
+        if then in (None, "record") or not timing.over_budget or self._is_warned:
             return
         took, budget = (format_quantity(value, "time") for value in (timing.duration_s, timing.budget_s))
         text = f"'{timing.stage}' took {took}; its budget is {budget}"

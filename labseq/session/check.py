@@ -271,10 +271,10 @@ def _timeout_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
     each = zip(assembly.sequence.shot, assembly.policy.steps, one.timeline, strict=True)
     for number, (spec, policy, (_, bars)) in enumerate(each):
         longest_s = sum(bar.duration_s for bar in bars)
-        if longest_s > policy.timeout_s:
+        if longest_s > policy.limit_s:
             longest = format_quantity(longest_s, "time")
             what = f"the step takes up to {longest}, longer than its timeout of "
-            what += format_quantity(policy.timeout_s, "time")
+            what += format_quantity(policy.limit_s, "time")
             place = (*spec.policy_loc, "timeout")
             yield number, one.point.document.problem(place, what, f"more than {longest}")
 

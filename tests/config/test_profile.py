@@ -17,11 +17,11 @@ from labseq.config.profile import (
     GridSettings,
     LinesChoice,
     ProfileSpec,
-    TimeoutSettings,
     load_profile,
 )
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, LineSpec, MotionSpec, SiteGrid
+from labseq.model.rules import Timeouts
 from labseq.settings import Settings, settings_of
 from tests.config.wrong_files import wrong_files
 
@@ -87,7 +87,7 @@ def test_what_may_be_left_out() -> None:
     assert spec.devices == {}
     assert spec.simulation is None
     assert spec.plugin_folders == []
-    assert spec.timeouts == TimeoutSettings()
+    assert spec.timeouts == Timeouts()
     empty = Document.parse(short + "devices:\nsimulation:\ntimeouts:\nplugin_folders:\n", "p.yaml")
     assert empty.validate(ProfileSpec) == spec
 
@@ -107,7 +107,7 @@ def with_option(address: str, value: str) -> ProfileSpec:
 
 
 def test_options_reach_the_profile() -> None:
-    assert with_option("timeouts.plan", "1 s").timeouts.plan == 1.0
+    assert with_option("timeouts.plan", "1 s").timeouts.plan_s == 1.0
     assert with_option("grid.column_frequency.step", "1 MHz").grid.column_frequency.step == 1e6
     assert with_option("mobile_tweezers.rf.max_peak", "1.5 V").motion.rf.max_peak_v == 1.5
     table = "[98 MHz, 100.1 MHz, 102 MHz]"

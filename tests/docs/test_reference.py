@@ -9,20 +9,21 @@ from types import FunctionType
 from typing import Any
 
 import pytest
-from pydantic import BaseModel, create_model
+from pydantic import create_model
 
 import labseq
 from labseq import errors, plugin, roles, testing
 from labseq.config.profile import ProfileSpec, load_profile
-from labseq.config.sequence import SequenceSpec, StepPolicySettings, load_sequence
+from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
+from labseq.model.rules import StepPolicy
 from labseq.plugin import simulation, system
 from labseq.registry import Registry
 from labseq.roles import ROLES
 from labseq.scaffold import reference
 from labseq.scaffold.reference import Table, settings
-from labseq.settings import Choice, PatternChoice, settings_at, settings_of
+from labseq.settings import Choice, PatternChoice, SettingsType, settings_at, settings_of
 
 from .scripts import load_script
 
@@ -62,11 +63,11 @@ PROFILE = {
 }
 
 
-SUBJECTS: dict[str, type[BaseModel] | None] = {
-    "step policy": StepPolicySettings,
+SUBJECTS: dict[str, SettingsType | None] = {
+    "step policy": StepPolicy,
     **{f"{entry.kind} {entry.name}": entry.settings_model for entry in SCRIPT.registry().entries()},
 }
-FILES: dict[str, type[BaseModel]] = {"sequence": SequenceSpec, "profile": ProfileSpec}
+FILES: dict[str, SettingsType] = {"sequence": SequenceSpec, "profile": ProfileSpec}
 MODELS = sorted({m for m in [*SUBJECTS.values(), *FILES.values(), Choice, PatternChoice] if m}, key=str)
 
 
@@ -110,7 +111,7 @@ def test_every_topic_can_be_explained() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
-def test_every_setting_says_what_it_is(model: type[BaseModel]) -> None:
+def test_every_setting_says_what_it_is(model: SettingsType) -> None:
     assert model.__doc__
     for one in (one for inner in (model, *models_below(model)) for one in settings_of(inner)):
         assert one.description, f"'{one.key}' of {model.__name__} has no description"
@@ -195,7 +196,7 @@ def test_every_public_name_says_what_it_is() -> None:
     assert [row[0] for row in table.rows if len(row[1].split()) < 3] == []
 
 
-def models_below(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+def models_below(model: SettingsType) -> Iterator[SettingsType]:
     """The models of all keys of a file, at any depth."""
     for setting in settings_of(model):
         for inner in setting.models:

@@ -23,9 +23,9 @@ from labseq.errors import (
     TransientError,
 )
 from labseq.model import TimelineEntry
+from labseq.model.rules import StepPolicy, Timeouts
 from labseq.roles import Shot, StepContext
-from labseq.sequencer.lab import Timeouts
-from labseq.sequencer.policies import RunPolicy, StepPolicy
+from labseq.sequencer.policies import RunPolicy
 from labseq.testing.fakes import RecordingCamera, RecordingDevice
 from labseq.testing.fakes.devices import RecordingMobileTweezers
 from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given

@@ -8,13 +8,11 @@ from typing import Any
 
 import pytest
 
-from labseq.assembly.lab import timeouts_of
-from labseq.config.profile import load_profile
 from labseq.errors import ConfigError, DeviceTimeoutError, StopRequested
 from labseq.guard import StopFlag
+from labseq.model.rules import Timeouts
 from labseq.roles import Context
 from labseq.safety.devices import N_READINGS, CheckedDevice, check_devices, check_each_device
-from labseq.sequencer.lab import Timeouts
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation
 
 from .small_runs import PROFILE
@@ -115,12 +113,6 @@ def profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         PROFILE + "devices: {shutter: {use: virtual}}\ntimeouts: {call: 100 s}\n", encoding="utf-8"
     )
     return path
-
-
-def test_each_timeout_of_a_profile_limits_what_it_is_for(profile: Path) -> None:
-    overrides = [("timeouts.safe_state", "7 s"), ("timeouts.plan", "3 s")]
-    _, spec = load_profile("./p.yaml", beside=profile.parent, overrides=overrides)
-    assert timeouts_of(spec) == Timeouts(call_s=100.0, safe_state_s=7.0, plan_s=3.0)
 
 
 def test_all_devices_of_a_profile_are_tried_in_the_order_of_opening(profile: Path) -> None:
