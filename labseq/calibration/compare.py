@@ -1,4 +1,4 @@
-"""Compares two calibrations of the same kind; age and deciding figure of one as text."""
+"""Compares two calibrations of the same kind; shows the age and the deciding figure of one as text."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from labseq.recording.schema import unit_of
 from labseq.units import format_quantity
 
 _DIMENSIONS: Final = {"m": "length", "Hz": "frequency", "rad": "angle", "s": "time"}
-_MAX_SKEW_S: Final = 60.0
-"""The clocks of two computers may differ by so much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +53,8 @@ def compare(before: CalibrationEntry, after: CalibrationEntry) -> tuple[list[Dif
         ConfigError: They are of different kinds.
     """
     if before.kind != after.kind:
-        what = f"{before.id} is of the kind '{before.kind}', {after.id} of the kind '{after.kind}'"
-        raise ConfigError(Problem(what, expected="two calibrations of one kind"))
+        problem = f"{before.id} is of the kind '{before.kind}', {after.id} of the kind '{after.kind}'"
+        raise ConfigError(Problem(problem, expected="two calibrations of one kind"))
     values = [
         _of_values(name, before.values[name], value)
         for name, value in after.values.items()
@@ -92,7 +90,8 @@ def _of_figure(name: str, before: float, after: float) -> Difference:
 def age_s(entry: CalibrationEntry) -> float | None:
     """Time since a calibration was made, in seconds; None if this computer's clock is behind that time."""
     age_s = (now() - datetime.fromisoformat(entry.taken_utc)).total_seconds()
-    return None if age_s < -_MAX_SKEW_S else max(0.0, age_s)
+    # the clocks of two computers may differ by a minute
+    return None if age_s < -60.0 else max(0.0, age_s)
 
 
 def quantity(value: float | None, name: str) -> str:

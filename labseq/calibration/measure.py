@@ -40,14 +40,6 @@ from labseq.plain import now_utc
 from labseq.roles import RunObserver
 from labseq.session.session import Session
 
-PICTURE_DPI: Final = 110
-PROBED_PER_POINT: Final = {"overlay": 50, "frequencies": 100}
-"""Sites to probe at each point of the scan: with 75 % loading their centre is known to about 35 nm."""
-FEWEST_REPEATS: Final = 4
-"""Of the sequences of these calibrations; more are only needed on small grids."""
-VALUE_FILES: Final = (".npy", ".csv")
-"""Suffixes of files of values; any other source is a run."""
-
 METHODS: Final[Mapping[str, Method]] = {
     method.kind: method
     for method in (
@@ -76,7 +68,7 @@ class CalibrationRequest:
         output: Folder for the data of the run.
         dry_run: "off", "full" or "fast".
         force: Whether to use the result even if it is worse than the calibration in use.
-        centre: "Y,X", the middle of the sites' grid on the frames, in pixels; None if nothing else is lit.
+        centre: "Y,X", the middle of the sites' grid on the frames, in pixels; None if no other traps are lit.
     """
 
     profile: str
@@ -100,7 +92,7 @@ class Outcome:
         before: The entry that was in use; None if there was none that can be compared.
         changes: Change of each value from that entry.
         run: The run that was analysed; None for a file.
-        refused: Why the result was not put to use; "" if it is in use.
+        refused: Why the result is not in use; "" if it is.
         warnings: Warnings for the user.
     """
 
@@ -127,7 +119,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
             in use stays in use.
         LabseqError: Another error ended the run.
     """
-    _centre(method, request)
+    _centre(method, request)  # a mistake in it is reported before the run is taken
     document, spec = load_profile(request.profile, beside=Path(), overrides=_of_profile(request.overrides))
     ignoring = _ignoring(store_of(document, spec).folder, spec, method)
     hardware = resolve_profile(
@@ -150,7 +142,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         store.use(stored, hardware.grid, force=True)
         overlay = store.active().get("overlay")
         if entry.kind == "frequencies" and overlay is not None:
-            store.use_none("overlay")
+            store.use_none("overlay")  # or its correction would be made twice
             warnings += (f"overlay {overlay.id} is no longer used: these frequencies include its correction",)
     if pin := spec.calibrations.use.of(method.kind):
         text = f"the profile says 'calibrations.use.{method.kind}: {clean(pin)}', which takes precedence"
@@ -168,10 +160,10 @@ def _analysed(
 ) -> tuple[Run | None, AnalysisResult]:
     """Take or open a run and analyse it, or read a file of values."""
     source = request.source
-    if source is not None and source.suffix.lower() in VALUE_FILES:
+    if source is not None and source.suffix.lower() in (".npy", ".csv"):
         if method.read is None:
-            what = f"a calibration of {method.kind} cannot be made from a file"
-            raise ConfigError(Problem(what, str(source), expected="a run's folder"))
+            problem = f"a calibration of {method.kind} cannot be made from a file"
+            raise ConfigError(Problem(problem, str(source), expected="a run's folder"))
         return None, method.read(source, hardware)
     run = (
         _measure(method, request, hardware, ignoring, observer)
@@ -199,7 +191,7 @@ def _measure(
     fitting = [*_meter(method, hardware.profile), *_target(method, grid), *_repeats(method, grid)]
     overrides = [*fitting, *request.overrides, ignoring]
     if not method.uses_detector:  # its settings may be wrong before it is calibrated
-        overrides = [one for one in overrides if not one.lstrip().startswith("profile.detector.")]
+        overrides = [text for text in overrides if not text.lstrip().startswith("profile.detector.")]
         overrides.append("profile.detector={use: blind}")
     with Session.open(
         method.sequence,
@@ -225,20 +217,20 @@ def _open(source: Path, request: CalibrationRequest, hardware: ResolvedProfile) 
     except RecordingError as error:
         raise ConfigError(Problem(str(error), "--from")) from error
     if run.target.shape != hardware.grid.shape:
-        came = " x ".join(map(str, run.target.shape))
+        run_sites = " x ".join(map(str, run.target.shape))
         expected = f"{hardware.grid.n_rows} x {hardware.grid.n_cols}, as in the profile"
-        raise ConfigError(Problem(f"the run has a grid of {came} sites", str(source), expected=expected))
-    taken_on = grid_facts(recorded_machine(run.record["resolved"]["profile"], "the profile of the run").grid)
-    if not same_grid(taken_on, own := grid_facts(hardware.grid)):
-        what = f"the run has a grid of {grid_text(taken_on)}"
-        raise ConfigError(Problem(what, str(source), expected=f"{grid_text(own)}, as in the profile"))
+        raise ConfigError(Problem(f"the run has a grid of {run_sites} sites", str(source), expected=expected))
+    run_grid = grid_facts(recorded_machine(run.record["resolved"]["profile"], "the profile of the run").grid)
+    if not same_grid(run_grid, own_grid := grid_facts(hardware.grid)):
+        problem = f"the run has a grid of {grid_text(run_grid)}"
+        raise ConfigError(Problem(problem, str(source), expected=f"{grid_text(own_grid)}, as in the profile"))
     if run.simulated != (request.dry_run != "off" or hardware.virtual_time):
-        what = f"the run was {'simulated' if run.simulated else 'taken with real devices'}"
+        problem = f"the run was {'simulated' if run.simulated else 'taken with real devices'}"
         expected = (
             f"one {'with real devices' if run.simulated else 'that was simulated'}, as the profile's are"
         )
         hint = "calibrations of dry runs are made with --dry-run" if run.simulated else ""
-        raise ConfigError(Problem(what, str(source), expected=expected, hint=hint))
+        raise ConfigError(Problem(problem, str(source), expected=expected, hint=hint))
     return run
 
 
@@ -271,7 +263,7 @@ def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:
 
 
 def _meter(method: Method, spec: ProfileSpec) -> list[str]:
-    """The overrides that make the step `equalise` measure with what the profile says."""
+    """The overrides that make the step `equalise` measure as the profile's `equalise` says."""
     if method.kind not in ("tweezers", "amplitudes"):
         return []
     meter = spec.equalise
@@ -285,8 +277,10 @@ def _target(method: Method, grid: SiteGrid) -> list[str]:
     if method.kind != "timing":
         return []
     if grid.shape == (1, 1):
-        what = "the grid has a single site, so that no atom can be moved"
-        raise ConfigError(Problem(what, "labseq calibrate timing", expected="a grid of at least two sites"))
+        problem = "the grid has a single site, so that no atom can be moved"
+        raise ConfigError(
+            Problem(problem, "labseq calibrate timing", expected="a grid of at least two sites")
+        )
     sizes = zip(("rows", "cols"), grid.shape, strict=True)
     block = [f"target.{axis}={max(1, 3 * n // 4)}" for axis, n in sizes]
     return [*block, "profile.mobile_tweezers.overhead_per_cycle=0 s"]
@@ -294,8 +288,10 @@ def _target(method: Method, grid: SiteGrid) -> list[str]:
 
 def _repeats(method: Method, grid: SiteGrid) -> list[str]:
     """The override for more repeats on a small grid, so that enough atoms are probed."""
-    n_repeats = math.ceil(PROBED_PER_POINT.get(method.kind, 0) / (grid.n_rows * grid.n_cols))
-    return [f"repeats={n_repeats}"] if n_repeats > FEWEST_REPEATS else []
+    # with so many sites at each point, of which 75 % are loaded, the centre is known to about 35 nm
+    n_sites = {"overlay": 50, "frequencies": 100}.get(method.kind, 0)
+    n_repeats = math.ceil(n_sites / (grid.n_rows * grid.n_cols))
+    return [f"repeats={n_repeats}"] if n_repeats > 4 else []  # their sequences have up to 4
 
 
 def _of_profile(overrides: Sequence[str]) -> list[Override]:
@@ -332,4 +328,4 @@ def _picture(result: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
         return None, ()
     if not can_draw():
         return None, (f"there is no picture: matplotlib is not installed ({install_hint('plot')})",)
-    return encode_figure(result.draw, dpi=PICTURE_DPI), ()
+    return encode_figure(result.draw, dpi=110), ()

@@ -25,11 +25,8 @@ from labseq.sequencer.clock import VirtualClock
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MIN_SATURATED: Final = 20
-"""Saturated pixels that are allowed in any frame: hot pixels and cosmic rays."""
-
 PROBE_ADDRESS: Final = ".probe.offset"
-"""Suffix of the address of a probe's offset among the parameters of a shot."""
+"""Ending of the address of a probe's offset among the parameters of a shot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,30 +77,31 @@ class CalibrationData:
         for shot in self.run.shots:
             frame = read_frames(shot.file).get(0)
             if frame is None:
-                what = f"the first image of shot {shot.index} was not kept"
+                problem = f"the first image of shot {shot.index} was not kept"
                 hint = "take a run with 'record_frames: all'"
-                raise ConfigError(Problem(what, path, expected="a frame of each shot", hint=hint))
+                raise ConfigError(Problem(problem, path, expected="a frame of each shot", hint=hint))
             shape = shape or frame.image.shape
             if frame.image.shape != shape:
                 sizes = f"{shape} and {frame.image.shape}"
                 raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
             n_saturated = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
-            if n_saturated > max(MIN_SATURATED, self.hardware.grid.n_rows * self.hardware.grid.n_cols // 20):
-                what = f"{n_saturated} pixels of the first frame of shot {shot.index} are saturated"
-                raise DeviceError(frame.camera, f"{what}; use less light, gain or exposure")
+            # 20 in any frame may be hot pixels and cosmic rays
+            if n_saturated > max(20, self.hardware.grid.n_rows * self.hardware.grid.n_cols // 20):
+                problem = f"{n_saturated} pixels of the first frame of shot {shot.index} are saturated"
+                raise DeviceError(frame.camera, f"{problem}; use less light, gain or exposure")
             yield frame
 
     def detector(self) -> Detector:
         """The profile's detector, with the calibrations that the analysis uses."""
         hardware = self.hardware
         clock = VirtualClock(StopFlag())
-        made, _ = construct({"detector": hardware.chosen["detector"]}, hardware.context(clock), 0)
-        return made["detector"]
+        plugins, _ = construct({"detector": hardware.chosen["detector"]}, hardware.context(clock), 0)
+        return plugins["detector"]
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """The sequence and the analysis for one kind of calibration.
+    """How one kind of calibration is made: its sequence and its analysis.
 
     Attributes:
         kind: The kind.
@@ -157,14 +155,16 @@ def count_probed(run: Run) -> ProbeCounts:
     """
     counts: dict[tuple[float, float], NDArray[np.int64]] = {}
     for shot in run.shots:
-        offset = next((v for k, v in shot.parameters.items() if k.endswith(PROBE_ADDRESS)), None)
-        seen = shot.occupancies
-        if offset is None or len(seen) < 2:
-            what = "the run does not scan the offset of a probe between two images"
+        values = (value for name, value in shot.parameters.items() if name.endswith(PROBE_ADDRESS))
+        offset, occupancies = next(values, None), shot.occupancies
+        if offset is None or len(occupancies) < 2:
+            problem = "the run does not scan the offset of a probe between two images"
             expected = "one such as 'labseq calibrate overlay' takes"
-            raise ConfigError(Problem(what, str(run.path), expected=expected))
+            raise ConfigError(Problem(problem, str(run.path), expected=expected))
         point = float(offset[0]), float(offset[1])
-        counts[point] = counts.get(point, 0) + np.stack([seen[0], seen[0] & seen[-1]]).astype(np.int64)
+        before, after = occupancies[0], occupancies[-1]
+        # an atom that comes to an empty site meanwhile is not a survivor
+        counts[point] = counts.get(point, 0) + np.stack([before, before & after]).astype(np.int64)
     if not counts:
         expected = "a scan of a probe's offset"
         raise ConfigError(Problem("the run has no shots", str(run.path), expected=expected))

@@ -1,4 +1,4 @@
-"""Evaluates the runs that calibrate sites, tweezers, frequencies and overlay."""
+"""Analyses the runs that calibrate sites, tweezers, frequencies, overlay and timing."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ from labseq.units import format_quantity
 Floats = NDArray[np.float64]
 
 ROUNDS: Final = 30
-SETTLED_M: Final = 0.1e-9
-"""Rounds of the fit of rows and columns, and the step below which it has converged."""
+"""Maximum number of rounds of the fit of rows and columns."""
 KNOWN_BEFORE_M: Final = 0.5e-6
 """Expected distance of a row or column from the common centre, 1 sigma, before the measurement."""
 WORST_ERROR_M: Final = 50e-9
@@ -54,23 +53,23 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     for frame in data.frames():
         total, n_frames = total + frame.image, n_frames + 1
     mean = total / n_frames
-    found = find_lattice(mean, data.hardware.grid, centre_px=data.centre_px)
-    spacings = [each for each in found.spacing_px if np.isfinite(each)]
+    lattice = find_lattice(mean, data.hardware.grid, centre_px=data.centre_px)
+    spacings = [spacing for spacing in lattice.spacing_px if np.isfinite(spacing)]
     figures = {
-        "residual_px": found.residual_px,
-        "n_sites_found": float(found.n_sites_found),
+        "residual_px": lattice.residual_px,
+        "n_sites_found": float(lattice.n_sites_found),
         "spacing_px": float(np.mean(spacings)) if spacings else np.nan,
-        "angle_rad": found.angle_rad,
-        "stretch": found.stretch,
-        "spot_px": found.spot_px,
-        "pixel_size_m": found.pixel_size_m,
+        "angle_rad": lattice.angle_rad,
+        "stretch": lattice.stretch,
+        "spot_px": lattice.spot_px,
+        "pixel_size_m": lattice.pixel_size_m,
     }
     quality = {name: value for name, value in figures.items() if np.isfinite(value)}
     return AnalysisResult(
-        {"positions_px": found.positions_px, "frame": found.frame},
+        {"positions_px": lattice.positions_px, "frame": lattice.frame},
         quality,
-        _summary_lines(found, n_frames),
-        draw=lambda: draw_sites(mean, found.positions_px, found.residuals_px),
+        _summary_lines(lattice, n_frames),
+        draw=lambda: draw_sites(mean, lattice.positions_px, lattice.residuals_px),
     )
 
 
@@ -83,25 +82,28 @@ def read_site_file(path: Path, hardware: ResolvedProfile) -> AnalysisResult:
     settings: Any = hardware.chosen["detector"].settings
     frame = getattr(settings, "frame", None)
     if frame is None:
-        what = "the detector does not say how large the frames are that the sites are on"
-        raise ConfigError(Problem(what, expected="a detector with the setting 'frame'"))
+        problem = "the detector does not say how large the frames are that the sites are on"
+        raise ConfigError(Problem(problem, expected="a detector with the setting 'frame'"))
     positions = read_sites(path, hardware.grid.shape)
     if np.any((positions < 0) | (positions > np.array(frame) - 1)):
-        what = f"some of the sites are outside of the frame of {frame[0]} x {frame[1]} pixels"
-        raise ConfigError(Problem(what, str(path), expected="(y, x) of each site on the frame"))
+        problem = f"some of the sites are outside of the frame of {frame[0]} x {frame[1]} pixels"
+        raise ConfigError(Problem(problem, str(path), expected="(y, x) of each site on the frame"))
     summary_lines = (f"{positions[..., 0].size} sites read from {path}",)
     return AnalysisResult({"positions_px": positions, "frame": frame}, {}, summary_lines)
 
 
-def _summary_lines(found: FoundLattice, n_frames: int) -> tuple[str, ...]:
-    seen = f"{found.n_sites_found} of {found.found.size} sites found on the mean of {n_frames} frames"
-    first = f"{seen}, {found.residual_px:.3f} px r.m.s. from a smooth lattice"
-    ways = zip(found.spacing_px, ("along rows", "from row to row"), strict=True)
+def _summary_lines(lattice: FoundLattice, n_frames: int) -> tuple[str, ...]:
+    count = f"{lattice.n_sites_found} of {lattice.found.size} sites found on the mean of {n_frames} frames"
+    first = f"{count}, {lattice.residual_px:.3f} px r.m.s. from a smooth lattice"
+    ways = zip(lattice.spacing_px, ("along rows", "from row to row"), strict=True)
     spacings = ", ".join(f"{px:.2f} px {way}" for px, way in ways if np.isfinite(px))
     if not spacings:
         return (first,)
-    angle, pixel = format_quantity(found.angle_rad, "angle"), format_quantity(found.pixel_size_m, "length")
-    form = f", stretched by {100 * (found.stretch - 1):.1f} %" if np.isfinite(found.stretch) else ""
+    angle, pixel = (
+        format_quantity(lattice.angle_rad, "angle"),
+        format_quantity(lattice.pixel_size_m, "length"),
+    )
+    form = f", stretched by {100 * (lattice.stretch - 1):.1f} %" if np.isfinite(lattice.stretch) else ""
     size = f"a pixel is {pixel} wide if the grid's spacing is true"
     return first, f"spacing {spacings}; rotated by {angle}{form}; {size}"
 
@@ -112,18 +114,18 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
     Raises:
         ConfigError: No shot of the run equalised the tweezers of this grid.
     """
-    found = _readings(data.run)
+    readings = _readings(data.run)
     rows, cols, before, after = (
-        np.array(found[name], np.float64)
+        np.array(readings[name], np.float64)
         for name in ("row_amplitudes", "column_amplitudes", "power_before", "power_after")
     )
     if (len(rows), len(cols)) != data.hardware.grid.shape:
         raise _wrong_run(data.run, f"it equalised {len(rows)} x {len(cols)} tweezers")
     names = ("separable_spread", "residual_spread", "noise", "n_measured")
-    quality = {name: float(found[name]) for name in names}
-    n_rounds = len(found["spreads"])
-    work = f"{n_rounds} round{'s' * (n_rounds > 1)}, {found['n_measured']} measurements"
-    spread = f"{quality['separable_spread']:.2%} (before: {found['spreads'][0]:.2%})"
+    quality = {name: float(readings[name]) for name in names}
+    n_rounds = len(readings["spreads"])
+    work = f"{n_rounds} round{'s' * (n_rounds > 1)}, {readings['n_measured']} measurements"
+    spread = f"{quality['separable_spread']:.2%} (before: {readings['spreads'][0]:.2%})"
     return AnalysisResult(
         {"row_amplitudes": rows, "column_amplitudes": cols},
         quality,
@@ -136,7 +138,7 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
 
 
 def analyse_timing(data: CalibrationData) -> AnalysisResult:
-    """Find how long a cycle takes to the light, from the start of the rearrangement.
+    """Find the time from the start of a rearrangement cycle until its light is on.
 
     The stage ``light`` of a shot counts from the frame, and so includes the detection. The clock of a
     simulated run stands still while the computer works; there the computer's time is added.
@@ -154,8 +156,8 @@ def analyse_timing(data: CalibrationData) -> AnalysisResult:
                 host_s = stage.host_s - detect.host_s if data.run.simulated else 0.0
                 taken_s.append(stage.duration_s - detect.duration_s + host_s)
     if not taken_s:
-        text = "no shot of it moved atoms; choose a target that random loadings do not meet"
-        raise ConfigError(Problem(text, str(data.run.path), expected="a run that rearranges"))
+        problem = "no shot of it moved atoms; choose a target that random loadings do not meet"
+        raise ConfigError(Problem(problem, str(data.run.path), expected="a run that rearranges"))
     median_s, p99_s = (float(value) for value in np.quantile(taken_s, (0.5, 0.99)))
     median, p99 = (format_quantity(value, "time") for value in (median_s, p99_s))
     return AnalysisResult(
@@ -168,14 +170,20 @@ def analyse_timing(data: CalibrationData) -> AnalysisResult:
 def _readings(run: Run) -> dict[str, Any]:
     """The readings of ``equalise`` in the last shot that has them."""
     for shot in reversed(run.shots):
-        found = {k.removeprefix(READINGS): v for k, v in shot.readings.items() if k.startswith(READINGS)}
-        if found:
-            return found
+        readings = {
+            name.removeprefix(READINGS): value
+            for name, value in shot.readings.items()
+            if name.startswith(READINGS)
+        }
+        if readings:
+            return readings
     raise _wrong_run(run, "no shot of it equalised the tweezers")
 
 
-def _wrong_run(run: Run, what: str) -> ConfigError:
-    return ConfigError(Problem(what, str(run.path), expected="a run with the step 'equalise', on this grid"))
+def _wrong_run(run: Run, problem: str) -> ConfigError:
+    return ConfigError(
+        Problem(problem, str(run.path), expected="a run with the step 'equalise', on this grid")
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,10 +258,11 @@ def fit_frequencies(
     ]
     fit = FrequenciesFit(hz[0], hz[1], -rows_m, -columns_m, row_error_m, column_error_m, overlay)
     if fit.error_m > worst_error_m:
-        known, wanted = (format_quantity(m, "length") for m in (fit.error_m, worst_error_m))
-        more = math.ceil((fit.error_m / worst_error_m) ** 2)
-        text = f"rows and columns are known to {known} only; for {wanted} take {more} times as many `repeats`"
-        raise DeviceError("mobile_tweezers", f"no frequencies found: too few atoms: {text}")
+        reached, required = (format_quantity(m, "length") for m in (fit.error_m, worst_error_m))
+        factor = math.ceil((fit.error_m / worst_error_m) ** 2)
+        problem = f"no frequencies found: too few atoms: rows and columns are only known to {reached}"
+        remedy = f"for {required} take {factor} times as many `repeats`"
+        raise DeviceError("mobile_tweezers", f"{problem}; {remedy}")
     return fit
 
 
@@ -289,8 +298,8 @@ def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
         low, high = (middle, high) if is_too_small else (low, middle)
     variance = errors**2 + high**2
     curve, curve_variance = _through(basis, values, variance)
-    own = np.where(np.abs(values - curve) > 3 * np.sqrt(variance), 1.0, high**2 / variance)
-    return curve + own * (values - curve), np.sqrt(own * errors**2 + (1 - own) ** 2 * curve_variance)
+    weight = np.where(np.abs(values - curve) > 3 * np.sqrt(variance), 1.0, high**2 / variance)
+    return curve + weight * (values - curve), np.sqrt(weight * errors**2 + (1 - weight) ** 2 * curve_variance)
 
 
 def _through(basis: Floats, values: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -308,22 +317,24 @@ def _centres(
     centres, n_cols = common.copy(), grid.n_cols
     spread: Floats = np.zeros((len(centres), len(centres)))
     for _ in range(ROUNDS):
-        of_site = np.stack(np.broadcast_arrays(centres[:n_cols], centres[n_cols:, None]), axis=-1)
-        p, slopes = _slopes(offset[:, None, None] - of_site, overlay.shape, grid)
+        site_centres = np.stack(np.broadcast_arrays(centres[:n_cols], centres[n_cols:, None]), axis=-1)
+        p, slopes = _slopes(offset[:, None, None] - site_centres, overlay.shape, grid)
         certainty, surprise = n / (p * (1 - p)), (k - n * p) / (p * (1 - p))
         information = np.zeros_like(spread)
         crossed = (certainty * slopes[..., 0] * slopes[..., 1]).sum(axis=0)
         information[n_cols:, :n_cols], information[:n_cols, n_cols:] = crossed, crossed.T
         squared = (certainty[..., None] * slopes**2).sum(axis=0)
-        own = np.concatenate([squared[..., 0].sum(axis=0), squared[..., 1].sum(axis=1)])
-        np.fill_diagonal(information, own + KNOWN_BEFORE_M**-2)
+        diagonal = np.concatenate([squared[..., 0].sum(axis=0), squared[..., 1].sum(axis=1)])
+        np.fill_diagonal(information, diagonal + KNOWN_BEFORE_M**-2)
         pull = (surprise[..., None] * slopes).sum(axis=0)
         force = np.concatenate([pull[..., 0].sum(axis=0), pull[..., 1].sum(axis=1)])
         spread = np.asarray(np.linalg.inv(information), np.float64)
         step = spread @ (force - (centres - common) * KNOWN_BEFORE_M**-2)
+        # a first step from far out would jump over the peak
         centres += np.clip(step, -overlay.shape.edge_m, overlay.shape.edge_m)
-        if np.abs(step).max() < SETTLED_M:
+        if np.abs(step).max() < 0.1e-9:
             break
+    # the excess scatter is that of single sites, over which a row or column averages
     excess = 1 + (overlay.dispersion - 1) / min(grid.shape)
     return centres[:n_cols], centres[n_cols:], spread * excess
 

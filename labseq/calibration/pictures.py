@@ -19,10 +19,6 @@ Floats = NDArray[np.float64]
 
 WIDTH_IN: Final = 9.0
 N_BINS: Final = 120
-ARROW_SPACINGS: Final = 0.5
-"""Length of the longest arrow, in spacings."""
-MARGIN_SPACINGS: Final = 2.0
-"""Margin around the outermost sites, in spacings."""
 SITE, ARROW = "#e8a33d", "#c8102e"
 
 
@@ -36,7 +32,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
     """
     spacing = _spacing_px(positions_px)
     y, x = positions_px.reshape(-1, 2).T
-    room = MARGIN_SPACINGS * spacing
+    room = 2.0 * spacing
     wide, high = np.ptp(x) + 2 * room, np.ptp(y) + 2 * room
     figure = make_figure(WIDTH_IN, WIDTH_IN * high / wide + 0.6, layout="constrained")
     axes = figure.add_subplot()
@@ -44,12 +40,12 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
     axes.imshow(mean, cmap="gray", vmin=dark, vmax=max(bright, dark + 1e-9), interpolation="nearest")
     axes.set_xlim(x.min() - room, x.max() + room)
     axes.set_ylim(y.max() + room, y.min() - room)
-    found = np.isfinite(residuals_px[..., 0]).ravel()
+    has_spot = np.isfinite(residuals_px[..., 0]).ravel()
     size = 0.6 * spacing / wide * WIDTH_IN * 72
-    for here, marker, label in ((found, "o", "site"), (~found, "x", "site without a spot")):
-        if here.any():
+    for selected, marker, label in ((has_spot, "o", "site"), (~has_spot, "x", "site without a spot")):
+        if selected.any():
             axes.plot(
-                *(x[here], y[here], marker),
+                *(x[selected], y[selected], marker),
                 label=label,
                 color=SITE,
                 markersize=size,
@@ -57,7 +53,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
                 markeredgewidth=0.8,
             )
     axes.plot(x[:1], y[:1], "s", color=SITE, markersize=1.4 * size, fillstyle="none", label="row 0, column 0")
-    longest = _draw_arrows(axes, x[found], y[found], residuals_px.reshape(-1, 2)[found], spacing)
+    longest = _draw_arrows(axes, x[has_spot], y[has_spot], residuals_px.reshape(-1, 2)[has_spot], spacing)
     axes.set_title(f"arrows: distance of spots from their sites, {longest:.2g} px at most")
     axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.legend(loc="upper right", fontsize="small", markerscale=0.5)
@@ -68,7 +64,8 @@ def _draw_arrows(axes: Axes, x: Floats, y: Floats, off_px: Floats, spacing_px: f
     """Draw the distances of spots from their sites, enlarged; return the longest, in pixels."""
     longest = float(np.hypot(*off_px.T).max(initial=0.0))
     if longest > 0:
-        along_y, along_x = ARROW_SPACINGS * spacing_px / longest * off_px.T
+        # the longest is as long as half a spacing
+        along_y, along_x = 0.5 * spacing_px / longest * off_px.T
         to_scale: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
         axes.quiver(x, y, along_x, along_y, color=ARROW, width=0.0015, **to_scale)
     return longest
@@ -90,7 +87,7 @@ def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
     above.axvspan(float(thresholds.min()), float(thresholds.max()), color=SITE, alpha=0.5, label="thresholds")
     above.set(xlabel=f"signal of all sites ({unit})", ylabel="signals")
     by_site = signals.reshape(len(signals), -1).T
-    counts = np.stack([np.histogram(of_site, edges)[0] for of_site in by_site], axis=1)
+    counts = np.stack([np.histogram(site_signals, edges)[0] for site_signals in by_site], axis=1)
     extent = (-0.5, len(by_site) - 0.5, low, high)
     below.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
     site = np.arange(len(by_site))
@@ -109,7 +106,6 @@ def _spacing_px(positions_px: Floats) -> float:
 
 
 DIRECTIONS: Final = ("along a row", "from row to row")
-ON_LINE_M: Final = 1e-9
 POINT, CURVE = "#1b5e8c", "#c8102e"
 
 
@@ -130,8 +126,10 @@ def draw_survival(
     figure = make_figure(8.0, 4.0, layout="constrained")
     middle = np.median(offset_m, axis=0)
     for axis, axes in enumerate(figure.subplots(1, 2, sharey=True)):
-        on_line = np.abs(offset_m[:, 1 - axis] - middle[1 - axis]) < ON_LINE_M
+        # the scan is a cross: only the points of its arm along this axis, apart from rounding
+        on_line = np.abs(offset_m[:, 1 - axis] - middle[1 - axis]) < 1e-9
         x_m, n, k = offset_m[on_line, axis], np.maximum(n_before[on_line], 1), n_survived[on_line]
+        # half an atom is added to both counts: the error is not 0 where all survive
         error = np.sqrt((k + 0.5) * (n - k + 0.5) / (n + 1)) / (n + 1)
         axes.errorbar(1e6 * x_m, k / n, error, fmt="o", color=POINT, markersize=4, label="atoms")
         line_m = np.repeat(middle[None], 200, axis=0)
@@ -160,8 +158,6 @@ def draw_tone_offsets(rows: tuple[Floats, Floats], columns: tuple[Floats, Floats
 
 
 SIZE_IN: Final = (8.4, 5.6)
-MIN_RANGE: Final = 0.05
-"""Minimum range of the colour scale, as deviation from the mean."""
 
 
 def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Figure:
@@ -176,10 +172,13 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
     figure = make_figure(*SIZE_IN, layout="constrained")
     panels = figure.subplots(2, 2, height_ratios=(2.2, 1.0))
     maps = [power / np.nanmean(power) - 1 for power in (before, after)]
-    most = max(MIN_RANGE, *(float(np.nanmax(np.abs(each))) for each in maps))
-    for axes, each, title in zip(panels[0], maps, ("before", "after"), strict=True):
-        axes.imshow(100 * each, cmap="RdBu_r", vmin=-100 * most, vmax=100 * most)
-        axes.set(title=f"{title}: {100 * float(np.nanstd(each)):.1f} % r.m.s.", xlabel="column", ylabel="row")
+    # at least 5 %, or noise would look like a pattern
+    most = max(0.05, *(float(np.nanmax(np.abs(deviation))) for deviation in maps))
+    for axes, deviation, title in zip(panels[0], maps, ("before", "after"), strict=True):
+        axes.imshow(100 * deviation, cmap="RdBu_r", vmin=-100 * most, vmax=100 * most)
+        axes.set(
+            title=f"{title}: {100 * float(np.nanstd(deviation)):.1f} % r.m.s.", xlabel="column", ylabel="row"
+        )
         _count(axes.xaxis)
         _count(axes.yaxis)
     bar = figure.colorbar(panels[0][0].images[0], ax=panels[0], shrink=0.9)

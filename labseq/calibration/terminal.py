@@ -49,18 +49,18 @@ class CalibrationRow:
     picture: Path | None = None
 
     @classmethod
-    def of(cls, calibration: Stored | Damaged, used: Mapping[str, str]) -> CalibrationRow:
-        """An entry of a store; ``used`` as :func:`in_use` returns it."""
+    def of(cls, calibration: Stored | Damaged, files_in_use: Mapping[str, str]) -> CalibrationRow:
+        """An entry of a store; ``files_in_use`` as :func:`in_use` returns it."""
         path = calibration.path
         if isinstance(calibration, Damaged):
-            is_used = used.get(calibration.kind) == path.name
+            is_used = files_in_use.get(calibration.kind) == path.name
             return cls(calibration.kind, calibration.id, path, is_used, str(calibration.error))
         entry = calibration.entry
         return cls(
             kind=entry.kind,
             id=entry.id,
             file=path,
-            in_use=used.get(entry.kind) == path.name,
+            in_use=files_in_use.get(entry.kind) == path.name,
             taken_utc=entry.taken_utc,
             age_s=age_s(entry),
             quality=entry.quality,
@@ -91,7 +91,7 @@ class CalibrationList:
     """The calibrations of a profile, oldest first.
 
     Attributes:
-        problems: Why it cannot be said which are in use.
+        problems: Why it is unknown which are in use.
     """
 
     folder: Path
@@ -120,10 +120,10 @@ def list_calibrations(profile: str, dry_run: DryRun, *, as_json: bool) -> None:
     store, spec = open_store(profile, dry_run)
     problems = list[str]()
     try:
-        used = in_use(store, spec.calibrations.use)
+        files_in_use = in_use(store, spec.calibrations.use)
     except ConfigError as error:
-        used, problems = {}, [str(error)]
-    rows = [CalibrationRow.of(calibration, used) for calibration in store.entries()]
+        files_in_use, problems = {}, [str(error)]
+    rows = [CalibrationRow.of(calibration, files_in_use) for calibration in store.entries()]
     print_report(CalibrationList(store.folder, rows, problems), as_json=as_json)
 
 
@@ -150,17 +150,17 @@ class CalibrationDetails(CalibrationRow):
         )
 
 
-def show_calibration(wanted: str, profile: str, dry_run: DryRun, *, as_json: bool) -> None:
+def show_calibration(calibration_id: str, profile: str, dry_run: DryRun, *, as_json: bool) -> None:
     """Print one calibration.
 
     Raises:
         ConfigError: There is no such calibration, there are several, or it is damaged.
     """
     store, spec = open_store(profile, dry_run)
-    stored = store.find(wanted)
+    stored = store.find(calibration_id)
     row = CalibrationRow.of(stored, in_use(store, spec.calibrations.use))
-    shown = {field.name: getattr(row, field.name) for field in fields(row)}
-    print_report(CalibrationDetails(**shown, values=stored.entry.values), as_json=as_json)
+    values = {field.name: getattr(row, field.name) for field in fields(row)}
+    print_report(CalibrationDetails(**values, values=stored.entry.values), as_json=as_json)
 
 
 def use_calibration(choice: str, profile: str, dry_run: DryRun, *, force: bool) -> None:
@@ -185,21 +185,21 @@ def use_calibration(choice: str, profile: str, dry_run: DryRun, *, force: bool) 
 
 
 def compare_calibrations(before: str, after: str, profile: str, dry_run: DryRun, *, as_json: bool) -> None:
-    """Print what changed from one calibration to another.
+    """Print the changes from one calibration to another.
 
     Raises:
         ConfigError: They are of different kinds, or one cannot be read.
     """
     store, _ = open_store(profile, dry_run)
-    one, other = store.find(before).entry, store.find(after).entry
-    ends = f"{one.id} ({_time_text(one.taken_utc)}) to {other.id} ({_time_text(other.taken_utc)})"
-    change = Change(one.kind, one.id, other.id, ends, *compare(one, other))
+    earlier, later = store.find(before).entry, store.find(after).entry
+    ends = f"{earlier.id} ({_time_text(earlier.taken_utc)}) to {later.id} ({_time_text(later.taken_utc)})"
+    change = Change(earlier.kind, earlier.id, later.id, ends, *compare(earlier, later))
     print_report(change, as_json=as_json)
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What changed from one calibration to another.
+    """The changes from one calibration to another.
 
     Attributes:
         before: Id of the earlier one.
@@ -237,14 +237,14 @@ FIGURES: Final[Sequence[Column[Difference]]] = (
 
 def in_use(store: Store, choices: CalibrationChoices) -> dict[str, str]:
     """Kind -> file name of the calibration in use."""
-    used = {kind: one.file for kind, one in store.active().items()}
+    files = {kind: active.file for kind, active in store.active().items()}
     for kind in CALIBRATION_KINDS:
         pin = choices.of(kind)
         if pin == OFF:
-            used.pop(kind, None)
+            files.pop(kind, None)
         elif pin is not None:
-            used[kind] = store.find(pin, kind).path.name
-    return used
+            files[kind] = store.find(pin, kind).path.name
+    return files
 
 
 def _kind(name: str, value: str) -> CalibrationKind:
@@ -253,8 +253,8 @@ def _kind(name: str, value: str) -> CalibrationKind:
             return kind
     if name in CALIBRATION_KINDS:
         raise ConfigError(Problem(f"{name} is '{clean(value)}'", expected=f"'{OFF}', or just an id"))
-    what, hint = f"'{clean(name)}' is not a kind of calibration", did_you_mean(name, CALIBRATION_KINDS)
-    raise ConfigError(Problem(what, expected=listing(CALIBRATION_KINDS), hint=hint))
+    problem, hint = f"'{clean(name)}' is not a kind of calibration", did_you_mean(name, CALIBRATION_KINDS)
+    raise ConfigError(Problem(problem, expected=listing(CALIBRATION_KINDS), hint=hint))
 
 
 def _summary(name: str, value: NDArray[np.float64]) -> str:
@@ -268,7 +268,7 @@ def _summary(name: str, value: NDArray[np.float64]) -> str:
 def _origin_text(value: Any) -> str:
     if isinstance(value, Mapping):
         items = cast("Mapping[str, Any]", value).items()
-        return ", ".join(f"{name} {each}" for name, each in items) or "-"
+        return ", ".join(f"{name} {item}" for name, item in items) or "-"
     return clean(str(value))
 
 
@@ -276,10 +276,6 @@ def _time_text(taken_utc: str | None) -> str:
     if taken_utc is None:
         return "-"
     return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # in one piece
-
-
-N_MARKS: Final = 10
-"""Number of progress lines of a run."""
 
 
 def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> None:
@@ -297,17 +293,17 @@ def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> 
     with reporting(as_json=as_json, failed=failed) as show:
         method = METHODS.get(kind)
         if method is None:
-            what, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
-            raise ConfigError(Problem(what, expected=listing(METHODS), hint=hint))
+            problem, hint = f"'{clean(kind)}' cannot be calibrated", did_you_mean(kind, METHODS)
+            raise ConfigError(Problem(problem, expected=listing(METHODS), hint=hint))
         outcome = calibrate(method, request, _Progress())
         show(Calibrated.of(outcome))
     if outcome.refused:
         entry = outcome.stored.entry
-        what = f"{entry.kind} {entry.id} is stored but not in use: {outcome.refused}"
+        problem = f"{entry.kind} {entry.id} is stored but not in use: {outcome.refused}"
         options = f"--force --profile {quote(request.profile)}"
         options += "" if request.dry_run == "off" else " --dry-run"
         hint = f"look at it, then 'labseq calibration use {entry.id} {options}'"
-        raise ConfigError(Problem(what, hint=hint))
+        raise ConfigError(Problem(problem, hint=hint))
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,6 +379,6 @@ class _Progress(LogLines):
             self._n_shots = values["record"].n_shots
         elif name == "shot_finished":
             self._n_done += 1
-            n, before = (k * N_MARKS // self._n_shots for k in (self._n_done, self._n_done - 1))
+            n, before = (k * 10 // self._n_shots for k in (self._n_done, self._n_done - 1))
             if n > before:
                 say(f"{self._n_done} of {self._n_shots} shots", stream=sys.stderr)

@@ -22,15 +22,6 @@ OUTER: Final = 0.5
 FLATTEST: Final = 1e-5
 """Skewness below which a peak is treated as a Gaussian."""
 MIN_FRAMES: Final = 30
-MIN_IN_PEAK: Final = 5
-APART: Final = 3.0
-"""Minimum distance of two peaks, in their combined widths; a single peak cut in two has 2."""
-FAINT: Final = 0.4
-"""Minimum distance of a site's peaks, relative to the usual distance."""
-MAX_ONE_PEAK: Final = 0.2
-"""Maximum fraction of sites with a single peak; one site is always allowed."""
-N_NEIGHBOURS: Final = 8
-"""Number of sites with two peaks, the nearest ones, from which a site with one takes the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +124,14 @@ def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: 
         below = (1 - full) * shapes.empty.below(ends)[0] + 1e-12
         above = full * shapes.full.above(ends)[1] + 1e-12
         outer = n_low * np.log((1 - shapes.between) * below) + n_high * np.log((1 - shapes.between) * above)
+        # 1e-7: a stray signal far from both peaks must not decide the fit
         return -float(counts @ np.log(density + 1e-7) + outer)
 
     full = np.clip(loading, 0.02, 0.98)
     start = np.array(
         [0.0, np.log(width_empty), 0.3, 1.0, np.log(width_full), 0.3, np.log(full / (1 - full)), -6.0]
     )
+    # the minimiser expects steps of about 1 in each parameter
     unit = np.array([width_empty / 3, 0.1, 0.3, width_full / 3, 0.1, 0.3, 0.3, 1.0])
     bounds = _bounds(start) / unit[:, None]
     options = {"maxiter": 500, "ftol": 1e-13, "gtol": 1e-3}
@@ -146,8 +139,8 @@ def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: 
     def in_units(x: Floats) -> float:
         return unlikelihood(x * unit)
 
-    found = minimize(in_units, start / unit, method="L-BFGS-B", bounds=bounds, options=options)
-    return _shapes(found.x * unit)[0]
+    result = minimize(in_units, start / unit, method="L-BFGS-B", bounds=bounds, options=options)
+    return _shapes(result.x * unit)[0]
 
 
 def _bounds(start: Floats) -> Floats:
@@ -158,6 +151,8 @@ def _bounds(start: Floats) -> Floats:
 
 
 def _shapes(x: Floats) -> tuple[Shapes, float]:
+    """The shapes that the parameters of the fit describe, and the fraction in the upper peak."""
+    # any number is allowed: widths are given as logarithms, fractions as log-odds
     empty = Peak(float(x[0]), float(np.exp(x[1])), float(x[2]))
     full = Peak(float(x[3]), float(np.exp(x[4])), float(x[5]))
     return Shapes(empty, full, float(1 / (1 + np.exp(-x[7])))), float(1 / (1 + np.exp(-x[6])))
@@ -195,7 +190,10 @@ class FittedThresholds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SitePeaks:
-    """The two peaks of each site, float64 (n_sites,); ``two``: sites with both peaks, bool (n_sites,)."""
+    """The two peaks of each site: positions, widths and numbers of signals, float64 (n_sites,).
+
+    ``two`` is true for the sites that show both peaks, bool (n_sites,).
+    """
 
     empty: Floats
     full: Floats
@@ -229,7 +227,7 @@ def fit_thresholds(signals: Floats, miss_cost: float = 3.0) -> FittedThresholds:
     if n_frames < MIN_FRAMES:
         raise LimitError("the number of frames for thresholds", n_frames, f"{MIN_FRAMES} or more")
     if not 0 < miss_cost < np.inf:
-        raise LimitError("the cost of a missed atom", miss_cost, "more than 0 imagined ones")
+        raise LimitError("the cost of a missed atom", miss_cost, "more than 0 false detections")
     by_site = np.ascontiguousarray(signals.reshape(n_frames, -1).T, np.float64)
     if not np.isfinite(by_site).all():
         raise DeviceError("detector", "some of the signals are not finite numbers; no thresholds fitted")
@@ -263,10 +261,10 @@ def _site_peaks(by_site: Floats) -> _SitePeaks:
     parts = [_moments(by_site, part) for part in (by_site <= cut[:, None], by_site > cut[:, None])]
     (empty, width_empty, n_empty), (full, width_full, n_full) = parts
     apart = (full - empty) / np.maximum(np.hypot(width_empty, width_full), 1e-300)
-    few = np.minimum(n_empty, n_full) < MIN_IN_PEAK
-    two = np.isfinite(apart) & (apart > APART) & ~few
-    if two.any():
-        two &= full - empty > FAINT * np.median((full - empty)[two])
+    few = np.minimum(n_empty, n_full) < 5
+    two = np.isfinite(apart) & (apart > 3.0) & ~few  # a single peak cut in two has 2.0
+    if two.any():  # peaks much closer than usual are not those of an empty and a full site
+        two &= full - empty > 0.4 * np.median((full - empty)[two])
     return _SitePeaks(empty, full, width_empty, width_full, n_empty, n_full, two)
 
 
@@ -281,6 +279,7 @@ def _moments(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
     """Mean and standard deviation without outliers, and the number of signals."""
     middle = _middle(by_site, part)
     off = np.abs(by_site - middle[:, None])
+    # 1.4826: a Gaussian's standard deviation in median absolute deviations
     near = part & (off < 4 * 1.4826 * _middle(off, part)[:, None] + 1e-12)
     n = near.sum(axis=1).astype(np.float64)
     count = np.maximum(n, 1)
@@ -291,7 +290,8 @@ def _moments(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
 
 def _check_enough(two: Bools, by_site: Floats) -> None:
     n_one = int((~two).sum())
-    if n_one > max(1.0, MAX_ONE_PEAK * len(two)) or not two.any():
+    # one site of a small array may always be broken, and one in five of a large one
+    if n_one > max(1.0, 0.2 * len(two)) or not two.any():
         remedy = "check the loading, the light, and that the sites are where the atoms are"
         if np.ptp(by_site) == 0:
             remedy = "all signals are equal: black or saturated frames"
@@ -311,6 +311,7 @@ def _with_single_peaks(
         for width, n in ((peaks.width_empty, peaks.n_empty), (peaks.width_full, peaks.n_full))
     )
     empty, full = _shrunk(peaks.empty, error_empty, two), _shrunk(peaks.full, error_full, two)
+    # the standard error of a width is 0.71 of that of the mean for a Gaussian, more for a skewed peak
     width_empty = _shrunk(peaks.width_empty, 0.85 * error_empty, two)
     width_full = _shrunk(peaks.width_full, 0.85 * error_full, two)
     near_empty, near_full = (_of_neighbours(values, two, shape) for values in (empty, full))
@@ -323,11 +324,11 @@ def _with_single_peaks(
 
 
 def _of_neighbours(values: Floats, known: Bools, shape: tuple[int, int]) -> Floats:
-    """For each site the median of the nearest sites whose values are known."""
+    """For each site the median of the eight nearest sites whose values are known."""
     from scipy.spatial import KDTree
 
     site = np.stack(np.unravel_index(np.arange(len(values)), shape), axis=1)
-    n = min(N_NEIGHBOURS, int(known.sum()))
+    n = min(8, int(known.sum()))
     _, nearest = KDTree(site[known]).query(site, k=n)
     return np.median(values[known][np.asarray(nearest).reshape(-1, n)], axis=1)
 
@@ -353,27 +354,24 @@ def _cheapest(
 ) -> tuple[Floats, Floats, Floats]:
     """Threshold of each site between 0 and 1, and probabilities of a missed atom and a false detection."""
     at = np.linspace(0.02, 0.98, 1921)
+    # widths in steps of 2.5 %: sites of nearly the same width share a curve, instead of one for each site
     steps = np.exp(np.linspace(np.log(0.5), np.log(2.0), 57))
     imagined = np.stack([shapes.empty.widened(step).above(at) for step in steps])
     missed = np.stack([shapes.full.widened(step).below(at) for step in steps])
-    found = list[tuple[float, float, float]]()
+    rows = list[tuple[float, float, float]]()
     places = np.arange(len(steps))
-    for of_empty, of_full in zip(ratio_empty, ratio_full, strict=True):
-        i, j = (int(np.rint(np.interp(np.log(r), np.log(steps), places))) for r in (of_empty, of_full))
+    for ratio_of_empty, ratio_of_full in zip(ratio_empty, ratio_full, strict=True):
+        i, j = (
+            int(np.rint(np.interp(np.log(r), np.log(steps), places))) for r in (ratio_of_empty, ratio_of_full)
+        )
         best = int(np.argmin(imagined[i] + miss_cost * missed[j]))
-        found.append((float(at[best]), float(missed[j, best]), float(imagined[i, best])))
-    at_best, missed_best, imagined_best = np.array(found).T
+        rows.append((float(at[best]), float(missed[j, best]), float(imagined[i, best])))
+    at_best, missed_best, imagined_best = np.array(rows).T
     return at_best, missed_best, imagined_best
 
 
 ENOUGH_SIGNALS: Final = 4000
 """Signals of all sites together; with fewer, thresholds may cost more than 1.3 times the best."""
-
-CHANCE: Final = 1e-3
-"""Probability that any site of an array counts as one that is never, or always, loaded only by chance."""
-
-MAX_NAMED: Final = 8
-"""Maximum number of sites that a message lists; for more, it gives only their number."""
 
 
 def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
@@ -385,10 +383,10 @@ def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
         LimitError: There are too few frames.
         ConfigError: The detector does not report its signals, or the run has no frames.
     """
-    detector, chosen = data.detector(), data.hardware.chosen["detector"]
+    detector, choice = data.detector(), data.hardware.chosen["detector"]
     if not isinstance(detector, ReportsSignals):
-        what = f"the detector '{chosen.entry.name}' does not report the signals that it compares"
-        raise ConfigError(Problem(what, expected="'threshold', 'weighted', or another that does"))
+        problem = f"the detector '{choice.entry.name}' does not report the signals that it compares"
+        raise ConfigError(Problem(problem, expected="'threshold', 'weighted', or another that does"))
     signals = np.stack([detector.signals(frame) for frame in data.frames()])
     fitted, unit = fit_thresholds(signals), detector.signal_unit
     quality = {
@@ -402,19 +400,20 @@ def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
         {"thresholds": fitted.thresholds},
         quality,
         _summary_lines(fitted, len(signals), unit),
-        {"unit": unit, "detector": chosen.dump()},
+        {"unit": unit, "detector": choice.dump()},
         lambda: draw_thresholds(signals, fitted.thresholds, unit),
     )
 
 
 def _n_not_by_chance(fitted: FittedThresholds, n_frames: int) -> int:
-    """Number of sites with one peak whose loading differs from the others' by more than chance explains."""
+    """Number of sites with one peak whose loading differs from the usual by more than chance explains."""
     from scipy.special import bdtr, bdtrc  # importing scipy.stats would take a second
 
     n_full, usual = np.rint(fitted.loading * n_frames), float(np.median(fitted.loading))
     chance = np.minimum(bdtr(n_full, n_frames, usual), bdtrc(n_full - 1, n_frames, usual))
     one_peak = fitted.never_loaded | fitted.always_loaded
-    return int(np.count_nonzero(one_peak & (chance < CHANCE / one_peak.size)))
+    # in one array of a thousand, a site is counted that is only by chance never, or always, loaded
+    return int(np.count_nonzero(one_peak & (chance < 1e-3 / one_peak.size)))
 
 
 def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[str, ...]:
@@ -429,16 +428,16 @@ def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[
         n_shots = -(-ENOUGH_SIGNALS // fitted.loading.size)
         text = "few signals: thresholds and expected errors may be far off; take"
         lines.append(f"warning: {text} --shots {n_shots}")
-    for sites, what in ((fitted.never_loaded, "never"), (fitted.always_loaded, "always")):
+    for sites, word in ((fitted.never_loaded, "never"), (fitted.always_loaded, "always")):
         if sites.any():
             lines.append(
-                f"warning: {_named(sites)} {what} loaded; the missing peak is that of the neighbours"
+                f"warning: {_named(sites)} {word} loaded; the missing peak is that of the neighbours"
             )
     return tuple(lines)
 
 
 def _named(sites: NDArray[np.bool_]) -> str:
     places = [f"({row}, {col})" for row, col in np.argwhere(sites)]
-    if len(places) > MAX_NAMED:
+    if len(places) > 8:
         return f"{len(places)} sites were"
     return f"site {places[0]} was" if len(places) == 1 else f"sites {', '.join(places)} were"

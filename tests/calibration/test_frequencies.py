@@ -84,7 +84,7 @@ def test_a_row_without_atoms_takes_the_place_of_its_neighbours(atoms: Any) -> No
 def test_too_few_atoms_are_refused(atoms: Any) -> None:
     rng = np.random.default_rng(6)
     offset, n, k = probe(atoms, np.zeros(12), np.zeros(16), 4, rng)
-    with pytest.raises(DeviceError, match=r"rows and columns are known to .* nm only; for .* take \d+ times"):
+    with pytest.raises(DeviceError, match=r"rows and columns are only known to .* nm; for .* take \d+ times"):
         fit_frequencies(offset, n, k, GRID, MOTION, worst_error_m=0.5e-9)
 
 
