@@ -34,7 +34,7 @@ from labseq.bench.comparison import (
     PlannerEntry,
     read_comparison,
 )
-from labseq.bench.planners import Where, compare
+from labseq.bench.planners import Resources, compare
 from labseq.bench.report import Report, Row, draw_histogram
 from labseq.model.estimate import Estimate
 from labseq.units import format_quantity
@@ -55,7 +55,7 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def planners(n_loadings: int) -> list[str]:
     """All planners side by side, one after the other so that times are true."""
     comparison = read_comparison(planners=PLANNERS, dop="15", loadings=n_loadings)
-    report = compare(comparison, Where(1))
+    report = compare(comparison, Resources(1))
     header = (
         "planner",
         "batches",
@@ -92,7 +92,7 @@ def sizes(n_loadings: int) -> list[str]:
     for grid, side in SIZES:
         target = f"{{pattern: compact, rows: {side}, cols: {side}}}"
         comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop="15", loadings=n_loadings)
-        (row,) = compare(comparison, Where(1)).rows
+        (row,) = compare(comparison, Resources(1)).rows
         times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
         rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])
     command = 'labseq bench planners --dop 15 --grid 64x64 --target "{pattern: compact, rows: 48, cols: 48}"'
@@ -395,7 +395,7 @@ def measure_figure(
     conditions = tuple(replace(one, motion=(*one.motion, *motion)) for one in figure.conditions)
     called = f"figure {figure.name}"
     comparison = Comparison(figure.planner_entries, conditions, n_loadings, 1, (), called)
-    return compare(comparison, Where(n_workers))
+    return compare(comparison, Resources(n_workers))
 
 
 def figure_lines(figure: Figure, report: Report, n_loadings: int) -> list[str]:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -41,33 +41,33 @@ Examples:
 """
 
 
-_STEPS: Final = 10
-"""Number of progress lines without a terminal."""
-
-
 @contextmanager
-def progress_of(what: str) -> Generator[Callable[[int, int], None]]:
-    """A progress bar on stderr if that is a terminal, else a line for every tenth; ``what`` is counted."""
+def progress_of(unit: str) -> Generator[Callable[[int, int], None]]:
+    """A progress bar on stderr if that is a terminal, else a line for every tenth.
+
+    Args:
+        unit: What is counted, in the plural.
+    """
     from labseq.console.output import say
 
     if not sys.stderr.isatty():
         reported = 0
 
-        def report_progress(done: int, wanted: int) -> None:
+        def report_progress(done: int, total: int) -> None:
             nonlocal reported
-            if done * _STEPS // wanted > reported:
-                reported = done * _STEPS // wanted
-                say(f"{done} of {wanted} {what}", stream=sys.stderr)
+            if done * 10 // total > reported:
+                reported = done * 10 // total
+                say(f"{done} of {total} {unit}", stream=sys.stderr)
 
         yield report_progress
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    parts = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, wanted: bar.update(task, completed=done, total=wanted)
+    columns = (TextColumn(unit), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(unit, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @bench.command(epilog=PLANNERS_EXAMPLES, short_help="Compare planners on the same random loadings.")
@@ -126,7 +126,7 @@ def planners(
 ) -> None:
     """Let planners plan the same random loadings, check every plan, and compare the results."""
     from labseq.bench.comparison import read_comparison
-    from labseq.bench.planners import Where, compare
+    from labseq.bench.planners import Resources, compare
     from labseq.cluster import check_workers
     from labseq.console import output
     from labseq.pictures.plans import check_picture
@@ -140,8 +140,8 @@ def planners(
         output.check_writable(path)
     write = output.json_writer(json)
     with progress_of("loadings") as progress:
-        where = Where(workers, scheduler, keys)
-        report = compare(comparison, where, announce=output.report_compiling, progress=progress)
+        resources = Resources(workers, scheduler, keys)
+        report = compare(comparison, resources, announce=output.report_compiling, progress=progress)
     output.say(*report.as_text())
     if report.rows:
         _write_files(report, csv, png, json)
@@ -169,9 +169,9 @@ def _raise_failures(report: Report) -> None:
     if report.ended_by is not None:
         raise report.ended_by
     if failed := [row for row in report.rows if row["n_failed"]]:
-        n, of = sum(row["n_failed"] for row in failed), sum(row["n_loadings"] for row in failed)
+        n, n_plans = sum(row["n_failed"] for row in failed), sum(row["n_loadings"] for row in failed)
         names = ", ".join(dict.fromkeys(f"'{row['planner']}'" for row in failed))
-        raise PlanError(f"{n} of {of} plans of {names} are wrong; they are not counted in the table")
+        raise PlanError(f"{n} of {n_plans} plans of {names} are wrong; they are not counted in the table")
 
 
 @bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the first light.")

@@ -1,4 +1,4 @@
-"""What is compared: planners with their settings, and conditions; read from the command line."""
+"""The planners and conditions of a comparison, read from the command line."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.units import parse_quantity
 
-Words = tuple[tuple[str, str], ...]
+SettingTexts = tuple[tuple[str, str], ...]
 """Settings as key and value, as typed."""
 
-BARE_MOTION: Final[Words] = (("overhead_per_batch", "0"), ("overhead_per_cycle", "0"))
+BARE_MOTION: Final[SettingTexts] = (("overhead_per_batch", "0"), ("overhead_per_cycle", "0"))
 """Overheads that are set to 0, because only ramps and transport are compared."""
 
-_ENTRY_SEPARATOR: Final = re.compile(r",(?=\s*[^\W\d][\w.-]*\s*(?:,|\Z|:\s*[^\W\d]\w*\s*=))")
-_SETTING_SEPARATOR: Final = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
-_MOTION_PREFIX: Final = "profile.mobile_tweezers."
-_NAME: Final = re.compile(r"[^\W\d][\w.-]*")
-_GRID: Final = re.compile(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*")
+_NAME: Final = r"[^\W\d][\w.-]*"
+"""Pattern of a planner's name."""
+_KEY_AND_EQUALS: Final = r"[^\W\d]\w*\s*="
+"""Pattern of a setting up to its value, which may contain commas."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +29,7 @@ class PlannerEntry:
     """A planner in a comparison; settings that are not given have their defaults."""
 
     planner: str
-    settings: Words = ()
+    settings: SettingTexts = ()
 
     @property
     def label(self) -> str:
@@ -59,7 +58,7 @@ class Condition:
     target: str
     loading: float
     degree_of_parallelism: int | None = None
-    motion: Words = BARE_MOTION
+    motion: SettingTexts = BARE_MOTION
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +71,14 @@ class Comparison:
         n_loadings: Number of loadings of each condition.
         seed: Seed of all loadings.
         settings: Settings from ``--set`` for every planner, as typed.
-        called: The place of errors for messages: an option or a figure.
+        called: How messages name the planners: an option or a figure.
     """
 
     planner_entries: tuple[PlannerEntry, ...]
     conditions: tuple[Condition, ...]
     n_loadings: int
     seed: int
-    settings: Words = ()
+    settings: SettingTexts = ()
     called: str = "--planners"
 
 
@@ -87,7 +86,7 @@ def parse_planners(text: str) -> tuple[PlannerEntry, ...]:
     """Read a list of planners, each with its individual settings.
 
     Raises:
-        ConfigError: The text is no such list, or names a planner or setting twice.
+        ConfigError: The text is not such a list, or names a planner or setting twice.
 
     Example:
         >>> [entry.label for entry in parse_planners("psca,psca:variant=paper,lsap")]
@@ -95,14 +94,17 @@ def parse_planners(text: str) -> tuple[PlannerEntry, ...]:
     """
     option = clean(f"--planners {text}")
     planner_entries: list[PlannerEntry] = []
-    for part in _ENTRY_SEPARATOR.split(text):
-        name, _, rest = part.partition(":")
-        settings = [setting.partition("=") for setting in _SETTING_SEPARATOR.split(rest)] if rest else []
-        if not _NAME.fullmatch(name.strip()) or not all(key.strip() and value for key, _, value in settings):
+    for part in re.split(rf",(?=\s*{_NAME}\s*(?:,|\Z|:\s*{_KEY_AND_EQUALS}))", text):
+        name, _, settings_text = part.partition(":")
+        items = re.split(rf",(?=\s*{_KEY_AND_EQUALS})", settings_text) if settings_text else []
+        settings = [item.partition("=") for item in items]
+        if not re.fullmatch(_NAME, name.strip()) or not all(
+            key.strip() and value for key, _, value in settings
+        ):
             expected = "names with commas between them, each perhaps with settings: psca,psca:variant=paper"
             raise ConfigError(Problem("this is not a list of planners", option, expected=expected))
-        words = tuple((key.strip(), value.strip()) for key, _, value in settings)
-        planner_entry = PlannerEntry(name.strip(), words)
+        texts = tuple((key.strip(), value.strip()) for key, _, value in settings)
+        planner_entry = PlannerEntry(name.strip(), texts)
         if planner_entry in planner_entries:
             raise ConfigError(
                 Problem(f"'{clean(planner_entry.label)}' is named twice", option, expected="once")
@@ -118,7 +120,7 @@ def parse_grid(text: str) -> tuple[int, int]:
         >>> parse_grid("20x24")
         (20, 24)
     """
-    match = _GRID.fullmatch(text)
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[xX]\s*(\d{1,6})\s*", text)
     shape = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= n <= MAX_SITES for n in shape):
         expected = f"ROWSxCOLS, 1 to {MAX_SITES} each, for example 20x20"
@@ -161,7 +163,7 @@ def parse_parallelism(text: str | None) -> tuple[int | None, ...]:
         ) from error
 
 
-def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
+def parse_overrides(texts: Sequence[str]) -> tuple[SettingTexts, SettingTexts]:
     """Separate the settings of planners from those of the motion in the values of ``--set``.
 
     Returns:
@@ -178,7 +180,7 @@ def parse_overrides(texts: Sequence[str]) -> tuple[Words, Words]:
     motion: list[tuple[str, str]] = []
     for text in texts:
         address, equals, value = text.partition("=")
-        key = address.strip().removeprefix(_MOTION_PREFIX)
+        key = address.strip().removeprefix("profile.mobile_tweezers.")
         settings = motion
         if key == address.strip():
             key, settings = key.removeprefix("planner."), planner
@@ -203,8 +205,8 @@ def read_comparison(
 ) -> Comparison:
     """Read the options of ``labseq bench planners``; raises ``ConfigError`` if one has an error."""
     settings, motion = parse_overrides(overrides)
-    where = parse_grid(grid), target, parse_loading(loading)
-    conditions = tuple(Condition(*where, n, (*BARE_MOTION, *motion)) for n in parse_parallelism(dop))
+    condition = parse_grid(grid), target, parse_loading(loading)
+    conditions = tuple(Condition(*condition, n, (*BARE_MOTION, *motion)) for n in parse_parallelism(dop))
     return Comparison(
         parse_planners(planners), conditions, loadings, seed, settings, f"--planners {planners}"
     )

@@ -173,23 +173,23 @@ def measure_latency(
         StopRequested: Ctrl-C or SIGTERM.
         LabseqError: The error that ended a shot.
     """
-    watch = _Watch(announce, progress, request.n_loadings)
+    times = _TimesRecorder(announce, progress, request.n_loadings)
     session = Session.open(
         request.sequence,
         profile=request.profile,
         overrides=request.overrides,
         seed=request.seed,
         dry_run="full",
-        observer=watch,
+        observer=times,
     )
     lab = session.build_lab()
-    lab = replace(lab, motion=replace(lab.motion, overhead_per_cycle_s=0.0))  # which models what is measured
-    measured = _Measured()
-    steps: list[tuple[str, Any]] = [*_up_to_the_image(session), ("latency", measured)]
+    lab = replace(lab, motion=replace(lab.motion, overhead_per_cycle_s=0.0))  # models what is measured here
+    rearrangement = _RearrangeOnce()
+    steps: list[tuple[str, Any]] = [*_up_to_the_image(session), ("latency", rearrangement)]
     with stop_on_signals(session.stop_flag):
         session.warm(lab)
         sequencer = Sequencer(
-            lab, steps, session.stop_flag, watch, watch, seed=request.seed, policy=RunPolicy(attempts=1)
+            lab, steps, session.stop_flag, times, times, seed=request.seed, policy=RunPolicy(attempts=1)
         )
         try:
             sequencer.open()
@@ -198,11 +198,11 @@ def measure_latency(
             device = dict(lab.mobile_tweezers.describe())
         finally:
             sequencer.shut_down()
-    return _report(request, session, lab, watch, measured, device)
+    return _report(request, session, lab, times, rearrangement, device)
 
 
-class _Watch:
-    """Observer and sink of the shots that keeps only the times."""
+class _TimesRecorder:
+    """Receives events and shots, and keeps only the times."""
 
     def __init__(
         self, announce: Callable[[float], None], progress: Callable[[int, int], None], n_loadings: int
@@ -213,18 +213,18 @@ class _Watch:
         self.shots: list[dict[str, tuple[float, float]]] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Pass on that kernels are compiled."""
+        """Announce that kernels are compiled."""
         if name == "compiling":
             self._announce(float(values["about_s"]))
 
     def write_shot(self, shot: ShotRecord) -> None:
         """Keep host time and modelled time of each stage."""
-        self.shots.append({t.stage: (t.host_s, t.duration_s) for t in shot.timing})
+        self.shots.append({stage.stage: (stage.host_s, stage.duration_s) for stage in shot.timing})
         if shot.shot_index >= N_WARM:
             self._progress(shot.shot_index + 1 - N_WARM, self._n_loadings)
 
 
-class _Measured(Step):
+class _RearrangeOnce(Step):
     """A step that rearranges once, without a window and without an image after it."""
 
     needs_image = True
@@ -242,8 +242,8 @@ class _Measured(Step):
         raise_priority()  # as a run in real time does before the frame
         plan, report = checked_plan(shot, 0)
         if plan.n_batches == 0:
-            what = "there is nothing to move: a random loading needs no moves, or has no atoms to move"
-            raise ConfigError(Problem(what, "shot", hint="choose another target or loading"))
+            problem = "there is nothing to move: a random loading needs no moves, or has no atoms to move"
+            raise ConfigError(Problem(problem, "shot", hint="choose another target or loading"))
         n_first = n_beginning(shot, plan, report, plan.n_batches)
         build = partial(tone_program, plan.first(n_first), shot.grid, shot.motion)
         is_whole = n_first == plan.n_batches
@@ -259,10 +259,10 @@ def _up_to_the_image(session: Session) -> list[tuple[str, Step]]:
     Raises:
         ConfigError: None of these steps takes an image.
     """
-    steps = list(takewhile(lambda named: not named[1].needs_image, session.assembly.steps))
+    steps = list(takewhile(lambda item: not item[1].needs_image, session.assembly.steps))
     if not any(step.takes_image for _, step in steps):
-        what = "there is no image before the first rearrangement"
-        raise session.assembly.document.error(("shot",), what, "an `image` step")
+        problem = "there is no image before the first rearrangement"
+        raise session.assembly.document.error(("shot",), problem, "an `image` step")
     return steps
 
 
@@ -270,18 +270,19 @@ def _report(
     request: LatencyRequest,
     session: Session,
     lab: Lab,
-    watch: _Watch,
-    measured: _Measured,
+    times_recorder: _TimesRecorder,
+    rearrangement: _RearrangeOnce,
     device: dict[str, Any],
 ) -> LatencyReport:
-    shots = watch.shots[N_WARM:]
-    times = {n: np.array([shot[n] for shot in shots]).T for n in (*HOST_STAGES, "start", "light")}
-    times["prepare"][0] -= times["tones"][0]
+    shots = times_recorder.shots[N_WARM:]
+    times = {name: np.array([shot[name] for shot in shots]).T for name in (*HOST_STAGES, "start", "light")}
+    times["prepare"][0] -= times["tones"][0]  # of which they are a part in the record
     light_s, modelled_s = times["light"]
+    # light ends with start: without it, the samples are at the device
     total_s = light_s - times["start"][0]
     between_s = total_s - sum(times[name][0] for name in HOST_STAGES)
     stages = [Stage.of(name, *times[name]) for name in HOST_STAGES]
-    n_batches, playing_s = np.median(np.array(measured.plans[N_WARM:]), axis=0)
+    n_batches, playing_s = np.median(np.array(rearrangement.plans[N_WARM:]), axis=0)
     return LatencyReport(
         n_loadings=request.n_loadings,
         seed=request.seed,
@@ -343,7 +344,7 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
 
 
 def _notes(report: LatencyReport) -> list[str]:
-    """Notes below the table: what was measured, and the computer."""
+    """Notes below the table: times, plans, profile and computer."""
     device = f"{report.device}, mode {report.mode}" if report.mode else report.device
     load = "" if report.load is None else f", load {report.load:.2g}"
     playing, delay = format_quantity(report.playing_s, "time"), format_quantity(report.delay_s, "time")

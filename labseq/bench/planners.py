@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from labseq.bench.comparison import Comparison
 from labseq.bench.report import Report, make_rows
-from labseq.bench.work import Done, Job, prepare, set_up, warm
+from labseq.bench.work import Job, JobResults, prepare, set_up, warm
 from labseq.cluster import ClusterWorkers
 from labseq.errors import LabseqError, StopRequested
 from labseq.kernel import announcing, n_cores
@@ -25,6 +25,7 @@ from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Workers
 @contextmanager
 def _signals(handler: Any, *numbers: int) -> Generator[None]:
     """Handle signals in another way for a while; other threads than the main one get none."""
+    # Python sets handlers in the main thread only
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, handler) for number in numbers if is_main}
     try:
@@ -34,15 +35,13 @@ def _signals(handler: Any, *numbers: int) -> Generator[None]:
             signal.signal(number, handler_before)
 
 
-MAX_AT_ONCE: Final = 50
-"""Maximum number of loadings of a job; workers lose their current jobs when a comparison is stopped."""
 ALONE_S: Final = 2.0
 """Minimum work for a second process, in seconds: about the time to start one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
-    """Where planners plan.
+class Resources:
+    """The processes in which planners plan.
 
     Attributes:
         n_workers: Number of processes on this computer; None for one per core, if there is enough work.
@@ -55,12 +54,9 @@ class Where:
     keys: Path | None = None
 
 
-HERE: Final = Where()
-
-
 def compare(
     comparison: Comparison,
-    where: Where = HERE,
+    resources: Resources = Resources(),
     *,
     announce: Callable[[float], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda _done, _wanted: None,
@@ -72,7 +68,7 @@ def compare(
 
     Args:
         comparison: Planners, conditions and loadings.
-        where: Where the planners plan.
+        resources: The processes in which the planners plan.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
         progress: Called with the numbers of loadings that are done and wanted.
 
@@ -81,11 +77,13 @@ def compare(
         PluginLoadError: A named plugin failed to load.
     """
     start_s = time.perf_counter()
-    cluster = None if where.scheduler is None else ClusterWorkers(where.scheduler, where.keys, "part")
+    cluster = (
+        None if resources.scheduler is None else ClusterWorkers(resources.scheduler, resources.keys, "part")
+    )
     prepared = set_up(comparison)
-    all_done: list[Done] = []
+    all_results: list[JobResults] = []
     n_done = 0
-    wanted = comparison.n_loadings * len(prepared)
+    n_wanted = comparison.n_loadings * len(prepared)
     ended_by: LabseqError | None = None
     received: list[int] = []
 
@@ -97,52 +95,52 @@ def compare(
         with _signals(interrupt, signal.SIGINT, signal.SIGTERM):
             with announcing(announce):
                 warm(prepared)
-            progress(0, wanted)
-            with closing(_results(comparison, where, cluster)) as results:
-                for done in results:
-                    all_done.append(done)
-                    n_done += len(done.loadings)
-                    progress(n_done, wanted)
+            progress(0, n_wanted)
+            with closing(_results(comparison, resources, cluster)) as results:
+                for job_results in results:
+                    all_results.append(job_results)
+                    n_done += len(job_results.loadings)
+                    progress(n_done, n_wanted)
     except KeyboardInterrupt:
         ended_by = StopRequested(received[0] if received else signal.SIGINT)
     except LabseqError as error:
         ended_by = error
     duration_s = time.perf_counter() - start_s
-    rows = make_rows(comparison, prepared, all_done)
+    rows = make_rows(comparison, prepared, all_results)
     return Report(comparison, rows, n_done, duration_s, ended_by)
 
 
-def _results(comparison: Comparison, where: Where, cluster: Workers | None) -> Generator[Done]:
+def _results(comparison: Comparison, resources: Resources, cluster: Workers | None) -> Generator[JobResults]:
     """The results of all loadings, in any order; closed early, it ends its processes at once."""
-    n_workers = where.n_workers or n_cores()
-    todo = _jobs(comparison, n_workers)
-    if cluster is None and n_workers > 1 and where.n_workers is None:
-        todo = yield from _begun(comparison, todo)
-        n_workers = min(n_workers, len(todo))
+    n_workers = resources.n_workers or n_cores()
+    jobs = _jobs(comparison, n_workers)
+    if cluster is None and n_workers > 1 and resources.n_workers is None:
+        jobs = yield from _begun(comparison, jobs)
+        n_workers = min(n_workers, len(jobs))
     if cluster is None and n_workers <= 1:
-        yield from map(prepare(comparison), todo) if todo else ()
+        yield from map(prepare(comparison), jobs) if jobs else ()
         return
-    left = iter(enumerate(todo))
+    remaining = iter(enumerate(jobs))
     workers = cluster or ProcessWorkers(n_workers, "part")
     with closing(workers):
         workers.prepare(prepare, comparison)
         n_out = 0
         while True:
-            for number, job in islice(left, max(0, QUEUED * workers.n_workers - n_out)):
+            for number, job in islice(remaining, max(0, QUEUED * workers.n_workers - n_out)):
                 workers.submit(number, job)
                 n_out += 1
             if not n_out:
                 return
-            for _, done in workers.finished(POLL_S):
+            for _, job_results in workers.finished(POLL_S):
                 n_out -= 1
-                yield done
+                yield job_results
 
 
-def _begun(comparison: Comparison, jobs: list[Job]) -> Generator[Done, None, list[Job]]:
-    """Do jobs in this process until it would have been worth a second one; returns those that are left."""
+def _begun(comparison: Comparison, jobs: list[Job]) -> Generator[JobResults, None, list[Job]]:
+    """Do jobs in this process until a second one is worth starting; returns the remaining jobs."""
     start_s, n_done = time.perf_counter(), 0
-    for done in map(prepare(comparison), jobs):
-        yield done
+    for job_results in map(prepare(comparison), jobs):
+        yield job_results
         n_done += 1
         if time.perf_counter() - start_s > ALONE_S:
             break
@@ -156,7 +154,8 @@ def _jobs(comparison: Comparison, n_workers: int) -> list[Job]:
     of each condition is done at any time.
     """
     n_loadings, n_conditions = comparison.n_loadings, len(comparison.conditions)
-    size = min(MAX_AT_ONCE, n_loadings, -(-n_loadings * n_conditions // (4 * n_workers)))
+    # at most 50: workers lose their current jobs when a comparison is stopped
+    size = min(50, n_loadings, -(-n_loadings * n_conditions // (4 * n_workers)))
     return [
         Job(condition, start, min(start + size, n_loadings))
         for start in range(0, n_loadings, size)

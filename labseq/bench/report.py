@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from labseq.bench.comparison import BARE_MOTION, Comparison, Condition, PlannerEntry
-from labseq.bench.work import Done, Failure, PreparedCondition, loading_seed
+from labseq.bench.work import Failure, JobResults, PreparedCondition, loading_seed
 from labseq.console.report import Column, table
 from labseq.console.text import percent, plural, time_text
 from labseq.errors import LabseqError
@@ -48,7 +48,7 @@ class Row:
     """Results of one planner under one condition.
 
     Attributes:
-        values: What is exported, see :func:`summarise`; also by ``row[name]``.
+        values: The values for export, see :func:`summarise`; also by ``row[name]``.
         first_failure: The first loading for which the planner failed or its plan broke a rule, or None.
         counts: int64 (n,), number of plans with 0, 1, 2, ... batches.
     """
@@ -76,7 +76,7 @@ def _percent(value: Estimate) -> str:
     return percent(value.value, 2)
 
 
-PLANNERS: Final[Sequence[Column[Row]]] = (
+COLUMNS: Final[Sequence[Column[Row]]] = (
     Column("planner", lambda row: row["label"]),
     Column("DOP", lambda row: row["degree_of_parallelism"], right=True),
     Column("batches", lambda row: row["n_batches"], right=True),
@@ -144,12 +144,12 @@ class Report:
 
     def as_csv(self) -> str:
         """The rows as CSV, SI, a line per row."""
-        flat = [_flat(to_plain(row.values)) for row in self.rows]
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
+        rows = [_flat(to_plain(row.values)) for row in self.rows]
+        buffer = io.StringIO()
+        writer = csv.DictWriter(buffer, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(flat)
-        return text.getvalue()
+        writer.writerows(rows)
+        return buffer.getvalue()
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -166,12 +166,13 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def make_rows(
-    comparison: Comparison, prepared: Sequence[PreparedCondition], jobs_done: Sequence[Done]
+    comparison: Comparison, prepared: Sequence[PreparedCondition], jobs_done: Sequence[JobResults]
 ) -> tuple[Row, ...]:
     """A row per condition and planner, of the jobs that are done, in any order."""
     rows: list[Row] = []
     for i, condition in enumerate(comparison.conditions):
-        parts = sorted((d for d in jobs_done if d.job.condition == i), key=lambda d: d.job.start)
+        parts = [part for part in jobs_done if part.job.condition == i]
+        parts.sort(key=lambda part: part.job.start)
         if not parts:
             continue
         results = np.concatenate([part.results for part in parts], axis=1)
@@ -181,6 +182,7 @@ def make_rows(
             values = _identity(entry, condition, prepared[i], k)
             values |= summarise(results[k], loadings, prepared[i].target.n_atoms)
             first = next((failure for failure in failures if failure.planner_entry == k), None)
+            # plans that break a rule are not counted
             counts = np.bincount(results[k]["n_batches"][~results[k]["failed"]])
             rows.append(Row(entry, condition, values, first, counts))
     return tuple(rows)
@@ -189,7 +191,7 @@ def make_rows(
 def _identity(
     entry: PlannerEntry, condition: Condition, prepared: PreparedCondition, k: int
 ) -> dict[str, Any]:
-    """What was measured: planner ``k`` with all its settings, and the condition."""
+    """Planner ``k`` with all its settings, and the condition."""
     runner = prepared.runners[k]
     return {
         "planner": entry.planner,
@@ -220,21 +222,23 @@ def summarise(results: NDArray[Any], loadings: NDArray[Any], n_atoms: int) -> di
         ``ratio_to_bound`` the mean number of batches over the mean bound, both over the loadings whose
         target was filled.
     """
-    right = ~results["failed"]
-    good = results[right]
-    filled = good["n_defects"] == 0
-    planning_s = good["planning_s"] if len(good) else np.array([math.nan])
+    valid = ~results["failed"]
+    valid_results = results[valid]
+    filled = valid_results["n_defects"] == 0
+    planning_s = valid_results["planning_s"] if len(valid_results) else np.array([math.nan])
     means = ("n_batches", "n_atoms_moved", "distance_m", "motion_s", "moving_s", "n_scans", "scan_s")
     return {
         "n_loadings": len(results),
         "n_short": int(np.count_nonzero(loadings["n_atoms"] < n_atoms)),
-        "n_failed": int(np.count_nonzero(~right)),
-        **{name: mean(good[name]) for name in means},
-        "filling_fraction": mean(1.0 - good["n_defects"] / max(1, n_atoms)),
-        **{name: mean(good[name]) for name in ("n_lost", "p_defect_free")},
-        "target_met": mean(filled & (good["n_surplus"] == 0)),
+        "n_failed": int(np.count_nonzero(~valid)),
+        **{name: mean(valid_results[name]) for name in means},
+        "filling_fraction": mean(1.0 - valid_results["n_defects"] / max(1, n_atoms)),
+        **{name: mean(valid_results[name]) for name in ("n_lost", "p_defect_free")},
+        "target_met": mean(filled & (valid_results["n_surplus"] == 0)),
         "bound": mean(loadings["n_lines"]),
-        "ratio_to_bound": ratio_of_means(good["n_batches"][filled], loadings["n_lines"][right][filled]),
+        "ratio_to_bound": ratio_of_means(
+            valid_results["n_batches"][filled], loadings["n_lines"][valid][filled]
+        ),
         "planning_s": {
             "median": float(np.median(planning_s)),
             "p99": float(np.quantile(planning_s, 0.99)),
@@ -250,7 +254,7 @@ def _table(report: Report) -> list[str]:
         hidden |= {"scans", "scans/ms"}
     if all(row["moving_s"] == row["motion_s"] for row in report.rows):
         hidden.add("moving/ms")
-    return table(report.rows, [column for column in PLANNERS if column.heading not in hidden])
+    return table(report.rows, [column for column in COLUMNS if column.heading not in hidden])
 
 
 def notes(report: Report) -> list[str]:
@@ -275,11 +279,11 @@ def notes(report: Report) -> list[str]:
 
 
 def _failure(comparison: Comparison, row: Row, failure: Failure) -> list[str]:
-    what = (
+    count = (
         f"{row['n_failed']} of {row['n_loadings']} plans are wrong; the first, of loading {failure.loading}"
     )
     return [
-        f"{row['label']}: {what}: {failure.message}",
+        f"{row['label']}: {count}: {failure.message}",
         f"  see it with: {_again(comparison, row, failure.loading)}",
     ]
 
@@ -289,15 +293,15 @@ def _again(comparison: Comparison, row: Row, loading: int) -> str:
     condition = row.condition
     rows, cols = condition.shape
     seed = loading_seed(comparison.seed, loading)
-    if condition.motion != BARE_MOTION:  # which takes a profile
+    if condition.motion != BARE_MOTION:  # `labseq plan` would need a profile for it
         return f"numpy.random.default_rng({seed}).random(({rows}, {cols})) < {condition.loading:g}"
-    words = ["labseq", "plan", f"random:{rows}x{cols}@{condition.loading:g}", "--seed", str(seed)]
-    words += ["--target", condition.target, "--planner", row.planner_entry.planner]
+    command = ["labseq", "plan", f"random:{rows}x{cols}@{condition.loading:g}", "--seed", str(seed)]
+    command += ["--target", condition.target, "--planner", row.planner_entry.planner]
     if "degree_of_parallelism" in row["settings"] and condition.degree_of_parallelism is not None:
-        words += ["--dop", str(condition.degree_of_parallelism)]
+        command += ["--dop", str(condition.degree_of_parallelism)]
     for key, value in (*comparison.settings, *row.planner_entry.settings):
-        words += ["--set", f"{key}={value}"]
-    return shlex.join(words)
+        command += ["--set", f"{key}={value}"]
+    return shlex.join(command)
 
 
 def save_histogram(path: Path, report: Report) -> None:
@@ -312,11 +316,11 @@ def save_histogram(path: Path, report: Report) -> None:
     """
 
     def draw() -> Figure:
-        condition, *more = report.comparison.conditions
+        condition, *other_conditions = report.comparison.conditions
         figure = make_figure(5.4, 4.2, layout="constrained")
         axes = figure.add_subplot()
         for i, row in enumerate(report.rows):
-            parallel = f", {row['degree_of_parallelism']} tweezers" if more else ""
+            parallel = f", {row['degree_of_parallelism']} tweezers" if other_conditions else ""
             label = f"{row['label']}{parallel}: {row['n_batches']}"
             draw_histogram(axes, row.counts, f"C{i % 10}", label)
         axes.set_xlabel("batches")
@@ -324,11 +328,11 @@ def save_histogram(path: Path, report: Report) -> None:
         if any(row.counts.any() for row in report.rows):
             axes.legend(frameon=False, fontsize=8)
         rows, cols = condition.shape
-        given = f"{100 * condition.loading:g} % loading"
-        if condition.degree_of_parallelism is not None and not more:
-            given += f", degree of parallelism {condition.degree_of_parallelism}"
+        conditions = f"{100 * condition.loading:g} % loading"
+        if condition.degree_of_parallelism is not None and not other_conditions:
+            conditions += f", degree of parallelism {condition.degree_of_parallelism}"
         target = report.rows[0]["target_name"]
-        title = f"{target} out of {rows} x {cols}, {given}\n{report.extent_text}"
+        title = f"{target} out of {rows} x {cols}, {conditions}\n{report.extent_text}"
         figure.suptitle(title, fontsize=9)
         return figure
 
@@ -337,9 +341,9 @@ def save_histogram(path: Path, report: Report) -> None:
 
 def draw_histogram(axes: Axes, counts: NDArray[np.int64], colour: str, label: str) -> None:
     """Draw the share of each number of batches; ``counts``: how often 0, 1, 2, ... were needed."""
-    seen = np.flatnonzero(counts)
-    if len(seen):
-        first, last = int(seen[0]), int(seen[-1])
+    occurring = np.flatnonzero(counts)
+    if len(occurring):
+        first, last = int(occurring[0]), int(occurring[-1])
         edges, share = np.arange(first, last + 2) - 0.5, counts[first : last + 1] / counts.sum()
         axes.stairs(share, edges, fill=True, color=colour, alpha=0.45, label=label)
         axes.stairs(share, edges, color=colour, linewidth=1)

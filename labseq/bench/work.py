@@ -68,7 +68,7 @@ def set_up(comparison: Comparison) -> list[PreparedCondition]:
 
 def warm(prepared: list[PreparedCondition]) -> None:
     """Compile all kernels that will be needed, or load them from the cache."""
-    importlib.import_module("labseq.motion.check_kernels")
+    importlib.import_module("labseq.motion.check_kernels")  # else the first plan would wait for them
     for runner in [runner for condition in prepared for runner in condition.runners]:
         if isinstance(runner.planner, NeedsWarmUp):
             try:
@@ -79,18 +79,18 @@ def warm(prepared: list[PreparedCondition]) -> None:
 
 
 def _prepare(
-    host: PluginHost, comparison: Comparison, condition: Condition, choice: TargetChoice
+    host: PluginHost, comparison: Comparison, condition: Condition, target_choice: TargetChoice
 ) -> PreparedCondition:
-    found = ProblemCollector()
+    problems = ProblemCollector()
     grid, motion, target = SiteGrid(*condition.shape), _motion(condition), None
-    with found:
-        target = choice.make(host, grid)
+    with problems:
+        target = target_choice.make(host, grid)
     runners: list[Runner] = []
     for planner_entry in comparison.planner_entries:
-        with found:
-            chosen = _planner(host, comparison, condition, planner_entry)
-            runners.append(_runner(chosen, grid, motion, comparison.seed))
-    found.raise_any()
+        with problems:
+            choice = _planner(host, comparison, condition, planner_entry)
+            runners.append(_runner(choice, grid, motion, comparison.seed))
+    problems.raise_any()
     assert target is not None
     return PreparedCondition(grid, motion, target, condition.loading, tuple(runners))
 
@@ -103,15 +103,17 @@ def _motion(condition: Condition) -> MotionSpec:
     document = Document.of_options(overrides, _MOTION_ADDRESS)
     motion = document.validate(MotionSpec, ("motion",), called=_MOTION_ADDRESS)
     n = condition.degree_of_parallelism
-    limit, what = min(
+    limit, meaning = min(
         (motion.max_tweezers, "the most tweezers that can be on at once"),
         (max(motion.max_row_tones, motion.max_column_tones), "the most tones of an axis"),
         key=lambda pair: pair[0],
     )
     if n is not None and not 1 <= n <= limit:
-        hint = f"or raise the limit: --set {_MOTION_ADDRESS}.max_tweezers={n}" if "tweezers" in what else ""
-        text = f"the degree of parallelism is {n}"
-        raise ConfigError(Problem(text, f"--dop {n}", expected=f"1 to {limit}, {what}", hint=hint))
+        hint = (
+            f"or raise the limit: --set {_MOTION_ADDRESS}.max_tweezers={n}" if "tweezers" in meaning else ""
+        )
+        problem = f"the degree of parallelism is {n}"
+        raise ConfigError(Problem(problem, f"--dop {n}", expected=f"1 to {limit}, {meaning}", hint=hint))
     return motion
 
 
@@ -119,8 +121,13 @@ def _planner(
     host: PluginHost, comparison: Comparison, condition: Condition, planner_entry: PlannerEntry
 ) -> ChosenPlugin:
     name, dop = planner_entry.planner, condition.degree_of_parallelism
-    overrides = [Override(f"planner.{k}", v, f"--set planner.{k}={v}") for k, v in comparison.settings]
-    overrides += [Override(f"planner.{k}", v, comparison.called) for k, v in planner_entry.settings]
+    overrides = [
+        Override(f"planner.{key}", value, f"--set planner.{key}={value}")
+        for key, value in comparison.settings
+    ]
+    overrides += [
+        Override(f"planner.{key}", value, comparison.called) for key, value in planner_entry.settings
+    ]
     entry = host.registry.find("planner", name)
     if entry is not None and dop is not None and settings_at(entry.settings_model, (_DOP,)):
         overrides.insert(0, Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
@@ -129,9 +136,9 @@ def _planner(
     return resolve(host, document, "planner", Choice(use=name).placed("planner"))
 
 
-def _runner(chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
-    planner, dop = construct_planner(chosen, grid, motion, seed)
-    return Runner(planner, chosen.entry.name, dump(chosen.entry, chosen.settings), dop)
+def _runner(choice: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
+    planner, dop = construct_planner(choice, grid, motion, seed)
+    return Runner(planner, choice.entry.name, dump(choice.entry, choice.settings), dop)
 
 
 RESULT: Final = np.dtype(
@@ -151,7 +158,7 @@ RESULT: Final = np.dtype(
         ("failed", np.bool_),
     ]
 )
-"""Results of one plan; linked batches, which share one pick-up, count as one. NaN without scans.
+"""Results of one plan; linked batches, which share one pick-up, count as one. Scans are NaN without any.
 
 ``moving_s`` is ``motion_s`` without the overheads of batches and cycle; ``n_lost`` and ``p_defect_free``
 are those of :class:`labseq.motion.Survival`.
@@ -161,7 +168,6 @@ LOADING: Final = np.dtype([("n_atoms", np.int32), ("n_lines", np.int32)])
 """Results of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
 
 _NO_SCANS: Final = (math.nan, math.nan)
-_FAILED: Final = (0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +190,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Done:
+class JobResults:
     """The results of a job.
 
     Attributes:
@@ -248,7 +254,7 @@ def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
     return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
 
 
-def work(prepared: list[PreparedCondition], seed: int, job: Job) -> Done:
+def work(prepared: list[PreparedCondition], seed: int, job: Job) -> JobResults:
     """Run every planner on the loadings of a job, and check and count its plans."""
     condition = prepared[job.condition]
     indices = range(job.start, job.stop)
@@ -270,12 +276,12 @@ def work(prepared: list[PreparedCondition], seed: int, job: Job) -> Done:
                         str(error) if isinstance(error, PlanError) else f"plan() raised {format_error(error)}"
                     )
                     failures.append(Failure(i, job.condition, index, message))
-                rows.append(_FAILED)
+                rows.append((0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True))
         results[i] = rows
-    return Done(job, results, loadings, tuple(failures))
+    return JobResults(job, results, loadings, tuple(failures))
 
 
-def prepare(comparison: Comparison) -> Callable[[Job], Done]:
+def prepare(comparison: Comparison) -> Callable[[Job], JobResults]:
     """Prepare for jobs; every planner is called once, so that no measured call is the first one."""
     prepared = set_up(comparison)
     warm(prepared)
@@ -285,16 +291,16 @@ def prepare(comparison: Comparison) -> Callable[[Job], Done]:
 
 
 def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> tuple[Any, ...]:
-    own = occupancy.copy()  # a planner may change its input
+    input_occupancy = occupancy.copy()  # a planner may change its input
     # some papers count scans, in which moving tweezers pick up and drop atoms without stopping
     scan: Any = getattr(runner.planner, "scan", None)
     scanned: Any = None
     start_s = perf_counter()
     if scan is not None:
-        scanned = scan(own, condition.target)
+        scanned = scan(input_occupancy, condition.target)
         plan = scanned.plan
     else:
-        plan = runner.planner.plan(own, condition.target)
+        plan = runner.planner.plan(input_occupancy, condition.target)
     planning_s = perf_counter() - start_s
     dop = runner.degree_of_parallelism
     report = check_plan(plan, occupancy, condition.target, dop, condition.grid, condition.motion)
@@ -303,7 +309,7 @@ def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> 
         scans = float(scanned.n_scans), scanned.duration_s(condition.grid, condition.motion)
     survival = predict_survival(plan, report, occupancy, condition.target, condition.grid, condition.motion)
     motion, starts = condition.motion, ~plan.linked
-    overhead_s = plan.n_batches and (
+    overhead_s = plan.n_batches and (  # a plan without batches has no overheads
         motion.overhead_per_cycle_s + np.count_nonzero(starts) * motion.overhead_per_batch_s
     )
     n_atoms_moved = int(np.diff(plan.batch_offsets)[starts].sum())

@@ -33,7 +33,6 @@ FORMAT: Final = 1
 """Version of an entry's file."""
 EntryStatus = Literal["waiting", "running", "stopped", "failed"]
 
-_POSITION: Final = re.compile(r"-?\d{1,1000}(/0*[1-9]\d{0,999})?")
 _NUMBER: Final = re.compile(r"(\d{4,})\.(?:json|id)")
 
 
@@ -47,7 +46,7 @@ class Entry:
         added_utc: When it was added, ISO 8601, UTC.
         sequence: The sequence's file, absolute.
         text: The text of that file when it was added; this is what will run.
-        options: What the user changed.
+        options: The options that the user gave.
         status: "waiting", "running", or how its run ended early.
         run_dir: The folder of its run, once there is one.
         error: Why it did not start or ended early; or "".
@@ -67,7 +66,7 @@ class Entry:
 
     @property
     def stored_text(self) -> StoredText:
-        """The text, to be read instead of the file."""
+        """The text that is read instead of the file."""
         return StoredText(self.text, f"{self.sequence} (as queued)")
 
     @property
@@ -114,8 +113,9 @@ class Queue:
             RecordingError: One is damaged, or cannot be read.
         """
         files = sorted(self.folder.glob("*.json")) if self.folder.is_dir() else []
-        read = [_read(file) for file in files if _NUMBER.fullmatch(file.name)]
-        return sorted((one for one in read if one is not None), key=lambda one: (one.position, one.id))
+        entries = [_read(file) for file in files if _NUMBER.fullmatch(file.name)]
+        existing = (entry for entry in entries if entry is not None)
+        return sorted(existing, key=lambda entry: (entry.position, entry.id))
 
     def add(self, sequence: Path, text: str, options: Options) -> Entry:
         """Add a sequence at the end, with the text that will run.
@@ -123,7 +123,7 @@ class Queue:
         Raises:
             RecordingError: The queue cannot be written to.
         """
-        last = max((one.position for one in self.entries()), default=Fraction(0))
+        last = max((entry.position for entry in self.entries()), default=Fraction(0))
         entry = Entry(self._new_id(), last + 1, now_utc(), sequence, text, options)
         self.write(entry)
         return entry
@@ -143,11 +143,11 @@ class Queue:
         Raises:
             ConfigError: There is no such entry, or it is running; nothing is removed.
         """
-        for one in [self._find(number) for number in ids]:
-            if one.status == "running" and not one.is_interrupted and not one.is_complete:
-                command = "labseq stop" if one.run_dir is None else f"labseq stop {one.run_dir}"
+        for entry in [self._find(number) for number in ids]:
+            if entry.status == "running" and not entry.is_interrupted and not entry.is_complete:
+                command = "labseq stop" if entry.run_dir is None else f"labseq stop {entry.run_dir}"
                 hint = f"'{command}' ends it first"
-                raise ConfigError(Problem(f"entry {one.id} is running", hint=hint))
+                raise ConfigError(Problem(f"entry {entry.id} is running", hint=hint))
         for number in ids:
             self.drop(number)
 
@@ -162,12 +162,13 @@ class Queue:
         Raises:
             ConfigError: There is no such entry.
         """
-        entry, other = self._find(number), self._find(before)
-        if entry.id == other.id:
+        entry, next_entry = self._find(number), self._find(before)
+        if entry.id == next_entry.id:
             return
-        below = [one.position for one in self.entries() if one.position < other.position and one is not entry]
-        lower = max(below, default=other.position - 2)
-        self.write(replace(entry, position=(lower + other.position) / 2))
+        positions = [queued.position for queued in self.entries() if queued.id != entry.id]
+        lower = max((p for p in positions if p < next_entry.position), default=next_entry.position - 2)
+        # a fraction, as there is always one between two others
+        self.write(replace(entry, position=(lower + next_entry.position) / 2))
 
     def ask_to_stop(self) -> bool:
         """Ask the process that runs the queue to take no further entry; False if there is none.
@@ -215,6 +216,7 @@ class Queue:
             return None
         lock = self.lock()
         with suppress(OSError):
+            # nobody runs the queue if the lock can be taken
             if (holder := lock.take()) is not None:
                 return holder
             lock.release()
@@ -222,11 +224,11 @@ class Queue:
 
     def _find(self, number: int) -> Entry:
         entries = self.entries()
-        for one in entries:
-            if one.id == number:
-                return one
-        known = ", ".join(str(one.id) for one in entries) or "nothing: the queue is empty"
-        raise ConfigError(Problem(f"the queue has no entry {number}", expected=known))
+        for entry in entries:
+            if entry.id == number:
+                return entry
+        expected = ", ".join(str(entry.id) for entry in entries) or "nothing: the queue is empty"
+        raise ConfigError(Problem(f"the queue has no entry {number}", expected=expected))
 
     def _file(self, number: int) -> Path:
         return self.folder / f"{number:04d}.json"
@@ -236,13 +238,17 @@ class Queue:
         with explained(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             while True:
-                given = [int(m[1]) for p in self.folder.iterdir() if (m := _NUMBER.fullmatch(p.name))]
-                number = max(given, default=0) + 1
+                used = [
+                    int(match[1]) for path in self.folder.iterdir() if (match := _NUMBER.fullmatch(path.name))
+                ]
+                number = max(used, default=0) + 1
                 try:
+                    # several processes may add entries at once: one of them makes the file
                     (self.folder / f"{number:04d}.id").touch(exist_ok=False)
                 except FileExistsError:
                     continue
-                for older in given:
+                # one mark is enough: no lower number is given again
+                for older in used:
                     (self.folder / f"{older:04d}.id").unlink(missing_ok=True)
                 return number
 
@@ -262,21 +268,21 @@ def _read(file: Path) -> Entry | None:
     if values.get("format") != FORMAT:
         raise RecordingError(file, f"is not a queue entry of format {FORMAT}", "move it away")
     try:
-        if not _POSITION.fullmatch(str(values.get("position"))):
+        if not re.fullmatch(r"-?\d{1,1000}(/0*[1-9]\d{0,999})?", str(values.get("position"))):
             raise ValueError("position: expected a number such as 3 or 5/2")
         entry = _adapter().validate_python(values)
         _check(entry, file)
     except ValueError as error:
-        what = str(error)
+        problem = str(error)
         if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise RecordingError(file, f"is a damaged queue entry: {what}", "move it away") from error
+            first_error = error.errors()[0]
+            problem = f"{'.'.join(map(str, first_error['loc']))}: {first_error['msg']}"
+        raise RecordingError(file, f"is a damaged queue entry: {problem}", "move it away") from error
     return replace(entry, options=replace(entry.options, overrides=tuple(entry.options.overrides)))
 
 
 def _check(entry: Entry, file: Path) -> None:
-    """Check what the types leave open.
+    """Check values that have the right types.
 
     Raises:
         ValueError: It is not as :meth:`Queue.add` writes it.

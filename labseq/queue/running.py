@@ -29,7 +29,7 @@ from labseq.session.check import CheckReport, check
 from labseq.session.session import Session
 
 POLL_S: Final = 0.5
-"""How often a queue that waits for new entries looks for them."""
+"""How often a queue that waits for new entries looks for them, in seconds."""
 
 Opening = Callable[[RunObserver | None], Session]
 """Opens a session whose events go to an observer."""
@@ -45,6 +45,7 @@ def add_checked(queue: Queue, sequence: Path, options: Options) -> tuple[Entry, 
     with Session.open(sequence, **asdict(options)) as session:
         document = session.assembly.document
         report, text, path = check(session), document.text, document.path.absolute()
+    # absolute, as `labseq queue run` may be started in another folder
     profile = None if options.profile is None else str(find_profile(options.profile, Path()).absolute())
     output = None if options.output is None else options.output.absolute()
     options = replace(options, profile=profile, output=output, overrides=tuple(options.overrides))
@@ -90,6 +91,7 @@ class QueueRun:
             raise ConfigError(Problem(f"the queue is already being run: {holder}", str(self.queue.folder)))
         self.queue.clear_stop()
         try:
+            # read each time, as other commands change the queue meanwhile
             while not self.queue.is_asked_to_stop:
                 is_paused = self.queue.is_paused
                 entry = None if is_paused else self._next()
@@ -105,17 +107,19 @@ class QueueRun:
 
     def _next(self) -> Entry | None:
         """The entry to take; entries whose runs are complete leave the queue."""
-        left: list[Entry] = []
+        open_entries: list[Entry] = []
         for entry in self.queue.entries():
             if entry.is_complete:
                 self.queue.drop(entry.id)
             elif entry.id not in self._tried:
-                left.append(entry)
-        interrupted = [entry for entry in left if entry.is_interrupted]
-        waiting = [entry for entry in left if entry.status == "waiting"]
+                open_entries.append(entry)
+        interrupted = [entry for entry in open_entries if entry.is_interrupted]
+        waiting = [entry for entry in open_entries if entry.status == "waiting"]
+        # an interrupted run holds shots already: its entry comes before all others
         return next(iter([*interrupted, *waiting]), None)
 
     def _work(self, entry: Entry) -> None:
+        # an entry that fails is not taken again by this process
         self._tried.add(entry.id)
         self.begin(entry)
         recorder = _EntryRecorder(
@@ -187,10 +191,10 @@ def _open(entry: Entry, observer: RunObserver) -> Session:
 
 def add_entry(sequence: Path, options: Options) -> None:
     """Check a sequence and add it to the queue."""
-    entry, checked = add_checked(Queue(data_root()), sequence, options)
-    for warning in checked.warnings:
+    entry, report = add_checked(Queue(data_root()), sequence, options)
+    for warning in report.warnings:
         say(*warning_lines(warning), stream=sys.stderr)
-    say(f"{entry.id}: {clean(str(sequence))}, {plural(checked.n_shots, 'shot')}, with its present text")
+    say(f"{entry.id}: {clean(str(sequence))}, {plural(report.n_shots, 'shot')}, with its present text")
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,11 +240,11 @@ class EntryRow:
 
     @property
     def notes(self) -> list[str]:
-        """What the user should know of it, for example why its run ended."""
+        """Notes for the user, for example why its run ended."""
         notes: list[str] = []
         if self.changed and self.state != "complete":
-            what = "was changed or removed since; the queued text will run"
-            notes.append(f"{clean(_short(self.sequence))} {what}")
+            name = clean(_short(self.sequence))
+            notes.append(f"{name} was changed or removed since; the queued text will run")
         if self.error:
             notes.append(visible(self.error.splitlines()[0][:MAX_ERROR]))
         if self.state in {"stopped", "failed"} and self.run_dir is not None:
@@ -290,8 +294,8 @@ def list_entries(*, as_json: bool) -> None:
 def pause_queue(is_paused: bool) -> None:
     """Pause the queue, or continue it, and print that."""
     Queue(data_root()).pause(is_paused)
-    paused = "the queue is paused: 'labseq queue pause --off' continues it"
-    say(paused if is_paused else "the queue continues")
+    paused_text = "the queue is paused: 'labseq queue pause --off' continues it"
+    say(paused_text if is_paused else "the queue continues")
 
 
 def run_entries(run_session: Callable[[Opening], None], *, keep_going: bool, watch: bool) -> int:
@@ -309,8 +313,8 @@ def run_entries(run_session: Callable[[Opening], None], *, keep_going: bool, wat
 
 
 def _report(entry: Entry) -> None:
-    again = f", resuming {entry.run_dir}" if entry.run_dir is not None else ""
-    say(f"queue: {entry.id} {clean(str(entry.sequence))}{again}")
+    resumed_run = f", resuming {entry.run_dir}" if entry.run_dir is not None else ""
+    say(f"queue: {entry.id} {clean(str(entry.sequence))}{resumed_run}")
 
 
 def _short(path: Path) -> str:

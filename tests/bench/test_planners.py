@@ -13,7 +13,7 @@ import pytest
 
 from labseq.bench import planners as bench
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry, read_comparison
-from labseq.bench.planners import Where, compare
+from labseq.bench.planners import Resources, compare
 from labseq.bench.report import Report
 from labseq.bench.work import draw, set_up
 from labseq.errors import ConfigError, PlanError
@@ -57,7 +57,7 @@ def labseq_register(registry):
     registry.planner("cold", Cold)
 """
 
-ALONE = Where(1)
+ALONE = Resources(1)
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_a_cluster_finds_what_one_process_finds(report: Report) -> None:
     with distributed.LocalCluster(
         n_workers=1, protocol="tcp", processes=False, dashboard_address=":0"
     ) as cluster:
-        where = Where(scheduler=cluster.scheduler_address)
+        where = Resources(scheduler=cluster.scheduler_address)
         found = compare(replace(SMALL, planner_entries=TWICE), where)
     assert without_times(to_plain(found)) == without_times(to_plain(report))
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
-from labseq.bench.planners import Where, compare
+from labseq.bench.planners import Resources, compare
 from labseq.bench.report import Report, save_histogram
 from labseq.errors import ConfigError
 from labseq.pictures.figures import make_figure
@@ -60,7 +60,7 @@ def labseq_register(registry):
 
 
 def compared(conditions: tuple[Condition, ...] = CONDITIONS, *planner_entries: PlannerEntry) -> Report:
-    return compare(Comparison(planner_entries or (PlannerEntry("psca"),), conditions, 10, 1), Where(1))
+    return compare(Comparison(planner_entries or (PlannerEntry("psca"),), conditions, 10, 1), Resources(1))
 
 
 @pytest.fixture(scope="module")
