@@ -25,7 +25,7 @@ from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """What a camera was armed for.
+    """A series of exposures that a camera was armed for.
 
     Attributes:
         n_frames: Number of exposures.
@@ -38,10 +38,6 @@ class Series:
     exposure_s: float
     trigger: Trigger
     em_gain: float = 1.0
-
-
-EDGES: Final = frozenset({"external", "external_start", "bulb"})
-"""Triggers that arrive on a line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,19 +201,19 @@ class CameraDriver(Camera):
         if series is None or self._n_read == series.n_frames:
             self._clock.sleep(timeout_s)
             raise self._no_frame(timeout_s)
-        taken, self._held = self._held or self._take(timeout_s), None
-        if taken is None:
+        exposure, self._held = self._held or self._take(timeout_s), None
+        if exposure is None:
             raise self._no_frame(timeout_s)
-        if taken.number > self._n_read:
-            self._held = taken
-            raise self._lost(taken.number - 1, "the camera's frame numbers have a gap")
-        self._n_read = taken.number + 1
-        if taken.image is None:
-            raise self._lost(taken.number, taken.fault)
-        exposure_s = series.exposure_s if math.isnan(taken.exposure_s) else taken.exposure_s
-        t_start_s = self._t_start_s(taken, exposure_s)
-        image = self._orientation.apply(taken.image)
-        return Frame(image, exposure_s, t_start_s, self._name, taken.number, taken.device_time_s)
+        if exposure.number > self._n_read:
+            self._held = exposure  # it is good: the next call returns it
+            raise self._lost(exposure.number - 1, "the camera's frame numbers have a gap")
+        self._n_read = exposure.number + 1
+        if exposure.image is None:
+            raise self._lost(exposure.number, exposure.fault)
+        exposure_s = series.exposure_s if math.isnan(exposure.exposure_s) else exposure.exposure_s
+        t_start_s = self._t_start_s(exposure, exposure_s)
+        image = self._orientation.apply(exposure.image)
+        return Frame(image, exposure_s, t_start_s, self._name, exposure.number, exposure.device_time_s)
 
     def self_test(self) -> None:
         """Take a frame without EM gain, if the camera can be triggered; those not yet read are dropped.
@@ -249,7 +245,7 @@ class CameraDriver(Camera):
         if trigger == "external_start" and facts.cycle_s < exposure_s:
             cycle, least = (format_quantity(s, "time") for s in (facts.cycle_s, exposure_s))
             raise LimitError(f"{self._name}: cycle_time", cycle, f"at least the exposure of {least}")
-        self.disarm()
+        self.disarm()  # the series before may not be over
         series = Series(n_frames, exposure_s, trigger, em_gain)
         try:
             self._start(series)
@@ -265,11 +261,12 @@ class CameraDriver(Camera):
         self._n_read = 0
         self._held: ExposureResult | None = None
 
-    def _t_start_s(self, taken: ExposureResult, exposure_s: float) -> float:
-        if not math.isnan(taken.t_start_s):
-            return taken.t_start_s
-        if taken.number < len(self._fired_s):
-            return self._fired_s[taken.number]
+    def _t_start_s(self, exposure: ExposureResult, exposure_s: float) -> float:
+        if not math.isnan(exposure.t_start_s):
+            return exposure.t_start_s
+        if exposure.number < len(self._fired_s):
+            return self._fired_s[exposure.number]
+        # the time of an external edge is unknown: the frame counts as read as soon as it was ready
         return self._clock.now() - exposure_s - self.facts.readout_s
 
     def _no_frame(self, timeout_s: float) -> DeviceTimeoutError:
@@ -282,18 +279,18 @@ class CameraDriver(Camera):
             reason = "the next one was not triggered"
         elif series.trigger == "external_start" and n_read:
             reason = f"frame {n_read} is not ready"
-        elif series.trigger in EDGES:
+        elif series.trigger in ("external", "external_start", "bulb"):
             reason = f"frame {n_read} waits for its external trigger; check the line"
         else:
             reason = f"frame {n_read} is not ready"
         text = f"no frame within {format_quantity(timeout_s, 'time')}: {reason}"
         return DeviceTimeoutError(self._name, text, timeout_s)
 
-    def _lost(self, last: int, why: str) -> TransientError:
+    def _lost(self, last: int, reason: str) -> TransientError:
         first, self._n_read = min(self._n_read, last), last + 1
-        which = f"frame {first} was" if first == last else f"frames {first} to {last} were"
+        frames = f"frame {first} was" if first == last else f"frames {first} to {last} were"
         n_frames = self._series.n_frames if self._series is not None else 0
-        return TransientError(f"{which} lost, of a series of {n_frames}: {why}", self._name)
+        return TransientError(f"{frames} lost, of a series of {n_frames}: {reason}", self._name)
 
     def _check_open(self) -> None:
         if not self._is_open:
@@ -301,7 +298,7 @@ class CameraDriver(Camera):
 
 
 LOOK_S: Final = 1.0
-"""How often the temperature is read, in seconds."""
+"""How often the temperature of a sensor is read, in seconds."""
 
 
 def _is_temperature_of_sensors(kelvin: float) -> float:
@@ -472,6 +469,7 @@ class SimulatedSensor:
             if series is None or self._n_exposed == series.n_frames:
                 return None
             if t_start_s is None and series.trigger == "internal":
+                # the camera times itself, however late it is asked
                 t_start_s = self._armed_s + self._n_exposed * self._period_s
             elif t_start_s is None:
                 t_start_s = self._clock.now()
@@ -494,9 +492,10 @@ class SimulatedSensor:
         """
         with self._lock:
             due_s = self._frames[0][0] if self._frames else float("inf")
-        missing_s = due_s - self._clock.now()
-        self._clock.sleep(max(0.0, min(missing_s, timeout_s)))
-        if missing_s > timeout_s:
+        # without the lock, so that another thread can expose meanwhile
+        remaining_s = due_s - self._clock.now()
+        self._clock.sleep(max(0.0, min(remaining_s, timeout_s)))
+        if remaining_s > timeout_s:
             return None
         with self._lock:
             return self._frames.popleft()[1] if self._frames else None

@@ -14,7 +14,9 @@ from contextlib import suppress
 from typing import Any, Final
 
 SLICE_S: Final = 0.005
+"""Longest single wait for a byte, in seconds."""
 _DIFFERS: Final = "not as commanded: "
+"""Beginning of a failure whose reply was a value, but another one than expected."""
 _sent: Final[dict[int, str]] = {}
 """Messages that are not sent again, by index -> why they failed; "" if they did not."""
 
@@ -92,7 +94,7 @@ class _Line:
         """Send a message and check the reply; returns what is wrong with it."""
         shown, within_s = _shown(message["send"]), message["within_s"]
         sent, end = (message[key].encode(self._encoding) for key in ("send", "until"))
-        self._port.reset_input_buffer()
+        self._port.reset_input_buffer()  # a reply that came late must not count as that to this message
         self._port.write(sent)
         self._port.flush()
         if not end:

@@ -53,7 +53,7 @@ def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) 
 
 
 def port_identities(port: str) -> tuple[str, ...]:
-    """What only one process can use of a serial port: its name, and the port that a link leads to.
+    """The names of a serial port that only one process can use: its own, and that which a link leads to.
 
     Example:
         >>> port_identities("socket://Box:4001")
@@ -67,7 +67,7 @@ def port_identities(port: str) -> tuple[str, ...]:
 
 
 class Port(Protocol):
-    """What drivers use of a port: a part of pyserial's ``Serial``."""
+    """The part of pyserial's ``Serial`` that drivers use."""
 
     @property
     def in_waiting(self) -> int:
@@ -75,7 +75,7 @@ class Port(Protocol):
         ...
 
     def read(self, size: int = 1, /) -> bytes:
-        """What has come, at most ``size`` bytes; waits a little for the first."""
+        """The bytes that have come, at most ``size``; waits a little for the first."""
         ...
 
     def write(self, data: bytes, /) -> int | None:
@@ -83,7 +83,7 @@ class Port(Protocol):
         ...
 
     def reset_input_buffer(self) -> None:
-        """Drop what has come."""
+        """Drop the bytes that have come."""
         ...
 
     def close(self) -> None:
@@ -100,7 +100,7 @@ def _broken() -> tuple[type[BaseException], ...]:
 
 
 BROKEN: Final = _broken()
-"""What a port raises when the line is gone; pyserial's own errors are OSErrors."""
+"""Errors of a port whose line is gone; pyserial's own are OSErrors."""
 
 
 def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
@@ -124,6 +124,7 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
     if "://" in port:
         options.pop("write_timeout", None)
     else:
+        # two programs on a port would get each other's replies
         options["exclusive"] = True
     try:
         return serial.serial_for_url(port, baudrate=baud_rate, timeout=SLICE_S, **options)
@@ -177,16 +178,14 @@ def serial_emergency(
     if not messages or not isinstance(name, str):
         return None
     serial: Any = port
-    options = {key: getattr(serial, key, None) for key in _OPTIONS}
+    keys = ("baudrate", "bytesize", "parity", "stopbits", "rtscts", "dsrdtr", "xonxoff")
+    options = {key: getattr(serial, key, None) for key in keys}
     set_options = {key: value for key, value in options.items() if value is not None}
     if "://" not in name:
-        set_options["write_timeout"] = 1.0
+        set_options["write_timeout"] = 1.0  # a device that takes no bytes must not block this
     values = [asdict(message) for message in messages]
     arguments = {"port": name, "options": set_options, "messages": values, "encoding": encoding, "echo": echo}
     return Emergency(Path(__file__).with_name("serial_emergency.py"), arguments)
-
-
-_OPTIONS: Final = ("baudrate", "bytesize", "parity", "stopbits", "rtscts", "dsrdtr", "xonxoff")
 
 
 def is_network_port(url: str) -> bool:

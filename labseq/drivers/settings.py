@@ -21,8 +21,6 @@ class RegionSettings(Settings):
     width: PositiveInt = Field(description="number of columns")
 
 
-TRIGGERS: Final = ("software", "internal", "external", "external_start", "bulb")
-"""All that may start exposures."""
 _ARMING_TIME: Final = (
     "time from arming for a series until it can be triggered, for budgets; simulated cameras take this long"
 )
@@ -89,15 +87,15 @@ class CameraSettings(OrientationSettings):
         self,
         readout_s: float,
         frame_shape: tuple[int, int] | None,
-        triggers: tuple[str, ...] = TRIGGERS,
+        triggers: tuple[str, ...] = ("software", "internal", "external", "external_start", "bulb"),
         **more: float,
     ) -> CameraFacts:
-        """The facts about the camera: what its driver knows, and the rest from here.
+        """The facts about the camera, from its driver and from these settings.
 
         Args:
             readout_s: From the end of an exposure until the frame can be read, in seconds.
             frame_shape: (height, width) of the images; None if not known.
-            triggers: What may start its exposures.
+            triggers: What may start its exposures; by default all that there are.
             **more: Further attributes of :class:`labseq.plugin.CameraFacts`, such as ``em_gain``.
         """
         settings = {
@@ -105,18 +103,18 @@ class CameraSettings(OrientationSettings):
             "arm_s": self.arming_time,
             "cycle_s": self.cycle_time or 0.0,
         }
-        known = {**settings, **more}
+        facts = {**settings, **more}
         return CameraFacts(
-            readout_s, frame_shape=frame_shape, triggers=triggers, line_trigger=self.line_trigger, **known
+            readout_s, frame_shape=frame_shape, triggers=triggers, line_trigger=self.line_trigger, **facts
         )
 
     def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
-        """Why region and binning do not go with a sensor of (height, width) pixels; "" if they do."""
+        """Why region and binning do not fit a sensor of (height, width) pixels; "" if they do."""
         y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
         if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
             rows, cols = sensor_shape
-            ends = f"`region` ends at row {y + height} and column {x + width}"
-            return f"{ends}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
+            end = f"`region` ends at row {y + height} and column {x + width}"
+            return f"{end}, beyond the sensor of {rows} x {cols} pixels; choose a smaller or another one"
         return _unbinnable(height, width, self.binning)
 
     def simulated_world(self, context: Context) -> tuple[Simulation, tuple[int, int]]:
@@ -125,13 +123,13 @@ class CameraSettings(OrientationSettings):
         Raises:
             ConfigError: There is none, it does not describe its sensor, or the region is beyond it.
         """
-        world = context.simulation
-        if world is None or world.sensor_shape is None:
-            text = "a simulated camera needs a simulation that describes its sensor"
-            raise ConfigError(f"{text}; add `simulation: {{use: virtual}}` to the profile")
-        if setting_error := self.sensor_conflict(world.sensor_shape):
+        simulation = context.simulation
+        if simulation is None or simulation.sensor_shape is None:
+            problem = "a simulated camera needs a simulation that describes its sensor"
+            raise ConfigError(f"{problem}; add `simulation: {{use: virtual}}` to the profile")
+        if setting_error := self.sensor_conflict(simulation.sensor_shape):
             raise ConfigError(setting_error)
-        return world, world.sensor_shape
+        return simulation, simulation.sensor_shape
 
     @model_validator(mode="after")
     def _cycle_time_is_of_external_start(self) -> Self:
@@ -153,7 +151,7 @@ class CameraSettings(OrientationSettings):
 
 
 class IndustrialCameraSettings(CameraSettings):
-    """Further settings of cameras on GigE Vision and USB3 Vision."""
+    """Settings of cameras on GigE Vision and USB3 Vision, in addition to those of every camera."""
 
     readout: Duration = Field(
         default=5e-3,

@@ -1,4 +1,4 @@
-"""What drivers of tweezers have in common: limits of programs, amplitudes and ramps."""
+"""Limits of programs, amplitudes and ramps, for drivers of tweezers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def check_tone_program(
     column_band_hz: tuple[float, float],
     most: float = 1.0,
 ) -> None:
-    """Refuse what must not reach the outputs, whatever produced the program.
+    """Refuse a tone program that must not reach the outputs, whatever produced it.
 
     Args:
         name: Name of the device, for the message.
@@ -47,17 +47,23 @@ def check_tone_program(
         raise LimitError(f"{name}: a segment's duration", "negative or not finite", "0 s or more")
     if not program.total_duration_s > 0:
         raise LimitError(f"{name}: length of the program", "0 s", "more than 0 s")
-    for word, axis, band_hz in (
+    for axis_name, axis, band_hz in (
         ("row", program.row, row_band_hz),
         ("column", program.column, column_band_hz),
     ):
         tones = axis.start_hz, axis.end_hz, axis.start_amplitude, axis.end_amplitude, axis.phase_rad
+        # one pass by a kernel; which tone it is, is found out only for the error
         if not is_within(*tones, axis.offsets, *band_hz, most + ROUNDING):
-            raise _excess(name, word, axis, program.batch, band_hz, most)
+            raise _excess(name, axis_name, axis, program.batch, band_hz, most)
 
 
 def _excess(
-    name: str, word: str, axis: AxisTones, batch: NDArray[np.int32], band_hz: tuple[float, float], most: float
+    name: str,
+    axis_name: str,
+    axis: AxisTones,
+    batch: NDArray[np.int32],
+    band_hz: tuple[float, float],
+    most: float,
 ) -> LimitError:
     """The error for the first tone that is out of its limits, or for amplitudes too high together."""
     band = f"the AOD's band, {band_hz[0] / 1e6:.6g} to {band_hz[1] / 1e6:.6g} MHz"
@@ -72,15 +78,14 @@ def _excess(
         if wrong.any():
             tone, end = np.argwhere(wrong)[0]
             segment = int(np.searchsorted(axis.offsets, tone, "right")) - 1
-            tone_name = (
-                f"{word} tone {tone - axis.offsets[segment]} in segment {segment} (batch {batch[segment]})"
-            )
+            number, place = tone - axis.offsets[segment], f"segment {segment} (batch {batch[segment]})"
             value = f"{values[tone, end] / scale:.9g} {unit}"
-            return LimitError(f"{name}: {quantity} of {tone_name}", value, limit)
+            return LimitError(f"{name}: {quantity} of {axis_name} tone {number} in {place}", value, limit)
+    # sums over the tones of each segment, as differences of running sums
     running = np.pad(np.cumsum(amplitudes, axis=1), ((0, 0), (1, 0)))
     sums = np.diff(running[:, axis.offsets]).max(axis=0)
     segment = int(sums.argmax())
-    quantity_name = f"{name}: sum of the {word} amplitudes in segment {segment} (batch {batch[segment]})"
+    quantity_name = f"{name}: sum of the {axis_name} amplitudes in segment {segment} (batch {batch[segment]})"
     return LimitError(quantity_name, f"{sums[segment]:.9g} {full}", f"{most:g}: the output would clip")
 
 

@@ -133,7 +133,7 @@ def check_each_device(
         devices: Name and device, in the order of opening.
         stop: The request to stop: the current device is made safe and closed, the others are not opened.
         simulation: The simulation that virtual devices act on: opened before them, closed after them.
-        warn: Receives what goes wrong with the watchdog.
+        warn: Receives warnings about the watchdog.
 
     Returns:
         Those that were tried, the simulation first.
@@ -149,7 +149,7 @@ def check_each_device(
             try:
                 checked = _examine(guard, name, device, timeouts, watchdog)
             finally:
-                with stop.held():
+                with stop.held():  # a second Ctrl-C must not leave it on
                     unsafe = attempt(guard, name, timeouts.safe_state_s, device.safe_state)
                     unclosed = attempt(guard, name, timeouts.safe_state_s, device.close)
                     if unsafe is None:
@@ -196,6 +196,7 @@ def _examine(
         checked = _read_versions(guard, checked, device, timeouts.call_s)
         guard.call(name, timeouts.call_s, device.self_test)
         checked = replace(checked, tested=overrides(device, Hardware.self_test))
+        # the median, as the first one may be slow
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
         return replace(checked, latency_s=statistics.median(readings_s))
     except LabseqError as failure:
@@ -203,10 +204,12 @@ def _examine(
 
 
 def _read_versions(guard: Guard, checked: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
-    """Read the versions of a device; that this fails says nothing about whether the device works."""
+    """Read the versions of a device; a failure is noted, but does not mean that the device is faulty."""
 
     def versions() -> dict[str, tuple[str, str]]:
-        return {name: (str(here), str(tried)) for name, (here, tried) in device.versions().items()}
+        return {
+            name: (str(installed), str(tested)) for name, (installed, tested) in device.versions().items()
+        }
 
     try:
         return replace(checked, versions=guard.call(checked.name, timeout_s, versions))

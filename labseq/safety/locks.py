@@ -15,9 +15,9 @@ from labseq.processes import Holder, Lock, Process
 from labseq.recording import lock_file
 
 BEAT_S: Final = 0.5
-"""How often a process that uses devices gives a sign of life."""
+"""How often a process that uses devices gives a sign of life, in seconds."""
 END_S: Final = 10.0
-"""How long a process may take to make its devices safe after SIGTERM, before it is killed."""
+"""How long a process may take to make its devices safe after SIGTERM before it is killed, in seconds."""
 HUNG_END_S: Final = 0.5
 """The same for one that hangs: it cannot obey SIGTERM."""
 
@@ -36,7 +36,7 @@ def lock_devices(
 
     Args:
         purpose: The use of the devices, shown to other users while they are locked.
-        warn: Receives a warning if nothing keeps others from a device.
+        warn: Receives a warning if a device cannot be locked.
         blocked: Called with device and holder if another process has locked it; returns whether to try
             again. Without it that is an error.
 
@@ -56,6 +56,7 @@ def lock_devices(
                     make_shared(lock.path.parent)
                     holder = lock.take()
                 except OSError as error:
+                    # a folder without locks must not keep anybody from working, nor from `labseq safe`
                     text = f"{lock.path} cannot be locked: {error.strerror or error}"
                     warn(f"{text}: nothing keeps another process from {device}")
                     break
@@ -104,11 +105,11 @@ def device_text(role: str, identity: str) -> str:
 def end_holders(
     profile: str, warn: Callable[[str], object], may_end: Callable[[str], bool]
 ) -> Callable[[str, Holder], bool]:
-    """For ``blocked`` of :func:`lock_devices`: end each process that uses devices, once.
+    """A function for ``blocked`` of :func:`lock_devices` that ends each process that uses devices, once.
 
     Args:
         profile: The profile, as it is named in commands.
-        warn: Receives what is done.
+        warn: Receives a line for each thing that is done.
         may_end: Asked whether to end a process that does not hang; receives which device it uses.
     """
     tried = set[Process | None]()
@@ -117,7 +118,7 @@ def end_holders(
         process, text = holder.process, f"{device} is in use by {holder}"
         if process in tried:
             return False
-        tried.add(process)
+        tried.add(process)  # once: it is not killed again if it still holds the next device
         is_other = process is not None and process.is_here and process.pid != os.getpid()
         if process is None or not is_other or not (holder.hangs or may_end(text)):
             hint = f"; 'labseq safe {profile} --end' ends that process first" if is_other else ""

@@ -122,7 +122,7 @@ def construct_hardware(
     Returns:
         Role or device name -> object; and name -> why it could not be constructed, with its place.
     """
-    plugin_choices = {role: c for role, c in hardware.chosen.items() if c.entry.role.has_twin}
+    plugin_choices = {role: choice for role, choice in hardware.chosen.items() if choice.entry.role.has_twin}
     failures: dict[str, LabseqError] = {}
     truth = hardware.profile.grid_model(), hardware.profile.motion
     devices, _ = construct(plugin_choices, hardware.context(clock), 0, truth=truth, refused=failures)
@@ -144,7 +144,10 @@ def make_profile_devices_safe(
     simulation = devices.pop("simulation", None)
     with stop.held():
         attempted = make_each_safe(in_safe_order(devices), hardware.profile.timeouts, simulation, observer)
-    refused: dict[str, LabseqError] = {role: e for role, e in hardware.refused.items() if role != "detector"}
+    # a detector is no device: nothing stays on if it cannot be constructed
+    refused: dict[str, LabseqError] = {
+        role: error for role, error in hardware.refused.items() if role != "detector"
+    }
     refused |= failures
     for role, error in refused.items():
         report_outcome(observer, "safe_state", role, error)
@@ -209,16 +212,16 @@ def make_profile_safe(
         stack.enter_context(stop_on_signals(stop))
         secured = make_profile_devices_safe(hardware, stop, observer)
     refused = [problem for error in hardware.refused.values() for problem in error.problems]
-    others = [problem for problem in problems.problems if problem not in refused]
+    other_problems = [problem for problem in problems.problems if problem not in refused]
     # a problem or an override may have left out or replaced a device
-    if not (secured.failures or others or overrides):
+    if not (secured.failures or other_problems or overrides):
         try:
             clear_active(hardware.key, hardware.identities)
         except RecordingError as failure:
             to_user(str(failure))
     if stop.is_set:
         raise StopRequested(stop.signal_number)
-    return replace(secured, problems=ConfigError(others) if others else None)
+    return replace(secured, problems=ConfigError(other_problems) if other_problems else None)
 
 
 def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollector) -> ResolvedProfile:
@@ -229,7 +232,7 @@ def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollec
         plugin_paths(document, spec.plugin_folders)
     folders: list[Path] = []
     for folder in spec.plugin_folders:
-        with suppress(ConfigError):  # reported already
+        with suppress(ConfigError):  # reported already; the other folders may have the devices' plugins
             folders += plugin_paths(document, [folder])
     return choose_plugins(document, spec, load_plugins(folders, spec.timeouts.load_s), "off", problems)
 
@@ -242,14 +245,14 @@ def stand_by(
     profile: str,
     overrides: Sequence[str] = (),
     observer: RunObserver | None = None,
-    tell: Callable[[str], object] = str,
+    announce: Callable[[str], object] = str,
 ) -> None:
     """Make devices safe when a process that uses them dies without having done so, or hangs; until Ctrl-C.
 
     The locks of the devices say which process that is; devices that other processes use are left alone.
 
     Args:
-        tell: Receives the devices at the beginning, then each process that died or hangs.
+        announce: Receives the devices at the beginning, then each process that died or hangs.
 
     Raises:
         ConfigError: The profile has an error, or names no device that is locked while it is in use.
@@ -265,12 +268,12 @@ def stand_by(
     devices = ", ".join(device_text(role, identity) for identity, role in identities.items())
     watch = _DeviceWatch(identities)
     with stop_on_signals(stop), suppress(StopRequested):
-        tell(f"standing by for {devices}; Ctrl-C ends this")
+        announce(f"standing by for {devices}; Ctrl-C ends this")
         while True:
-            stop.wait(0.1)
+            stop.wait(0.1)  # a process that dies is noticed within this
             for holder, roles in watch.new_troubles():
-                why = f"has not answered for {holder.silent_s:.0f} s" if holder.is_running else "died"
-                tell(f"{now().astimezone():%Y-%m-%d %H:%M:%S} {holder} {why}")
+                trouble = f"has not answered for {holder.silent_s:.0f} s" if holder.is_running else "died"
+                announce(f"{now().astimezone():%Y-%m-%d %H:%M:%S} {holder} {trouble}")
                 stop.wait(FIRST_S)
                 for role in roles:
                     _secure(hardware, role, stop, watch, observer)
