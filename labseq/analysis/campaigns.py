@@ -60,6 +60,7 @@ def export_campaign(folder: Path, path: Path) -> None:
         RecordingError: A run is damaged, or the file cannot be written.
     """
     campaign, runs = recorded_runs(folder)
+    # before the file is touched, as a run may be damaged
     results = combined(campaign, runs)
     with explained(path), whole_file(path) as file:
         results.to_netcdf(Path(file.name), engine="h5netcdf")

@@ -171,6 +171,7 @@ def draw_curves(
         line: A function of x that is drawn through the points instead of joining them.
     """
     for (name, (x, y, low, high)), colour, marker in zip(curves.items(), (DARK, ORANGE), "os", strict=False):
+        # a value without an error has no bar
         bars = scale * np.nan_to_num([y - low, high - y]).clip(min=0.0)
         look: dict[str, Any] = {"markersize": 5, "linewidth": 0.9, "capsize": 2, "capthick": 0.9, "zorder": 3}
         style = "none" if ticks or line is not None else "-"
@@ -289,10 +290,12 @@ def defects(counts: Sequence[int], n_sites: int, n_all: int, end: str) -> Panel 
     if not n_shots or not n_sites:
         return None
     number = np.arange(len(counts))
+    # if sites were independent, the number of defects would have a binomial distribution
     independent = binomial(n_sites, float(np.dot(counts, number)) / n_shots / n_sites, len(counts))
     padded_counts = np.pad(counts, (0, len(independent) - len(counts)))
     first = int(np.flatnonzero((padded_counts > 0) | (independent > MIN_SHARE))[0])
     width = -(-(len(independent) - first) // MAX_BARS)  # numbers of defects that a bar spans
+    # from 0, if that leaves less than half of the picture empty
     first = 0 if width == 1 and first < MAX_BARS // 2 else first
     starts = np.arange(first, len(independent), width)
     expected = np.add.reduceat(independent, starts)

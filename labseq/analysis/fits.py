@@ -59,6 +59,7 @@ def _exponential(x: Floats, amplitude: float, decay: float, offset: float) -> Fl
 
 
 def _guess_exponential(x: Floats, y: Floats) -> dict[str, float]:
+    # the logarithms of values near 0 are noise
     positive = y > 0.02 * y.max()
     slope = np.polyfit(x[positive], np.log(y[positive]), 1)[0] if positive.sum() > 1 else 0.0
     return {"amplitude": float(y[0]), "decay": -1 / slope if slope < 0 else float(np.ptp(x)), "offset": 0.0}
@@ -81,6 +82,7 @@ def _gaussian(x: Floats, amplitude: float, centre: float, sigma: float, offset: 
 
 def _guess_gaussian(x: Floats, y: Floats) -> dict[str, float]:
     offset, height, centre, width = _peak(x, y)
+    # the full width at half maximum is 2.355 standard deviations
     return {"amplitude": height, "centre": centre, "sigma": width / 2.355, "offset": offset}
 
 
@@ -108,7 +110,7 @@ def _saturation(x: Floats, level: float, time: float) -> Floats:
 
 def _guess_saturation(x: Floats, y: Floats) -> dict[str, float]:
     level = float(y.max())
-    rises = x[np.argmax(y >= 0.63 * level)]
+    rises = x[np.argmax(y >= 0.63 * level)]  # 1 - 1/e
     return {"level": level, "time": float(rises) or float(np.ptp(x)) / 3}
 
 
@@ -484,8 +486,10 @@ def _minimise(
     def residual(trial: Any) -> Floats:
         return (model.evaluate(x, **trial.valuesdict()) - y) / sigma
 
+    # its square root is the relative step of MINPACK
     options: dict[str, Any] = {"epsfcn": model.relative_step**2} if model.relative_step else {}
     try:
+        # the scatter about the fit stands for errors that the points do not have
         result: Any = lmfit.minimize(residual, parameters, scale_covar=not is_weighted, **options)
     except (ValueError, FloatingPointError, OverflowError) as error:
         raise _problem(f"the fit failed: {error}", "points that follow the model") from error

@@ -307,7 +307,7 @@ def _scan_maps(scan: Scanned, title: str, means: Sequence[float], label: str) ->
                 y_ticks=y.labels,
                 values=values[indices],
                 label=label,
-                limits=(float(np.nanmin(values)), float(np.nanmax(values))),
+                limits=(float(np.nanmin(values)), float(np.nanmax(values))),  # the same in all maps
             )
         )
     return tuple(panels)
@@ -362,6 +362,7 @@ class _Summary:
         """Survival and times, from the files of some shots; unreadable ones are left out."""
         survival, totals = Survival.empty(self.run.target.shape), StageTotals()
         loads = steps_that_load(self.run)
+        # from all parts of the run, as its beginning may differ from its end
         for shot in evenly(self.run.shots, self._max_read):
             with suppress(RecordingError):
                 survival.add(shot, loads)

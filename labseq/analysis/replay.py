@@ -214,6 +214,7 @@ def _replay_plans(shot: Shot, planner: Planner, pipeline: _Pipeline, grid: SiteG
         replayed, same, failure = None, False, ""
         try:
             start_s = perf_counter()
+            # on the recorded occupancy: a replayed detector does not change what the planner gets
             plan = call_planner(planner, name, image.occupancy, shot.target, guard)
             planning_s = perf_counter() - start_s
             report = check_plan(plan, image.occupancy, shot.target, dop, grid, pipeline.motion, name)

@@ -144,6 +144,7 @@ def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float
     if len({dimension_of(unit) for unit in units}) > 1:
         return None
     unit = units[int(np.argmax(np.abs(values)))]
+    # without the rounding error of the division: 0.3 ms, not 0.30000000000000004 ms
     return tuple(float(f"{value / factor_of(unit):.12g}") for value in values), re.sub(
         r"\bu(?=[msVWK]\b)", "µ", unit
     )

@@ -88,6 +88,7 @@ def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
     """Compute the statistics of shots from the index, or from their files if needed; no frames are read."""
     rows = [shot.row for shot in shots]
     judged = [row for row in rows if not math.isnan(row.filling_fraction) and row.ends_with_image_step]
+    # the same shots for both, so that true and seen defects can be compared
     with_truth = [row for row in rows if "n_defects_true" in row.simulation and len(row.images)]
     return Statistics(
         n_shots=len(rows),

@@ -115,6 +115,7 @@ def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
 
 def _place(name: str) -> tuple[bool, int, str]:
     """Sorting key: known stages in their order, then others, then whole steps."""
+    # plugins may report stages of their own
     return name.startswith(STEP), ORDER.index(name) if name in ORDER else len(ORDER), name
 
 

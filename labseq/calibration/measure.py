@@ -132,6 +132,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         quality=result.quality,
         grid=grid_facts(hardware.grid),
         origin={**_origin(method, request, hardware, run), **result.origin},
+        # the time of the measurement, as an old run may be analysed again
         taken_utc=now_utc() if run is None else str(run.record["t_start_utc"]),
     )
     store = store_of(document, spec, request.dry_run)
@@ -139,7 +140,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
     stored = store.add(entry, picture)
     refused = "" if request.force else why_left_out(entry, hardware.calibrations) or store.why_worse(entry)
     if not refused:
-        store.use(stored, hardware.grid, force=True)
+        store.use(stored, hardware.grid, force=True)  # compared above
         overlay = store.active().get("overlay")
         if entry.kind == "frequencies" and overlay is not None:
             store.use_none("overlay")  # or its correction would be made twice
@@ -282,6 +283,7 @@ def _target(method: Method, grid: SiteGrid) -> list[str]:
             Problem(problem, "labseq calibrate timing", expected="a grid of at least two sites")
         )
     sizes = zip(("rows", "cols"), grid.shape, strict=True)
+    # 9/16 of the sites, of which random loading fills three quarters
     block = [f"target.{axis}={max(1, 3 * n // 4)}" for axis, n in sizes]
     return [*block, "profile.mobile_tweezers.overhead_per_cycle=0 s"]
 

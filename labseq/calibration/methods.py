@@ -49,6 +49,7 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
         DeviceError: No lattice was found; says why.
         ConfigError: The run has no frames.
     """
+    # added up one by one, so that only one frame is in memory
     total, n_frames = np.zeros(1), 0
     for frame in data.frames():
         total, n_frames = total + frame.image, n_frames + 1
@@ -247,6 +248,7 @@ def fit_frequencies(
     if n.shape[1:] != grid.shape:
         raise ValueError(f"counts of shape {n.shape}; expected (n_points, {grid.n_rows}, {grid.n_cols})")
     overlay = fit_overlay(offset, n, k, grid)
+    # beyond the reach no atom survives, wherever the centre is
     near = distance_m(offset - overlay.centre_m, unit_axes(grid)) < overlay.shape.reach_m
     columns_m, rows_m, spread = _centres(offset[near], n[near], k[near], overlay, grid)
     errors_m = np.sqrt(np.diag(spread))
@@ -290,6 +292,7 @@ def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
     n = len(values)
     degree = 2 if n >= 6 else 1 if n >= 3 else 0
     basis = np.vander(np.linspace(-1, 1, n), degree + 1)
+    # bisection: chi squared falls as the scatter rises
     low, high = 0.0, float(np.ptp(values)) + 1e-30
     for _ in range(60):
         middle = (low + high) / 2

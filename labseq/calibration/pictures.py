@@ -89,6 +89,7 @@ def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
     by_site = signals.reshape(len(signals), -1).T
     counts = np.stack([np.histogram(site_signals, edges)[0] for site_signals in by_site], axis=1)
     extent = (-0.5, len(by_site) - 0.5, low, high)
+    # logarithmic, as the few signals between the peaks matter
     below.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
     site = np.arange(len(by_site))
     below.step(site, thresholds.ravel(), where="mid", color=ARROW, linewidth=0.8, label="threshold")

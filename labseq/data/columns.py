@@ -171,6 +171,7 @@ def _array(values: Sequence[Any], *, text: bool = False) -> NDArray[Any]:
             return np.array(values, np.bool_)
         if kinds == {int}:
             return np.array(values, np.int64)
+        # numpy has no missing integer: a column with gaps is of floats
         return np.array([math.nan if value is None else value for value in values], np.float64)
     return np.array([_text(value) for value in values], object)
 

@@ -110,6 +110,7 @@ def _write_parquet(run: Run, path: Path) -> None:
     metadata = {
         column.name: {"units": column.units, "description": column.description} for column in columns_of(run)
     }
+    # Parquet keeps metadata for each field, and for the whole table
     fields = [field.with_metadata(metadata[field.name]) for field in table.schema]
     run_metadata = {b"labseq": json.dumps(facts_of(run)).encode()}
     schema = pa.schema(fields, {**(table.schema.metadata or {}), **run_metadata})

@@ -61,6 +61,7 @@ class ChosenPoints:
             parameters: Address -> value, from the shot's line of the index.
         """
         values = [parameters[address] for address in self._addresses]
+        # as text, because values may be lists, which are not keys
         number = self._numbers.setdefault(dumps(values), len(self.points))
         if number == len(self.points):
             self.points.append(values)

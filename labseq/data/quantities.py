@@ -85,6 +85,7 @@ def _survival(shot: Shot, _: TargetPattern, before: str = "", after: str = "") -
     first, last = _image(shot, before, 0), _image(shot, after, -1)
     if first is None or last is None or first.t_start_s >= last.t_start_s:
         return NO_VALUE
+    # an image is taken at the end of its cycle, so that the cycle of the first image does not count
     start, end = (first.step, first.cycle), (last.step, last.cycle)
     cycles = (cycle for cycle in shot.cycles if start < (cycle.step, cycle.cycle) <= end)
     expected = np.logical_or(*follow_atoms(first.occupancy, cycles))
@@ -179,6 +180,7 @@ def make_quantity(
             name, "", quantity.is_rate, True, lambda shot: quantity.events_of(shot, target, *images)
         )
     values = (results or {}).get(name)
+    # results that are true or false are counted as events
     is_rate = name == "success" or (values is not None and {*map(type, values.values())} == {bool})
 
     def events_of(shot: Shot) -> tuple[float, float]:

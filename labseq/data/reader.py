@@ -45,6 +45,7 @@ def open_run(path: str | Path) -> Run:
         raise RecordingError(repr(path), "is not a path", "give a run's folder or a file in it") from None
     folder = folders.find_run(path)
     record = read_run(folder)
+    # the state before the index: if the run is complete by now, the index has all of its lines
     status, error = read_state(folder)
     rows, n_damaged = read_index(folder)
     load = caching_loader()

@@ -171,6 +171,7 @@ def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int
         counts[point] += 1
     axes = [dict(zip(map(dumps, values), values, strict=True)) for values in zip(*points, strict=True)]
     keys = [tuple(map(dumps, point)) for point in points]
+    # a list of points that holds each combination once is a grid, too
     is_product = math.prod(map(len, axes)) == len(points) == len(set(keys))
     if is_product:
         dims, shape = tuple(addresses), tuple(map(len, axes))

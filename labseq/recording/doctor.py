@@ -97,6 +97,7 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
     all_markers = markers()
     active = {marker.run_dir for marker in all_markers if marker.is_active}
     for run_dir in _runs(root, report):
+        # run.json comes last when a folder is made
         is_being_made = not _may_exist(run_dir / folders.RUN_FILE) and _is_young(run_dir)
         if run_dir.resolve() in active or is_being_made:
             report.in_progress.append(run_dir)
@@ -191,6 +192,7 @@ class _LineFile:
             RecordingError: It cannot be written; the old file is unchanged.
         """
         if self._removed:
+            # to the quarantine first: if this is interrupted, a line is in both files, and none is lost
             goal = _quarantine_of(self.path.parent) / self.path.name
             _log_move(self.path.parent, "damaged or superfluous lines", self.path, goal)
             with explained(goal):
@@ -520,6 +522,7 @@ def _may_exist(path: Path) -> bool:
 def _is_young(path: Path) -> bool:
     """Whether something may belong to a run that is just being created: it is less than a minute old."""
     try:
+        # of either sign, as the clock of a file server may be ahead
         return abs(time.time() - path.stat().st_mtime) < 60.0
     except OSError:
         return False

@@ -118,6 +118,7 @@ def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
     """Read attributes: attribute of the record -> plain value; those of a newer minor format are ignored."""
     values: dict[str, Any] = {}
     for field in fields:
+        # `values` itself stands for an attribute that is missing
         value = read_attribute(node, field.name, values)
         if value is values:
             continue

@@ -255,7 +255,7 @@ def _float(value: Any) -> float:
 
 
 def _integers(values: Iterable[Any]) -> Sequence[int]:
-    return array("q", values)
+    return array("q", values)  # eight bytes a number: an index may have many thousand lines
 
 
 def _floats(values: Iterable[Any]) -> Sequence[float]:

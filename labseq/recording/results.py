@@ -147,6 +147,7 @@ def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
         for row in rows:
             for key, value in row.items():
                 if key not in (SHOT, ERROR) and isinstance(value, bool | int | float | str):
+                    # the name that the sequence gives; that of the file has no spaces or slashes
                     name = f"{PREFIX}{about.get('analysis', path.stem)}.{key}"
                     columns.setdefault(name, {})[row[SHOT]] = value
     return columns

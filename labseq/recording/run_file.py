@@ -92,6 +92,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     optional = ("units", "overrides", "scan", "devices", "resolved", "provenance")
     wrong = [name for name, kind in required.items() if not isinstance(record.get(name), kind)]
     wrong += [name for name in optional if not isinstance(record.get(name) or {}, dict)]
+    # counts are columns of int64 in tables
     if not wrong and not 0 <= record["n_shots"] < 2**63:
         wrong = ["n_shots"]
     changes: dict[str, Any] = record.get("overrides") or {}

@@ -480,6 +480,7 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
     ):
         if not 0 <= row["n_batches_played"] <= row["n_batches"]:
             raise ValueError(f"{row['n_batches_played']} of {row['n_batches']} batches were played")
+        # the tables hold the rows of all cycles, one after the other: each cycle takes its own from the front
         own_batches, batches = batches[: row["n_batches"]], batches[row["n_batches"] :]
         own_sites, sites = sites[: row["n_atom_moves"]], sites[row["n_atom_moves"] :]
         offsets = np.concatenate([[0], np.cumsum(own_batches["n_atom_moves"])])

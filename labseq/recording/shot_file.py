@@ -280,6 +280,7 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
     Raises:
         RecordingError: It is missing, damaged, or of another format.
     """
+    # opening a named pipe would wait for ever
     if other_kind := something_else(path):
         raise RecordingError(path, f"cannot be read: {other_kind}", "restore it from a backup")
     if not path.is_file():

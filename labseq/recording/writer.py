@@ -280,6 +280,7 @@ class RunWriter:
     def _finish(self, status: RunStatus, error: str) -> None:
         with suppress(OSError):
             (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
+        # the state comes last: a reader that sees it finds all other lines
         self.event("run_finished", status=status, error=error, n_shots=self.n_written)
         write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error))
 
