@@ -132,6 +132,7 @@ def trend(name: str, shots: Floats, values: Floats, *, is_rate: bool) -> Panel |
         averaged = "1 shot" if window == 1 else f"{window} shots"
         axes.set(title=f"{name} by shot; line: mean of {averaged}", xlabel="shot", ylabel=f"{name} (%)")
         axes.set_xlim(shots[0] - 0.5, shots[-1] + 0.5)
+        # -4 and 104 leave room for the marks at 0 and 100 %
         axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(100 * values, 0.1, MIN_RANGE_PERCENT)))
         whole_numbers(axes.xaxis)
 
@@ -233,7 +234,7 @@ def draw_map(
     axes.set(title=title, xlabel=x_label, ylabel=y_label)
     axes.grid(visible=False)
     set_labels(axes.xaxis, x_ticks, room=24, most=MAX_TICKS)
-    set_labels(axes.yaxis, y_ticks, room=sys.maxsize, most=MAX_TICKS)
+    set_labels(axes.yaxis, y_ticks, room=sys.maxsize, most=MAX_TICKS)  # never turned
     if max(values.shape) <= 6:  # the numbers fit into the cells
         for (row, col), value in np.ndenumerate(values):
             if np.isfinite(value):
@@ -271,7 +272,7 @@ def draw_sites(
     x, y = cells.reshape(-1, 2).T
     axes.set(title=title, aspect="equal")
     axes.set_xlim(x.min() - 0.3, x.max() + 0.3)
-    axes.set_ylim(y.max() + 0.3, y.min() - 0.3)
+    axes.set_ylim(y.max() + 0.3, y.min() - 0.3)  # downwards, as on a frame
     axes.set_axis_off()
     extend = "min" if (finite < low).any() else "neither"
     axes.figure.colorbar(filled, ax=axes, pad=0.02, shrink=0.85, extend=extend, label=label)
@@ -362,7 +363,7 @@ def loss_causes(losses: Mapping[str, Estimate]) -> Panel | None:
         }
         axes.barh(at, means, height=0.65, color=LIGHT, xerr=np.nan_to_num(errors), **bars)
         axes.set_yticks(at, causes)
-        axes.invert_yaxis()
+        axes.invert_yaxis()  # the worst at the top
         axes.set(title="lost in a shot, by cause", xlabel="atoms (known in the simulation)")
         _vertical_grid(axes)
         axes.set_xlim(left=0.0)
@@ -457,6 +458,7 @@ def signals_of_sites(shots: Sequence[Shot]) -> Panel:
         total = f"{signals.size} signals on the first image of {len(signals)} shots"
         title = f"{total}, {int((signals > thresholds).sum())} above threshold"
         axes.set(title=title, xlabel=f"signal of a site ({unit})" if unit else "signal of a site")
+        # logarithmic, as the tails of the peaks decide about errors
         axes.set(ylabel="sites", yscale="log")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend()

@@ -121,7 +121,7 @@ def _step(x: Floats, before: float, after: float, centre: float, width: float) -
 
 
 def _guess_step(x: Floats, y: Floats) -> dict[str, float]:
-    centre = float(np.interp(0.0, *_rising((y[0] + y[-1]) / 2 - y, x)))
+    centre = float(np.interp(0.0, *_rising((y[0] + y[-1]) / 2 - y, x)))  # where y is half way
     return {"before": float(y[0]), "after": float(y[-1]), "centre": centre, "width": float(np.ptp(x)) / 8}
 
 

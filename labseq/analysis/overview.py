@@ -360,6 +360,7 @@ class _Summary:
     @cached_property
     def read(self) -> tuple[Survival, RunTiming]:
         """Survival and times, from the files of some shots; unreadable ones are left out."""
+        # both in one pass, so that each file is read once
         survival, totals = Survival.empty(self.run.target.shape), StageTotals()
         loads = steps_that_load(self.run)
         # from all parts of the run, as its beginning may differ from its end

@@ -103,6 +103,7 @@ def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
     # an axis at least, even if all points have the same value
     varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]
     together: dict[int, list[str]] = {}
+    # addresses that change together share an axis
     for i in varied:
         leader = next((k for k in together if _follows(columns, numbers, i, k)), i)
         together.setdefault(leader, []).append(addresses[i])

@@ -259,6 +259,7 @@ class Survival:
             cycle = next(cycles, None) if ended_cycle >= 0 else None
             number += cycle is not None
             start_s, end_s = images.t_start_s[i - 1] if i else -1.0, images.t_start_s[i]
+            # an atom that was loaded in between would count as a survivor
             if not i or any(start_s <= t_s < end_s for t_s in loaded_s):
                 continue
             moved, kept = follow_atoms(occupancies[i - 1], () if cycle is None else (cycle,))

@@ -49,6 +49,7 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
         The exit code: 1 if the run's own planner or detector did not reproduce the recorded results.
     """
     run = chosen_run(path)
+    # before the work, as the file may not be writable
     write = json_writer(None if output is None else str(output))
     with reporting(as_json=as_json) as show:
         report = ReplayReport(replay(run, request, announce=report_compiling))

@@ -179,7 +179,7 @@ def measure_latency(
         profile=request.profile,
         overrides=request.overrides,
         seed=request.seed,
-        dry_run="full",
+        dry_run="full",  # the driver's real code runs, down to the simulated card
         observer=times,
     )
     lab = session.build_lab()
@@ -326,6 +326,7 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
         figure = make_figure(6.4, 3.2, layout="constrained")
         axes = figure.add_subplot(xlabel="frame in memory to light (ms)", ylabel="programs")
         light_ms = 1e3 * np.array(light_s)
+        # logarithmic, as the rare long times matter
         bins = np.geomspace(0.95 * light_ms.min(), 1.05 * light_ms.max(), 80)
         axes.hist(light_ms, bins, color="#3b6ea5")
         axes.set(xscale="log", yscale="log", ylim=(0.7, None))  # counts begin at one

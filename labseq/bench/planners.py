@@ -88,7 +88,7 @@ def compare(
     received: list[int] = []
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
-        received.append(number)
+        received.append(number)  # KeyboardInterrupt does not say which signal it was
         raise KeyboardInterrupt
 
     try:

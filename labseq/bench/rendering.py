@@ -160,6 +160,7 @@ def in_two_threads(render: Callable[[Samples, int], None], n_samples: int) -> No
         for at in range(start, stop, CHUNK):
             render(out[: min(CHUNK, stop - at)], at)
 
+    # the kernels release Python's lock
     half = n_samples // 2
     with ThreadPoolExecutor(1) as executor:
         second_half = executor.submit(work, half, n_samples)

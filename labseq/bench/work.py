@@ -100,6 +100,7 @@ def _motion(condition: Condition) -> MotionSpec:
         Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
         for key, value in condition.motion
     ]
+    # validated as in a profile, so that mistakes are reported as there
     document = Document.of_options(overrides, _MOTION_ADDRESS)
     motion = document.validate(MotionSpec, ("motion",), called=_MOTION_ADDRESS)
     n = condition.degree_of_parallelism

@@ -144,6 +144,7 @@ class _Shots:
                 set_attributes(copy, {"default": "detection"})
 
     def _share(self, source: Any, copy: Any, name: str) -> None:
+        # compared by content: each shot's file has a copy of its own
         content = {
             key: str(value[()]) if value.ndim == 0 else value[()].tobytes() for key, value in source.items()
         }
@@ -158,7 +159,7 @@ class _Shots:
 def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
     """Copy one item of a group; large arrays are compressed, and frames left out if not requested."""
     link = source.get(name, getlink=True)
-    if isinstance(link, h5py.SoftLink):
+    if isinstance(link, h5py.SoftLink):  # leads to the frames of the same shot
         shot = "/".join(copy.name.split("/")[:3])
         copy[name] = h5py.SoftLink(link.path.replace("/entry", shot, 1))
         return

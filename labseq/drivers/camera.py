@@ -341,6 +341,7 @@ def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: st
     within_since_s: float | None = None
     while True:
         now_s, temperature_k = clock.now(), read_k()
+        # it may pass through the setpoint before it is steady
         if abs(temperature_k - cooling.temperature_k) > cooling.tolerance_k:
             within_since_s = None
         elif within_since_s is None:

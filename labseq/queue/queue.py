@@ -72,6 +72,7 @@ class Entry:
     @property
     def is_interrupted(self) -> bool:
         """Whether the process that ran it died before its end."""
+        # a process on another computer cannot be looked for: it counts as gone
         is_gone = self.owner is None or not (self.owner.is_here and self.owner.is_running)
         return self.status == "running" and is_gone
 
@@ -262,7 +263,7 @@ def _read(file: Path) -> Entry | None:
     try:
         values = parse_object(read_file(file)) or {}
     except RecordingError:
-        if not os.path.lexists(file):
+        if not os.path.lexists(file):  # another command has removed it since it was listed
             return None
         raise
     if values.get("format") != FORMAT:
@@ -294,6 +295,7 @@ def _check(entry: Entry, file: Path) -> None:
         raise ValueError(f"text: it is longer than {MAX_BYTES >> 10} KiB")
     paths = {"sequence": entry.sequence, "output": entry.options.output, "run_dir": entry.run_dir}
     for name, path in paths.items():
+        # an edited entry must not lead elsewhere
         if path is not None and (".." in path.parts or "\0" in str(path)):
             raise ValueError(f"{name}: expected a path without '..'")
 

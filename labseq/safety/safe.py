@@ -275,7 +275,7 @@ def stand_by(
                 trouble = f"has not answered for {holder.silent_s:.0f} s" if holder.is_running else "died"
                 announce(f"{now().astimezone():%Y-%m-%d %H:%M:%S} {holder} {trouble}")
                 stop.wait(FIRST_S)
-                for role in roles:
+                for role in roles:  # one by one, as another process may use some of them again
                     _secure(hardware, role, stop, watch, observer)
 
 
@@ -285,6 +285,7 @@ def _secure(
     """Make one device safe, and try again for a while, unless a process that works has begun to use it."""
     hardware = replace(profile, chosen={role: profile.chosen[role]})
     to_user, deadline_s = partial(warn, observer), time.monotonic() + TRY_AGAIN_S
+    # a process that works is never ended
     ends = end_holders(str(profile.document.path), to_user, lambda _: False)
 
     def blocked(device: str, holder: Holder) -> bool:
