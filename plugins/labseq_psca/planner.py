@@ -6,7 +6,7 @@ import importlib
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,8 +18,6 @@ from labseq.plugin.planning import choose_plan
 
 Kernel = Callable[..., tuple[NDArray[np.int16], NDArray[np.int32]]]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]
-
-_ORDERS: Final[dict[RowOrder, int]] = {"half_filled": 0, "fullest": -1, "emptiest": 1}  # see kernels
 
 
 class ToneLimits(Settings):
@@ -92,7 +90,8 @@ class PscaPlanner:
         self._settings = settings
         self._repair_below = settings.repair_below if settings.variant == "fewest" else 0.0
         self._eject_slots = motion.eject_slots
-        self._order = _ORDERS[settings.row_order]
+        # as in kernels_rows, which is not imported here: it takes numba
+        self._order = {"half_filled": 0, "fullest": -1, "emptiest": 1}[settings.row_order]
         self._grid = context.grid
         self._motion = motion
 
@@ -119,7 +118,7 @@ class PscaPlanner:
 
         Args:
             occupancy: bool (n_rows, n_cols), as detected.
-            target: The wanted pattern, of the same shape.
+            target: The pattern to make, of the same shape.
 
         Returns:
             Batches of one line each, of at most ``degree_of_parallelism`` atoms.
@@ -139,7 +138,7 @@ class PscaPlanner:
             if 0 < n_defects <= self._repair_below * target.n_atoms:
                 plans = (plan, self._repair(occupied, fill, target))
                 grid, dop = self._grid, self.degree_of_parallelism
-                if grid.shape != target.shape:
+                if grid.shape != target.shape:  # a planner may be called for another array than the profile's
                     grid = SiteGrid(*target.shape, grid.spacing_m, lattice=grid.lattice, shear=grid.shear)
                 return choose_plan(plans, occupied, target, dop, grid, self._motion)
         return plan
@@ -155,7 +154,7 @@ class PscaPlanner:
 
         motion, spacing_m = self._motion, self._grid.spacing_m
         losses = motion.losses
-        per_second = target.n_atoms / losses.lifetime_s
+        per_second = target.n_atoms / losses.lifetime_s  # of all atoms, which wait while some move
         batch_s = motion.overhead_per_batch_s + motion.pick_up_s + motion.drop_off_s
         costs = (
             -math.log1p(-losses.move),

@@ -21,9 +21,7 @@ from labseq_spcm.library import Library, load_spcm
 POLL_S: Final = 0.2e-3
 """Time between two reads of the card's status."""
 TRANSFER_TIMEOUT_S: Final = 1.0
-"""How much longer than at its slowest speed the bus may take."""
-SLOW_BUS: Final = 0.5e9
-"""Bytes per second that every slot for the card reaches."""
+"""How much longer than at its slowest speed the bus may take, in seconds."""
 
 
 class Buffer:
@@ -141,43 +139,43 @@ class AwgCard:
         with self._translated_errors(f"reading register {register}"):
             return int(self._card.get_i(register))
 
-    def write(self, register: int, value: int, what: str) -> None:
+    def write(self, register: int, value: int, name: str) -> None:
         """Write a register that cannot be read back."""
-        with self._translated_errors(f"{what} = {value}"):
+        with self._translated_errors(f"{name} = {value}"):
             self._card.set_i(register, value)
 
-    def set(self, register: int, value: int, what: str, tolerance: int = 0) -> int:
+    def set(self, register: int, value: int, name: str, tolerance: int = 0) -> int:
         """Write a register and read it back: the card rounds some values and snaps others.
 
         Args:
             register: Its number.
             value: The value to set.
-            what: Its name, for messages.
+            name: Its name, for messages.
             tolerance: By how much the card may round.
 
         Returns:
             The value that the card reads.
         """
-        self.write(register, value, what)
-        found = self.read(register)
-        if abs(found - value) > tolerance:
-            raise DeviceError(self.name, f"{what} was set to {value}, and the card reads {found}")
-        return found
+        self.write(register, value, name)
+        actual = self.read(register)
+        if abs(actual - value) > tolerance:
+            raise DeviceError(self.name, f"{name} was set to {value}, and the card reads {actual}")
+        return actual
 
-    def write_list(self, entries: NDArray[np.void], what: str) -> None:
+    def write_list(self, entries: NDArray[np.void], action: str) -> None:
         """Write many registers in one call; ``spcm``'s own ``register_list`` overruns its 1024 entries.
 
         Args:
             entries: (n,), as the driver library's ``ST_LIST_PARAM``: register, type, value.
-            what: What it does, for messages.
+            action: What it does, for messages.
         """
         address = ctypes.c_void_p(entries.ctypes.data)
-        with self._translated_errors(what):
+        with self._translated_errors(action):
             self._card.set_ptr(self.spcm.SPC_REGISTER_LIST, address, entries.nbytes)
 
-    def command(self, command: int, what: str) -> None:
+    def command(self, command: int, action: str) -> None:
         """Send a command, one or several M2CMD bits."""
-        with self._translated_errors(what):
+        with self._translated_errors(action):
             self._card.set_i(self.spcm.SPC_M2CMD, command)
 
     def write_setup(self) -> None:
@@ -196,7 +194,7 @@ class AwgCard:
         """Transfer samples to the on-board memory, and wait until they have arrived."""
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
-        limit_s = frames.nbytes / SLOW_BUS + TRANSFER_TIMEOUT_S
+        limit_s = frames.nbytes / 0.5e9 + TRANSFER_TIMEOUT_S  # every slot for the card reaches 0.5 GB/s
         text = f"{frames.nbytes} bytes were not uploaded"
         self.wait_until(lambda: bool(self.status & self.spcm.M2STAT_DATA_END), text, limit_s, poll_s)
 

@@ -38,12 +38,8 @@ FLEXIBLE: Final = (8, 9, 10, 11)
 LONE: Final = (20,)
 """The core that always belongs to output 1."""
 
-AMPLITUDE_STEPSIZE: Final = 64
-"""Amplitude slopes become finer, 298 / 64 per second, with fewer and larger increments."""
 ARRIVAL_S: Final = 20e-6
 """Latency of commands sent by DMA (EDMSuite, on an M4i.9622)."""
-PORTION: Final = 1000
-"""Commands sent in one call, when the queue has room for them; no block has as many."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 
@@ -99,10 +95,10 @@ def worst_distance_m(grid: SiteGrid, motion: MotionSpec) -> float:
     bend = BENDS[FrequencyCourse[motion.speed_profile.upper()]]
     n_commands = 2 * (motion.max_row_tones + motion.max_column_tones) + 2
     n_sites = np.arange(1, max(grid.shape) + 1)
-    way_m = n_sites * grid.spacing_m
-    wanted = np.ceil(np.sqrt(bend * way_m / (8 * limits.FOLLOWS_M)))
-    by_rate = way_m / motion.speed_m_s * limits.DDS_COMMANDS_PER_S // n_commands
-    return float((bend * way_m / (8 * np.maximum(1, np.minimum(wanted, by_rate)) ** 2)).max())
+    travel_m = n_sites * grid.spacing_m
+    for_distance = np.ceil(np.sqrt(bend * travel_m / (8 * limits.FOLLOWS_M)))
+    by_rate = travel_m / motion.speed_m_s * limits.DDS_COMMANDS_PER_S // n_commands
+    return float((bend * travel_m / (8 * np.maximum(1, np.minimum(for_distance, by_rate)) ** 2)).max())
 
 
 def choose_cores(name: str, settings: SpcmSettings, motion: MotionSpec, grid: SiteGrid) -> Cores:
@@ -151,9 +147,6 @@ class Commands:
         return Commands(entries, np.concatenate([self.ends, len(self.entries) + rest.ends]))
 
 
-NO_COMMANDS: Final = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
-
-
 def compile_commands(
     name: str, program: ToneProgram, cores: Cores, keep_warm: KeepWarm | None = None
 ) -> Commands:
@@ -186,17 +179,17 @@ def compile_commands(
         raise _too_many_tones(name, program, cores, int(ends[0]))
     if n_blocks == kernels.TOO_SHORT:
         segment = int(ends[0])
-        what = f"{name}: duration of a segment in batch {program.batch[segment]}"
+        quantity = f"{name}: duration of a segment in batch {program.batch[segment]}"
         limit = "83.2 ns, the DDS's shortest time"
-        raise LimitError(what, f"{program.duration_s[segment]:.4g} s", limit)
+        raise LimitError(quantity, f"{program.duration_s[segment]:.4g} s", limit)
     ends = ends[:n_blocks]
     registers, values = registers[: ends[-1]], values[: ends[-1]]
     _check_slope(name, registers, values)
     entries = np.empty(len(registers), ENTRY)
     entries["register"] = registers
-    whole = (registers == kernels.SOURCE) | (registers == kernels.COMMAND)
-    entries["type"] = np.where(whole, TYPE_INT64, TYPE_DOUBLE)
-    entries["value"] = np.where(whole, values.astype(np.int64), values.view(np.int64))
+    is_integer = (registers == kernels.SOURCE) | (registers == kernels.COMMAND)
+    entries["type"] = np.where(is_integer, TYPE_INT64, TYPE_DOUBLE)
+    entries["value"] = np.where(is_integer, values.astype(np.int64), values.view(np.int64))
     return Commands(entries, ends)
 
 
@@ -231,9 +224,9 @@ def _too_many_tones(name: str, program: ToneProgram, cores: Cores, segment: int)
     n_row, n_column = (
         int(axis.offsets[segment + 1] - axis.offsets[segment]) for axis in (program.row, program.column)
     )
-    what = f"{name}: row and column tones in batch {program.batch[segment]}"
+    quantity = f"{name}: row and column tones in batch {program.batch[segment]}"
     limit = f"{len(cores.row)} and {len(cores.column)}, the DDS's cores on these outputs"
-    return LimitError(what, f"{n_row} and {n_column}", limit, "lower max_row_tones and max_column_tones")
+    return LimitError(quantity, f"{n_row} and {n_column}", limit, "lower max_row_tones and max_column_tones")
 
 
 class Dds(PlayMode):
@@ -258,7 +251,7 @@ class Dds(PlayMode):
         self._cores = cores
         self._keep_warm = keep_warm
         self._is_idle = False
-        self._commands = NO_COMMANDS
+        self._commands = Commands(np.empty(0, ENTRY), np.zeros(0, np.int64))
         self._continues = False
         self._n_sent = 0
         self._n_events = 0
@@ -276,7 +269,8 @@ class Dds(PlayMode):
         card.set(spcm.SPC_DDS_CORES_ON_CH0, self._cores.masks[0], "cores of output 0")
         card.set(spcm.SPC_DDS_CORES_ON_CH1, self._cores.masks[1], "cores of output 1")
         card.set(spcm.SPC_DDS_DATA_TRANSFER_MODE, spcm.SPCM_DDS_DTM_DMA, "DDS transfer mode")
-        card.set(spcm.SPC_DDS_AMP_RAMP_STEPSIZE, AMPLITUDE_STEPSIZE, "DDS amplitude ramp step size")
+        # amplitude slopes become finer, 298 / 64 per second, with fewer and larger increments
+        card.set(spcm.SPC_DDS_AMP_RAMP_STEPSIZE, 64, "DDS amplitude ramp step size")
 
     def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:
         """Compile a program, and queue its first commands; returns its playing time in seconds."""
@@ -381,7 +375,7 @@ class Dds(PlayMode):
         """
         card, spcm = self._card, self._card.spcm
         entries, ends = self._commands.entries, self._commands.ends
-        portion = min(PORTION, len(entries) - self._n_sent)
+        portion = min(1000, len(entries) - self._n_sent)  # no block has as many
         if not portion or portion > self._queue_length - card.read(spcm.SPC_DDS_QUEUE_CMD_COUNT):
             return False
         last = int(np.searchsorted(ends, self._n_sent + portion, "right")) - 1

@@ -24,10 +24,7 @@ M2STAT_CARD_READY = 0x4
 
 LOWEST_MV = 80
 HELD_S = 2.0
-"""How long another process may still hold the card: one that dies gives it back within that time."""
-PAUSE_S = 1e-3
-TEXT_LENGTH = 200
-"""Longest error text of the driver library."""
+"""How long another process may still hold the card, in seconds: one that dies gives it back by then."""
 
 
 class EmergencyError(Exception):
@@ -71,10 +68,10 @@ def off(library: str, card: str, mode: str) -> str:
 def load(library: str) -> Any:
     """The driver library, its functions with their signatures."""
     try:
-        found: Any = ctypes.WinDLL(library) if sys.platform == "win32" else ctypes.CDLL(library)
+        cdll: Any = ctypes.WinDLL(library) if sys.platform == "win32" else ctypes.CDLL(library)
     except (OSError, TypeError) as error:
         raise EmergencyError(f"the driver library {library!r} cannot be loaded: {error}") from error
-    return signed(found)
+    return signed(cdll)
 
 
 def signed(library: Any) -> Any:
@@ -100,7 +97,7 @@ class _Card:
             reason = _error(library, None)
             if time.monotonic() > deadline_s:
                 raise EmergencyError(f"the card {name!r} cannot be opened for {HELD_S:g} s: {reason}")
-            time.sleep(PAUSE_S)
+            time.sleep(1e-3)
         self._handle = handle
 
     def switch_off(self, *, is_dds: bool) -> str:
@@ -116,11 +113,11 @@ class _Card:
             (SPC_M2CMD, M2CMD_CARD_RESET, "reset of the card"),
         ]
         refused: dict[str, str] = {}
-        for register, value, what in steps:
+        for register, value, step in steps:
             # once more after an error: it may be one from before, which blocks the library until it is read
             if self._write(register, value) and (reason := self._write(register, value)):
-                refused[what] = reason
-        reasons = "; ".join(f"{what}: {reason}" for what, reason in refused.items())
+                refused[step] = reason
+        reasons = "; ".join(f"{step}: {reason}" for step, reason in refused.items())
         if len(refused) > 1 and "reset of the card" in refused:
             raise EmergencyError(reasons)
         status = self._read(SPC_M2STATUS)
@@ -128,9 +125,9 @@ class _Card:
         if enabled or not status & M2STAT_CARD_READY:
             text = f"the card reads status {status:#x} and enabled outputs {enabled}"
             raise EmergencyError(f"{text}; {reasons}" if reasons else text)
-        done = "card stopped, outputs 0 and 1 disabled"
+        outcome = "card stopped, outputs 0 and 1 disabled"
         how = "" if "reset of the card" in refused else " by its reset"
-        return f"{done}{how}; refused: {reasons}" if refused else done
+        return f"{outcome}{how}; refused: {reasons}" if refused else outcome
 
     def close(self) -> None:
         """Give the card back."""
@@ -151,6 +148,6 @@ class _Card:
 
 def _error(library: Any, handle: int | None) -> str:
     """The pending error's text; reading it unlocks the library."""
-    text = ctypes.create_string_buffer(TEXT_LENGTH + 56)
+    text = ctypes.create_string_buffer(256)  # the driver library writes at most 200 characters
     code = library.spcm_dwGetErrorInfo_i32(handle, None, None, ctypes.addressof(text))
     return (text.value.decode(errors="replace").strip().splitlines() or [f"error {code:#x}"])[0]

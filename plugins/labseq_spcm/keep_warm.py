@@ -13,11 +13,8 @@ from labseq.plugin import Context, LimitError, format_quantity
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.settings import KeepWarmSettings
 
-CLEARANCE: Final = 0.5
-"""Distance from the outermost place of a mobile tweezer, ejection slots included, in tone spacings (ours)."""
 PERIOD: Final = 1 << 16
 """Samples of the loop: the tones are at multiples of 10 kHz at 625 MS/s."""
-FULL_SCALE: Final = 32767
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,33 +38,36 @@ def keep_warm_tones(name: str, settings: KeepWarmSettings, context: Context) -> 
             power is too much.
     """
     grid, motion = context.grid, context.motion
-    rf, chosen = motion.rf, list[float]()
-    for word, hz, sites_hz, band, full, n_most in (
+    rf, amplitudes = motion.rf, list[float]()
+    for axis, hz, sites_hz, band, full, n_most in (
         ("row", settings.row_frequency, grid.row_frequency_hz, rf.row_band_hz, rf.row_amplitudes,
          motion.max_row_tones),
         ("column", settings.column_frequency, grid.column_frequency_hz, rf.column_band_hz,
          rf.column_amplitudes, motion.max_column_tones),
     ):  # fmt: skip
-        _check_parking(name, word, hz, sites_hz, motion.eject_slots, band)
-        each = full or (1 / n_most,) * n_most
+        _check_parking(name, axis, hz, sites_hz, motion.eject_slots, band)
+        tone_amplitudes = full or (1 / n_most,) * n_most
         power = (
-            sum(a**2 for a in sorted(each)[-n_most:]) if settings.amplitude is None else settings.amplitude**2
+            sum(a**2 for a in sorted(tone_amplitudes)[-n_most:])
+            if settings.amplitude is None
+            else settings.amplitude**2
         )
         power_w = power * rf.full_scale_power_w
         if power_w > rf.max_mean_power_w:
-            most, came = (format_quantity(w, "power") for w in (rf.max_mean_power_w, power_w))
-            what = f"{name}: mean power of the {word} axis' keep-warm tone"
-            raise LimitError(what, came, f"{most} at the AOD", setting=("keep_warm", "amplitude"))
-        chosen.append(math.sqrt(min(1.0, power)))
-    return KeepWarm((settings.row_frequency, settings.column_frequency), (chosen[0], chosen[1]))
+            most, mean_power = (format_quantity(w, "power") for w in (rf.max_mean_power_w, power_w))
+            quantity = f"{name}: mean power of the {axis} axis' keep-warm tone"
+            raise LimitError(quantity, mean_power, f"{most} at the AOD", setting=("keep_warm", "amplitude"))
+        amplitudes.append(math.sqrt(min(1.0, power)))
+    return KeepWarm((settings.row_frequency, settings.column_frequency), (amplitudes[0], amplitudes[1]))
 
 
 def _check_parking(
-    name: str, word: str, hz: float, sites_hz: NDArray[np.float64], slots: int, band: tuple[float, float]
+    name: str, axis: str, hz: float, sites_hz: NDArray[np.float64], slots: int, band: tuple[float, float]
 ) -> None:
     """Refuse a tone that could heat an atom, or that the AOD does not deflect."""
     step_hz = float(np.abs(np.diff(sites_hz)).max(initial=0.0))
-    reach_hz = (slots + CLEARANCE) * step_hz
+    # half a tone spacing beyond the outermost place of a mobile tweezer (ours)
+    reach_hz = (slots + 0.5) * step_hz
     below, above = float(sites_hz.min()) - reach_hz, float(sites_hz.max()) + reach_hz
     if band[0] <= hz <= band[1] and not below < hz < above:
         return
@@ -76,9 +76,9 @@ def _check_parking(
     limit = f"{free}: within the AOD's band and off the atoms"
     if not ranges:
         limit = "none: the mobile tweezers need the whole band; lower eject_slots"
-    key = f"{word}_frequency"
-    what = f"{name}: keep_warm.{key}"
-    raise LimitError(what, f"{hz / 1e6:.6g} MHz", limit, setting=("keep_warm", key))
+    key = f"{axis}_frequency"
+    setting = f"{name}: keep_warm.{key}"
+    raise LimitError(setting, f"{hz / 1e6:.6g} MHz", limit, setting=("keep_warm", key))
 
 
 def tone_samples(
@@ -89,7 +89,7 @@ def tone_samples(
     for axis, channel in enumerate((row_channel, 1 - row_channel)):
         periods = round(tones.hz[axis] / sample_rate_hz * n_samples)
         turns = np.arange(n_samples) * periods % n_samples / n_samples
-        frames[:, channel] = np.rint(FULL_SCALE * tones.amplitude[axis] * np.cos(2 * np.pi * turns))
+        frames[:, channel] = np.rint(32767 * tones.amplitude[axis] * np.cos(2 * np.pi * turns))
     return frames
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 SIMULATED: Final = "simulated"
 """Device names that begin like this belong to simulated cards; the vendor's never do."""
 LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
-WITHOUT_A_CARD: Final = "to try things without a card, set `card: simulated`"
 
 
 def simulated_settings() -> dict[str, str | int] | str:
@@ -111,7 +110,8 @@ def load_spcm(name: str, library: Library) -> Any:
     except Exception as error:  # spcm raises a bare Exception without the library
         reason = (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")
         text = f"the Python package 'spcm' finds no driver library ({reason}); install Spectrum's driver"
-        raise DeviceError(name, f"{text} for this system; {WITHOUT_A_CARD}") from error
+        hint = "to try things without a card, set `card: simulated`"
+        raise DeviceError(name, f"{text} for this system; {hint}") from error
 
 
 def _not_installed(name: str, error: ModuleNotFoundError) -> DeviceError:

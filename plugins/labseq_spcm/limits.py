@@ -69,18 +69,18 @@ def full_scale_mv(name: str, rf: RfSpec) -> int:
     Raises:
         LimitError: The card cannot make it, its relay might switch, or it is too much for the amplifiers.
     """
-    what, wanted_mv = f"{name}: rf.full_scale", round(1e3 * rf.full_scale_v)
+    setting, amplitude_mv = f"{name}: rf.full_scale", round(1e3 * rf.full_scale_v)
     value = format_quantity(rf.full_scale_v, "voltage")
     low, high = AMPLITUDE_MV
-    if not low <= wanted_mv <= high:
-        raise LimitError(what, value, f"the card's {low} mV to {high} mV")
-    if RELAY_MV[0] <= wanted_mv <= RELAY_MV[1]:
+    if not low <= amplitude_mv <= high:
+        raise LimitError(setting, value, f"the card's {low} mV to {high} mV")
+    if RELAY_MV[0] <= amplitude_mv <= RELAY_MV[1]:
         gap = f"below {RELAY_MV[0]} mV or above {RELAY_MV[1]} mV"
-        raise LimitError(what, value, gap, "between them the card's output relay may switch, for 10 ms")
+        raise LimitError(setting, value, gap, "between them the card's output relay may switch, for 10 ms")
     if rf.full_scale_v > rf.max_peak_v:
         most = format_quantity(rf.max_peak_v, "voltage")
-        raise LimitError(what, value, f"rf.max_peak, {most}", "more damages the amplifiers")
-    return wanted_mv
+        raise LimitError(setting, value, f"rf.max_peak, {most}", "more damages the amplifiers")
+    return amplitude_mv
 
 
 def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:

@@ -41,13 +41,9 @@ from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, 
 from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
 from labseq_spcm.stream import Stream, check_rendering
 
-RAMP_S: Final = 0.3e-3
-"""How long the amplifiers take to ramp down a program that is cut short."""
 RAMP_STEPS: Final = 15
 HOT_C: Final = 80
 """Highest temperature that passes the self test, in degrees Celsius (our choice)."""
-RECOVERY: Final = 2
-"""Type of the firmware with which a card starts if its own cannot be loaded."""
 TEST_SAMPLES: Final = 1 << 16
 """Samples of both outputs, all 0, that the self test sends to the card's memory."""
 
@@ -113,12 +109,12 @@ class SpcmMobileTweezers(MobileTweezers):
         tones = self._keep_warm
         if tones is None:
             return ""
-        each = (
+        texts = (
             f"{hz / 1e6:.6g} MHz ({format_quantity(a**2 * self._rf.full_scale_power_w, 'power')})"
             for hz, a in zip(tones.hz, tones.amplitude, strict=True)
         )
         dark = ", dark from upload to start" if self._settings.mode in ("replay", "fifo") else ""
-        return f"keep-warm tones off the atoms: {' and '.join(each)}{dark}"
+        return f"keep-warm tones off the atoms: {' and '.join(texts)}{dark}"
 
     def warnings(self) -> list[str]:
         """A course that the mode ``dds`` cannot follow closely enough, a rate that is slow to render."""
@@ -400,11 +396,11 @@ class SpcmMobileTweezers(MobileTweezers):
         return None if self._card is None else self.library.emergency(script, {"mode": self._settings.mode})
 
     def _ramp_down(self, card: AwgCard) -> None:
-        """Lower the amplitude in steps, within the amplifier's present path."""
+        """Lower the amplitude in steps within 0.3 ms, in the amplifier's present path."""
         above_relay = limits.RELAY_MV[1] + 1
         end_mv = above_relay if self._amplitude_mv >= above_relay else limits.AMPLITUDE_MV[0]
         for step in range(1, RAMP_STEPS + 1):
-            self._clock.sleep(RAMP_S / RAMP_STEPS)
+            self._clock.sleep(0.3e-3 / RAMP_STEPS)
             drop_mv = (self._amplitude_mv - end_mv) * step / RAMP_STEPS
             set_amplitude(card, round(self._amplitude_mv - drop_mv))
 
@@ -422,7 +418,8 @@ class SpcmMobileTweezers(MobileTweezers):
         mode.halt()
         card.stop()
         spcm = card.spcm
-        if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == RECOVERY:
+        # type 2 is the firmware with which a card starts if its own cannot be loaded
+        if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == 2:
             text = "the card runs its recovery firmware; restart the computer, else update the firmware"
             raise DeviceError(self._name, f"{text} with Spectrum's Control Center")
         sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("output module", spcm.SPC_MON_TC_MODULE_0))
@@ -433,8 +430,8 @@ class SpcmMobileTweezers(MobileTweezers):
                 raise DeviceError(self._name, f"{text}: check the fans")
         rates_hz = card.read(spcm.SPC_SAMPLERATE), self._facts["sample_rate_hz"]
         if rates_hz[0] != rates_hz[1]:
-            found, expected = (format_quantity(hz, "frequency") for hz in rates_hz)
-            raise DeviceError(self._name, f"the sample rate is {found}; expected {expected}, as it was set")
+            actual, expected = (format_quantity(hz, "frequency") for hz in rates_hz)
+            raise DeviceError(self._name, f"the sample rate is {actual}; expected {expected}, as it was set")
         if self._settings.mode == "replay":
             frames = Buffer().reserve(TEST_SAMPLES)
             frames[:] = 0
@@ -442,7 +439,7 @@ class SpcmMobileTweezers(MobileTweezers):
             card.upload(frames)
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those of the package, the drivers and the card's firmware."""
+        """Versions of the package, the drivers and the card's firmware."""
         return versions(self._opened()[0])
 
     def describe(self) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""How a program gets to the outputs: what the modes of the card have in common."""
+"""Base class of the card's modes: how a program gets to the outputs."""
 
 from __future__ import annotations
 

@@ -21,8 +21,6 @@ from labseq_spcm.settings import SpcmSettings
 CHUNK: Final = 1 << 18
 """Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
 RING_CHUNKS: Final = 4
-MIN_FILL: Final = 1 << 20
-"""Smallest part of the on-board memory that is used as a FIFO, in bytes."""
 
 
 class InterleavedRenderer:
@@ -65,7 +63,7 @@ class InterleavedRenderer:
 
 
 class SampleMode(PlayMode):
-    """What ``replay`` and ``fifo`` have in common: rendered samples, and a loop for the keep-warm tones.
+    """Base of ``replay`` and ``fifo``: rendered samples, and a loop for the keep-warm tones.
 
     Args:
         card: The open card.
@@ -118,10 +116,10 @@ class Replay(SampleMode):
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         n_samples = renderer.n_samples
         if n_samples > self._memory_samples:
-            what = f"{self._card.name}: length of the program"
+            quantity = f"{self._card.name}: length of the program"
             length, most = (f"{n / self._rate_hz:.4g} s" for n in (n_samples, self._memory_samples))
             hint = "use mode: fifo, or a lower sample_rate"
-            raise LimitError(what, length, f"{most}: the card's memory", hint)
+            raise LimitError(quantity, length, f"{most}: the card's memory", hint)
         frames = self._buffer.reserve(n_samples)
         renderer.write(0, frames)
         self.render_s = time.perf_counter() - start_s
@@ -161,7 +159,8 @@ class Fifo(SampleMode):
         self._renderer: InterleavedRenderer | None = None
         self._n_rendered = self._n_samples = 0
         ahead = int(settings.fill_s * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
-        self._fill = 1 << round(math.log2(max(MIN_FILL, ahead)))
+        # of the on-board memory, in bytes; the card takes powers of two
+        self._fill = 1 << round(math.log2(max(1 << 20, ahead)))
         self._set_mode()
 
     def _set_mode(self) -> None:

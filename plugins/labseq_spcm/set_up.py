@@ -1,4 +1,4 @@
-"""What is set once, with the outputs off, in the order of the manual.
+"""Sets up the card once, with the outputs off, in the order of the manual.
 
 Reset, active channels, clock, outputs, trigger. Every value is read back, because the card rounds some and
 snaps others.
@@ -7,14 +7,12 @@ snaps others.
 from __future__ import annotations
 
 from importlib import metadata
-from typing import Any, Final
+from typing import Any
 
 from labseq.plugin import DeviceError
 from labseq_spcm import limits
 from labseq_spcm.card import AwgCard
 from labseq_spcm.settings import SpcmSettings
-
-BOTH_CHANNELS: Final = 0b11
 
 
 def check_type(card: AwgCard, settings: SpcmSettings) -> None:
@@ -45,7 +43,7 @@ def check_type(card: AwgCard, settings: SpcmSettings) -> None:
 def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str, Any]:
     """Set up everything that does not depend on the mode; returns facts about the card and its real rate."""
     card.command(card.spcm.M2CMD_CARD_RESET, "reset")
-    card.set(card.spcm.SPC_CHENABLE, BOTH_CHANNELS, "active channels")
+    card.set(card.spcm.SPC_CHENABLE, 0b11, "active channels")
     rate_hz = _set_clock(card, settings)
     _set_outputs(card, amplitude_mv)
     _set_trigger(card, settings)
@@ -62,7 +60,7 @@ def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str
 
 
 def versions(card: AwgCard) -> dict[str, tuple[str, str]]:
-    """Versions of the vendor's software and of the firmware: found, tried; no real card was."""
+    """Versions of the vendor's software and of the firmware: installed, tested; no real card was tested."""
     spcm = card.spcm
     return {
         "package spcm": (metadata.version("spcm"), "1.13.4"),

@@ -12,9 +12,6 @@ from labseq_spcm import limits
 Mode: TypeAlias = Literal["replay", "fifo", "stream", "dds"]
 Channel: TypeAlias = Literal[0, 1]
 
-LOOK_AHEAD_S: Final = 250e-6
-FILL_S: Final = {"fifo": 8e-3, "stream": 20e-3}
-OVERHEAD_S: Final = {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3, "dds": 5e-3}
 NO_TRIGGER: Final = (
     "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
 )
@@ -112,7 +109,7 @@ class SpcmSettings(Settings):
         return rate_hz
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """The names of the card, which only one process can use."""
         serial = (f"Spectrum card {self.serial}",) if self.serial else ()
         return () if self.card == "simulated" else (f"Spectrum {self.card}", *serial)
 
@@ -145,10 +142,10 @@ class SpcmSettings(Settings):
             )
         least_s = self._buffered_s(self.sample_rate)
         if self.look_ahead is not None and self.look_ahead < least_s:
-            came, least = (format_quantity(s, "time") for s in (self.look_ahead, least_s))
+            look_ahead, least = (format_quantity(s, "time") for s in (self.look_ahead, least_s))
             raise ValueError(
-                f"look_ahead is {came}; expected at least {least}: the card's own buffers and two blocks of "
-                "notify_size at this sample_rate"
+                f"look_ahead is {look_ahead}; expected at least {least}: the card's own buffers and two "
+                "blocks of notify_size at this sample_rate"
             )
         return self
 
@@ -158,17 +155,17 @@ class SpcmSettings(Settings):
 
     @property
     def overhead_per_cycle_s(self) -> float:
-        """How long a cycle takes to the light, from its plan on: measured, see the timing budget."""
-        return OVERHEAD_S[self.mode]
+        """Time from a cycle's plan to its light: measured, see the timing budget."""
+        return {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3, "dds": 5e-3}[self.mode]
 
     @property
     def fill_s(self) -> float:
         """Playing time that is rendered ahead, of the modes that render while they play."""
-        return self.fill or FILL_S[self.mode]
+        return self.fill or {"fifo": 8e-3, "stream": 20e-3}[self.mode]
 
     def look_ahead_s(self, sample_rate_hz: float) -> float:
         """The look-ahead at the rate that the card's clock really makes."""
-        return self.look_ahead or max(LOOK_AHEAD_S, self._buffered_s(sample_rate_hz))
+        return self.look_ahead or max(250e-6, self._buffered_s(sample_rate_hz))
 
 
 def _hz(value: float) -> str:

@@ -30,21 +30,9 @@ from labseq_spcm.limits import FRAME_BYTES, OUTPUT_FIFO_BYTES, SAMPLE_STEP
 from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
 
-READY_SAMPLES: Final = 1 << 19
-"""Most samples that are rendered between ``prepare`` and ``start``: 0.8 ms at 625 MS/s."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
-LOCK_RETRY_S: Final = 10e-6
-"""After that time the thread tries again if a call of the driver is at work."""
-HALT_S: Final = 0.1
-"""Longest time that the loop may take to end; it looks for that after each part that it renders."""
-PLAYING_POLL_S: Final = 1e-3
-"""Longest time between two looks at the ring while a program plays."""
 TRIES: Final = 5
-MOST_LOAD: Final = 0.9
-"""Largest part of the playing time that rendering may take, on all cores that share it."""
-SHARED: Final = 1.6
-"""How many times faster two cores are than one: each renders an axis, one interleaves both."""
 BUS_SAMPLES: Final = 1 << 22
 """Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
 
@@ -57,31 +45,32 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
     """
     grid, motion = context.grid, context.motion
     along = 1 if grid.n_cols > 1 else 0  # a site is a pair (row, column)
-    most = min(motion.max_tweezers, (motion.max_row_tones, motion.max_column_tones)[along])
-    n_tones = max(1, min(most, grid.shape[along] - 1))
-    here = np.zeros((n_tones, 2), np.int16)
-    here[:, along] = np.arange(n_tones)
-    there = here.copy()
-    there[:, along] += grid.shape[along] > 1
-    moves = Plan.from_batches([(here, there), (there, here)] * 5)
+    most_tweezers = min(motion.max_tweezers, (motion.max_row_tones, motion.max_column_tones)[along])
+    n_tones = max(1, min(most_tweezers, grid.shape[along] - 1))
+    sources = np.zeros((n_tones, 2), np.int16)
+    sources[:, along] = np.arange(n_tones)
+    goals = sources.copy()
+    goals[:, along] += grid.shape[along] > 1
+    moves = Plan.from_batches([(sources, goals), (goals, sources)] * 5)
     workspaces: dict[tuple[int, int], Any] = {}
-    program = made_of(tone_program(moves, grid, motion), sample_rate_hz, row_channel, 1, workspaces)
+    program = stream_program(tone_program(moves, grid, motion), sample_rate_hz, row_channel, 1, workspaces)
     n_samples = int(program.words[k.LENGTH])
     box, scratch, out = np.zeros(k.N_WORDS, np.int64), new_scratch(), np.zeros((n_samples, 2), np.int16)
     box[k.RENDER], box[k.SCRATCH] = render_address(), scratch.ctypes.data
     parts = range(0, n_samples, k.MOST_SAMPLES)
-    took_s, made_hz = np.full(len(parts), np.inf), 0.0
+    took_s, rendered_hz = np.full(len(parts), np.inf), 0.0
     for _ in range(TRIES):
         for number, start in enumerate(parts):
             place, n_part = out[start:].ctypes.data, min(k.MOST_SAMPLES, n_samples - start)
             start_s = time.perf_counter()
             k.render_frames(box, program.words, start, place, n_part)
             took_s[number] = min(took_s[number], time.perf_counter() - start_s)
-        made_hz = n_samples / took_s.sum() * (SHARED if n_cores() > 1 else 1.0)
-        if sample_rate_hz < MOST_LOAD * made_hz:
+        # two cores are 1.6 times as fast as one: each renders an axis, one interleaves both
+        rendered_hz = n_samples / took_s.sum() * (1.6 if n_cores() > 1 else 1.0)
+        if sample_rate_hz < 0.9 * rendered_hz:  # the rest is for other work of the computer
             return
-    wanted, made = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, made_hz))
-    text = f"mode: stream at {wanted}, but this computer renders {n_tones} moving tones at {made}"
+    required, reached = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, rendered_hz))
+    text = f"mode: stream at {required}, but this computer renders {n_tones} moving tones at {reached}"
     hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: replay"
     raise DeviceError(name, f"{text}; {hint}")
 
@@ -105,7 +94,7 @@ class Program:
     playing_s: float
 
 
-def made_of(
+def stream_program(
     program: ToneProgram,
     sample_rate_hz: float,
     row_channel: int,
@@ -153,7 +142,7 @@ class Stream(PlayMode):
         DeviceError: The bus is too slow for the sample rate.
     """
 
-    max_wait_s = PLAYING_POLL_S
+    max_wait_s = 1e-3
     beginning_s = BEGINNING_S
 
     def __init__(
@@ -175,7 +164,8 @@ class Stream(PlayMode):
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
         self._ring.reshape(-1, block, 2)[:] = self._silence
-        self._ready = [Buffer().reserve(READY_SAMPLES) for _ in range(3)]
+        # for what is rendered between `prepare` and `start`: at most 0.8 ms at 625 MS/s
+        self._ready = [Buffer().reserve(1 << 19) for _ in range(3)]
         for frames in self._ready:
             frames[:] = 0  # so that the memory is there
         self._scratch = new_scratch()
@@ -218,8 +208,8 @@ class Stream(PlayMode):
             if took_s <= frames.nbytes / needed:
                 return
         speed, most_hz = frames.nbytes / took_s, frames.nbytes / took_s / FRAME_BYTES
-        wanted, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, most_hz))
-        text = f"the bus carries {speed / 1e9:.3g} GB/s, but mode: stream at {wanted} needs"
+        rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, most_hz))
+        text = f"the bus carries {speed / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
         hint = f"use a slot with more lanes, a sample_rate below {most}, or mode: replay"
         raise DeviceError(card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
 
@@ -256,29 +246,29 @@ class Stream(PlayMode):
             box, self._is_on, self._failure, self._prepared = self._box, False, None, None
             box[k.STOP] = 1
             self._wake()
-            until_s = time.perf_counter() + HALT_S
+            until_s = time.perf_counter() + 0.1  # it looks for the stop after each part that it renders
             while box[k.IS_FEEDING] and time.perf_counter() < until_s:
                 time.sleep(50e-6)
 
     def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
         """Hand a program to the loop, which renders it until it starts; returns its playing time, s."""
         start_s = time.perf_counter()
-        made = self._prepared = self._made(program)
+        stream = self._prepared = self._new_program(program)
         if self._has_thread:  # in virtual time the loop's work would be this thread's
             with self._lock:
-                self._box[k.PREPARED] = made.words.ctypes.data
+                self._box[k.PREPARED] = stream.words.ctypes.data
                 self._wake()
         self.render_s = time.perf_counter() - start_s
         self._check_failure()
-        return made.playing_s
+        return stream.playing_s
 
-    def _made(self, program: ToneProgram) -> Program:
-        made = made_of(program, self._rate_hz, self._row_channel, self._block, self._workspaces)
+    def _new_program(self, program: ToneProgram) -> Program:
+        stream = stream_program(program, self._rate_hz, self._row_channel, self._block, self._workspaces)
         self._ready.append(self._ready.pop(0))
-        made.words[k.READY_MADE] = self._ready[-1].ctypes.data
-        made.words[k.ROOM] = len(self._ready[-1])
-        self._alive.append(made)
-        return made
+        stream.words[k.READY_MADE] = self._ready[-1].ctypes.data
+        stream.words[k.ROOM] = len(self._ready[-1])
+        self._alive.append(stream)
+        return stream
 
     def start(self, command: int) -> None:  # noqa: ARG002 - the card runs already
         """Have the prepared program follow what was handed over."""
@@ -291,11 +281,11 @@ class Stream(PlayMode):
 
     def append(self, program: ToneProgram) -> float:
         """Have the rest of a program follow its beginning, or the silence after it."""
-        made = self._made(program)
+        stream = self._new_program(program)
         self._check_failure()
         with self._lock:
-            self._queue(made)
-        return made.playing_s
+            self._queue(stream)
+        return stream.playing_s
 
     def _queue(self, program: Program) -> None:
         box, n = self._box, int(self._box[k.QUEUED])
@@ -378,7 +368,7 @@ class Stream(PlayMode):
             Time to wait, in seconds; 0: the loop can go on; None: it is over.
         """
         if not self._lock.acquire(blocking=False):  # the driver is about to halt, or to read a failure
-            return LOCK_RETRY_S
+            return 10e-6
         try:
             if not self._is_on or box is not self._box:
                 return None

@@ -20,9 +20,6 @@ ROOM_K: Final = 293.15
 COLDEST_K: Final = 183.15
 """Lowest temperature that the cooler reaches: -90 degC (ours)."""
 
-TIME_CONSTANT_S: Final = 60.0
-"""Time constant of the cooling, in seconds (ours)."""
-
 SWING: Final = 0.6
 """Phase of the oscillation per time constant, in radians (ours): it overshoots by exp(-pi / 0.6), 0.5 %."""
 
@@ -50,9 +47,9 @@ class Cooler:
         """Temperature of the sensor now, in kelvins."""
         if self._start_s is None:
             return ROOM_K
-        t = (self._clock.now() - self._start_s) / TIME_CONSTANT_S
-        left = math.exp(-t) * (math.cos(SWING * t) + math.sin(SWING * t) / SWING)
-        return self._end_k + (ROOM_K - self._end_k) * left
+        t = (self._clock.now() - self._start_s) / 60.0  # in time constants of 60 s (ours)
+        remaining = math.exp(-t) * (math.cos(SWING * t) + math.sin(SWING * t) / SWING)
+        return self._end_k + (ROOM_K - self._end_k) * remaining
 
 
 class VirtualCamera(CameraDriver):

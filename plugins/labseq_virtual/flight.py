@@ -67,26 +67,26 @@ def draw_atoms(
     spread = WIDER / np.sqrt(np.array([4.0, 4.0, 2.0]) * most[:, None])
     atoms = np.empty((len(depth), 6))
     bound = np.zeros(len(depth))
-    left = np.arange(len(depth))
-    while len(left):
-        normal = rng.standard_normal((len(left), PROPOSALS, 3))
-        place = normal * spread[left, None]
+    remaining = np.arange(len(depth))
+    while len(remaining):
+        normal = rng.standard_normal((len(remaining), PROPOSALS, 3))
+        place = normal * spread[remaining, None]
         s = 1.0 + place[..., 2] ** 2
-        a = most[left, None] / s * np.exp(-2 * (place[..., 0] ** 2 + place[..., 1] ** 2) / s)
+        a = most[remaining, None] / s * np.exp(-2 * (place[..., 0] ** 2 + place[..., 1] ** 2) / s)
         slow = erf(np.sqrt(a)) - 2 * np.sqrt(a / np.pi) * np.exp(-a)
-        weight = np.exp(a - most[left, None] + 0.5 * (normal**2).sum(axis=-1)) * slow
-        taken = rng.random(weight.shape) < weight
-        first = taken.argmax(axis=1)
-        done = taken[np.arange(len(left)), first]
-        atoms[left[done], :3] = place[done, first[done]] * size
-        bound[left[done]] = a[done, first[done]]
-        left = left[~done]
-    left = np.arange(len(depth))
-    while len(left):
-        velocity = rng.standard_normal((len(left), 3))
-        slow = 0.5 * (velocity**2).sum(axis=1) < bound[left]
-        atoms[left[slow], 3:] = np.sqrt(kt[left[slow], None]) * velocity[slow]
-        left = left[~slow]
+        weight = np.exp(a - most[remaining, None] + 0.5 * (normal**2).sum(axis=-1)) * slow
+        is_accepted = rng.random(weight.shape) < weight
+        first = is_accepted.argmax(axis=1)
+        is_placed = is_accepted[np.arange(len(remaining)), first]
+        atoms[remaining[is_placed], :3] = place[is_placed, first[is_placed]] * size
+        bound[remaining[is_placed]] = a[is_placed, first[is_placed]]
+        remaining = remaining[~is_placed]
+    remaining = np.arange(len(depth))
+    while len(remaining):
+        velocity = rng.standard_normal((len(remaining), 3))
+        slow = 0.5 * (velocity**2).sum(axis=1) < bound[remaining]
+        atoms[remaining[slow], 3:] = np.sqrt(kt[remaining[slow], None]) * velocity[slow]
+        remaining = remaining[~slow]
     return atoms
 
 
@@ -285,28 +285,30 @@ class RfTransport:
 
         Those of one batch after the other: batches without a pause are separated by the dark between them.
         """
-        found: list[Tracks] = []
+        tracks_of_axes: list[Tracks] = []
         for axis, spans in enumerate((pulse.rows, pulse.columns)):
             if not spans:
                 return
             start_s, end_s = pulse.start_s - self.margin_s, pulse.end_s + 2 * self.margin_s
             min_v = float(self._full_v[axis].min()) * math.sqrt(MIN_TONE_DEPTH)
             transit_s = self._light.transit_time
-            found.append(track_tones(spans, start_s, end_s, self._bands[axis], transit_s, min_v, SLEW_HZ))
-        n_frames = min(len(tracks.t_s) for tracks in found)
+            tracks_of_axes.append(
+                track_tones(spans, start_s, end_s, self._bands[axis], transit_s, min_v, SLEW_HZ)
+            )
+        n_frames = min(len(tracks.t_s) for tracks in tracks_of_axes)
         sites: list[Floats] = []
         depths: list[Floats] = []
-        for axis, tracks in enumerate(found):
+        for axis, tracks in enumerate(tracks_of_axes):
             hz, volts = tracks.frequency_hz[:n_frames], tracks.amplitude_v[:n_frames]
             intended, full_v = self._positions.intended(axis, hz), self._full_v[axis]
             sites.append(self._positions.actual(axis, hz))
             depths.append((volts / np.interp(intended, np.arange(len(full_v)), full_v)) ** 2)
         bright = _light(depths) > DARK
-        self._jumps += find_jumps(found, sites, depths, bright)
+        self._jumps += find_jumps(tracks_of_axes, sites, depths, bright)
         for frames in _batches(bright):
-            on = [~np.isnan(one[frames]).all(axis=0) for one in sites]
-            parts = (one[frames][:, on[axis]] for axis in (0, 1) for one in (sites[axis], depths[axis]))
-            yield tuple(map(np.ascontiguousarray, parts)), found[0].t_s[frames]
+            on = [~np.isnan(positions[frames]).all(axis=0) for positions in sites]
+            parts = (values[frames][:, on[axis]] for axis in (0, 1) for values in (sites[axis], depths[axis]))
+            yield tuple(map(np.ascontiguousarray, parts)), tracks_of_axes[0].t_s[frames]
 
     def _near(self, rows: Floats, cols: Floats) -> Mask:
         """Sites that any tweezer comes close to, bool (n_rows, n_cols)."""
@@ -358,7 +360,7 @@ def _lines(tracks: Floats, n_sites: int) -> Mask:
 
 def _light(depths: list[Floats]) -> Floats:
     """Depth factor of the deepest tweezer in each frame, (n_frames,)."""
-    rows, cols = (np.nan_to_num(one).max(axis=1, initial=0.0) for one in depths)
+    rows, cols = (np.nan_to_num(depth).max(axis=1, initial=0.0) for depth in depths)
     return rows * cols
 
 

@@ -94,17 +94,14 @@ def noise_hz(settings: SimulationSettings) -> float:
     return 2 / 3 * stiffness / 4 * settings.intensity_noise
 
 
-RECOIL_K: Final = 0.36196e-6
-"""Recoil temperature of 87Rb on its D2 line (D. Steck, Rubidium 87 D Line Data)."""
-
-
 def recoil_heat(settings: SimulationSettings) -> float:
     """How much hotter the light of an image keeps the atoms than the cooling alone would, in kelvin.
 
     Each photon adds a third of the recoil temperature in a harmonic well (R. Grimm, M. Weidemueller,
     Y. Ovchinnikov, Adv. At. Mol. Opt. Phys. 42, 95, 2000), which cooling takes away within ``cooling_time``.
     """
-    return settings.scattering_rate * RECOIL_K / 3 * settings.cooling_time
+    recoil_k = 0.36196e-6  # of 87Rb on its D2 line (D. Steck, Rubidium 87 D Line Data)
+    return settings.scattering_rate * recoil_k / 3 * settings.cooling_time
 
 
 def pair_survival(settings: SimulationSettings) -> float:

@@ -74,12 +74,12 @@ def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
     second, residual_after = _fit(courses[:, after], at_s[after])
     shift, slope, bend = (second - first).T
     inner_s = INNER * step_s
-    bent = np.abs(bend) * inner_s**2 > CHIRP_RAD
-    place_s = np.where(bent, -slope / np.where(bent, 2 * bend, 1.0), 0.0)
+    changes_chirp = np.abs(bend) * inner_s**2 > CHIRP_RAD
+    place_s = np.where(changes_chirp, -slope / np.where(changes_chirp, 2 * bend, 1.0), 0.0)
     size = _wrapped(shift + slope * place_s + bend * place_s**2)
-    fine = (np.maximum(residual_before, residual_after) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
-    found = peaks(np.where(fine, np.abs(size), 0.0), MIN_RAD, 2 * INNER)
-    return [(float(tracks.t_s[k + OUTER] + place_s[k]), k + OUTER, float(size[k])) for k in found]
+    is_clear = (np.maximum(residual_before, residual_after) < RESIDUAL_RAD) & (np.abs(place_s) <= inner_s)
+    middles = peaks(np.where(is_clear, np.abs(size), 0.0), MIN_RAD, 2 * INNER)
+    return [(float(tracks.t_s[k + OUTER] + place_s[k]), k + OUTER, float(size[k])) for k in middles]
 
 
 def depth_jumps(depth: Floats) -> list[tuple[int, float]]:
@@ -113,35 +113,35 @@ def _wrapped(phase_rad: Floats) -> Floats:
 
 
 def find_jumps(
-    found: list[Tracks], sites: list[Floats], depths: list[Floats], bright: NDArray[np.bool_]
+    tracks_of_axes: list[Tracks], sites: list[Floats], depths: list[Floats], bright: NDArray[np.bool_]
 ) -> list[tuple[Any, ...]]:
     """The jumps of the row and the column tones, and of their tweezers, each as a row of :data:`JUMPS`.
 
     Args:
-        found: Tones of the rows and of the columns.
+        tracks_of_axes: Tones of the rows and of the columns.
         sites: Their positions in sites, (n_frames, n_tones) each.
         depths: Their factors of the full depth, likewise.
         bright: bool (n_frames,), whether a tweezer is deep; atoms do not feel a phase that jumps in the dark.
     """
     jumps: list[tuple[Any, ...]] = []
-    for axis, tracks in enumerate(found):
+    for axis, tracks in enumerate(tracks_of_axes):
         for j in range(sites[axis].shape[1]):
             for time_s, k, size in phase_jumps(tracks, j):
                 if not bright[max(0, k - HOPS) : k + HOPS + 1].all():
                     continue
                 place = sites[axis][min(k, len(sites[axis]) - 1), j]
-                where = (place, math.nan) if axis == 0 else (math.nan, place)
-                jumps.append((time_s, b"phase", *where, size))
+                sites_of_jump = (place, math.nan) if axis == 0 else (math.nan, place)
+                jumps.append((time_s, b"phase", *sites_of_jump, size))
     rows, cols = (np.nan_to_num(depth) for depth in depths)
     for i in range(rows.shape[1]):
         for j in range(cols.shape[1]):
             for k, size in depth_jumps(rows[:, i] * cols[:, j]):
                 near = slice(max(0, k - HOPS), k + HOPS + 1)
-                where = (_known(sites[0][near, i]), _known(sites[1][near, j]))
-                jumps.append((float(found[0].t_s[k]), b"depth", *where, size))
+                sites_of_jump = (_first_known(sites[0][near, i]), _first_known(sites[1][near, j]))
+                jumps.append((float(tracks_of_axes[0].t_s[k]), b"depth", *sites_of_jump, size))
     return jumps
 
 
-def _known(values: Floats) -> float:
-    known = values[~np.isnan(values)]
-    return float(known[0]) if len(known) else math.nan
+def _first_known(values: Floats) -> float:
+    finite = values[~np.isnan(values)]
+    return float(finite[0]) if len(finite) else math.nan

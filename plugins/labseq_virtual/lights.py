@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Final
 
 from labseq.plugin import ConfigError, LineProgram, LineSpec
 from labseq_virtual.settings import LightSettings
-
-N_REMEMBERED: Final = 8
-"""Number of line programs kept; an event needs the last one or two."""
 
 
 class Lights:
@@ -26,12 +22,12 @@ class Lights:
         self._needs = {kind: getattr(settings, kind) for kind in LightSettings.model_fields}
         for kind, needed in self._needs.items():
             if names and (missing := [name for name in needed if name not in names]):
-                known = ", ".join(f"'{name}'" for name in names)
-                raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {known}")
+                lines = ", ".join(f"'{name}'" for name in names)
+                raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {lines}")
         self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
         self._switches = [spec.name for spec in specs if spec.turns_off == "static_tweezers"]
         self._wires: dict[str, Callable[[float, float], object]] = {}
-        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=N_REMEMBERED)
+        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=8)  # an event needs the last one or two
 
     def reset(self) -> None:
         """Forget all programs: all light is on until the lines play again."""

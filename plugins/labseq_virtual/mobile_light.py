@@ -18,10 +18,6 @@ from labseq_virtual.tone_positions import TonePositions
 
 Floats = NDArray[np.float64]
 
-LOOK_BACK: Final = 6.0
-"""How much of an output is analysed for its tones, in transit times of the sound."""
-MIN_RELATIVE_V: Final = 0.05
-"""Voltage of the weakest tone that is found, relative to that of the full depth (ours)."""
 SLEW_HZ: Final = 0.2e6
 """Largest change of frequency of a tone at rest in a transit time (ours)."""
 
@@ -86,15 +82,16 @@ class MobileLight:
         self, rows: Sequence[RfSpan], columns: Sequence[RfSpan], now_s: float
     ) -> MobileTones | None:
         """The tones that the outputs have played just before a time; None if there are none."""
-        found: list[tuple[Floats, Floats]] = []
+        tones: list[tuple[Floats, Floats]] = []
         transit_s = self._light.transit_time
         for spans, band, full_v in zip((rows, columns), bands(self._grid), self._full_v, strict=True):
-            start_s, min_v = now_s - LOOK_BACK * transit_s, MIN_RELATIVE_V * float(full_v.min())
+            # six transit times of the sound; tones weaker than 5 % of the full depth's are left out (ours)
+            start_s, min_v = now_s - 6.0 * transit_s, 0.05 * float(full_v.min())
             tracks = track_tones(spans, start_s, now_s, band, transit_s, min_v, SLEW_HZ)
             frame = len(tracks.t_s) // 2
             on = np.isfinite(tracks.frequency_hz[frame])
-            found.append((tracks.frequency_hz[frame, on], tracks.amplitude_v[frame, on]))
-        return self._tones(found, self._full_v)
+            tones.append((tracks.frequency_hz[frame, on], tracks.amplitude_v[frame, on]))
+        return self._tones(tones, self._full_v)
 
     def positions_m(self, tones: MobileTones) -> Floats:
         """Where the tweezers are, float64 (n_row_tones, n_column_tones, 2), (x, y) from the grid's centre."""
@@ -102,12 +99,12 @@ class MobileLight:
         row, column = tones.row[:, None, None], tones.column[None, :, None]
         return self._grid.positions_m[0, 0] + row * a2 + column * a1
 
-    def _tones(self, found: Sequence[tuple[Floats, Floats]], full: Sequence[Floats]) -> MobileTones | None:
-        if not all(len(hz) for hz, _ in found):
+    def _tones(self, tones: Sequence[tuple[Floats, Floats]], full: Sequence[Floats]) -> MobileTones | None:
+        if not all(len(hz) for hz, _ in tones):
             return None
         parts: list[Floats] = []
-        for axis, (hz, amplitude) in enumerate(found):
+        for axis, (hz, amplitude) in enumerate(tones):
             intended = self._positions.intended(axis, hz)
-            of_site = np.interp(intended, np.arange(len(full[axis])), full[axis])
-            parts += [self._positions.actual(axis, hz), (amplitude / of_site) ** 2]
+            full_amplitude = np.interp(intended, np.arange(len(full[axis])), full[axis])
+            parts += [self._positions.actual(axis, hz), (amplitude / full_amplitude) ** 2]
         return MobileTones(*parts)

@@ -22,10 +22,6 @@ from labseq.plugin.simulation import RfSamples, RfSource, RfSpan, RfTones
 BLOCK: Final = 1024
 """Samples tested together in the search for silence."""
 
-EDGE: Final = 0.05
-"""Fraction of the band at each end over which the AOD's response falls to 0 (ours)."""
-
-
 BAND_HZ: Final = 50e6
 """Smallest width of the AODs' band (ours)."""
 BESIDE: Final = 0.25
@@ -157,9 +153,9 @@ def _of_tones(spans: Sequence[RfTones], start_s: float, end_s: float, band: Band
 
 
 def _response(n: int) -> NDArray[np.float64]:
-    """Diffraction efficiency over the band: 1 except at the soft edges."""
+    """Diffraction efficiency over the band: it falls to 0 over 5 % of the band at each end (ours)."""
     from_edge = np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5) / n
-    return np.sin(np.pi / 2 * np.minimum(1.0, from_edge / EDGE)) ** 2
+    return np.sin(np.pi / 2 * np.minimum(1.0, from_edge / 0.05)) ** 2
 
 
 Floats = NDArray[np.float64]
@@ -172,8 +168,6 @@ REACH_HZ: Final = 800e3
 """Half the width of the part of a spectrum that belongs to one tone (ours)."""
 APART_HZ: Final = 450e3
 """Smallest distance of two tones that can be resolved (ours)."""
-MAX_TONES: Final = 64
-"""Maximum number of simultaneous tones of an axis."""
 FRAMES: Final = 8192
 """Spectra computed at once: 80 MB at a transit time of 10 us, for programs of any length."""
 
@@ -215,12 +209,14 @@ def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> No
     step_hz = float(np.concatenate(steps_hz).min(initial=np.inf))
     if step_hz < (min_hz := max(APART_HZ, MIN_TURNS / transit_s)):
         step, least = (format_quantity(hz, "frequency") for hz in (step_hz, min_hz))
-        what = f"the smallest step of the sites' tones at a transit_time of {transit}"
-        raise LimitError(what, step, f"at least {least}: tones closer than that cannot be resolved", hint)
+        quantity = f"the smallest step of the sites' tones at a transit_time of {transit}"
+        raise LimitError(quantity, step, f"at least {least}: tones closer than that cannot be resolved", hint)
     sites = PEAK_SPEED[motion.speed_profile] * motion.speed_m_s * transit_s / grid.spacing_m
     if sites > MAX_SITES:
-        what = f"the motion of a mobile tweezer in a transit_time of {transit}"
-        raise LimitError(what, f"{sites:.2g} sites", f"{MAX_SITES:g}: a faster chirp blurs the tones", hint)
+        quantity = f"the motion of a mobile tweezer in a transit_time of {transit}"
+        raise LimitError(
+            quantity, f"{sites:.2g} sites", f"{MAX_SITES:g}: a faster chirp blurs the tones", hint
+        )
 
 
 def track_tones(
@@ -254,8 +250,9 @@ def track_tones(
     bin_hz = signal.rate_hz / sound.n_window
     reach, apart = (max(2, round(hz / bin_hz)) for hz in (REACH_HZ, APART_HZ))
     parts = range(0, sound.n_frames, FRAMES)
-    found = [find_tones(_power(sound.spectra(k)), min_v**2, apart, reach, MAX_TONES) for k in parts]
-    centroid, count = (np.concatenate(part) for part in zip(*found, strict=True))
+    n_most = 64  # simultaneous tones of an axis
+    tones = [find_tones(_power(sound.spectra(k)), min_v**2, apart, reach, n_most) for k in parts]
+    centroid, count = (np.concatenate(part) for part in zip(*tones, strict=True))
     tracks, n_tracks = link_tones(centroid, count, slew_hz / HOPS / bin_hz)
     tracks = np.ascontiguousarray(tracks[:, :n_tracks])
     width, hop = sound.tau / sound.n_window, sound.hop / sound.n_window
@@ -289,9 +286,9 @@ class _Spectra:
 
         if self._last is None or self._last[0] != first:
             part = self._frames[first : first + FRAMES] * self._window
-            found = cast("NDArray[np.complex64]", fft.fft(part, overwrite_x=True))
-            found *= self._turn
-            self._last = first, found
+            spectra = cast("NDArray[np.complex64]", fft.fft(part, overwrite_x=True))
+            spectra *= self._turn
+            self._last = first, spectra
         return self._last[1]
 
 
@@ -346,7 +343,7 @@ class PulseReceiver:
     def look(self, until_s: float) -> tuple[Sequence[RfSpan], Sequence[RfSpan], bool]:
         """What rows and columns played since the last pulse was received, and whether light is on at a time.
 
-        It stays to be received.
+        The next call of ``receive_until`` returns it, too.
         """
         for seen, spans in zip(self._seen, self._source.played(until_s), strict=True):
             seen += spans

@@ -192,7 +192,7 @@ class VirtualSimulation(Simulation):
             raise DeviceError(self._name, text)
 
     def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
-        """Call ``on_edge`` at every later edge of the line that triggers a role."""
+        """Call ``on_pulse`` at every later pulse of the line that triggers a role."""
         self._lights.wire(role, on_pulse)
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:

@@ -15,7 +15,7 @@ import pytest
 from labseq_spcm import stream_kernels as k
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm.stream import Stream, check_rendering, made_of
+from labseq_spcm.stream import Stream, check_rendering, stream_program
 from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
 
 from labseq.motion import render, tone_program
@@ -105,7 +105,7 @@ def test_a_batch_that_is_rendered_too_slowly_begins_later_and_is_played_to_the_s
         step = lab.tweezers.library.call_in_virtual_time
         lab.tweezers.library.call_in_virtual_time = lambda _: step(slow_step)
         program = lab.program(8)
-        made = made_of(program, lab.rate_hz, 0, 1, {})
+        made = stream_program(program, lab.rate_hz, 0, 1, {})
         duration_s = lab.tweezers.prepare(program)
         lab.card.forget(lab.clock.now())
         lab.tweezers.play()
