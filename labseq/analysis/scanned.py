@@ -25,7 +25,7 @@ from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_
 DEFAULT: Final = ("filling", "defect_free")
 """The quantities at the points of a scan, unless others are named."""
 WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
-"""The same for a run without a target."""
+"""The quantities at the points of a scan of a run without a target, unless others are named."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,7 +86,7 @@ def best_point(run: Run) -> BestPoint | None:
 def extremum(
     places: NDArray[np.float64], scores: NDArray[np.float64], values: Sequence[Estimated], best: int
 ) -> NDArray[np.float64]:
-    """How far the maximum of a parabola is from the best point, along each axis.
+    """Distance of a parabola's maximum from the best point, along each axis.
 
     The parabola, without mixed terms, is fitted to the nearer half of the points, weighted with their
     errors. Where it has no maximum within these points, the answer is 0.

@@ -43,7 +43,7 @@ _TEXTS: Final = frozenset({"file", *(field.name for field in _FIELDS if field.dt
 QUANTITIES: Final = tuple(name for name in DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
 """Columns of every run that are numerical results of a shot."""
 FRACTIONS: Final = frozenset({"success", "filling_fraction"})
-"""Those of them that are shown in per cent."""
+"""Quantities that are shown in per cent."""
 
 
 def _readings(row: IndexRow) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""What the drivers of one role have in common, for those who write one.
+"""Base classes and helpers for authors of drivers, by role.
 
-A driver need not use any of it: a role is a Protocol. But a camera's series, its limits,
-its lost frames and its errors are the same for all cameras, and are made once, here.
+A driver need not use any of it: it only has to fulfil its role. But a camera's series, its limits,
+its lost frames and its errors are the same for all cameras, and are handled once, here.
 """
 
 from labseq.drivers.camera import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle

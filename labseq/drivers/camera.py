@@ -298,7 +298,7 @@ class CameraDriver(Camera):
 
 
 LOOK_S: Final = 1.0
-"""How often the temperature of a sensor is read, in seconds."""
+"""Time between two readings of a sensor's temperature, in seconds."""
 
 
 def _is_temperature_of_sensors(kelvin: float) -> float:

@@ -163,7 +163,7 @@ class SerialMessage:
 def serial_emergency(
     port: Port, messages: Sequence[SerialMessage], encoding: str = "latin-1", *, echo: bool = False
 ) -> Emergency | None:
-    """How another process switches off a device on a serial line: the port is opened and messages are sent.
+    """The emergency of a device on a serial line: another process opens the port and sends messages.
 
     Args:
         port: The open port.

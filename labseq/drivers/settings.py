@@ -27,7 +27,7 @@ _ARMING_TIME: Final = (
 
 
 class OrientationSettings(Settings):
-    """How images lie relative to the sensor; sites and regions around them are places in the image."""
+    """Orientation of the images relative to the sensor; sites are places in the image."""
 
     transpose: bool = Field(
         default=False, description="exchange rows and columns of the sensor's frame, before `flip`"
@@ -40,7 +40,7 @@ class OrientationSettings(Settings):
 
     @property
     def orientation(self) -> Orientation:
-        """The same for drivers."""
+        """The orientation as drivers use it."""
         return Orientation(self.transpose, self.flip)
 
 
@@ -72,7 +72,7 @@ class CameraSettings(OrientationSettings):
 
     @property
     def mode(self) -> SensorMode:
-        """How the sensor is read."""
+        """Region and binning with which the sensor is read."""
         region = self.region
         place = None if region is None else (region.y, region.x, region.height, region.width)
         return SensorMode(place, self.binning)

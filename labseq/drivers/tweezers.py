@@ -18,7 +18,7 @@ Amplitudes: TypeAlias = tuple[Floats, Floats]
 """Amplitudes of the row tones (n_rows,) and of the column tones (n_cols,), fractions of full scale."""
 
 ROUNDING: Final = 1e-9
-"""How far a sum of amplitudes may exceed its limit by rounding errors."""
+"""Amount by which rounding may bring a sum of amplitudes above its limit."""
 REALS: Final = const("float64", 1)
 
 

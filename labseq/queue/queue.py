@@ -217,7 +217,7 @@ class Queue:
             return None
         lock = self.lock()
         with suppress(OSError):
-            # nobody runs the queue if the lock can be taken
+            # no process runs the queue if the lock can be taken
             if (holder := lock.take()) is not None:
                 return holder
             lock.release()

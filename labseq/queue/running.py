@@ -29,7 +29,7 @@ from labseq.session.check import CheckReport, check
 from labseq.session.session import Session
 
 POLL_S: Final = 0.5
-"""How often a queue that waits for new entries looks for them, in seconds."""
+"""Time between two looks for new entries while the queue waits, in seconds."""
 
 Opening = Callable[[RunObserver | None], Session]
 """Opens a session whose events go to an observer."""

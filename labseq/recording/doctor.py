@@ -126,7 +126,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
             if is_locked or _is_in_progress(run_dir):
                 report.in_progress.append(run_dir)
                 return
-            check = _Check(run_dir, dry_run=False)  # anew, as the run may have changed before it was locked
+            check = _Check(run_dir, dry_run=False)  # again, as the run may have changed before it was locked
             check.check_run()
         finally:
             lock.release()

@@ -305,4 +305,6 @@ _READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "bytes": _integer,
 }
 _READ: Final = tuple((field.name, _READERS[field.name]) for field in fields(IndexRow))
-"""How the values of a line are read, in the order of the attributes; an index has many thousand lines."""
+"""Name and reader of each value of a line, in the order of the attributes.
+
+Computed once, as an index has many thousand lines."""

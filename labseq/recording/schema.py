@@ -257,7 +257,7 @@ IMAGES: Final = Table(
         """
     ),
 )
-"""Of :class:`ImageRecord`."""
+"""The table of an :class:`ImageRecord` for each image."""
 
 EXPOSURES: Final = Table(
     "camera/<name>/exposures",
@@ -274,7 +274,7 @@ EXPOSURES: Final = Table(
         t_device_s="device_time_s",
     ),
 )
-"""Of :class:`Frame`."""
+"""The table of a :class:`Frame` for each exposure, without its pixels."""
 
 CYCLES: Final = Table(
     "rearrangement/cycles",
@@ -302,7 +302,7 @@ CYCLES: Final = Table(
         planned_duration_s="report.duration_s",
     ),
 )
-"""Of :class:`CycleRecord`."""
+"""The table of a :class:`CycleRecord` for each cycle."""
 
 
 def _shapes(plan: Plan) -> NDArray[np.int32]:
@@ -441,7 +441,7 @@ TIMING: Final = Table(
         """
     ),
 )
-"""Of :class:`StageTiming`."""
+"""The table of a :class:`StageTiming` for each stage."""
 
 STEPS: Final = Table(
     "steps",
@@ -459,7 +459,7 @@ STEPS: Final = Table(
         """
     ),
 )
-"""Of :class:`StepTiming`."""
+"""The table of a :class:`StepTiming` for each step."""
 
 TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, PATHS, CYCLES, STEPS, TIMING)
 

@@ -355,7 +355,7 @@ def _images(group: Any) -> list[ImageRecord]:
 
 
 def _detector(group: Any) -> dict[str, Any]:
-    """What the detector reported about itself in a shot: arguments of its record."""
+    """The values that a detector reported about itself, as arguments of the shot's record."""
     values: dict[str, Any] = {
         argument: group[name][()]
         for argument, name in (("thresholds", "threshold"), ("sites_px", "sites_px"))

@@ -15,11 +15,11 @@ from labseq.processes import Holder, Lock, Process
 from labseq.recording import lock_file
 
 BEAT_S: Final = 0.5
-"""How often a process that uses devices gives a sign of life, in seconds."""
+"""Time between two signs of life of a process that uses devices, in seconds."""
 END_S: Final = 10.0
-"""How long a process may take to make its devices safe after SIGTERM before it is killed, in seconds."""
+"""Time that a process has after SIGTERM to make its devices safe before it is killed, in seconds."""
 HUNG_END_S: Final = 0.5
-"""The same for one that hangs: it cannot obey SIGTERM."""
+"""Time before a process that hangs is killed, as it cannot obey SIGTERM, in seconds."""
 
 
 @contextmanager
