@@ -70,7 +70,7 @@ class VendorLibrary:
         return False
 
     def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
-        """How another process switches the card off: the driver's script, with the vendor's library."""
+        """The driver's script that switches the card off from another process, with the vendor's library."""
         return Emergency(script, {**arguments, "library": LIBRARY, "card": self._device_name})
 
 

@@ -33,7 +33,7 @@ AMPLITUDE_MV: Final = (80, 2000)
 RELAY_MV: Final = (420, 480)
 """Both paths of the amplifier make these amplitudes; which one is used depends on the earlier amplitude."""
 RELAY_S: Final = 10e-3
-"""How long the output is off when the path changes; of the output's own relay the manual gives no time."""
+"""Time that the output is off when the path changes; the manual gives none for the output's own relay."""
 
 SAMPLE_STEP: Final = 32
 """Memory sizes are multiples of this, in samples per channel."""
@@ -53,7 +53,7 @@ DDS_AMPLITUDE_SLOPE: Final = 3.05e5
 DDS_COMMANDS_PER_S: Final = 10e6
 """Rate at which commands reach the DDS by DMA (EDMSuite)."""
 FOLLOWS_M: Final = 20e-9
-"""How closely a tweezer is to follow a curved course: a tenth of an atom's thermal spread (ours)."""
+"""Largest distance of a tweezer from a curved course: a tenth of an atom's thermal spread (ours)."""
 DDS_DELAY_S: Final = 560e-9
 """From the trigger to the output (EDMSuite)."""
 

@@ -302,12 +302,12 @@ class Stream(PlayMode):
 
     @property
     def n_pauses(self) -> int:
-        """How many moves came later than planned, because the computer was too slow."""
+        """Number of moves that came later than planned because the computer was too slow."""
         return self._n_pauses + int(self._box[k.N_PAUSES])
 
     @property
     def least_ahead_s(self) -> float:
-        """How far ahead of the card the last program was written, where it was closest; below 0: too late."""
+        """Least time by which the last program was written ahead of the card; below 0: too late."""
         return float(self._box[k.LEAST]) / self._rate_hz
 
     def triggered(self) -> bool:
@@ -354,7 +354,7 @@ class Stream(PlayMode):
                 code = k.feed(box, rate_hz, timer, signal.words)
 
     def _virtual_step(self) -> float | None:
-        """What the thread does, a step at a time."""
+        """One step of the thread's work."""
         pause_s = self._step(self._box, 0)
         if pause_s != 0.0:
             return pause_s

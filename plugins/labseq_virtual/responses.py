@@ -127,7 +127,7 @@ def move_tables() -> Floats:
 def lowering(
     fraction: float, duration_s: float, depth_k: Floats, temperature_k: Floats
 ) -> tuple[Floats, Floats]:
-    """What a ramp of the static tweezers to a lower depth does.
+    """The effect on atoms of a ramp of the static tweezers to a lower depth.
 
     Args:
         fraction: Depth after the ramp over that before, up to 1.

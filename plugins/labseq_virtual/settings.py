@@ -69,7 +69,7 @@ class QcmosSettings(Settings):
 
 
 class ImageSettings(Settings):
-    """What the virtual camera sees."""
+    """The image that the virtual camera takes."""
 
     frame: tuple[PositiveInt, PositiveInt] = Field(
         default=(512, 512), description="[height, width] of the sensor in pixels (ours: a common EMCCD)"
@@ -184,7 +184,7 @@ class ImageSettings(Settings):
 
 
 class TweezerImageSettings(Settings):
-    """What a further camera sees: the light of the tweezers, and none of atoms.
+    """The image of a further camera: the light of the tweezers, and none of atoms.
 
     An industrial camera: read noise of 2 electrons, 0.1 electrons per count, wells of 7000 electrons (ours).
     """

@@ -95,7 +95,7 @@ class VirtualSimulation(Simulation):
         return View.of(self._settings.image, mode).readout_fraction
 
     def seen_by(self, camera: str) -> TweezerView:
-        """What any other camera than that of the atoms receives: the light of the tweezers."""
+        """The view of any camera but that of the atoms: the light of the tweezers."""
         del camera
         settings, seed = self._settings.tweezer_image, self._seed
         return TweezerView(self, self._mobile_light, self._grid, settings, seed, self._random)
@@ -277,7 +277,7 @@ class VirtualSimulation(Simulation):
         return self._static.depth, self._mobile_light.of_outputs(rows, columns, now_s)
 
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
-        """What the mobile tweezers did to atoms in this shot, if their outputs are connected.
+        """Events of the atoms that the mobile tweezers moved in this shot, if their outputs are connected.
 
         Returns:
             "flights" (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps"

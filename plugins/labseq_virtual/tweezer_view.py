@@ -79,7 +79,7 @@ class TweezerView(Simulation):
         return Frame(image, exposure_s, t_start_s)
 
     def describe(self) -> Mapping[str, Any]:
-        """What the camera sees, in SI."""
+        """The light that the camera sees, in SI."""
         return self._settings.model_dump(mode="json")
 
     def _light(self) -> list[Light]:
