@@ -7,12 +7,13 @@ A plugin is a module (or an installed package with an entry point of group
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import pluggy
 
-from labseq.model import RunRecord, ShotRecord
-from labseq.registry import Registry
+if TYPE_CHECKING:
+    from labseq.model import RunRecord, ShotRecord
+    from labseq.registry import Registry
 
 hookspec: Final = pluggy.HookspecMarker("labseq")
 hookimpl: Final = pluggy.HookimplMarker("labseq")

@@ -41,7 +41,6 @@ from pydantic_core import PydanticCustomError
 
 from labseq.errors import Loc
 from labseq.messages import clean, shown
-from labseq.text_files import beside
 from labseq.units import expected, parse_any, parse_quantity, unit_names
 
 FOLDER: Final = "folder"
@@ -299,9 +298,17 @@ def _not_too_long(duration_s: float) -> float:
     return duration_s
 
 
+def path_beside(folder: Path, path: str) -> Path:
+    """A path that a file in ``folder`` names; ``~`` is the user's home."""
+    try:
+        return folder / Path(path).expanduser()
+    except RuntimeError:  # "~nobody"
+        return folder / path
+
+
 def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
     context = cast("Mapping[str, Path]", info.context or {})
-    return beside(context.get(FOLDER, Path()), str(path))
+    return path_beside(context.get(FOLDER, Path()), str(path))
 
 
 Text: TypeAlias = Annotated[str, Field(min_length=1)]

@@ -104,14 +104,6 @@ def alike_file(path: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> str:
     return f"did you mean '{clean(names[meant])}'?" if meant else ""
 
 
-def beside(folder: Path, path: str) -> Path:
-    """A path that a file in ``folder`` names; ``~`` is the user's home."""
-    try:
-        return folder / Path(path).expanduser()
-    except RuntimeError:  # "~nobody"
-        return folder / path
-
-
 def is_file(path: Path) -> bool:
     """Whether this is a file; False if that cannot be found out."""
     try:

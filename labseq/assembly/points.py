@@ -11,20 +11,22 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_role, dump, named, resolve, validate
-from labseq.assembly.profile import ResolvedProfile
 from labseq.config.addresses import PROFILE, ROLES, VARIABLES
-from labseq.config.document import Document
 from labseq.config.scan import Axis, Scan, put
-from labseq.config.sequence import SequenceSpec, StepSpec
-from labseq.config.yaml_nodes import Node
 from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
 from labseq.messages import clean
-from labseq.roles import Step
 from labseq.settings import Choice, settings_of
 from labseq.units import parse_any
+
+if TYPE_CHECKING:
+    from labseq.assembly.profile import ResolvedProfile
+    from labseq.config.document import Document
+    from labseq.config.sequence import SequenceSpec, StepSpec
+    from labseq.config.yaml_nodes import Node
+    from labseq.roles import Step
 
 MAX_PROBLEMS: Final = 20
 """The check of a scan stops after this number of problems."""

@@ -20,8 +20,7 @@ from labseq.plugins import PluginHost
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
-from labseq.settings import settings_of
-from labseq.text_files import beside
+from labseq.settings import path_beside, settings_of
 
 
 def resolved_of(run: Run) -> dict[str, Any]:
@@ -93,7 +92,7 @@ def plugins_of(run: Run) -> PluginHost:
     named = (("profile_path", resolved["profile"]), ("sequence_path", resolved))
     return load_plugins(
         [
-            beside(Path(run.record[path]).parent, folder)
+            path_beside(Path(run.record[path]).parent, folder)
             for path, settings in named
             for folder in settings.get("plugin_folders", ())
         ]

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, resolve
-from labseq.assembly.points import Point, ScanPoints
 from labseq.assembly.policies import check_quantity
-from labseq.config.scan import AdaptiveScan, RangeAxis
 from labseq.data.points import SCANNER
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
-from labseq.roles import Scanner, Step
 from labseq.units import written
+
+if TYPE_CHECKING:
+    from labseq.assembly.points import Point, ScanPoints
+    from labseq.config.scan import AdaptiveScan, RangeAxis
+    from labseq.roles import Scanner, Step
 
 TO_OPTIMISE: Final = "to optimise"
 """What the scan needs its quantity for, in messages."""

@@ -13,8 +13,8 @@ from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector, collecting
 from labseq.messages import clean, shown, visible
-from labseq.settings import FORMAT, SettingsType
-from labseq.text_files import beside, decode, is_folder, read_bytes
+from labseq.settings import FORMAT, SettingsType, path_beside
+from labseq.text_files import decode, is_folder, read_bytes
 
 M = TypeVar("M")
 
@@ -250,7 +250,7 @@ def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
     Raises:
         ConfigError: One does not exist.
     """
-    paths = [beside(document.path.parent, folder) for folder in folders]
+    paths = [path_beside(document.path.parent, folder) for folder in folders]
     problems = [
         document.problem(
             ("plugin_folders", i),

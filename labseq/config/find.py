@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from labseq.errors import ConfigError, Problem
 from labseq.files import PROFILES, SEQUENCES, packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import clean, did_you_mean, listing, visible
+from labseq.settings import path_beside
 from labseq.text_files import (
     YAML_SUFFIXES,
     alike_file,
-    beside as path_beside,
     files_in,
     is_file,
     is_folder,

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.model.camera import Frame
-from labseq.model.grid import Occupancy, TargetPattern
-from labseq.model.plan import Plan, PlanReport
+if TYPE_CHECKING:
+    from labseq.model.camera import Frame
+    from labseq.model.grid import Occupancy, TargetPattern
+    from labseq.model.plan import Plan, PlanReport
 
 ShotStatus = Literal["complete", "interrupted", "failed"]
 RunStatus = Literal["running", "complete", "stopped", "failed"]

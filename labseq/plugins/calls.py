@@ -10,12 +10,14 @@ from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.guard import Guard
 from labseq.messages import format_error, one_line
-from labseq.registry import Owner
+
+if TYPE_CHECKING:
+    from labseq.registry import Owner
 
 T = TypeVar("T")
 

@@ -7,9 +7,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, Final, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, Protocol, TypeVar
 
-from labseq.errors import Problem
 from labseq.model import (
     COMPUTER,
     CalibrationEntry,
@@ -28,9 +27,12 @@ from labseq.model import (
     TweezersFacts,
 )
 from labseq.model.lines import IDLE, lines_of, margin_s
-from labseq.roles.deciding import Detector, Planner
-from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
-from labseq.roles.simulation import Simulation
+
+if TYPE_CHECKING:
+    from labseq.errors import Problem
+    from labseq.roles.deciding import Detector, Planner
+    from labseq.roles.hardware import Device, MobileTweezers, StaticTweezers
+    from labseq.roles.simulation import Simulation
 
 
 class Clock(Protocol):
