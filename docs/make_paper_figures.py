@@ -33,7 +33,7 @@ from labseq.analysis.statistics import Statistics, statistics_of
 from labseq.data.points import scan_points
 from labseq.files import write_file
 from labseq.model.estimate import Estimate, Rate
-from labseq.sequencer.policies import RunPolicy
+from labseq.model.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
 
 DOCS = Path(__file__).parent

@@ -27,7 +27,7 @@ import labseq
 from labseq import builtin
 from labseq.cli.app import app
 from labseq.errors import LabseqError, Problem
-from labseq.model.rules import StepPolicy
+from labseq.model.policies import StepPolicy
 from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import Registry
 from labseq.roles import ROLES

@@ -30,9 +30,9 @@ from labseq.config.scan import AdaptiveScan, Scan
 from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
 from labseq.model import TargetPattern
+from labseq.model.policies import RunPolicy
 from labseq.recording.results import PREFIX
 from labseq.roles import Context, Step
-from labseq.sequencer.policies import RunPolicy
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of
 

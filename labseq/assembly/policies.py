@@ -12,11 +12,10 @@ from labseq.data.columns import QUANTITIES
 from labseq.data.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
+from labseq.model.policies import RunPolicy, StepPolicy
 from labseq.model.records import unique_names
-from labseq.model.rules import StepPolicy
 from labseq.recording.results import PREFIX
 from labseq.roles import Step
-from labseq.sequencer.policies import RunPolicy
 from labseq.settings import settings_of
 
 _JUDGED: Final = frozenset(

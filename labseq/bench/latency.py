@@ -19,11 +19,11 @@ from labseq.console.text import plural, time_text
 from labseq.errors import ConfigError, Problem
 from labseq.guard import stop_on_signals
 from labseq.model import ShotRecord, TimelineEntry
+from labseq.model.policies import RunPolicy
 from labseq.motion import tone_program
 from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Shot, Step, StepContext
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
 from labseq.session.session import Session
 from labseq.units import format_quantity

@@ -23,7 +23,7 @@ from labseq.console.text import age_text, clock_time, encodes, plural, settings_
 from labseq.errors import Problem
 from labseq.messages import clean
 from labseq.model import CalibrationEntry, TimelineEntry
-from labseq.model.rules import StepPolicy
+from labseq.model.policies import StepPolicy
 from labseq.recording import data_root
 from labseq.session.check import CheckReport, check
 from labseq.session.rehearsal import Rehearsal

@@ -19,7 +19,7 @@ from labseq.messages import clean
 from labseq.model import CALIBRATION_KINDS, FrequencyComb, MotionSpec, SiteGrid
 from labseq.model.lines import LineSpec
 from labseq.model.motion import Sites
-from labseq.model.rules import Blinding, Timeouts
+from labseq.model.policies import Blinding, Timeouts
 from labseq.settings import (
     FORMAT,
     Choice,

@@ -15,7 +15,7 @@ from labseq.config.document import Document, FallbackValues, StoredText, check_k
 from labseq.config.scan import Scan, ScanOrder, read_scan
 from labseq.errors import Loc, ProblemCollector, collecting
 from labseq.messages import clean, shown
-from labseq.model.rules import OverBudget, Then, WhenExhausted
+from labseq.model.policies import OverBudget, Then, WhenExhausted
 from labseq.settings import (
     FORMAT,
     Choice,

@@ -17,7 +17,7 @@ from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernel import load_kernels
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.recording import find_dead_run
 from labseq.roles import Hardware, Simulation, in_opening_order, overrides
 from labseq.safety.locks import lock_devices

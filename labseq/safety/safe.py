@@ -27,7 +27,7 @@ from labseq.errors import (
 )
 from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.messages import clean
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, find_dead_run, lock_file

@@ -28,7 +28,7 @@ from labseq.console.output import say
 from labseq.errors import ConfigError, LabseqError, Problem, StopRequested
 from labseq.files import PLUGINS
 from labseq.messages import clean, closest
-from labseq.model.rules import StepPolicy
+from labseq.model.policies import StepPolicy
 from labseq.registry import Entry, Registry
 from labseq.roles import EVENTS, ROLES
 from labseq.scaffold.words import default_of, docstring, summary, value_of

@@ -20,7 +20,7 @@ from labseq.config.profile import DeviceChoice, LinesChoice, MobileTweezersChoic
 from labseq.config.scan import FORMS, AdaptiveChoice
 from labseq.config.sequence import AnalysisChoice, SequenceSpec
 from labseq.files import whole_file
-from labseq.model.rules import StepPolicy
+from labseq.model.policies import StepPolicy
 from labseq.registry import Entry, Registry
 from labseq.scaffold.words import summary
 from labseq.settings import Choice, DefaultIfEmpty, PatternChoice, Quantity, Settings, SettingsType, si_of

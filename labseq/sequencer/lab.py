@@ -20,7 +20,7 @@ from labseq.model import (
     SiteGrid,
     TargetPattern,
 )
-from labseq.model.rules import Blinding, Timeouts
+from labseq.model.policies import Blinding, Timeouts
 from labseq.roles import (
     Camera,
     Clock,

@@ -17,8 +17,8 @@ from labseq.errors import LabseqError, StopRequested
 from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
 from labseq.messages import error_text, format_error
 from labseq.model import ShotRecord, TimelineEntry
+from labseq.model.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.model.records import ShotStatus, unique_names
-from labseq.model.rules import StepPolicy, Then
 from labseq.plain import now_utc
 from labseq.roles import RunObserver, Step
 from labseq.sequencer.images import with_waits
@@ -31,7 +31,6 @@ from labseq.sequencer.lab import (
     open_device,
 )
 from labseq.sequencer.leader import Emit, LeaderAnswers
-from labseq.sequencer.policies import RunPolicy, may_be_retried
 from labseq.sequencer.shot import Events, RunningShot, Stages
 from labseq.watchdog import Watchdog
 

@@ -32,8 +32,8 @@ from labseq.model import (
     StepTiming,
     TimelineEntry,
 )
+from labseq.model.policies import StepPolicy
 from labseq.model.records import OVERSHOOT_S, STEP
-from labseq.model.rules import StepPolicy
 from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
 from labseq.sequencer.images import CameraSeries, take_frame

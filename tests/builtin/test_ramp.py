@@ -7,7 +7,7 @@ import pytest
 from labseq.builtin.steps import RampStep, ReleaseStep
 from labseq.errors import DeviceError, DeviceTimeoutError, TransientError
 from labseq.model import LineSpec
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.testing.fakes import RecordingLines
 from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
 

@@ -9,7 +9,7 @@ import pytest
 from labseq.builtin.rearrange import RearrangeStep
 from labseq.errors import DeviceError, InvalidPlanError, PlanError
 from labseq.model import Plan
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.testing.fakes import ScriptedPlanner
 from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given
 

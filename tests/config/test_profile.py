@@ -21,7 +21,7 @@ from labseq.config.profile import (
 )
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, LineSpec, MotionSpec, SiteGrid
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.settings import Settings, settings_of
 from tests.config.wrong_files import wrong_files
 

@@ -17,7 +17,7 @@ from labseq.config.profile import ProfileSpec, load_profile
 from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
-from labseq.model.rules import StepPolicy
+from labseq.model.policies import StepPolicy
 from labseq.plugin import simulation, system
 from labseq.registry import Registry
 from labseq.roles import ROLES

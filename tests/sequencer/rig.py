@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from labseq.builtin.steps import ImageStep, LoadStep
-from labseq.sequencer.policies import RunPolicy
+from labseq.model.policies import RunPolicy
 from labseq.sequencer.run import Sequencer
 from labseq.testing.fakes import ListSink, RecordingObserver, fake_lab
 

@@ -9,7 +9,7 @@ from labseq.builtin.rearrange import RearrangeStep
 from labseq.builtin.steps import DeviceStep
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.model import CameraFacts, SiteGrid, TargetPattern
-from labseq.model.rules import Blinding
+from labseq.model.policies import Blinding
 from labseq.roles import Context
 from labseq.testing.fakes import RecordingCamera, RecordingDevice, RecordingMobileTweezers, ScriptedDetector
 from tests.sequencer.rig import IMAGE, LOAD, Rig, given

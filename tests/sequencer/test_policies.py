@@ -23,9 +23,8 @@ from labseq.errors import (
     TransientError,
 )
 from labseq.model import TimelineEntry
-from labseq.model.rules import StepPolicy, Timeouts
+from labseq.model.policies import RunPolicy, StepPolicy, Timeouts
 from labseq.roles import Shot, StepContext
-from labseq.sequencer.policies import RunPolicy
 from labseq.testing.fakes import RecordingCamera, RecordingDevice
 from labseq.testing.fakes.devices import RecordingMobileTweezers
 from tests.sequencer.rig import IMAGE, LOAD, SAFE_ORDER, Rig, given

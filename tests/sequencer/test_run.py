@@ -12,7 +12,7 @@ from labseq.builtin.rearrange import RearrangeStep
 from labseq.builtin.steps import DeviceStep, WaitStep
 from labseq.errors import DeviceError, DeviceTimeoutError, LabseqError, StopRequested, TransientError
 from labseq.messages import MAX_ERROR
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.sequencer.run import TRANSITIONS, State
 from labseq.testing.fakes import ListSink
 from labseq.watchdog import Watchdog

@@ -8,8 +8,7 @@ from labseq.builtin.rearrange import RearrangeStep
 from labseq.builtin.steps import DeviceStep, ImageStep, WaitStep
 from labseq.errors import DeviceError, TransientError
 from labseq.model import CameraFacts, LineSpec
-from labseq.model.rules import StepPolicy
-from labseq.sequencer.policies import RunPolicy
+from labseq.model.policies import RunPolicy, StepPolicy
 from labseq.testing.fakes import RecordingCamera
 from tests.sequencer.rig import IMAGE, LOAD, Rig, given
 

@@ -10,7 +10,7 @@ import pytest
 
 from labseq.errors import ConfigError, DeviceTimeoutError, StopRequested
 from labseq.guard import StopFlag
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.roles import Context
 from labseq.safety.devices import N_READINGS, CheckedDevice, check_devices, check_each_device
 from labseq.testing.fakes import Calls, FakeClock, Hang, RecordingDevice, RecordingSimulation

@@ -23,7 +23,7 @@ from labseq.model import (
     VisitedPoint,
     as_occupancy,
 )
-from labseq.model.rules import Timeouts
+from labseq.model.policies import Timeouts
 from labseq.roles import WHOLE_SENSOR, Clock, Context, Signal, Simulation
 from labseq.sequencer.lab import Lab
 from labseq.testing.fakes.devices import (
