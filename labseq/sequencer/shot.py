@@ -32,7 +32,7 @@ from labseq.model import (
     StepTiming,
     TimelineEntry,
 )
-from labseq.model.policies import StepPolicy
+from labseq.model.policies import NO_POLICY, StepPolicy
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
@@ -106,7 +106,7 @@ class Stages:
     def __init__(self, lab: Lab, record: ShotRecord, emit: Emit) -> None:
         self.start_s = lab.clock.now()
         self.step = 0
-        self.policy = StepPolicy()
+        self.policy = NO_POLICY
         self._clock = lab.clock
         self._budgets = lab.budgets
         self._record = record
@@ -287,7 +287,7 @@ class RunningShot:
             timed_by = ", ".join(dict.fromkeys(entry.timed_by.name for entry in entries))
             host_s = time.perf_counter() - host_start_s
             self.record.steps.append(StepTiming(number, name, timed_by, start_s, *durations, host_s))
-        self.stages.policy, self.in_step = StepPolicy(), False
+        self.stages.policy, self.in_step = NO_POLICY, False
 
     def record_duration(self, planned_s: float, achieved_s: float) -> None:
         """Record the duration that hardware kept; see ``labseq.plugin.Shot``."""
