@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.analysis.timing import StageStatistics
+from labseq.analysis.timing import Quantiles, StageStatistics
 from labseq.data import Run, Shot
 from labseq.data.images import average_frame, signals_of
 from labseq.model import SiteGrid
@@ -388,10 +388,11 @@ def stages_of_a_shot(title: str, stages: Sequence[StageStatistics], clocks: Mapp
         shown_s: list[float] = []
         for number, ((clock, name), colour) in enumerate(zip(clocks.items(), (DARK, ORANGE), strict=False)):
             aside = 0.17 * (2 * number - 1) if len(clocks) > 1 else 0.0
-            times = np.array([getattr(stage, clock) for stage in stages], np.float64)
+            shown: list[Quantiles] = [getattr(stage, clock) for stage in stages]
+            p50, p99 = np.array([(time_s.p50, time_s.p99) for time_s in shown], np.float64).T
             # times below 1 us come from models that neglect a stage
-            y = np.flatnonzero(times[:, 0] > (1e-6 if clock == "session_s" else 0.0))
-            p50, p99 = times[y, 0], np.fmax(times[y, 0], times[y, 1])
+            y = np.flatnonzero(p50 > (1e-6 if clock == "session_s" else 0.0))
+            p50, p99 = p50[y], np.fmax(p50, p99)[y]
             axes.hlines(y + aside, p50, p99, color=colour, linewidth=1.6, capstyle="round")
             axes.plot(p50, y + aside, color=colour, marker="o", markersize=5, linestyle="none", label=name)
             shown_s += [*p50, *p99]

@@ -24,7 +24,13 @@ ORDER: Final = (
 WRITE: Final = "write"
 """Stage of encoding a shot, and of writing its file and its line in the index."""
 
-Quantiles = tuple[float, float]
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Median and 99th percentile; NaN without values."""
+
+    p50: float
+    p99: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +63,15 @@ class RunTiming:
     """The stages of a run's shots.
 
     Attributes:
+        n_shots: Shots of the run.
+        simulated: Whether the run was simulated: the session's clock is then that of the models.
         n_read: Shots whose files were read.
         shot_s: Median and 99th percentile of the steps of a shot together, on the session's clock.
         stages: The stages, in the order of a shot; whole steps last.
     """
 
+    n_shots: int
+    simulated: bool
     n_read: int
     shot_s: Quantiles
     stages: tuple[StageStatistics, ...]
@@ -101,7 +111,13 @@ class StageTotals:
         stages = self.stages()
         writing = _writing(run, total_s / n_read if n_read else math.nan)
         n_stages = sum(not stage.stage.startswith(STEP) for stage in stages)
-        return RunTiming(n_read, quantiles(self._shot_s), (*stages[:n_stages], *writing, *stages[n_stages:]))
+        return RunTiming(
+            n_shots=len(run.shots),
+            simulated=run.simulated,
+            n_read=n_read,
+            shot_s=quantiles(self._shot_s),
+            stages=(*stages[:n_stages], *writing, *stages[n_stages:]),
+        )
 
 
 def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
@@ -139,7 +155,7 @@ def _writing(run: Run, shot_s: float) -> list[StageStatistics]:
     if not times_s:
         return []
     host_s = quantiles(times_s)
-    session_s = (math.nan, math.nan) if run.simulated else host_s  # models have no disk
+    session_s = Quantiles(math.nan, math.nan) if run.simulated else host_s  # models have no disk
     share = float(np.mean(times_s)) / shot_s if shot_s and not run.simulated else math.nan
     budget_s = _writing_budget_s(run)
     n_over = 0 if run.simulated else sum(time_s > budget_s + OVERSHOOT_S for time_s in times_s)
@@ -166,10 +182,10 @@ def quantiles(values: Sequence[float] | NDArray[np.float64]) -> Quantiles:
     """Median and 99th percentile, interpolated; NaN without values.
 
     Example:
-        >>> quantiles([1.0, 2.0, 3.0])[0]
+        >>> quantiles([1.0, 2.0, 3.0]).p50
         2.0
     """
     if not len(values):
-        return math.nan, math.nan
+        return Quantiles(math.nan, math.nan)
     p50, p99 = np.quantile(values, (0.5, 0.99))
-    return float(p50), float(p99)
+    return Quantiles(float(p50), float(p99))

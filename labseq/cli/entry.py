@@ -128,9 +128,10 @@ def _usage_json(error: Any) -> str:
 
         return as_line(json_errors(problem))
     if command in ("run", "show"):
-        from labseq.cli.run import json_result
+        from labseq.cli.summary import Summary
+        from labseq.console.output import as_line
 
-        return json_result(None, None, problem)
+        return as_line(Summary().ended_by(problem))
     return ""
 
 

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.assembly.options import Options
-from labseq.console.errors import lines_of
 from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import existing_run
 from labseq.console.text import plural, quoted
 from labseq.data import Run, open_run
-from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
+from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import install_hint, visible
 from labseq.queue.queue import Queue
@@ -30,6 +29,7 @@ from labseq.session.stopping import ask_to_stop, find_running, is_running, owner
 
 if TYPE_CHECKING:
     from labseq.cli.live import LiveView
+    from labseq.cli.summary import Summary
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool = False) -> None:
@@ -79,32 +79,29 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
     finally:
         with suppress(Exception):  # a broken terminal must not hide the result of the run
             observer.close()
-        run = _read_back(session)
-        if run is not None:
-            _report(run)
-        if answer is not None:
-            with nullcontext() if failure is None else suppress(RecordingError):  # the failure is reported
-                answer(json_result(session, run, failure))
+        _print_result(None if session is None else session.run_dir, failure, answer)
 
 
-def json_result(session: Session | None, run: Run | None, failure: BaseException | None) -> str:
-    """The result of a run as one line of JSON."""
-    from labseq.cli.summary import json_summary  # only now, because it takes 0.1 s to import
+def _print_result(
+    run_dir: Path | None, failure: BaseException | None, answer: Callable[[str], None] | None
+) -> None:
+    """Print the summary of a run, if it was created; and its JSON by ``answer``."""
+    run = _read_back(run_dir)
+    if run is None and answer is None:
+        return
+    from labseq.cli.summary import Summary  # only now, because it takes 0.1 s to import
 
-    values = json_summary(run)
-    if run is None and session is not None and session.run_dir is not None:
-        values["run_dir"] = str(session.run_dir)
-    if failure is not None:  # the status may be missing if the disk is full
-        values["status"] = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
-        values["error"] = "\n".join(lines_of(failure))
-    return as_line(values)
+    summary = Summary(run_dir=run_dir) if run is None else Summary.of(run)
+    if run is not None:
+        _report(summary)
+    if answer is not None:
+        with nullcontext() if failure is None else suppress(RecordingError):  # the failure is reported
+            answer(as_line(summary if failure is None else summary.ended_by(failure)))
 
 
-def _report(run: Run) -> None:
+def _report(summary: Summary) -> None:
     """Print the summary; an error of stdout, such as a full disk, does not affect the run."""
-    from labseq.cli.summary import summary_lines
-
-    lines = summary_lines(run)
+    lines = summary.as_text()
     try:
         say(*lines)
     except RecordingError as error:
@@ -112,11 +109,11 @@ def _report(run: Run) -> None:
             say(f"warning: {error}; the run is not affected", *lines, stream=sys.stderr)
 
 
-def _read_back(session: Session | None) -> Run | None:
-    if session is None or session.run_dir is None:
+def _read_back(run_dir: Path | None) -> Run | None:
+    if run_dir is None:
         return None
     try:
-        return open_run(session.run_dir)
+        return open_run(run_dir)
     except LabseqError:
         return None
 

@@ -5,32 +5,24 @@ from __future__ import annotations
 import math
 import shutil
 import textwrap
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from labseq.analysis.scanned import ScanRequest, scan_report
-from labseq.cli.summary import MAX_ROWS, json_summary, summary_lines
-from labseq.console.errors import lines_of
+from labseq.analysis.scanned import ScanReport, ScanRequest, scan_report
+from labseq.cli.summary import MAX_ROWS, Summary
 from labseq.console.events import outcome, scanned_values
-from labseq.console.output import as_line, say
-from labseq.console.report import aligned
+from labseq.console.output import say
+from labseq.console.report import Column, print_report, table
 from labseq.console.runs import chosen_run
-from labseq.console.text import percent, settings_text
+from labseq.console.text import percent, settings_text, time_text
 from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
-from labseq.units import format_quantity
 
 if TYPE_CHECKING:
     from labseq.analysis.timing import RunTiming, StageStatistics
-
-SHOT_KEYS: Final = (
-    *("attempt", "status", "error", "success", "filling_fraction", "seen_defect_free_cycle", "n_cycles"),
-    *("n_batches", "n_atom_moves", "n_missing_atoms", "stage_s", "parameters", "file"),
-)
-"""Keys of a shot's line in the index that ``--json`` prints."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,103 +45,159 @@ def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) 
     wanted = tables or Tables()
     try:
         run = chosen_run(path)
-        values = (_json_tables(run, wanted) if wanted.any else json_summary(run)) if as_json else {}
+        report = RunTables.of(run, wanted) if wanted.any else Summary.of(run)
     except LabseqError as error:
         if as_json:
-            say(as_line(json_summary(None) | {"error": "\n".join(lines_of(error))}))
+            print_report(Summary().ended_by(error), as_json=True)
         raise
-    if as_json:
-        say(as_line(values))
-    elif wanted.any:
-        say(*_table_lines(run, wanted))
-    else:
-        say(*shot_table(run, most=MAX_ROWS), "", *summary_lines(run))
+    if not wanted.any and not as_json:
+        say(*shot_table([ShotRow.of(shot, run) for shot in run.shots], most=MAX_ROWS), "")
+    print_report(report, as_json=as_json)
 
 
-def _table_lines(run: Run, wanted: Tables) -> list[str]:
-    """The chosen tables, with an empty line between them."""
-    choices = (
-        (wanted.shots, lambda: shot_table(run, details=True)),
-        (wanted.timing, lambda: timing_table(run)),
-        (wanted.scan is not None, lambda: scan_table(run, wanted.scan or ScanRequest())),
-        (wanted.devices, lambda: devices_table(run)),
-    )
-    found = [table() for is_wanted, table in choices if is_wanted]
-    return [line for table in found for line in ("", *table)][1:]
+@dataclass(frozen=True, slots=True)
+class ShotRow:
+    """A shot, or an attempt at one that did not complete.
 
-
-def _json_tables(run: Run, wanted: Tables) -> dict[str, Any]:
-    values: dict[str, Any] = {"run_dir": str(run.path), "status": run.status}
-    if wanted.shots:
-        values["shot_list"] = [
-            {"index": shot.index, **{name: getattr(shot.row, name) for name in SHOT_KEYS}}
-            for shot in _all_attempts(run)
-        ]
-    if wanted.timing:
-        values["timing"] = _json_timing(run)
-    if wanted.scan is not None:
-        values |= {"points": []} if _all_skipped(run) else scan_report(run, wanted.scan).as_json()
-    if wanted.devices:
-        values["devices"] = _devices(run)
-    return values
-
-
-def shot_table(run: Run, *, details: bool = False, most: int = 0) -> list[str]:
-    """A row per shot; with details also scanned values, batches, and attempts that did not complete."""
-    addresses: list[str] = [str(one) for one in run.scan.get("addresses", ())] if details else []
-    header = ["shot", *map(clean, addresses), "outcome", "filling", "cycles", "atom moves", "shot time"]
-    rows = [_shot_row(shot, run, details=details) for shot in (_all_attempts(run) if details else run.shots)]
-    at = 1 + len(addresses)
-    if details:
-        header.insert(at + 3, "batches")
-    return aligned([header, *rows], right=[i for i in range(len(header)) if i != at], most=most)
-
-
-def _all_attempts(run: Run) -> list[Shot]:
-    return sorted((*run.shots, *run.attempts), key=lambda shot: (shot.index, shot.attempt))
-
-
-def _shot_row(shot: Shot, run: Run, *, details: bool) -> tuple[str, ...]:
-    row = shot.row
-    result = outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, run.target.n_atoms)
-    if shot.status != "complete":
-        result = f"attempt {shot.attempt} {shot.status}: {clean(row.error)}"
-    counts = ("n_cycles", "n_batches", "n_atom_moves") if details else ("n_cycles", "n_atom_moves")
-    return (
-        str(shot.index),
-        *(scanned_values(run.scan, shot.index, shot.parameters) if details else ()),
-        result,
-        percent(shot.filling_fraction),
-        *(str(getattr(row, name)) for name in counts),
-        _time(row.duration_s),
-    )
-
-
-def scan_table(run: Run, request: ScanRequest) -> list[str]:
-    """A row per point of the scan, or a map; and the fits.
-
-    Raises:
-        ConfigError: The run has no scan, or no shots yet; or the request cannot be met.
+    Attributes:
+        scanned: Address -> scanned value, in the units of the sequence.
+        outcome: The result in words.
     """
-    if _all_skipped(run):
-        return [f"no point of the scan has a shot: {len(run.skipped)} of {run.n_shots} were skipped"]
-    return scan_report(run, request).as_text()
+
+    index: int
+    attempt: int
+    status: str
+    error: str
+    scanned: Mapping[str, str]
+    outcome: str
+    success: bool | None
+    filling_fraction: float
+    seen_defect_free_cycle: int
+    n_cycles: int
+    n_batches: int
+    n_atom_moves: int
+    n_missing_atoms: int
+    duration_s: float
+    stage_s: Mapping[str, float]
+    parameters: Mapping[str, Any]
+    file: str
+
+    @classmethod
+    def of(cls, shot: Shot, run: Run) -> ShotRow:
+        """The row of a shot of a run."""
+        addresses = [str(address) for address in run.scan.get("addresses", ())]
+        computed = {
+            "index": shot.index,
+            "scanned": dict(
+                zip(addresses, scanned_values(run.scan, shot.index, shot.parameters), strict=True)
+            ),
+            "outcome": _outcome(shot, run),
+        }
+        names = [field.name for field in fields(cls) if field.name not in computed]
+        return cls(**computed, **{name: getattr(shot.row, name) for name in names})
 
 
-def _all_skipped(run: Run) -> bool:
-    return bool(run.record.get("scan")) and bool(run.skipped) and not run.shots
+def _outcome(shot: Shot, run: Run) -> str:
+    if shot.status != "complete":
+        return f"attempt {shot.attempt} {shot.status}: {clean(shot.row.error)}"
+    return outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, run.target.n_atoms)
 
 
-def timing_table(run: Run) -> list[str]:
-    """A row per stage: its budget and its durations."""
-    timing = _read_timing(run)
-    clocks = ("modelled", "host") if run.simulated else ("measured",)
-    heads = [head for clock in clocks for head in (f"{clock} p50", "p99")]
-    header = ("stage", "a shot", "budget", *heads, "share", "over budget")
-    rows = [_stage_row(stage, n_clocks=len(clocks)) for stage in timing.stages]
-    lines = aligned([header, *rows], right=range(1, len(header)))
-    p50_s, p99_s = (format_quantity(s, "time") for s in timing.shot_s)
-    return [*lines, "", f"shot: {p50_s} (p50), {p99_s} (p99), of {timing.n_read} of {len(run.shots)} shots"]
+SHOTS: Final[Sequence[Column[ShotRow]]] = (
+    Column("shot", lambda shot: shot.index, right=True),
+    Column("outcome", lambda shot: shot.outcome),
+    Column("filling", lambda shot: percent(shot.filling_fraction), right=True),
+    Column("cycles", lambda shot: shot.n_cycles, right=True),
+    Column("atom moves", lambda shot: shot.n_atom_moves, right=True),
+    Column("shot time", lambda shot: time_text(shot.duration_s), right=True),
+)
+
+
+def shot_table(shots: Sequence[ShotRow], *, details: bool = False, most: int = 0) -> list[str]:
+    """A row per shot; with details also scanned values and batches."""
+    columns = [*SHOTS]
+    if details:
+        columns.insert(-2, Column("batches", lambda shot: shot.n_batches, right=True))
+        addresses = shots[0].scanned if shots else ()
+        columns[1:1] = [Column(clean(address), _scanned(address), right=True) for address in addresses]
+    return table(shots, columns, most)
+
+
+def _scanned(address: str) -> Callable[[ShotRow], str]:
+    return lambda shot: shot.scanned[address]
+
+
+@dataclass(frozen=True, slots=True)
+class SkippedScan:
+    """A scan of which every point was skipped."""
+
+    n_shots: int
+
+    def as_json(self) -> dict[str, Any]:
+        """No points."""
+        return {"points": []}
+
+    def as_text(self) -> list[str]:
+        """Why there is no table."""
+        return [f"no point of the scan has a shot: all {self.n_shots} shots were skipped"]
+
+
+@dataclass(frozen=True, slots=True)
+class RunTables:
+    """The tables of a run that were asked for, None for the others.
+
+    Attributes:
+        shot_list: The shots, with attempts that did not complete.
+        timing: The stages of the shots.
+        scan: The points of the scan.
+        devices: Name of each device -> its description at the start of the run.
+    """
+
+    run_dir: Path
+    status: str
+    shot_list: Sequence[ShotRow] | None
+    timing: RunTiming | None
+    scan: ScanReport | SkippedScan | None
+    devices: Mapping[str, Mapping[str, Any]] | None
+
+    @classmethod
+    def of(cls, run: Run, wanted: Tables) -> RunTables:
+        """The wanted tables.
+
+        Raises:
+            ConfigError: A table has no data, or the request for the scan cannot be met.
+        """
+        attempts = sorted((*run.shots, *run.attempts), key=lambda shot: (shot.index, shot.attempt))
+        return cls(
+            run_dir=run.path,
+            status=run.status,
+            shot_list=[ShotRow.of(shot, run) for shot in attempts] if wanted.shots else None,
+            timing=_read_timing(run) if wanted.timing else None,
+            scan=None if wanted.scan is None else _read_scan(run, wanted.scan),
+            devices=_devices(run) if wanted.devices else None,
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """The tables that were asked for; of the scan, its points stand beside them."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
+        found = {name: value for name, value in values.items() if value is not None}
+        return found | (self.scan.as_json() if self.scan else {})
+
+    def as_text(self) -> list[str]:
+        """The tables, with an empty line between them."""
+        tables = [
+            None if self.shot_list is None else shot_table(self.shot_list, details=True),
+            None if self.timing is None else timing_table(self.timing),
+            None if self.scan is None else self.scan.as_text(),
+            None if self.devices is None else devices_table(self.devices),
+        ]
+        return [line for lines in tables if lines is not None for line in ("", *lines)][1:]
+
+
+def _read_scan(run: Run, request: ScanRequest) -> ScanReport | SkippedScan:
+    if run.scan and run.skipped and not run.shots:
+        return SkippedScan(run.n_shots)
+    return scan_report(run, request)
 
 
 def _read_timing(run: Run) -> RunTiming:
@@ -168,39 +216,36 @@ def _read_timing(run: Run) -> RunTiming:
     return timing
 
 
-def _stage_row(stage: StageStatistics, *, n_clocks: int) -> tuple[str, ...]:
-    clocks = (stage.session_s, stage.host_s)[:n_clocks]
-    return (
-        clean(stage.stage),
-        f"{stage.n_per_shot:.3g}",
-        _time(stage.budget_s),
-        *(_time(s) for clock in clocks for s in clock),
-        percent(stage.share),
-        "-" if math.isnan(stage.budget_s) else f"{stage.n_over} of {stage.n}",
-    )
-
-
-def _time(value_s: float) -> str:
-    return "-" if math.isnan(value_s) else format_quantity(value_s, "time")
-
-
-def _json_timing(run: Run) -> dict[str, Any]:
-    def quantiles(pair: tuple[float, float]) -> dict[str, float]:
-        return dict(zip(("p50", "p99"), pair, strict=True))
-
-    timing = _read_timing(run)
-    stages = [
-        asdict(stage) | {"session_s": quantiles(stage.session_s), "host_s": quantiles(stage.host_s)}
-        for stage in timing.stages
+def timing_table(timing: RunTiming) -> list[str]:
+    """A row per stage: its budget and its durations."""
+    clock = "modelled" if timing.simulated else "measured"
+    columns: list[Column[StageStatistics]] = [
+        Column("stage", lambda stage: clean(stage.stage)),
+        Column("a shot", lambda stage: f"{stage.n_per_shot:.3g}", right=True),
+        Column("budget", lambda stage: time_text(stage.budget_s), right=True),
+        Column(f"{clock} p50", lambda stage: time_text(stage.session_s.p50), right=True),
+        Column("p99", lambda stage: time_text(stage.session_s.p99), right=True),
+        Column("host p50", lambda stage: time_text(stage.host_s.p50), right=True),
+        Column("p99", lambda stage: time_text(stage.host_s.p99), right=True),
+        Column("share", lambda stage: percent(stage.share), right=True),
+        Column("over budget", _over_budget, right=True),
     ]
-    return {"n_read": timing.n_read, "shot_s": quantiles(timing.shot_s), "stages": stages}
+    if not timing.simulated:  # both clocks are the same
+        del columns[5:7]
+    p50, p99 = time_text(timing.shot_s.p50), time_text(timing.shot_s.p99)
+    shots = f"{timing.n_read} of {timing.n_shots} shots"
+    return [*table(timing.stages, columns), "", f"shot: {p50} (p50), {p99} (p99), of {shots}"]
 
 
-def devices_table(run: Run) -> list[str]:
+def _over_budget(stage: StageStatistics) -> str:
+    return "-" if math.isnan(stage.budget_s) else f"{stage.n_over} of {stage.n}"
+
+
+def devices_table(devices: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The description of each device at the start of the run."""
     width = max(20, shutil.get_terminal_size().columns - 2)
     lines: list[str] = []
-    for name, described in _devices(run).items():
+    for name, described in devices.items():
         settings = {key: value for key, value in described.items() if key != "model"}
         lines.append(visible(f"{name}: {described.get('model', 'model unknown')}"))
         lines += [f"  {line}" for line in textwrap.wrap(visible(settings_text(settings)), width)]

@@ -1,12 +1,15 @@
-"""The summary of a run: a table of its points or cycles, and a few lines of statistics."""
+"""The summary of a run: a table of its points or cycles, and a few lines of statistics; the same as JSON."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Final
 
 from labseq.analysis.scanned import (
+    ScanReport,
     ScanRequest,
     counted_text,
     rate_text,
@@ -17,13 +20,15 @@ from labseq.analysis.scanned import (
     value_text,
 )
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
-from labseq.console.report import aligned
+from labseq.console.errors import lines_of
+from labseq.console.report import Column, Facts, aligned, table
 from labseq.console.text import count_of, plural, quoted
 from labseq.data import Run
-from labseq.data.best import best_point
+from labseq.data.best import BestPoint, best_point
 from labseq.data.follower import Follower
+from labseq.errors import StopRequested
 from labseq.messages import clean
-from labseq.model.estimate import mean
+from labseq.model.estimate import Estimate, mean
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
 
@@ -36,35 +41,120 @@ MAX_DEFECTS: Final = 6
 NOT_JUDGED: Final = "not judged: no image step after the last rearrangement"
 
 
-def summary_lines(run: Run) -> list[str]:
-    """A table of the run's points or cycles, and its statistics. Shots and cycles are counted from 0."""
-    statistics = statistics_of(run.shots, run.target)
-    table = cycle_table(statistics)
-    if scanned(run) is not None:
-        table = scan_report(run, ScanRequest()).table(MAX_ROWS)
-    skipped = f", {len(run.skipped)} skipped" if run.skipped else ""
-    kept = f", {plural(len(run.attempts), 'attempt')} kept that did not complete" if run.attempts else ""
-    rows = [
-        ("run", str(run.path)),
-        ("status", f"{run.status}: {run.error}" if run.status == "failed" else run.status),
-        ("shots", f"{len(run.shots)} of {run.n_shots}{skipped}{kept}"),
-        *_skipped_rows(run),
-        *_best_rows(run),
-        *(_atom_rows(run) if run.target.is_none else statistics_rows(statistics)),
-        ("wall time", _wall_time(run)),
-    ]
-    rows += [("watchdog", clean(line)) for line in watchdog_lines(run.path)]
-    if run.n_damaged_lines:
-        rows.append(("warning", f"{plural(run.n_damaged_lines, 'line')} of the index cannot be read"))
-    resume = (
-        [f"resume it with: labseq resume {quoted(run.path)}"] if run.status in ("stopped", "failed") else []
-    )
-    return [*table, *([""] if table else []), *aligned(rows), *resume]
+@dataclass(frozen=True, slots=True)
+class SkippedShots:
+    """Shots that a policy skipped for the same reason."""
+
+    shots: Sequence[int]
+    why: str
 
 
-def _best_rows(run: Run) -> list[tuple[str, str]]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """The result of a run. Of a run that never started, only the status and the error are known.
+
+    Attributes:
+        run_dir: The run's folder.
+        shots: Number of shots that were taken.
+        skipped: Number of shots that were skipped.
+        defect_free: Fraction of the shots that met the target.
+        filling_fraction: Mean filling of the target.
+        status: "complete", "stopped", "failed" or "running".
+        error: Why it failed.
+        statistics: Results of the shots.
+        n_shots: Number of shots that were asked for.
+        skipped_shots: Why shots were skipped, each reason with its shots.
+        n_attempts: Number of attempts that did not complete.
+        has_target: Whether the sequence has a target.
+        n_atoms: Mean number of atoms on the first and on the last image; none without images.
+        scan: Filling and defect-free fraction at each point of the scan.
+        best: The best point of an adaptive scan.
+        wall_time_s: Time until the end of the last shot; of a resumed run, of all its parts together.
+        watchdog: What the watchdog did.
+        n_damaged_lines: Lines of the index that cannot be read.
+    """
+
+    run_dir: Path | None = None
+    shots: int = 0
+    skipped: int = 0
+    defect_free: float = math.nan
+    filling_fraction: float = math.nan
+    status: str = "failed"
+    error: str | None = None
+    statistics: Statistics | None = None
+    n_shots: int = 0
+    skipped_shots: Sequence[SkippedShots] = ()
+    n_attempts: int = 0
+    has_target: bool = True
+    n_atoms: Sequence[Estimate] = ()
+    scan: ScanReport | None = None
+    best: BestPoint | None = None
+    wall_time_s: float = math.nan
+    watchdog: Sequence[str] = ()
+    n_damaged_lines: int = 0
+
+    @classmethod
+    def of(cls, run: Run) -> Summary:
+        """The result of a run, so far."""
+        return cls(
+            run_dir=run.path,
+            shots=len(run.shots),
+            skipped=len(run.skipped),
+            defect_free=run.defect_free,
+            filling_fraction=run.filling_fraction,
+            status=run.status,
+            error=run.error or None,
+            statistics=statistics_of(run.shots, run.target),
+            n_shots=run.n_shots,
+            skipped_shots=_by_reason(run),
+            n_attempts=len(run.attempts),
+            has_target=not run.target.is_none,
+            n_atoms=_n_atoms(run),
+            scan=None if scanned(run) is None else scan_report(run, ScanRequest()),
+            best=best_point(run),
+            wall_time_s=_wall_time_s(run),
+            watchdog=watchdog_lines(run.path),
+            n_damaged_lines=run.n_damaged_lines,
+        )
+
+    def ended_by(self, failure: BaseException) -> Summary:
+        """The same, with an error that the run's files need not have: the disk may be full."""
+        status = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
+        return replace(self, status=status, error="\n".join(lines_of(failure)))
+
+    def as_json(self) -> dict[str, Any]:
+        """All attributes; of the scan, its points stand beside them."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
+        return values | (self.scan.as_json() if self.scan else {})
+
+    def as_text(self) -> list[str]:
+        """A table of the points or cycles, and the statistics."""
+        tables = self.scan.table(MAX_ROWS) if self.scan else cycle_table(self.statistics)
+        ended_early = self.status in ("stopped", "failed")
+        resume = (
+            [f"resume it with: labseq resume {quoted(self.run_dir)}"] if self.run_dir and ended_early else []
+        )
+        return [*tables, *([""] if tables else []), *aligned(self._facts()), *resume]
+
+    def _facts(self) -> Facts:
+        skipped = f", {self.skipped} skipped" if self.skipped else ""
+        kept = f", {plural(self.n_attempts, 'attempt')} kept that did not complete" if self.n_attempts else ""
+        damaged = f"{plural(self.n_damaged_lines, 'line')} of the index cannot be read"
+        return [
+            ("run", str(self.run_dir)),
+            ("status", f"failed: {self.error}" if self.error and self.status == "failed" else self.status),
+            ("shots", f"{self.shots} of {self.n_shots}{skipped}{kept}"),
+            *_skipped_rows(self.skipped_shots),
+            *_best_rows(self.best),
+            *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
+            ("wall time", _wall_time(self.wall_time_s)),
+            *(("watchdog", clean(line)) for line in self.watchdog),
+            *([("warning", damaged)] if self.n_damaged_lines else []),
+        ]
+
+
+def _best_rows(best: BestPoint | None) -> Facts:
     """The best point of an adaptive scan, with its value and the suggested one."""
-    best = best_point(run)
     if best is None:
         return []
     at = ", ".join(f"{clean(address)} {value}" for address, value in best.point.written.items())
@@ -74,56 +164,41 @@ def _best_rows(run: Run) -> list[tuple[str, str]]:
     return [("best point", f"{at}: {value}"), ("suggested", f"{suggested} ({source})")]
 
 
-def _atom_rows(run: Run) -> list[tuple[str, str]]:
-    """The atoms on the first and the last image of the shots of a run without a target."""
+def _n_atoms(run: Run) -> list[Estimate]:
     counts = [shot.row.images.n_atoms for shot in run.shots if len(shot.row.images)]
-    first, last = (mean([of_shot[i] for of_shot in counts]) for i in (0, -1))
-    return [
-        ("target", "none"),
-        *([("atoms", f"{first} on the first image, {last} on the last")] if counts else []),
-    ]
+    return [mean([of_shot[i] for of_shot in counts]) for i in (0, -1)] if counts else []
 
 
-def json_summary(run: Run | None) -> dict[str, Any]:
-    """The summary as ``--json`` prints it; None for a run that never started."""
-    if run is None:
-        nothing = {"defect_free": None, "filling_fraction": None}
-        return {"run_dir": None, "shots": 0, **nothing, "status": "failed"}
-    values = run.summary() | {"statistics": statistics_of(run.shots, run.target)}
-    if scanned(run) is not None:
-        values |= scan_report(run, ScanRequest()).as_json()
-    if (best := best_point(run)) is not None:
-        values["best"] = best
-    if run.skipped:
-        values["skipped_shots"] = [{"shots": shots, "why": why} for why, shots in _by_reason(run)]
-    return values | ({"error": run.error} if run.error else {})
+def _atom_rows(n_atoms: Sequence[Estimate]) -> Facts:
+    """The atoms on the images of a run without a target."""
+    texts = [f"{n} on the {which} image" for n, which in zip(n_atoms, ("first", "last"), strict=False)]
+    return [("target", "none"), *([("atoms", ", ".join(texts))] if texts else [])]
 
 
-def cycle_table(statistics: Statistics) -> list[str]:
+CYCLES: Final[Sequence[Column[CycleStatistics]]] = (
+    Column("cycle", lambda cycle: cycle.cycle, right=True),
+    Column("shots", lambda cycle: cycle.n_shots, right=True),
+    Column("defect-free", lambda cycle: rate_text(cycle.defect_free), right=True),
+    Column("filling", lambda cycle: share_text(cycle.filling), right=True),
+    Column("atom moves", lambda cycle: cycle.n_atom_moves, right=True),
+    Column("batches", lambda cycle: cycle.n_batches, right=True),
+    Column("left out", lambda cycle: cycle.n_left_out, right=True),
+)
+
+
+def cycle_table(statistics: Statistics | None) -> list[str]:
     """A row per cycle, judged on the image at its end; empty without cycles."""
-    if not statistics.cycles:
+    if statistics is None or not statistics.cycles:
         return []
-    header = ("cycle", "shots", "defect-free", "filling", "atom moves", "batches", "left out")
-    lines = aligned([header, *map(_cycle_row, statistics.cycles)], right=range(len(header)))
     ended = statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots
     reached = "; only shots that reached it count" if ended else ""
-    return [*lines, f"each cycle is judged on its own final image{reached}"]
+    return [*table(statistics.cycles, CYCLES), f"each cycle is judged on its own final image{reached}"]
 
 
-def _cycle_row(cycle: CycleStatistics) -> tuple[str, ...]:
-    return (
-        str(cycle.cycle),
-        str(cycle.n_shots),
-        rate_text(cycle.defect_free),
-        share_text(cycle.filling),
-        str(cycle.n_atom_moves),
-        str(cycle.n_batches),
-        str(cycle.n_left_out),
-    )
-
-
-def statistics_rows(statistics: Statistics) -> list[tuple[str, str]]:
+def statistics_rows(statistics: Statistics | None) -> Facts:
     """The results of the shots: name and value of each line."""
+    if statistics is None:
+        return []
     one = statistics
     is_judged = bool(one.defect_free.n_trials)
     rows = [
@@ -163,23 +238,22 @@ def histogram_text(counts: Sequence[int]) -> str:
     return f"{', '.join(parts)} shots"
 
 
-def _skipped_rows(run: Run) -> list[tuple[str, str]]:
+def _skipped_rows(skipped: Sequence[SkippedShots]) -> Facts:
     """A row for each reason why shots were skipped, with the shots."""
-    groups = _by_reason(run)
     rows = [
         ("skipped", f"{'shot' if len(shots) == 1 else 'shots'} {_numbers(shots)}: {clean(why)}")
-        for why, shots in groups[:MAX_LISTED]
+        for shots, why in ((group.shots, group.why) for group in skipped[:MAX_LISTED])
     ]
-    n_more = len(groups) - MAX_LISTED
+    n_more = len(skipped) - MAX_LISTED
     return rows if n_more <= 0 else [*rows, ("", f"and for {plural(n_more, 'other reason')}")]
 
 
-def _by_reason(run: Run) -> list[tuple[str, list[int]]]:
+def _by_reason(run: Run) -> list[SkippedShots]:
     """The reasons why shots were skipped, each with the indices of its shots."""
-    found: dict[str, list[int]] = {}
+    shots_of: dict[str, list[int]] = {}
     for shot, why in sorted(run.skipped.items()):
-        found.setdefault(why, []).append(shot)
-    return [*found.items()]
+        shots_of.setdefault(why, []).append(shot)
+    return [SkippedShots(shots, why) for why, shots in shots_of.items()]
 
 
 def _numbers(shots: Sequence[int]) -> str:
@@ -187,8 +261,11 @@ def _numbers(shots: Sequence[int]) -> str:
     return ", ".join(str(shot) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
 
 
-def _wall_time(run: Run) -> str:
-    """Time until the end of the last shot; of a resumed run, of all its parts together."""
+def _wall_time(time_s: float) -> str:
+    return "-" if math.isnan(time_s) else f"{format_quantity(time_s, 'time')} on the computer's clock"
+
+
+def _wall_time_s(run: Run) -> float:
     ends = {"shot_finished", "shot_repeated"}
-    until_s = max((event.t_s for event in Follower(run.path).events() if event.name in ends), default=0.0)
-    return "-" if not until_s else f"{format_quantity(until_s, 'time')} on the computer's clock"
+    times_s = [event.t_s for event in Follower(run.path).events() if event.name in ends]
+    return max(times_s, default=math.nan)

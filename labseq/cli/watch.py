@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from labseq.cli.live import observer_for
-from labseq.cli.summary import summary_lines
+from labseq.cli.summary import Summary
 from labseq.console.output import say
 from labseq.console.runs import chosen_run
 from labseq.data import Shot, open_run
@@ -42,7 +42,7 @@ def watch_run(
     except KeyboardInterrupt:
         lines = [f"no longer watched; the run {run_dir} continues"]
     else:
-        lines = summary_lines(open_run(run_dir))
+        lines = Summary.of(open_run(run_dir)).as_text()
     finally:
         view.close()
     say(*lines, stream=shown)

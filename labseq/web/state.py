@@ -239,7 +239,7 @@ def stage_rows(totals: StageTotals, *, simulated: bool) -> list[dict[str, Any]]:
     """Stages of the latest shots: host times in a simulated run, as measured on real hardware."""
     rows = list[dict[str, Any]]()
     for stage in totals.stages():
-        median_s, p99_s = stage.host_s if simulated else stage.session_s
+        shown_s = stage.host_s if simulated else stage.session_s
         whole = stage.stage.startswith(STEP)
         rows.append(
             {
@@ -248,9 +248,9 @@ def stage_rows(totals: StageTotals, *, simulated: bool) -> list[dict[str, Any]]:
                 ),
                 "is_step": whole,
                 "n": stage.n,
-                "median_s": finite(median_s),
-                "p99_s": finite(p99_s),
-                "modelled_s": finite(stage.session_s[0]) if simulated else None,
+                "median_s": finite(shown_s.p50),
+                "p99_s": finite(shown_s.p99),
+                "modelled_s": finite(stage.session_s.p50) if simulated else None,
                 "budget_s": finite(stage.budget_s),
                 "n_over": stage.n_over,
                 "margin_s": OVERSHOOT_S,

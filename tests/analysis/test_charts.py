@@ -21,7 +21,7 @@ from labseq.analysis.charts import (
     stages_of_a_shot,
     trend,
 )
-from labseq.analysis.timing import StageStatistics
+from labseq.analysis.timing import Quantiles, StageStatistics
 from labseq.model import SiteGrid
 from labseq.model.estimate import Estimate, Rate, jeffreys
 from labseq.pictures.figures import RED, make_figure
@@ -34,7 +34,7 @@ def points(n: int = 4) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def stage(name: str, session_s: tuple[float, float], host_s: tuple[float, float], budget_s: float) -> Any:
-    return StageStatistics(name, 1, 1.0, budget_s, session_s, host_s, 0.5, 0)
+    return StageStatistics(name, 1, 1.0, budget_s, Quantiles(*session_s), Quantiles(*host_s), 0.5, 0)
 
 
 def trend_of(n: int, *, is_rate: bool = False) -> Panel:

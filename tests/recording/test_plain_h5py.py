@@ -14,8 +14,8 @@ import pytest
 import labseq
 from labseq.analysis.overview import overview, picture_of
 from labseq.analysis.shot import save_shot, shot_picture
-from labseq.cli.show import shot_table
-from labseq.cli.summary import summary_lines
+from labseq.cli.show import ShotRow, shot_table
+from labseq.cli.summary import Summary
 from labseq.data.images import average_frame, loading_map, signals_of
 
 from .records import make_shot, write
@@ -113,9 +113,9 @@ def test_a_sequence_without_a_target_is_run_shown_and_drawn(tmp_path: Path) -> N
     assert [shot.row.success for shot in run.shots] == [None] * 2
     assert all(math.isnan(shot.row.filling_fraction) for shot in run.shots)
     assert [math.isnan(shot.filling_fraction) for shot in run.shots] == [True, True]
-    assert all("not judged" not in line and "defect" not in line for line in summary_lines(run))
-    assert any("on the first image" in line for line in summary_lines(run))
-    assert "no target" in shot_table(run)[1]
+    assert all("not judged" not in line and "defect" not in line for line in Summary.of(run).as_text())
+    assert any("on the first image" in line for line in Summary.of(run).as_text())
+    assert "no target" in shot_table([ShotRow.of(shot, run) for shot in run.shots])[1]
     overview(run).save(tmp_path / "overview.png")
     save_shot(tmp_path / "shot.png", shot_picture(run, 0))
 

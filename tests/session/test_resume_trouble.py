@@ -15,7 +15,7 @@ import pytest
 import labseq
 from labseq.analysis.timing import writing_s
 from labseq.cli.live import Tally
-from labseq.cli.summary import summary_lines
+from labseq.cli.summary import Summary
 from labseq.cli.watch import WatchedRun
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
@@ -139,10 +139,11 @@ def test_a_clock_that_is_set_changes_nothing_but_time_stamps(
     assert max(writing_s(run)) < DAY_S / 2
     stamped = ("run ", "wall time ", "resumed ", "warning")
     shown, expected = (
-        [line for line in summary_lines(each) if not line.startswith(stamped)] for each in (run, undisturbed)
+        [line for line in Summary.of(each).as_text() if not line.startswith(stamped)]
+        for each in (run, undisturbed)
     )
     assert shown == expected
-    (wall_time,) = (line for line in summary_lines(run) if line.startswith("wall time "))
+    (wall_time,) = (line for line in Summary.of(run).as_text() if line.startswith("wall time "))
     assert re.fullmatch(r"wall time +[\d.]+ m?s on the computer's clock", wall_time)
     watched = WatchedRun(run.path)
     tally = Tally(watched.now)
