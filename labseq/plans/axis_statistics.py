@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -42,7 +42,9 @@ class AxisStatistics:
         crest_batch: Index of the batch with this crest factor.
         mean_power_w: Mean power into 50 Ohm while tones are on.
         highest_power_w: Highest short-term mean power, from the tones' amplitudes.
-        gain: Power gain of the amplifier between output and AOD, as a factor.
+        aod_peak_v: Highest voltage after the amplifier, across 50 Ohm.
+        aod_mean_power_w: Mean power at the AOD while tones are on.
+        aod_highest_power_w: Highest short-term mean power at the AOD.
         path_share: Name of each render path -> its share of the samples with tones on.
     """
 
@@ -58,30 +60,10 @@ class AxisStatistics:
     crest_batch: int
     mean_power_w: float
     highest_power_w: float
-    gain: float
+    aod_peak_v: float
+    aod_mean_power_w: float
+    aod_highest_power_w: float
     path_share: Mapping[str, float]
-
-    @property
-    def aod_peak_v(self) -> float:
-        """Highest voltage after the amplifier, across 50 Ohm."""
-        return self.peak_v * math.sqrt(self.gain)
-
-    @property
-    def aod_mean_power_w(self) -> float:
-        """Mean power at the AOD while tones are on."""
-        return self.mean_power_w * self.gain
-
-    @property
-    def aod_highest_power_w(self) -> float:
-        """Highest short-term mean power at the AOD."""
-        return self.highest_power_w * self.gain
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, SI, JSON-ready."""
-        values = asdict(self)
-        del values["name"], values["gain"]
-        derived = ("aod_peak_v", "aod_mean_power_w", "aod_highest_power_w")
-        return values | {name: getattr(self, name) for name in derived}
 
 
 def measure_axes(
@@ -108,19 +90,26 @@ def measure_axes(
         carries = (program.kind[on] == SegmentKind.TRANSPORT) & (energies > 0.0)
         crests = np.sqrt(np.where(carries, peaks**2 * n_samples / np.where(carries, energies, 1.0), 0.0))
         loudest, sharpest = int(peaks.argmax()), int(crests.argmax())
+        peak_v = float(volts * peaks[loudest])
+        mean_power_w = float(volts**2 * energies.sum() / n_samples.sum() / LOAD_OHM)
+        highest_power_w = _highest_power_w(tones, segments, rf)
+        gain = 10 ** (rf.amplifier_gain_db / 10)  # of power, so that a voltage gains its square root
         paths = {path.name.lower(): n_samples[renderer.path[axis, on] == path].sum() for path in PATHS}
         return AxisStatistics(
             name=AXES[axis],
-            **_tone_statistics(tones, segments, rf),
+            **_tone_statistics(tones, segments),
             max_tones=int(np.diff(tones.offsets)[on].max()),
             band_hz=(rf.row_band_hz, rf.column_band_hz)[axis],
             snapped_m=float(np.abs(drive(grid, motion, axis).comb_error_m).max(initial=0.0)),
-            peak_v=float(volts * peaks[loudest]),
+            peak_v=peak_v,
             peak_batch=int(program.batch[on[loudest]]),
             crest_factor=float(crests[sharpest]) if carries.any() else None,
             crest_batch=int(program.batch[on[sharpest]]),
-            mean_power_w=float(volts**2 * energies.sum() / n_samples.sum() / LOAD_OHM),
-            gain=10 ** (rf.amplifier_gain_db / 10),
+            mean_power_w=mean_power_w,
+            highest_power_w=highest_power_w,
+            aod_peak_v=peak_v * math.sqrt(gain),
+            aod_mean_power_w=mean_power_w * gain,
+            aod_highest_power_w=highest_power_w * gain,
             path_share={name: float(n / n_samples.sum()) for name, n in paths.items()},
         )
 
@@ -146,8 +135,15 @@ def _scan(
     return peaks, energies
 
 
-def _tone_statistics(tones: AxisTones, segments: range, rf: RfSpec) -> dict[str, Any]:
-    """Frequencies, highest sum of amplitudes, and highest power, which changes linearly in a segment."""
+def _highest_power_w(tones: AxisTones, segments: range, rf: RfSpec) -> float:
+    """The highest power of the tones together, which changes linearly in a segment."""
+    squares = np.cumsum(np.square([tones.start_amplitude, tones.end_amplitude]), axis=1)
+    sums = np.diff(np.concatenate([np.zeros((2, 1)), squares], axis=1)[:, tones.offsets], axis=1)
+    return rf.full_scale_v**2 / (2 * LOAD_OHM) * float(sums[:, segments.start : segments.stop].max())
+
+
+def _tone_statistics(tones: AxisTones, segments: range) -> dict[str, Any]:
+    """Frequencies, and highest sum of amplitudes."""
     from labseq.motion.tone_kernels import greatest_sum
 
     part = slice(tones.offsets[segments.start], tones.offsets[segments.stop])
@@ -156,11 +152,7 @@ def _tone_statistics(tones: AxisTones, segments: range, rf: RfSpec) -> dict[str,
         [tones.start_hz, tones.end_hz, tones.start_amplitude, tones.end_amplitude, tones.phase_rad]
     )
     bounds = [tones.offsets[i : i + 2].tolist() for i in segments]
-    squares = np.cumsum(np.square([tones.start_amplitude, tones.end_amplitude]), axis=1)
-    sums = np.diff(np.concatenate([np.zeros((2, 1)), squares], axis=1)[:, tones.offsets], axis=1)
-    full_scale_power_w = rf.full_scale_v**2 / (2 * LOAD_OHM)
     return {
         "frequency_hz": (float(hz.min()), float(hz.max())),
         "amplitude_sum": float(max(greatest_sum(values, first, last, 0.0) for first, last in bounds)),
-        "highest_power_w": full_scale_power_w * float(sums[:, segments.start : segments.stop].max()),
     }

@@ -227,22 +227,6 @@ class PlannedWaveform:
         """Render everything once, and return the statistics of the row and the column axis."""
         return measure_axes(self.program, self.renderer, self.segments, self.moves.grid, self.moves.motion)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Everything except the statistics, SI, JSON-ready; indices of batches count from 0."""
-        return {
-            "source": self.moves.source,
-            "planner": self.moves.planner,
-            "degree_of_parallelism": self.moves.degree_of_parallelism,
-            "seed": self.moves.seed,
-            "first_batch": self.batches.start,
-            "n_batches": len(self.batches),
-            "duration_s": self.duration_s,
-            "tones_on_s": self.tones_on_s,
-            "sample_rate_hz": self.renderer.sample_rate_hz,
-            "n_samples": len(self.samples),
-            "n_bytes": self.n_bytes,
-        }
-
 
 def plan_waveform(
     request: WaveformRequest,

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from labseq.plans.waveform import (
     plan_waveform,
     read_batches,
 )
+from labseq.plans.waveform_report import WaveformReport
 
 RATE = "250 MHz"
 ONE_ATOM = json.dumps(
@@ -61,7 +63,9 @@ def samples_of(made: PlannedWaveform) -> np.ndarray[Any, np.dtype[np.int16]]:
 def test_a_plan_in_a_file_gives_the_same_samples(whole: PlannedWaveform, plan_json: Path) -> None:
     read = waveform(PlanRequest(str(plan_json)))
     assert np.array_equal(samples_of(read), samples_of(whole))
-    assert read.as_dict() | {"source": ""} == whole.as_dict() | {"source": ""}
+    assert replace(WaveformReport.of(read), source="", subject={}) == replace(
+        WaveformReport.of(whole), source="", subject={}
+    )
 
 
 @pytest.mark.parametrize(("as_plan", "mark"), [(True, ""), (False, "\ufeff")])
@@ -105,7 +109,6 @@ def test_the_numbers_are_those_of_the_samples(batches: str | None) -> None:
         assert sum(axis.path_share.values()) == pytest.approx(1.0)
         low_hz, high_hz = axis.band_hz
         assert low_hz <= axis.frequency_hz[0] <= axis.frequency_hz[1] <= high_hz
-        json.dumps(axis.as_dict(), allow_nan=False)
     assert made.tones_on_s == pytest.approx(len(on) / made.renderer.sample_rate_hz, rel=1e-4)
     assert made.n_bytes == samples.nbytes
 

@@ -11,7 +11,7 @@ import pytest
 from labseq.assembly.planning import PlanRequest
 from labseq.messages import install_hint
 from labseq.plans.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.plans.waveform_report import WaveformOutput, note, report, show_waveform, title
+from labseq.plans.waveform_report import WaveformOutput, WaveformReport, note, show_waveform, title
 
 assert numba  # loaded already, so that a command does not turn compiling off for the tests after it
 
@@ -35,7 +35,7 @@ def made() -> PlannedWaveform:
 
 
 def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
-    lines = report(made, made.statistics())
+    lines = WaveformReport.of(made).as_text()
     n = made.moves.plan.n_batches
     assert all(fact in lines[0] for fact in ("random:6x6@0.7", "seed 3", "27 atoms on 6 x 6 sites"))
     assert f"batches    {n}" in lines
@@ -49,8 +49,8 @@ def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
 def test_some_batches_are_named_in_report_and_title() -> None:
     made = plan_waveform(WaveformRequest(REQUEST.plan, "1-2", REQUEST.sample_rate))
     n = made.moves.plan.n_batches
-    text = "\n".join(report(made, made.statistics()))
-    assert all(f"1 to 2 (2 of {n})" in one for one in (title(made), text))
+    report = WaveformReport.of(made)
+    assert all(f"1 to 2 (2 of {n})" in text for text in (title(report), "\n".join(report.as_text())))
 
 
 def test_samples_that_are_all_zero_have_no_crest_factor(tmp_path: Path) -> None:
