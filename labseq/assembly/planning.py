@@ -5,13 +5,10 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from labseq.assembly.calibrations import calibrated_machine
 from labseq.assembly.lab import construct_planner
@@ -32,7 +29,7 @@ from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
 from labseq.guard import Guard
 from labseq.messages import clean, format_error, visible
-from labseq.model import Batch, MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
+from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
@@ -281,26 +278,6 @@ class PlannedMoves:
         plan = self.plan if self.refused is None else self.plan.first(self.refused.batch)
         return predict_survival(plan, self.report, self.occupancy, self.target, self.grid, self.motion)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Everything, JSON-ready; occupancies as rows of 0 and 1, ejected atoms at sites off the grid."""
-        report, refused = self.report, self.refused
-        about_grid = ("n_rows", "n_cols", "spacing_m", "lattice", "shear")
-        return {
-            "planner": self.planner,
-            "grid": {name: getattr(self.grid, name) for name in about_grid},
-            "degree_of_parallelism": self.degree_of_parallelism,
-            "seed": self.seed,
-            "occupancy": _bits(self.occupancy),
-            "target": {"fill": _bits(self.target.fill), "clear": _bits(self.target.clear)},
-            "n_batches": self.plan.n_batches,
-            "n_atom_moves": self.plan.n_atom_moves,
-            "duration_s": report.duration_s,
-            "survival": asdict(self.survival),
-            "batches": [_batch(batch) for batch in self.plan.batches],
-            "predicted": _bits(report.predicted),
-            "refused": refused and {"batch": refused.batch, "move": refused.move, "why": str(refused)},
-        }
-
 
 def plan_moves(
     request: PlanRequest,
@@ -388,20 +365,3 @@ def call_planner(
     raise PlanError(
         f"plan() raised {format_error(error)}" + (f" ({place})" if place else ""), name
     ) from error
-
-
-def _batch(batch: Batch) -> dict[str, Any]:
-    """A batch as :mod:`labseq.plans.plan_file` reads it."""
-    values: dict[str, Any] = {
-        "from": batch.from_sites.tolist(),
-        "to": batch.to_sites.tolist(),
-        "linked": batch.linked,
-    }
-    if batch.tones is None:
-        return values
-    names = ("row", "column", "row_off", "column_off")
-    return values | {"tones": {name: getattr(batch.tones, name).tolist() for name in names}}
-
-
-def _bits(sites: NDArray[np.bool_]) -> list[list[int]]:
-    return sites.astype(int).tolist()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
 
@@ -16,10 +17,11 @@ from labseq.assembly.occupancies import read_source
 from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.console.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
-from labseq.console.report import aligned
+from labseq.console.report import Facts, aligned
 from labseq.console.text import count_of, encodes, percent, plural
 from labseq.kernel import interpret
 from labseq.model import Batch, TonePaths
+from labseq.motion import Survival
 from labseq.pictures.plans import occupancies, on_grid
 from labseq.units import format_quantity
 
@@ -51,15 +53,16 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     if source.occupancy.size <= 64 * 64:  # planning in plain Python is then faster than loading numba
         interpret()
     moves = plan_moves(request, source, announce=report_compiling, keep_refused=True)
+    report = PlanReport.of(moves)
     if output.png is not None:
         _draw(moves, output.png)
     if output.json != STDOUT:
-        write(moves.as_dict())
+        write(report)
     if output.step or output.json != STDOUT:
         print_plan(moves, sys.stdout, step=output.step)
     say(*(f"warning: {text}" for text in warnings(moves, request)), stream=sys.stderr)
     if output.json == STDOUT:
-        write(moves.as_dict())
+        write(report)
     if moves.refused is not None:
         raise moves.refused
 
@@ -211,7 +214,7 @@ def _print_all(console: Console, moves: PlannedMoves, *, step: bool) -> None:
     if key := canvas.key(before, after):
         _print(console, key, Text())
     _print(console, *refused_lines(moves, canvas, arrow))
-    _print(console, *map(Text, aligned(totals(moves))))
+    _print(console, *map(Text, aligned(PlanReport.of(moves).totals())))
 
 
 def _print_steps(console: Console, steps: Iterable[list[Text]]) -> None:
@@ -250,7 +253,7 @@ def title(moves: PlannedMoves) -> str:
     return f"{moves.planner}, degree of parallelism {moves.degree_of_parallelism}: {', '.join(parts)}"
 
 
-def subject(moves: PlannedMoves) -> list[tuple[str, str]]:
+def subject(moves: PlannedMoves) -> Facts:
     """Occupancy, target and planner."""
     grid, target = moves.grid, moves.target
     sites = (
@@ -266,27 +269,102 @@ def subject(moves: PlannedMoves) -> list[tuple[str, str]]:
     ]
 
 
-def totals(moves: PlannedMoves) -> list[tuple[str, str]]:
-    """The plan in numbers."""
-    plan, report = moves.plan, moves.report
-    n_atoms = moves.target.n_atoms
-    if moves.refused is not None:
-        valid = f"{plan.n_batches}, of which {moves.refused.batch} come before the refused one"
-        return [("batches", valid), ("atom moves", str(plan.n_atom_moves))]
-    lost: list[tuple[str, str]] = []
-    if plan.n_batches:
-        survival = moves.survival
-        text = f"{survival.n_lost:.2g} atoms expected until the next image"
-        lost.append(("lost", f"{text}; defect-free then: {percent(survival.p_defect_free, 1)}"))
-    rows = [
-        ("batches", str(plan.n_batches)),
-        ("atom moves", str(plan.n_atom_moves)),
-        ("duration", format_quantity(report.duration_s, "time")),
-        ("tweezers", f"at most {moves.max_tweezers} on at once"),
-        ("ejected", plural(moves.n_ejected, "atom")),
-        *lost,
-        ("filled", f"{count_of(moves.n_filled, n_atoms)} target sites"),
-    ]
-    if report.n_surplus:
-        rows.append(("surplus", f"{plural(report.n_surplus, 'atom')} on sites that must be empty"))
-    return rows
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanReport:
+    """A plan, SI, as :mod:`labseq.plans.plan_file` reads it; occupancies as rows of 0 and 1.
+
+    Attributes:
+        planner: Name of the planner.
+        degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
+        seed: Seed of all random numbers; None if there is none.
+        grid: Size, spacing and lattice of the grid.
+        occupancy: Before the plan.
+        target: "fill", sites to hold an atom, and "clear", sites to be empty.
+        n_batches: Number of batches.
+        n_atom_moves: Number of atom moves.
+        duration_s: From the start of the cycle, overheads included.
+        max_tweezers: Maximum number of mobile tweezers on at once.
+        n_ejected: Atoms that leave the grid.
+        n_filled: Sites of the target that hold an atom after the plan.
+        n_surplus: Atoms that are left on sites to be empty.
+        survival: What the plan costs, by the losses of the profile.
+        batches: The batches; the sites of ejected atoms are off the grid.
+        predicted: The occupancy after the plan; of a refused plan, after the batches before the refused one.
+        refused: The rule that the plan breaks, if it does.
+    """
+
+    planner: str
+    degree_of_parallelism: int
+    seed: int | None
+    grid: Mapping[str, Any]
+    occupancy: NDArray[np.integer[Any]]
+    target: Mapping[str, NDArray[np.integer[Any]]]
+    n_batches: int
+    n_atom_moves: int
+    duration_s: float
+    max_tweezers: int
+    n_ejected: int
+    n_filled: int
+    n_surplus: int
+    survival: Survival
+    batches: Sequence[Mapping[str, Any]]
+    predicted: NDArray[np.integer[Any]]
+    refused: Refusal | None
+
+    @classmethod
+    def of(cls, moves: PlannedMoves) -> PlanReport:
+        """The numbers of a plan, and the plan."""
+        plan, report, refused = moves.plan, moves.report, moves.refused
+        about_grid = ("n_rows", "n_cols", "spacing_m", "lattice", "shear")
+        return cls(
+            planner=moves.planner,
+            degree_of_parallelism=moves.degree_of_parallelism,
+            seed=moves.seed,
+            grid={name: getattr(moves.grid, name) for name in about_grid},
+            occupancy=moves.occupancy.astype(int),
+            target={"fill": moves.target.fill.astype(int), "clear": moves.target.clear.astype(int)},
+            n_batches=plan.n_batches,
+            n_atom_moves=plan.n_atom_moves,
+            duration_s=report.duration_s,
+            max_tweezers=moves.max_tweezers,
+            n_ejected=moves.n_ejected,
+            n_filled=moves.n_filled,
+            n_surplus=report.n_surplus,
+            survival=moves.survival,
+            batches=[_batch(batch) for batch in plan.batches],
+            predicted=report.predicted.astype(int),
+            refused=None if refused is None else Refusal(refused.batch, refused.move, str(refused)),
+        )
+
+    def totals(self) -> Facts:
+        """The plan in numbers."""
+        if self.refused is not None:
+            valid = f"{self.n_batches}, of which {self.refused.batch} come before the refused one"
+            return [("batches", valid), ("atom moves", str(self.n_atom_moves))]
+        lost = f"{self.survival.n_lost:.2g} atoms expected until the next image"
+        defect_free = percent(self.survival.p_defect_free, 1)
+        surplus = f"{plural(self.n_surplus, 'atom')} on sites that must be empty"
+        return [
+            ("batches", str(self.n_batches)),
+            ("atom moves", str(self.n_atom_moves)),
+            ("duration", format_quantity(self.duration_s, "time")),
+            ("tweezers", f"at most {self.max_tweezers} on at once"),
+            ("ejected", plural(self.n_ejected, "atom")),
+            *([("lost", f"{lost}; defect-free then: {defect_free}")] if self.n_batches else []),
+            ("filled", f"{count_of(self.n_filled, int(self.target['fill'].sum()))} target sites"),
+            *([("surplus", surplus)] if self.n_surplus else []),
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a plan is refused: the batch and the atom move in it, -1 for no particular one."""
+
+    batch: int
+    move: int
+    why: str
+
+
+def _batch(batch: Batch) -> Mapping[str, Any]:
+    tones = {} if batch.tones is None else {"tones": batch.tones}
+    return {"from": batch.from_sites, "to": batch.to_sites, "linked": batch.linked, **tones}

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.model import Batch
-from labseq.plans.plan import PlanOutput, moves_text, plan_once, print_plan, totals, warnings
+from labseq.plans.plan import PlanOutput, PlanReport, moves_text, plan_once, print_plan, warnings
 
 assert numba  # loaded already, so that the command does not turn compiling off for the tests after it
 
@@ -140,7 +140,7 @@ def test_a_planner_that_leaves_defects_and_surplus_is_reported(
     defects, surplus = warnings(moves, request)
     assert f"{moves.report.n_defects} target sites empty" in defects
     assert f"{moves.report.n_surplus} atoms on sites that must be empty" in surplus
-    assert dict(totals(moves))["surplus"].startswith(f"{moves.report.n_surplus} atoms")
+    assert dict(PlanReport.of(moves).totals())["surplus"].startswith(f"{moves.report.n_surplus} atoms")
 
 
 BROKEN = """

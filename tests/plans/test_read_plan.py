@@ -9,19 +9,19 @@ from hypothesis import given, settings, strategies as st
 
 from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError
+from labseq.plain import dumps, to_plain
+from labseq.plans.plan import PlanReport
 from labseq.plans.plan_file import read_plan
 
 
 def planned(**options: Any) -> dict[str, Any]:
-    return plan_moves(
-        PlanRequest("random:8x9@0.7", "{pattern: compact, rows: 4, cols: 4}", **options)
-    ).as_dict()
+    request = PlanRequest("random:8x9@0.7", "{pattern: compact, rows: 4, cols: 4}", **options)
+    return to_plain(PlanReport.of(plan_moves(request)))
 
 
 def read(document: dict[str, Any], **options: Any) -> dict[str, Any]:
-    return read_plan(
-        json.dumps(document).encode(), "plan.json", PlanRequest("plan.json", **options)
-    ).as_dict()
+    data = json.dumps(document).encode()
+    return to_plain(PlanReport.of(read_plan(data, "plan.json", PlanRequest("plan.json", **options))))
 
 
 @settings(max_examples=8)
@@ -39,9 +39,9 @@ def read(document: dict[str, Any], **options: Any) -> dict[str, Any]:
 def test_a_plan_reads_back_as_it_was_written(seed: int, target: str, dop: int) -> None:
     request = PlanRequest("random:8x9@0.7", target, degree_of_parallelism=dop, seed=seed)
     moves = plan_moves(request)
-    document = moves.as_dict()
+    document = to_plain(PlanReport.of(moves))
     again = read_plan(json.dumps(document).encode(), "plan.json", PlanRequest("plan.json"))
-    assert again.as_dict() == document
+    assert to_plain(PlanReport.of(again)) == document
     assert (again.source, again.motion) == ("plan.json", moves.motion)
     assert np.array_equal(again.report.n_tweezers, moves.report.n_tweezers)
 
@@ -63,10 +63,8 @@ def test_more_tweezers_than_the_plan_allows_are_refused() -> None:
 
 
 def test_a_profile_brings_motion_and_tones() -> None:
-    document = plan_moves(
-        PlanRequest("random:20x20@0.75", "{pattern: compact, rows: 6, cols: 6}", seed=1)
-    ).as_dict()
-    data = json.dumps(document).encode()
+    request = PlanRequest("random:20x20@0.75", "{pattern: compact, rows: 6, cols: 6}", seed=1)
+    data = dumps(PlanReport.of(plan_moves(request))).encode()
     slow = PlanRequest("plan.json", profile="virtual", overrides=["profile.mobile_tweezers.speed=65 um/ms"])
     fast, slower = read_plan(data, "plan.json", PlanRequest("plan.json")), read_plan(data, "plan.json", slow)
     assert slower.motion.speed_m_s == pytest.approx(0.065)

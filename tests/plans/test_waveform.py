@@ -14,6 +14,8 @@ import labseq
 from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError, LimitError
 from labseq.model import Plan, SegmentKind
+from labseq.plain import dumps
+from labseq.plans.plan import PlanReport
 from labseq.plans.waveform import (
     DEFAULT_RATE_HZ,
     PlannedWaveform,
@@ -51,7 +53,7 @@ def whole() -> PlannedWaveform:
 @pytest.fixture
 def plan_json(tmp_path: Path) -> Path:
     path = tmp_path / "plan.JSON"
-    path.write_text(json.dumps(plan_moves(REQUEST).as_dict()), "utf-8")
+    path.write_text(dumps(PlanReport.of(plan_moves(REQUEST))), "utf-8")
     return path
 
 
@@ -73,7 +75,7 @@ def test_standard_input_holds_a_plan_or_an_occupancy(
     whole: PlannedWaveform, as_plan: bool, mark: str
 ) -> None:
     rows = whole.moves.occupancy.astype(int).tolist()
-    text = json.dumps(whole.moves.as_dict()) if as_plan else "\n".join(str(row)[1:-1] for row in rows)
+    text = dumps(PlanReport.of(whole.moves)) if as_plan else "\n".join(str(row)[1:-1] for row in rows)
     request = PlanRequest("-") if as_plan else PlanRequest("-", "{pattern: checkerboard, rows: 4, cols: 4}")
     made = plan_waveform(WaveformRequest(request, None, RATE), io.BytesIO((mark + text).encode()))
     assert made.moves.source == "standard input"

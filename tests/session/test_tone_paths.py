@@ -11,6 +11,8 @@ import pytest
 import labseq
 from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.errors import ConfigError
+from labseq.plain import to_plain
+from labseq.plans.plan import PlanReport
 from labseq.plans.plan_file import parse_plan
 
 PLANNER = """
@@ -134,7 +136,7 @@ def test_atoms_end_where_the_plan_says(folder: Path, profile: str, overrides: tu
 def test_what_labseq_plan_writes_is_read_again(folder: Path) -> None:
     request = PlanRequest("random:5x5@0.6", str(folder / "s.yaml"), planner="lanes", seed=1)
     moves = plan_moves(request)
-    values: dict[str, Any] = json.loads(json.dumps(moves.as_dict()))
+    values: dict[str, Any] = to_plain(PlanReport.of(moves))
     assert parse_plan(json.dumps(values).encode(), "plan.json").plan.is_same(moves.plan)
     tones = values["batches"][0]["tones"]
     for words, key, wrong in (

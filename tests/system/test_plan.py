@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from labseq.assembly.planning import PlanRequest, plan_moves
+from labseq.plain import to_plain
+from labseq.plans.plan import PlanReport
 
 pytestmark = pytest.mark.system
 
@@ -34,7 +36,7 @@ def test_the_plan_for_an_occupancy_from_a_pipe_is_that_of_a_run(tmp_path: Path) 
     request = PlanRequest(
         "random:20x20@0.75", "{pattern: kagome, rows: 15, cols: 15}", degree_of_parallelism=7, seed=11
     )
-    expected = plan_moves(request).as_dict()
+    expected = to_plain(PlanReport.of(plan_moves(request)))
     rows = "\n".join("".join(map(str, row)) for row in expected["occupancy"])
     command = (
         "-m",
