@@ -71,7 +71,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         for path in (base / folder).rglob("*kernels*.py")
     ]
     code = f"""
-import importlib, labseq.kernel as k
+import importlib, labseq.kernels.kernel as k
 [*map(importlib.import_module, {names!r})]
 if not all(one.is_cached() for one in k._PENDING if not one.is_helper):
     k.load_kernels()

@@ -21,9 +21,9 @@ import pytest
 from numba.core import event
 
 import labseq
-import labseq.kernel
-from labseq.kernel import announcing, c_address, const, kernel, load_kernels
-from labseq.native import (
+import labseq.kernels.kernel
+from labseq.kernels.kernel import announcing, c_address, const, kernel, load_kernels
+from labseq.kernels.native import (
     WakeSignal,
     call_c,
     carray,
@@ -39,14 +39,14 @@ from labseq.native import (
 MAX_LACK = 3
 
 LEAF = """
-    from labseq.kernel import helper_kernel
+    from labseq.kernels.kernel import helper_kernel
 
     @helper_kernel("int64(int64)")
     def leaf(x):
         return x + {step}
 """
 MIDDLE = """
-    from labseq.kernel import helper_kernel
+    from labseq.kernels.kernel import helper_kernel
     from {package} import leaf
 
     @helper_kernel("int64(int64)")
@@ -54,7 +54,7 @@ MIDDLE = """
         return 2 * leaf.leaf(x)
 """
 TOP = """
-    from labseq.kernel import kernel
+    from labseq.kernels.kernel import kernel
     from {package} import middle
     from {package}.constants import OFFSET
 
@@ -104,7 +104,7 @@ class Package:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "cache"
     monkeypatch.setenv("LABSEQ_CACHE", str(folder))
-    monkeypatch.setattr(labseq.kernel, "_PENDING", {})  # without those that other tests have imported
+    monkeypatch.setattr(labseq.kernels.kernel, "_PENDING", {})  # without those that other tests have imported
     return folder
 
 
@@ -163,7 +163,7 @@ def test_constants_of_other_modules_and_in_tuples_and_functions_of_numba_belong_
     top = """
         import {package}.constants
         import {package}
-        from labseq.kernel import kernel
+        from labseq.kernels.kernel import kernel
         from {package}.helper import PAIR, double
 
         @kernel("float64(float64)")
@@ -240,8 +240,8 @@ def test_threads_may_make_the_first_call_at_the_same_time(package: Package) -> N
 
 
 def test_processes_fill_the_cache(package: Package, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(labseq.kernel, "WORTH_A_PROCESS_S", 0.0)
-    monkeypatch.setattr(labseq.kernel, "n_cores", lambda: 2)
+    monkeypatch.setattr(labseq.kernels.kernel, "WORTH_A_PROCESS_S", 0.0)
+    monkeypatch.setattr(labseq.kernels.kernel, "n_cores", lambda: 2)
     polled: list[None] = []
     top = package.define()
     announced: list[float] = []
@@ -258,8 +258,8 @@ def test_processes_fill_the_cache(package: Package, monkeypatch: pytest.MonkeyPa
 def test_a_worker_that_may_start_no_processes_compiles_by_itself(
     package: Package, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(labseq.kernel, "WORTH_A_PROCESS_S", 0.0)
-    monkeypatch.setattr(labseq.kernel, "n_cores", lambda: 2)
+    monkeypatch.setattr(labseq.kernels.kernel, "WORTH_A_PROCESS_S", 0.0)
+    monkeypatch.setattr(labseq.kernels.kernel, "n_cores", lambda: 2)
     monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # type: ignore[attr-defined]
     assert package.result() == 102
 
@@ -383,7 +383,7 @@ def test_interpreted_kernels_never_load_numba() -> None:
         import sys
         import numpy as np
         import labseq.motion, labseq_psca
-        from labseq.kernel import announcing, interpret
+        from labseq.kernels.kernel import announcing, interpret
         print("numba" in sys.modules)
         interpret()
         with announcing(print):
@@ -402,14 +402,14 @@ def test_kernels_are_interpreted_unless_numba_is_loaded_or_the_user_decides(
     monkeypatch: pytest.MonkeyPatch, is_loaded: bool, disable_jit: str | None, interpreted: bool
 ) -> None:
     switch = threading.Event()
-    monkeypatch.setattr(labseq.kernel, "_INTERPRETED", switch)
+    monkeypatch.setattr(labseq.kernels.kernel, "_INTERPRETED", switch)
     monkeypatch.setitem(sys.modules, "numba", ModuleType("numba"))
     if not is_loaded:
         monkeypatch.delitem(sys.modules, "numba")
     monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
     if disable_jit is not None:
         monkeypatch.setenv("NUMBA_DISABLE_JIT", disable_jit)
-    labseq.kernel.interpret()
+    labseq.kernels.kernel.interpret()
     assert switch.is_set() == interpreted
 
 

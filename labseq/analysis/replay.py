@@ -372,7 +372,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
         PluginLoadError: A named plugin failed to load.
         RecordingError: run.json lacks the settings of the run.
     """
-    from labseq.kernel import announcing
+    from labseq.kernels.kernel import announcing
 
     changes, shots = request.changes(), shots_of(run, request.shots)
     assembly = assembly_of(run)

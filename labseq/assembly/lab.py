@@ -13,7 +13,7 @@ from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.wiring import wrong_wiring
 from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
-from labseq.kernel import announcing, load_kernels
+from labseq.kernels.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation

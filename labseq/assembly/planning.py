@@ -297,7 +297,7 @@ def plan_moves(
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
-    from labseq.kernel import announcing
+    from labseq.kernels.kernel import announcing
 
     source = source or read_source(request.occupancy, request.seed)
     occupancy, seed = source.occupancy, request.seed if source.seed is None else source.seed

@@ -18,7 +18,7 @@ from labseq.bench.report import Report, make_rows
 from labseq.bench.work import Job, JobResults, prepare, set_up, warm
 from labseq.cluster import ClusterWorkers
 from labseq.errors import LabseqError, StopRequested
-from labseq.kernel import announcing, n_cores
+from labseq.kernels.kernel import announcing, n_cores
 from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Workers
 
 

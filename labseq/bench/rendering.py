@@ -79,7 +79,7 @@ def bench_waveform(
         repeats: Number of repetitions.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
     """
-    from labseq.kernel import announcing, load_kernels
+    from labseq.kernels.kernel import announcing, load_kernels
 
     moves = plan_moves(PLAN, announce=announce)
     rate_hz = comb_sample_rate(moves.grid)

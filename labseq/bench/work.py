@@ -19,7 +19,7 @@ from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.config.addresses import Override
 from labseq.config.document import Document
 from labseq.errors import ConfigError, PlanError, Problem, ProblemCollector
-from labseq.kernel import load_kernels
+from labseq.kernels.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival

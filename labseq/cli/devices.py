@@ -16,7 +16,7 @@ from labseq.console.output import report_compiling, say
 from labseq.console.report import Column, aligned, reporting, table
 from labseq.console.text import time_text
 from labseq.errors import ConfigError, DeviceError, Problem
-from labseq.kernel import announcing
+from labseq.kernels.kernel import announcing
 from labseq.messages import clean
 from labseq.plugins import PluginHost, PluginInfo
 from labseq.safety.devices import CheckedDevice, DevicesReport, check_devices

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, kernel
+from labseq.kernels.kernel import const, kernel
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

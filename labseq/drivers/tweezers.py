@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LimitError
-from labseq.kernel import const, kernel
+from labseq.kernels.kernel import const, kernel
 from labseq.model import AxisTones, ToneProgram
 from labseq.roles import Context
 

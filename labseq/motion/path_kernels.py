@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, helper_kernel
+from labseq.kernels.kernel import const, helper_kernel
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -28,7 +28,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, helper_kernel, kernel
+from labseq.kernels.kernel import const, helper_kernel, kernel
 from labseq.motion.render_kernels import (
     AXIS,
     BLENDED,

@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import helper_kernel, kernel
+from labseq.kernels.kernel import helper_kernel, kernel
+from labseq.kernels.native import carray, pointer
 from labseq.motion.render_comb_kernels import render_comb
 from labseq.motion.render_kernels import (
     AXIS,
@@ -45,7 +46,6 @@ from labseq.motion.render_kernels import (
     store,
     strip_samples,
 )
-from labseq.native import carray, pointer
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, helper_kernel, kernel
+from labseq.kernels.kernel import const, helper_kernel, kernel
 
 N_STATE: Final = 8
 """Numbers in the state of a group of tones in a block."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import LimitError
-from labseq.kernel import c_address
+from labseq.kernels.kernel import c_address
 from labseq.model import SiteGrid, ToneProgram, Waveform
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import const, helper_kernel, kernel
+from labseq.kernels.kernel import const, helper_kernel, kernel
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -19,7 +19,7 @@ from labseq.console.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
 from labseq.console.report import Facts, aligned
 from labseq.console.text import count_of, encodes, percent, plural
-from labseq.kernel import interpret
+from labseq.kernels.kernel import interpret
 from labseq.model import Batch, TonePaths
 from labseq.motion import Survival
 from labseq.pictures.plans import occupancies, on_grid

@@ -221,7 +221,7 @@ def read_plan(
         ConfigError: It is not a plan, it does not fit the grid or breaks a rule, or the request
             asks for something to be planned.
     """
-    from labseq.kernel import announcing
+    from labseq.kernels.kernel import announcing
 
     file = parse_plan(data, name)
     machine = _machine(file, name, request)

@@ -247,7 +247,7 @@ def plan_waveform(
         PlanError: The planner failed, or its plan breaks a rule.
         LimitError: The tones break a limit of AOD or amplifier.
     """
-    from labseq.kernel import announcing
+    from labseq.kernels.kernel import announcing
 
     moves, machine = read_moves(request.plan, stdin, announce)
     rate = read_sample_rate(request.sample_rate, request.plan, machine)

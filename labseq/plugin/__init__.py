@@ -35,7 +35,7 @@ from labseq.errors import (
     TransientError,
 )
 from labseq.hookspecs import hookimpl
-from labseq.kernel import const, helper_kernel, kernel
+from labseq.kernels.kernel import const, helper_kernel, kernel
 from labseq.model import (
     COMPUTER,
     AxisTones,

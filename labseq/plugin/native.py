@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from labseq.kernel import c_address, n_cores
-from labseq.native import (
+from labseq.kernels.kernel import c_address, n_cores
+from labseq.kernels.native import (
     N_SIGNAL,
     WakeSignal,
     call_c,

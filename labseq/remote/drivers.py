@@ -15,7 +15,7 @@ from labseq.assembly.plugin_choice import ChosenPlugin
 from labseq.errors import ConfigError, DeviceError, LabseqError, Problem
 from labseq.files import devices_root
 from labseq.guard import Guard, StopFlag
-from labseq.kernel import load_kernels
+from labseq.kernels.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.recording import clear_active, mark_active
 from labseq.roles import ROLES, Context, overrides

@@ -16,7 +16,7 @@ from labseq.assembly.profile import resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested
 from labseq.guard import Guard, StopFlag, stop_on_signals
-from labseq.kernel import load_kernels
+from labseq.kernels.kernel import load_kernels
 from labseq.model.policies import Timeouts
 from labseq.recording import find_dead_run
 from labseq.roles import Hardware, Simulation, in_opening_order, overrides

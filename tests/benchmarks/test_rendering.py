@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.bench.rendering import Samples, in_two_threads, render_all, uniform_program
-from labseq.kernel import const, kernel
+from labseq.kernels.kernel import const, kernel
 from labseq.model import FrequencyCourse, MotionSpec, SiteGrid, TargetPattern, ToneProgram
 from labseq.motion import Renderer, comb_sample_rate, tone_program
 from labseq.motion.render_reference import render_reference

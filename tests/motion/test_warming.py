@@ -6,7 +6,7 @@ import sys
 FIRST_PLAN = """
 import gc
 import sys
-import labseq.kernel as kernel
+import labseq.kernels.kernel as kernel
 import labseq.motion as motion
 from labseq import Plan, SiteGrid, TargetPattern
 

@@ -28,7 +28,7 @@ from labseq_spcm.mobile_tweezers import SpcmMobileTweezers, SpcmSettings
 from labseq_spcm.stream import Stream
 from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.settings import TtlSettings
-from labseq.kernel import load_kernels
+from labseq.kernels.kernel import load_kernels
 from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, SiteGrid
 from labseq.plugin.motion import RfSpec

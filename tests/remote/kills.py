@@ -56,7 +56,7 @@ detector: {{use: threshold}}
 """
 CLIENT = """
 import sys
-from labseq.kernel import load_kernels
+from labseq.kernels.kernel import load_kernels
 from labseq.model import Plan
 from labseq.motion import tone_program
 from labseq.assembly.lab import construct

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from labseq.errors import InvalidPlanError, LabseqError
-from labseq.kernel import load_kernels
+from labseq.kernels.kernel import load_kernels
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import RULES, check_plan
 from labseq.roles import Context, NeedsWarmUp, Planner

@@ -1,4 +1,4 @@
-"""What the functions of `labseq.native` are in compiled code; imported when numba is.
+"""What the functions of `labseq.kernels.native` are in compiled code; imported when numba is.
 
 numba looks at the names of arguments: those of a function, of its overload and of the intrinsic must agree.
 """
@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba.core.types import int64, voidptr
 from numba.extending import intrinsic, overload
 
-from labseq import native
+from labseq.kernels import native
 
 _WORD, _BYTE = ir.IntType(64), ir.IntType(8)
 _C_FUNCTION = ir.FunctionType(ir.IntType(32), [_WORD] * 3)

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernel import helper_kernel, kernel, with_numba
+from labseq.kernels.kernel import helper_kernel, kernel, with_numba
 
 Ints = NDArray[np.int64]
 
@@ -53,7 +53,7 @@ def swap(address: Any, value: Any) -> Any:
     return before
 
 
-with_numba(lambda: importlib.import_module("labseq.native_code"))
+with_numba(lambda: importlib.import_module("labseq.kernels.native_code"))
 
 N_TIMER: Final = 10
 _CLOCK, _FIRST, _SECOND, _SCALE, _PER, _SLEEP, _SECONDS, _TICKS, _PAUSE = range(9)
