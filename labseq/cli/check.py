@@ -88,23 +88,24 @@ def policy_texts(assembly: Assembly) -> list[str]:
     texts = [text for text in [_differing(policy.otherwise, StepPolicy(over_budget="record"))] if text]
     if policy.when_exhausted == "skip_point":
         texts.append("if all attempts at a shot fail, its point is skipped")
-    for number, (step, own) in enumerate(zip(spec.shot, policy.steps, strict=True)):
-        if text := _differing(own, policy.otherwise):
+    for number, (step, step_policy) in enumerate(zip(spec.shot, policy.steps, strict=True)):
+        if text := _differing(step_policy, policy.otherwise):
             texts.append(f"step {number} ({step.name or step.kind}): {text}")
     return texts + [_check(check) for check in spec.policy.checks]
 
 
-def _differing(own: StepPolicy, otherwise: StepPolicy) -> str:
+def _differing(policy: StepPolicy, otherwise: StepPolicy) -> str:
+    """How a policy differs from another; "" if it does not."""
     parts: list[str] = []
-    if own.timeout_s is not None:
-        parts.append(f"{format_quantity(own.timeout_s, 'time')} at most")
-    if own.retries:
-        parts.append("retried once" if own.retries == 1 else f"retried {own.retries} times")
-    if own.on_failure and own.on_failure != otherwise.on_failure:
-        parts.append(f"a failure {_THEN[own.on_failure]}")
-    if own.over_budget and own.over_budget != otherwise.over_budget:
+    if policy.timeout_s is not None:
+        parts.append(f"{format_quantity(policy.timeout_s, 'time')} at most")
+    if policy.retries:
+        parts.append("retried once" if policy.retries == 1 else f"retried {policy.retries} times")
+    if policy.on_failure and policy.on_failure != otherwise.on_failure:
+        parts.append(f"a failure {_THEN[policy.on_failure]}")
+    if policy.over_budget and policy.over_budget != otherwise.over_budget:
         then = {"record": "is only recorded", "warn": "is a warning"} | _THEN
-        parts.append(f"a stage over its budget {then[own.over_budget]}")
+        parts.append(f"a stage over its budget {then[policy.over_budget]}")
     return ", ".join(parts)
 
 
@@ -250,7 +251,7 @@ class CheckedSequence:
 def _free_bytes(folder: Path) -> int:
     """Free space of the disk on which a folder is, or will be."""
     path = folder.absolute()
-    return shutil.disk_usage(next(one for one in (path, *path.parents) if one.exists())).free
+    return shutil.disk_usage(next(parent for parent in (path, *path.parents) if parent.exists())).free
 
 
 def check_sequence(
@@ -336,7 +337,7 @@ def _limits(assembly: Assembly) -> Facts:
     dop = assembly.planner.dump().get("degree_of_parallelism")
     uses = f"; the planner uses {min(dop, motion.max_tweezers)}" if dop else ""
     hardware = assembly.hardware.chosen.items()
-    real = [role for role, one in hardware if one.entry.role.is_hardware and not one.virtual_time]
+    real = [role for role, plugin in hardware if plugin.entry.role.is_hardware and not plugin.virtual_time]
     waits = (
         ("device call", timeouts.call_s),
         ("safe state", timeouts.safe_state_s),

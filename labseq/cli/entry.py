@@ -9,15 +9,10 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Final, NoReturn
+from typing import Any, NoReturn
 
 from labseq.console.output import discard_unwritten, replace_unencodable, say
 from labseq.errors import ConfigError, RecordingError
-
-MAX_WAIT_S: Final = 1.0
-"""Maximum time for the threads of plugins to end, in seconds."""
-_PLAIN_DRY_RUN: Final = frozenset({"doctor"})
-"""Commands with a ``--dry-run`` option that takes no value."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -68,7 +63,8 @@ def arrange(arguments: Sequence[str]) -> list[str]:
     options, rest = arguments[:end], arguments[end:]
     debug = ["--debug"] if "--debug" in options else []
     command = next((option for option in options if not option.startswith("-")), "")
-    values = {} if command in _PLAIN_DRY_RUN else {"--dry-run": "--dry-run=full"}
+    # the --dry-run of doctor takes no value
+    values = {} if command == "doctor" else {"--dry-run": "--dry-run=full"}
     follows = [*options[1:], "-"][: len(options)]
     values_of = (
         "--scan=" if option == "--scan" and _is_no_quantity(following) else values.get(option, option)
@@ -105,12 +101,12 @@ def _report_usage(error: Any, arguments: Sequence[str]) -> int:
 
 def _in_own_words(error: Any) -> Any:
     """The error of a value of the wrong type or beyond a limit, worded as that of a setting in a file."""
-    parameter, found = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
-    if parameter is None or found is None:
+    parameter, errors = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
+    if parameter is None or errors is None:
         return error
     from labseq.config.validation import explain
 
-    first = found(include_url=False)[0]
+    first = errors(include_url=False)[0]
     value = first["input"]
     is_whole = isinstance(value, str) and value.lstrip("+-").isdecimal()
     name = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.metavar
@@ -140,7 +136,7 @@ def _end_process(code: Any) -> NoReturn:
 
     At this point all data are on disk and every device is safe, so such a thread can be ended.
     """
-    deadline = time.monotonic() + MAX_WAIT_S
+    deadline = time.monotonic() + 1.0  # seconds
     with suppress(KeyboardInterrupt):  # on Ctrl-C, stop waiting
         for thread in _plugin_threads():
             thread.join(max(0.0, deadline - time.monotonic()))

@@ -180,8 +180,8 @@ class RunTables:
     def as_json(self) -> dict[str, Any]:
         """The tables that were asked for; of the scan, its points stand beside them."""
         values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
-        found = {name: value for name, value in values.items() if value is not None}
-        return found | (self.scan.as_json() if self.scan else {})
+        wanted = {name: value for name, value in values.items() if value is not None}
+        return wanted | (self.scan.as_json() if self.scan else {})
 
     def as_text(self) -> list[str]:
         """The tables, with an empty line between them."""
@@ -253,5 +253,5 @@ def devices_table(devices: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _devices(run: Run) -> dict[str, dict[str, Any]]:
-    found: Any = run.record.get("devices") or {}
-    return {str(name): dict(one) if isinstance(one, Mapping) else {} for name, one in found.items()}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+    devices: Any = run.record.get("devices") or {}
+    return {str(name): dict(about) if isinstance(about, Mapping) else {} for name, about in devices.items()}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]

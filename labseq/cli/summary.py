@@ -195,30 +195,37 @@ def cycle_table(statistics: Statistics | None) -> list[str]:
     return [*table(statistics.cycles, CYCLES), f"each cycle is judged on its own final image{reached}"]
 
 
-def statistics_rows(statistics: Statistics | None) -> Facts:
+def statistics_rows(results: Statistics | None) -> Facts:
     """The results of the shots: name and value of each line."""
-    if statistics is None:
+    if results is None:
         return []
-    one = statistics
-    is_judged = bool(one.defect_free.n_trials)
+    is_judged = bool(results.defect_free.n_trials)
     rows = [
-        ("defect-free", counted_text(one.defect_free) if is_judged or not one.n_shots else NOT_JUDGED),
-        ("seen defect-free", count_of(one.seen.n, one.seen.n_trials)),
-        ("filling", share_text(one.filling)),
+        (
+            "defect-free",
+            counted_text(results.defect_free) if is_judged or not results.n_shots else NOT_JUDGED,
+        ),
+        ("seen defect-free", count_of(results.seen.n, results.seen.n_trials)),
+        ("filling", share_text(results.filling)),
     ]
-    if one.defects:
-        rows.append(("defects", histogram_text(one.defects)))
-    elif one.cycles and not is_judged:
+    if results.defects:
+        rows.append(("defects", histogram_text(results.defects)))
+    elif results.cycles and not is_judged:
         rows.append(
-            ("defects", f"{histogram_text(one.cycles[-1].defects)}, after {plural(len(one.cycles), 'cycle')}")
+            (
+                "defects",
+                f"{histogram_text(results.cycles[-1].defects)}, after {plural(len(results.cycles), 'cycle')}",
+            )
         )
-    if one.too_short.n:
-        rows.append(("window", f"too short in {count_of(one.too_short.n, one.too_short.n_trials)}"))
-    if one.losses:
-        causes = [f"{cause.replace('_', ' ')} {loss}" for cause, loss in one.losses.items() if loss.value]
+    if results.too_short.n:
+        rows.append(("window", f"too short in {count_of(results.too_short.n, results.too_short.n_trials)}"))
+    if results.losses:
+        causes = [f"{cause.replace('_', ' ')} {loss}" for cause, loss in results.losses.items() if loss.value]
         rows.append(("lost in a shot", ", ".join(causes) or "no atoms"))
-    if not math.isnan(one.defects_true.value):
-        rows.append(("true defects", f"{one.defects_true} in a shot, {one.defects_seen} on its last image"))
+    if not math.isnan(results.defects_true.value):
+        rows.append(
+            ("true defects", f"{results.defects_true} in a shot, {results.defects_seen} on its last image")
+        )
     return rows
 
 

@@ -30,8 +30,6 @@ LASTING: Final = frozenset(
 """Events that must stay on the screen above the live view."""
 FIXED: Final = {"left_on": "the static tweezers stay on; 'labseq safe PROFILE' switches them off"}
 """Events whose line has no values."""
-NOTICED_S: Final = 1.0
-"""A device that settles within this time is not announced."""
 _LOGGED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
 
 
@@ -79,7 +77,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "safe_state" | "closed" if not values["ok"]:
             task = "brought to its safe state" if name == "safe_state" else "closed"
             return f"warning: {values['device']} could not be {task}: {values['error']}"
-        case "settling" if values["timeout_s"] >= NOTICED_S:
+        case "settling" if values["timeout_s"] >= 1.0:  # s; a shorter wait is not worth a line
             longest = format_quantity(values["timeout_s"], "time")
             return f"waiting for {values['device']} to settle, at most {longest}"
         case "compiling":
@@ -185,8 +183,8 @@ def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: in
     if math.isnan(filling_fraction):
         return "not judged: no image" if n_atoms else "no target"
     n_defects = round((1.0 - filling_fraction) * n_atoms)
-    found = plural(n_defects, "defect") if n_defects else "surplus atoms"
-    return f"{found} ({seen})" if seen else found
+    defects = plural(n_defects, "defect") if n_defects else "surplus atoms"
+    return f"{defects} ({seen})" if seen else defects
 
 
 def point_text(values: Mapping[str, Any]) -> str:

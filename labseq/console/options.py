@@ -17,7 +17,6 @@ import typer
 from labseq.files import PLUGIN_PATH, PROFILES, data_root, packaged_profiles_dir
 
 _FILES: Final = ("sequence", "profile")
-_YAML: Final = (".yaml", ".yml")
 MAX_RUNS: Final = 20
 """Maximum number of runs that completion offers, the newest first."""
 
@@ -42,19 +41,19 @@ def file_kinds(incomplete: str) -> list[str]:
 
 def profile_names(incomplete: str) -> list[str]:
     """Names of the profiles in ./hardware_profiles and of those that come with labseq."""
-    found: set[str] = set()
+    names: set[str] = set()
     for folder in (Path(PROFILES), packaged_profiles_dir()):
         with suppress(OSError):
-            found |= {path.stem for path in folder.iterdir() if path.suffix.lower() in _YAML}
-    return sorted(name for name in found if name.startswith(incomplete))
+            names |= {path.stem for path in folder.iterdir() if path.suffix.lower() in (".yaml", ".yml")}
+    return sorted(name for name in names if name.startswith(incomplete))
 
 
 def run_folders(incomplete: str) -> list[str]:
     """Folders of runs, the newest first."""
     with suppress(OSError):
         runs = sorted(data_root().glob("????-??-??/[0-9]*/run.json"), reverse=True)
-        found = (str(path.parent) for path in runs)
-        return [run for run in found if run.startswith(incomplete)][:MAX_RUNS]
+        folders = (str(path.parent) for path in runs)
+        return [run for run in folders if run.startswith(incomplete)][:MAX_RUNS]
     return []
 
 

@@ -101,14 +101,14 @@ def settings_text(settings: Mapping[str, Any]) -> str:
         >>> settings_text({"degree_of_parallelism": 7, "max_tones": {"row": 16, "col": None}, "file": None})
         'degree_of_parallelism 7, max_tones (row 16)'
     """
-    words: list[str] = []
+    parts: list[str] = []
     for key, value in settings.items():
         if isinstance(value, Mapping):
             within = settings_text(cast("Mapping[str, Any]", value))
-            words += [f"{key} ({within})"] if within else []
+            parts += [f"{key} ({within})"] if within else []
         elif value is not None:
-            words.append(f"{key} {value}")
-    return ", ".join(words)
+            parts.append(f"{key} {value}")
+    return ", ".join(parts)
 
 
 def quoted(path: Path) -> str:
