@@ -222,7 +222,8 @@ def try_rows(
                     n_kept = keep(kept, n_kept, atoms, orientation, froms[i], tos[k], n)
                 n_trials += 1
                 work += n_cols * limit * most
-                if n_trials == TRIALS or work > WORK or kept[0, ATOMS] == n_left:
+                is_complete = n_kept > 0 and kept[0, ATOMS] == n_left
+                if n_trials == TRIALS or work > WORK or is_complete:
                     return n_kept
         if level <= worth_keeping(kept, n_kept):  # the next level is lower
             break
