@@ -119,8 +119,8 @@ class Assembly:
         entry, core, n = None, type(self.hardware.profile if of_profile else self.sequence), 1
         if of_profile:
             n = 2 if top == "devices" else 1
-            own = self.hardware.chosen.get(str(loc[n - 1])) if len(loc) >= n else None
-            entry = own and own.entry
+            chosen = self.hardware.chosen.get(str(loc[n - 1])) if len(loc) >= n else None
+            entry = chosen and chosen.entry
         elif top == "planner":
             entry = self.planner.entry
         elif top == "target" and self.sequence.target is not None:
@@ -190,7 +190,7 @@ def assemble(
     check_dry_run(dry_run)
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(options.overrides)
-    profile_set = [one._replace(address=f"profile.{one.address}") for one in for_profile]
+    profile_set = [override._replace(address=f"profile.{override.address}") for override in for_profile]
     problems = ProblemCollector()
     try:
         document, sequence, scan = load_sequence(
@@ -236,11 +236,11 @@ def _assembled(
 ) -> Assembly:
     """Make the target, planner, steps and analyses of a sequence on its profile."""
     is_whole = not problems.problems
-    made: dict[str, Any] = {}
+    objects: dict[str, Any] = {}
     with problems:
-        made["target"], made["target_dump"] = make_target(hardware, document, sequence)
+        objects["target"], objects["target_dump"] = make_target(hardware, document, sequence)
     with problems:
-        made["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
+        objects["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
     analyses, results = make_analyses(hardware, document, sequence, problems)
     policy = make_policy(document, sequence, steps, results, problems)
@@ -256,10 +256,10 @@ def _assembled(
         problems.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
-    target, planner = made["target"], made["planner"]
+    target, planner = objects["target"], objects["planner"]
     resolved = {
         **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan"}),
-        "target": made["target_dump"],
+        "target": objects["target_dump"],
         "planner": planner.dump(),
         "shot": with_policies(document, sequence, step_dumps),
         "analysis": analyses,
@@ -309,9 +309,9 @@ def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
         amplitudes = {"row_amplitudes": [*rf.row_amplitudes], "column_amplitudes": [*rf.column_amplitudes]}
         roles["mobile_tweezers"] |= {"rf": roles["mobile_tweezers"]["rf"] | amplitudes}
     devices = {name: hardware.chosen[name].dump() for name in spec.devices}
-    own = spec.grid_model()
+    written_grid = spec.grid_model()
     for axis in ("row_frequency", "column_frequency"):
-        tones, before = (getattr(grid, f"{axis}_hz").tolist() for grid in (hardware.grid, own))
+        tones, before = (getattr(grid, f"{axis}_hz").tolist() for grid in (hardware.grid, written_grid))
         if tones != before:  # changed by calibrations
             core["grid"][axis]["table"] = tones
     return {**core, **roles, "devices": devices}
@@ -374,13 +374,13 @@ def make_analyses(
     dumps: list[dict[str, Any]] = []
     results: list[str] = []
     for choice in sequence.analysis:
-        prefix, made = f"{PREFIX}{choice.use}.", None
+        prefix, instance = f"{PREFIX}{choice.use}.", None
         with problems:
             chosen = resolve(hardware.host, document, "analysis", choice)
             context = Context(choice.use, hardware.grid, hardware.motion, calibrations=hardware.calibrations)
-            made = construct_one(chosen, context)
+            instance = construct_one(chosen, context)
             dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
-        results += [f"{prefix}{name}" for name in getattr(made, "results", ("",))]
+        results += [f"{prefix}{name}" for name in getattr(instance, "results", ("",))]
     return dumps, results
 
 

@@ -43,7 +43,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
     hardware = point.hardware
     profile, motion = hardware.profile, hardware.motion
     chosen = {**hardware.chosen, "planner": point.planner}
-    made, streams = construct(
+    objects, streams = construct(
         chosen, hardware.context(clock), seed, truth=(profile.grid_model(), profile.motion)
     )
     lab = Lab(
@@ -51,20 +51,20 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         motion=motion,
         target=target,
         clock=clock,
-        camera=made["camera"],
-        static_tweezers=made["static_tweezers"],
-        mobile_tweezers=made["mobile_tweezers"],
-        detector=made["detector"],
-        planner=made["planner"],
+        camera=objects["camera"],
+        static_tweezers=objects["static_tweezers"],
+        mobile_tweezers=objects["mobile_tweezers"],
+        detector=objects["detector"],
+        planner=objects["planner"],
         planner_name=point.planner.entry.name,
-        degree_of_parallelism=parallelism_of(point.planner, made["planner"], motion),
-        devices={name: made[name] for name in profile.devices},
-        simulation=made.get("simulation"),
+        degree_of_parallelism=parallelism_of(point.planner, objects["planner"], motion),
+        devices={name: objects[name] for name in profile.devices},
+        simulation=objects.get("simulation"),
         random_streams=streams,
         timeouts=profile.timeouts,
         calibrations=hardware.calibrations,
         blinding=profile.blinding,
-        lines=made.get("lines"),
+        lines=objects.get("lines"),
         line_specs=profile.line_specs,
         budgets=profile.budgets.model_dump(),
     )
@@ -98,29 +98,29 @@ def construct(
         ConfigError: A constructor refuses its settings; with their place.
         PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
     """
-    made: dict[str, Any] = {}
+    objects: dict[str, Any] = {}
     streams: list[RandomStream] = []
     for role in sorted(chosen, key=lambda role: role != "simulation"):  # the others receive the simulation
-        simulation: Simulation | None = made.get("simulation", context.simulation)
-        own = replace(context, name=role, simulation=simulation)
+        simulation: Simulation | None = objects.get("simulation", context.simulation)
+        role_context = replace(context, name=role, simulation=simulation)
         if chosen[role].entry.kind == "camera" != role:  # no line triggers it
             seen = None if simulation is None else simulation.seen_by(role)
-            own = replace(own, simulation=seen, lines=())
+            role_context = replace(role_context, simulation=seen, lines=())
         if role == "simulation":
             stream = RandomStream(seed, "")
             grid, motion = (context.grid, context.motion) if truth is None else truth
-            own = replace(own, random=stream, grid=grid, motion=motion)
+            role_context = replace(role_context, random=stream, grid=grid, motion=motion)
         else:
             stream = RandomStream(seed, role)
-            own = replace(own, random=stream)
+            role_context = replace(role_context, random=stream)
         streams.append(stream)
         try:
-            made[role] = construct_one(chosen[role], own)
+            objects[role] = construct_one(chosen[role], role_context)
         except LabseqError as error:
             if refused is None:
                 raise
             refused[role] = error
-    return made, tuple(streams)
+    return objects, tuple(streams)
 
 
 def construct_planner(
@@ -132,8 +132,8 @@ def construct_planner(
         ConfigError: Its constructor refuses its settings.
         PluginLoadError: Its constructor raised, or made no planner; names the plugin.
     """
-    made, _ = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)
-    return made["planner"], parallelism_of(chosen, made["planner"], motion)
+    objects, _ = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)
+    return objects["planner"], parallelism_of(chosen, objects["planner"], motion)
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
@@ -158,7 +158,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     if _differs(before.hardware, after.hardware, "detector"):
         names.add("detector")
     chosen = {**after.hardware.chosen, "planner": after.planner}
-    made, streams = construct(
+    objects, streams = construct(
         {name: chosen[name] for name in chosen if name in names},
         replace(after.hardware.context(lab.clock), simulation=lab.simulation),
         seed,
@@ -167,11 +167,11 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
     roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
     return replace(
         lab,
-        **{role: made[role] for role in roles if role in made},
-        devices={name: made.get(name, device) for name, device in lab.devices.items()},
+        **{role: objects[role] for role in roles if role in objects},
+        devices={name: objects.get(name, device) for name, device in lab.devices.items()},
         motion=motion,
         planner_name=after.planner.entry.name,
-        degree_of_parallelism=parallelism_of(after.planner, made["planner"], motion),
+        degree_of_parallelism=parallelism_of(after.planner, objects["planner"], motion),
         random_streams=_streams(lab.random_streams, streams),
     ), reopened
 
@@ -201,12 +201,12 @@ def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tu
     return (*(stream for stream in old if stream.name not in names), *new)
 
 
-def parallelism_of(planner: ChosenPlugin, made: Any, motion: MotionSpec) -> int:
+def parallelism_of(chosen: ChosenPlugin, planner: Any, motion: MotionSpec) -> int:
     """Maximum number of mobile tweezers in a batch: the planner's own limit, else that of the motion."""
     dop = call_plugin(
-        planner.entry.owner,
+        chosen.entry.owner,
         "its degree_of_parallelism",
-        lambda: getattr(made, "degree_of_parallelism", motion.max_tweezers),
+        lambda: getattr(planner, "degree_of_parallelism", motion.max_tweezers),
     )
     return dop if isinstance(dop, int) else motion.max_tweezers
 

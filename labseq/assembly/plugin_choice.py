@@ -63,11 +63,11 @@ class ChosenPlugin:
         """What only one process can use, of the hardware of a role; () if all of it is simulated."""
         if self.virtual_time:
             return ()
-        found = None
+        identities = None
         with suppress(Exception):  # of the plugin
-            found = None if self.settings is None else self.settings.identities()
-        if found is not None:
-            return tuple(map(str, found))
+            identities = None if self.settings is None else self.settings.identities()
+        if identities is not None:
+            return tuple(map(str, identities))
         return (f"{role} of {'' if self.document is None else self.document.path.resolve()}",)
 
     def dump(self) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def validate(
     other_keys = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
-        made = call_plugin(
+        settings = call_plugin(
             entry.owner,
             f"the settings model of {called}",
             lambda: document.validate(
@@ -153,7 +153,7 @@ def validate(
         )
     except PluginLoadError as error:
         raise document.error(loc, str(error)) from error
-    return None if entry.settings_model is None else made
+    return None if entry.settings_model is None else settings
 
 
 def choose(
@@ -280,9 +280,9 @@ def construct_role(entry: Entry, *arguments: Any) -> Any:
     """
 
     def make() -> Any:
-        made = entry.factory(*arguments)
-        check_role(entry, made)
-        return made
+        instance = entry.factory(*arguments)
+        check_role(entry, instance)
+        return instance
 
     return call_plugin(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)
 
@@ -302,7 +302,7 @@ def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
     return target
 
 
-def check_role(entry: Entry, made: object) -> None:
+def check_role(entry: Entry, instance: object) -> None:
     """Raise if an object cannot play its role; from then on its methods are called without asking.
 
     Raises:
@@ -310,20 +310,28 @@ def check_role(entry: Entry, made: object) -> None:
     """
     base = entry.role.base
     called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{base.__name__}"
-    if made is None or isinstance(made, type):
-        raise entry.owner.fault(f"the factory of {called} made {_called(made)}; expected an object; {see}")
+    if instance is None or isinstance(instance, type):
+        raise entry.owner.fault(
+            f"the factory of {called} made {_called(instance)}; expected an object; {see}"
+        )
     if issubclass(base, ABC):
-        if not isinstance(made, base):
-            text = f"the factory of {called} made {_called(made)}, which is not derived from {base.__name__}"
+        if not isinstance(instance, base):
+            text = (
+                f"the factory of {called} made {_called(instance)}, which is not derived from {base.__name__}"
+            )
             raise entry.owner.fault(f"{text}; {see}")
         return
     # a Protocol: planners and others without state need no base class, only the method
     methods = [name for name in vars(base) if not name.startswith("_")]
-    if missing := [name for name in methods if not callable(getattr(made, name, None))]:
+    if missing := [name for name in methods if not callable(getattr(instance, name, None))]:
         raise entry.owner.fault(f"{called} has no method {', '.join(missing)}; {see}")
 
 
-def _called(made: object) -> str:
-    if made is None:
+def _called(instance: object) -> str:
+    if instance is None:
         return "None"
-    return f"the class {made.__name__} itself" if isinstance(made, type) else f"a {type(made).__name__}"
+    return (
+        f"the class {instance.__name__} itself"
+        if isinstance(instance, type)
+        else f"a {type(instance).__name__}"
+    )

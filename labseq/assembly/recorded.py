@@ -29,10 +29,10 @@ def resolved_of(run: Run) -> dict[str, Any]:
     Raises:
         RecordingError: run.json lacks them.
     """
-    found: Any = run.record.get("resolved")
-    if not (isinstance(found, dict) and isinstance(found.get("profile"), dict)):
+    resolved: Any = run.record.get("resolved")
+    if not (isinstance(resolved, dict) and isinstance(resolved.get("profile"), dict)):
         raise RecordingError(run.path / RUN_FILE, "does not say what the run was taken with")
-    return cast("dict[str, Any]", found)
+    return cast("dict[str, Any]", resolved)
 
 
 def stored_text(path: Path, sha256: str) -> StoredText:

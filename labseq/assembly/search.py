@@ -66,7 +66,7 @@ class Search:
         Raises:
             ConfigError: A plugin refuses these values.
         """
-        alone = self.scan.at([values[one.address] for one in self.ranges])
+        alone = self.scan.at([values[range_.address] for range_ in self.ranges])
         try:
             return self.corners.with_values([*alone.values(0)])
         except ConfigError as error:
@@ -74,19 +74,19 @@ class Search:
 
     def values_in(self, parameters: Mapping[str, Any]) -> dict[str, float]:
         """The values of the point among the parameters of a shot: address -> value, SI."""
-        return {one.address: parameters[one.address] for one in self.ranges}
+        return {range_.address: parameters[range_.address] for range_ in self.ranges}
 
     def written(self, values: Mapping[str, Any]) -> dict[str, str]:
         """The values of a point as text in the units of the sequence: address -> text."""
         pairs = zip(self.ranges, self.units, strict=True)
-        return {one.address: written(values[one.address], unit) for one, unit in pairs}
+        return {range_.address: written(values[range_.address], unit) for range_, unit in pairs}
 
     def record(self) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; the points are in the index."""
         return {
-            "addresses": [one.address for one in self.ranges],
+            "addresses": [range_.address for range_ in self.ranges],
             "written_units": self.units,
-            "ranges": [asdict(one) for one in self.ranges],
+            "ranges": [asdict(range_) for range_ in self.ranges],
             SCANNER: self.chosen.dump(),
             "figure": self.scan.choice.quantity,
             "maximise": self.scan.choice.maximise is not None,
@@ -115,13 +115,15 @@ class Search:
                 raise self._error(f"{text}: {error}" if str(error) else text) from error
             if answer is None:
                 return None
-            expected = [one.address for one in self.ranges]
+            expected = [range_.address for range_ in self.ranges]
             if values is None or {*values} != {*expected}:
                 came = f"a {type(answer).__name__}" if values is None else f"values for {_names(values)}"
                 text = f"next_point() gave {came}; expected a value for each of {_names(expected)}"
                 raise self._error(text)
             units = zip(self.ranges, self.units, strict=True)
-            return {one.address: self._snapped(one, values[one.address], unit) for one, unit in units}
+            return {
+                range_.address: self._snapped(range_, values[range_.address], unit) for range_, unit in units
+            }
 
         try:
             return guard.call(self.name, timeout_s, next_point)

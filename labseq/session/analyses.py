@@ -75,8 +75,8 @@ def analyses_of(run: Run) -> list[dict[str, Any]]:
     Raises:
         RecordingError: run.json lacks the settings of the run.
     """
-    found: Any = resolved_of(run).get("analysis") or []
-    return [dict(one) for one in cast("list[dict[str, Any]]", found)]
+    settings: Any = resolved_of(run).get("analysis") or []
+    return [dict(one) for one in cast("list[dict[str, Any]]", settings)]
 
 
 def prepare(run: Run, settings: Mapping[str, Any]) -> PreparedAnalysis:

@@ -96,24 +96,24 @@ class AnalysisProcesses:
         """Start their processes; from now on results are taken from these."""
         self._run_dir = run_dir
         for analysis in self._analyses:
-            if (one := self._started(run_dir, analysis)) is not None:
-                self._processes[one.name] = one
+            if (process := self._started(run_dir, analysis)) is not None:
+                self._processes[process.name] = process
         for used in self._unwritten:
             self._observer.event(_USED, used)
 
     def look(self) -> None:
         """Warn once about each analysis that has failed; fast enough to call between shots."""
-        for one in self._processes.values():
-            one.look(self._warn)
+        for process in self._processes.values():
+            process.look(self._warn)
 
     def finish(self) -> None:
         """After the run: give each analysis time for the remaining shots, then report missing results."""
-        for one in self._processes.values():
-            one.end_of_run()
+        for process in self._processes.values():
+            process.end_of_run()
         end_s = time.monotonic()
-        for one in self._processes.values():
-            one.wait(end_s, self._warn)
-            self._report_missing(one.name)
+        for process in self._processes.values():
+            process.wait(end_s, self._warn)
+            self._report_missing(process.name)
         self._processes = {}
 
     def await_shots(self, name: str, shots: Sequence[int]) -> None:
@@ -142,17 +142,17 @@ class AnalysisProcesses:
     def _rows(self, analysis: Mapping[str, Any], shots: Collection[int]) -> tuple[Rows, bool]:
         """The results of shots that come in time, and whether more can come."""
         if self._run_dir is not None:
-            one = self._processes.get(str(analysis[USE]))
-            return ({}, False) if one is None else one.wait_for(shots, self._stop)
+            process = self._processes.get(str(analysis[USE]))
+            return ({}, False) if process is None else process.wait_for(shots, self._stop)
         assert self._run is not None  # it died before it had read the results of its last point
-        one = self._started(self._run.path, analysis)
-        if one is None:
+        process = self._started(self._run.path, analysis)
+        if process is None:
             return {}, False
         try:
-            return one.wait_for(shots, self._stop)
+            return process.wait_for(shots, self._stop)
         finally:
-            one.end_of_run()
-            one.wait(time.monotonic(), self._warn)
+            process.end_of_run()
+            process.wait(time.monotonic(), self._warn)
 
     def _started(self, run_dir: Path, analysis: Mapping[str, Any]) -> _AnalysisProcess | None:
         try:

@@ -53,7 +53,7 @@ class _Checks:
     def __init__(self, run: PreparedRun, guard: Guard) -> None:
         self.run = run
         self.guard = guard
-        self.found = ProblemCollector()
+        self.problems = ProblemCollector()
         self.rehearsals: dict[tuple[object, ...], list[Rehearsal]] = {}
         self.detectors: list[Detector] = []
         self._labs: dict[tuple[int, int], Lab] = {}
@@ -69,10 +69,10 @@ class _Checks:
         return self._points[key]
 
     def raise_problems(self) -> None:
-        """Raise what was found, unless the check was stopped: calls that end early find nothing."""
+        """Raise the problems, unless the check was stopped: calls that end early report nothing."""
         self.run.stop_flag.check()
         try:
-            self.found.raise_any()
+            self.problems.raise_any()
         except ConfigError as error:
             scanned = self.run.assembly.scanned
             raise error if scanned is None else scanned.scan.explained(error) from None
@@ -104,21 +104,21 @@ class _PointCheck:
     @property
     def shot_s(self) -> tuple[float, float]:
         """Minimum and maximum duration of a shot, in seconds."""
-        bars = [bar for _, own in self.timeline for bar in own]
+        bars = [bar for _, of_step in self.timeline for bar in of_step]
         return sum(bar.min_duration_s for bar in bars), sum(bar.duration_s for bar in bars)
 
     def _add(self, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
-        self.checks.found.add(self.point.document.error(loc, what, expected, hint))
+        self.checks.problems.add(self.point.document.error(loc, what, expected, hint))
 
     def _add_to_profile(self, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
-        self.checks.found.add(self.point.hardware.document.error(loc, what, expected, hint))
+        self.checks.problems.add(self.point.hardware.document.error(loc, what, expected, hint))
 
     def ask_steps(self) -> None:
         """Have every step check its settings against the devices."""
         for spec, (name, step) in zip(self.shot, self.point.steps, strict=True):
-            for setting, one in _wrong_settings(self._guard, self.lab, name, step).items():
+            for setting, problem in _wrong_settings(self._guard, self.lab, name, step).items():
                 loc = (*spec.loc, setting) if setting else spec.loc
-                self._add(loc, one.what, one.expected, one.hint)
+                self._add(loc, problem.what, problem.expected, problem.hint)
 
     @cached_property
     def timeline(self) -> Timeline:
@@ -129,8 +129,8 @@ class _PointCheck:
                 named.append((name, plan_timeline(self.lab, self._guard, number, name, step)))
             except LimitError as error:
                 self._add(self.shot[number].loc, str(error))
-        bars = with_waits([own for _, own in named], self.lab.step_context)
-        return [(name, own) for (name, _), own in zip(named, bars, strict=True)]
+        timelines = with_waits([bars for _, bars in named], self.lab.step_context)
+        return [(name, bars) for (name, _), bars in zip(named, timelines, strict=True)]
 
     def ask_timeline(self) -> None:
         """Have every step lay out its timeline."""
@@ -138,9 +138,10 @@ class _PointCheck:
 
     def ask_timing(self) -> None:
         """Refuse durations that the computer cannot keep."""
-        for number, one, is_refused in _badly_timed(self):
+        for number, problem, is_refused in _badly_timed(self):
             if is_refused:
-                self._add((*self.shot[number].loc, "duration"), one.what, one.expected, one.hint)
+                loc = (*self.shot[number].loc, "duration")
+                self._add(loc, problem.what, problem.expected, problem.hint)
 
     def ask_devices(self) -> None:
         """Have camera and lines check what each step of a shot would ask of them."""
@@ -181,10 +182,10 @@ class _PointCheck:
         context = self.lab.step_context
         if trigger_line(self.lab.line_specs, "camera") is None:
             return
-        bars = [(self.shot[n].loc, bar) for n, (_, own) in enumerate(self.timeline) for bar in own]
-        for loc, one in unsuitable_exposures(context.camera, context.lines_facts, bars):
+        bars = [(self.shot[n].loc, bar) for n, (_, of_step) in enumerate(self.timeline) for bar in of_step]
+        for loc, problem in unsuitable_exposures(context.camera, context.lines_facts, bars):
             add = self._add_to_profile if loc[0] == "camera" else self._add
-            add(loc, one.what, one.expected, one.hint)
+            add(loc, problem.what, problem.expected, problem.hint)
 
     def _ask_lines(self, kind: str, duration_s: float) -> None:
         lab = self.lab
@@ -216,30 +217,29 @@ class _PointCheck:
                 return
 
 
-ROUGH: Final = 0.1
-"""Part of a duration by which the computer may be late without a warning."""
-
-
-def _badly_timed(one: _PointCheck) -> Iterator[tuple[int, Problem, bool]]:
+def _badly_timed(point_check: _PointCheck) -> Iterator[tuple[int, Problem, bool]]:
     """Steps of fixed length that the computer cannot keep, or only roughly: index, what, if refused."""
-    bars, least = [own for _, own in one.timeline], format_quantity(COMPUTER.accuracy_s, "time")
-    for number, own in enumerate(bars):
-        own_s = sum(bar.duration_s for bar in own)
-        last = own[-1] if own else None
+    timelines = [bars for _, bars in point_check.timeline]
+    least = format_quantity(COMPUTER.accuracy_s, "time")
+    for number, bars in enumerate(timelines):
+        duration_s = sum(bar.duration_s for bar in bars)
+        last = bars[-1] if bars else None
         if last is None or not 0 < last.duration_s == last.min_duration_s or last.timed_by != COMPUTER:
             continue
-        after = next((bar for later in bars[number + 1 :] for bar in later[:1]), last)
+        after = next((bar for later in timelines[number + 1 :] for bar in later[:1]), last)
         late_s = COMPUTER.accuracy_s + after.latency_s
-        wanted, late = (format_quantity(t, "time") for t in (own_s, late_s))
-        if own_s < COMPUTER.accuracy_s:
-            what = f"the computer cannot keep {wanted}: it is typically 0.4 ms late, now and then several ms"
-            by = one.lab.step_context.release_by
+        duration, late = (format_quantity(t, "time") for t in (duration_s, late_s))
+        if duration_s < COMPUTER.accuracy_s:
+            what = (
+                f"the computer cannot keep {duration}: it is typically 0.4 ms late, now and then several ms"
+            )
+            by = point_check.lab.step_context.release_by
             hint = "to free the atoms, use the step `release`"
             hint += f", which '{by.name}' times" if by else ""
             hint += "; to pulse a light, use a line that is on in `wait` alone"
             yield number, Problem(what, expected=f"at least {least}", hint=hint), True
-        elif late_s > ROUGH * own_s:
-            what = f"the computer cannot time {wanted} exactly: it may last about {late} longer"
+        elif late_s > 0.1 * duration_s:  # less needs no warning
+            what = f"the computer cannot time {duration} exactly: it may last about {late} longer"
             if after.latency_s:
                 what += f", because '{after.label}' begins late at the outputs of '{after.timed_by.name}'"
             yield number, Problem(what), False
@@ -249,26 +249,27 @@ def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, 
     """Setting -> what is wrong with it, as a step says; "" for a step that fails to say it."""
     devices, timeout_s = dict(lab.hardware()), lab.timeouts.call_s
     try:
-        found = guard.call(f"step '{name}'", timeout_s, step.check_devices, devices, lab.step_context)
-        problems = {str(setting): what for setting, what in dict(found).items()}
-        return {key: one if isinstance(one, Problem) else Problem(str(one)) for key, one in problems.items()}
+        answer = guard.call(f"step '{name}'", timeout_s, step.check_devices, devices, lab.step_context)
+        problems = {str(setting): what for setting, what in dict(answer).items()}
+        return {key: p if isinstance(p, Problem) else Problem(str(p)) for key, p in problems.items()}
     except LabseqError as failure:
         return {"": Problem(str(failure))}
     except (TypeError, ValueError):
         return {"": Problem(f"check_devices() of step '{name}' returned no mapping")}
 
 
-def _timing_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+def _timing_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """Warnings about durations that the computer keeps roughly."""
-    for number, found, is_refused in _badly_timed(one):
+    for number, problem, is_refused in _badly_timed(point_check):
         if not is_refused:
-            yield number, one.point.document.problem((*one.shot[number].loc, "duration"), found.what)
+            place = (*point_check.shot[number].loc, "duration")
+            yield number, point_check.point.document.problem(place, problem.what)
 
 
-def _timeout_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+def _timeout_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """Warnings about steps that may take longer than the timeout of their policy."""
-    assembly = one.checks.run.assembly
-    each = zip(assembly.sequence.shot, assembly.policy.steps, one.timeline, strict=True)
+    assembly = point_check.checks.run.assembly
+    each = zip(assembly.sequence.shot, assembly.policy.steps, point_check.timeline, strict=True)
     for number, (spec, policy, (_, bars)) in enumerate(each):
         longest_s = sum(bar.duration_s for bar in bars)
         if longest_s > policy.limit_s:
@@ -276,7 +277,7 @@ def _timeout_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
             what = f"the step takes up to {longest}, longer than its timeout of "
             what += format_quantity(policy.limit_s, "time")
             place = (*spec.policy_loc, "timeout")
-            yield number, one.point.document.problem(place, what, f"more than {longest}")
+            yield number, point_check.point.document.problem(place, what, f"more than {longest}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,8 +353,8 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
             _PointCheck.ask_devices,
         )
         for ask in asks:
-            for one in numbers:
-                ask(one)
+            for point_check in numbers:
+                ask(point_check)
             checks.raise_problems()
         _rehearse_all(checks, numbers, runs)
         run_s = _run_s(checks)
@@ -361,7 +362,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         warnings = _warnings(checks, numbers)
     finally:
         guard.end()
-    rehearsals, bars = first.rehearsed, [bar for _, own in first.timeline for bar in own]
+    rehearsals, bars = first.rehearsed, [bar for _, of_step in first.timeline for bar in of_step]
     warnings += _judgement_warnings(assembly, [*rehearsals])
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
@@ -373,7 +374,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         next(iter(rehearsals.values()), None),
         _shot_bytes(assembly, first.lab, bars),
         spans_on(first.lab.line_specs, bars),
-        {name: text for name, one in first.lab.hardware() if (text := one.idle_output)},
+        {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
     )
 
 
@@ -392,20 +393,20 @@ def _run_s(checks: _Checks) -> tuple[float, float]:
 
 def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -> list[Problem]:
     """What is allowed but probably not intended, once, with the points of the scan where it is so."""
-    found: dict[Any, tuple[Problem, list[int]]] = {}
+    warnings: dict[Any, tuple[Problem, list[int]]] = {}
     is_adaptive, n_points = checks.run.assembly.search is not None, sum(map(len, numbers.values()))
     judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings
     for judge in (*judges, _timing_warnings, _device_warnings, _instance_warnings):
-        for one, own in numbers.items():
-            if 0 not in own and is_adaptive and judge is _window_warnings:
+        for point_check, of_check in numbers.items():
+            if 0 not in of_check and is_adaptive and judge is _window_warnings:
                 continue  # the search is there to find out about the corners
-            for key, problem in judge(one):
-                found.setdefault((judge, key), (problem, []))[1].extend(own)
+            for key, problem in judge(point_check):
+                warnings.setdefault((judge, key), (problem, []))[1].extend(of_check)
     texts: list[Problem] = []
-    for problem, own in found.values():
-        if len(own) < n_points and not is_adaptive:
-            others = f", and {len(own) - 1} others" if len(own) > 1 else ""
-            at = f"at point {min(own)} of the scan{others}"
+    for problem, points in warnings.values():
+        if len(points) < n_points and not is_adaptive:
+            others = f", and {len(points) - 1} others" if len(points) > 1 else ""
+            at = f"at point {min(points)} of the scan{others}"
             problem = replace(problem, hint=f"{problem.hint}; {at}" if problem.hint else at)
         texts.append(problem)
     return texts
@@ -415,27 +416,27 @@ def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) ->
     """Rehearse the moves at every point that differs from those before it."""
     run = checks.run
     distinct: dict[tuple[object, ...], _PointCheck] = {}
-    for one in points:
-        distinct.setdefault(one.rehearsal_key, one)
+    for point_check in points:
+        distinct.setdefault(point_check.rehearsal_key, point_check)
     wait_s, asked = MAX_WAIT_S / max(1, len(distinct) - 1), set[int]()
-    for n, (key, one) in enumerate(distinct.items()):
+    for n, (key, point_check) in enumerate(distinct.items()):
         checks.rehearsals[key] = []
-        if not one.windows:
+        if not point_check.windows:
             continue
-        is_new = id(one.lab) not in asked
+        is_new = id(point_check.lab) not in asked
         if is_new:
-            run.warm(one.lab, devices=runs and n == 0)
+            run.warm(point_check.lab, devices=runs and n == 0)
         deadline = time.monotonic() + (wait_s if n else MAX_WAIT_S)
-        n_loadings, windows = N_LOADINGS_ELSEWHERE if n else N_LOADINGS, [*one.windows.values()]
-        found, plans, failure = rehearse(checks.guard, one.lab, windows, n_loadings, deadline)
-        checks.rehearsals[key] = found
+        n_loadings, windows = N_LOADINGS_ELSEWHERE if n else N_LOADINGS, [*point_check.windows.values()]
+        rehearsals, plans, failure = rehearse(checks.guard, point_check.lab, windows, n_loadings, deadline)
+        checks.rehearsals[key] = rehearsals
         if is_new:
-            one.ask_tweezers(plans if n == 0 else plans[:1])
-            asked.add(id(one.lab))
+            point_check.ask_tweezers(plans if n == 0 else plans[:1])
+            asked.add(id(point_check.lab))
         if failure is not None:
-            hint = failure.hint and f"{failure.hint} {_plan_options(run.assembly, one.point)}"
+            hint = failure.hint and f"{failure.hint} {_plan_options(run.assembly, point_check.point)}"
             loc = (*run.assembly.sequence.planner.loc, "use")
-            checks.found.add(one.point.document.error(loc, failure.what, hint=hint))
+            checks.problems.add(point_check.point.document.error(loc, failure.what, hint=hint))
 
 
 def _plan_options(assembly: Assembly, point: Point) -> str:
@@ -448,10 +449,13 @@ def _plan_options(assembly: Assembly, point: Point) -> str:
     return shlex.join(options)
 
 
-def _window_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
-    document, shot = one.point.document, one.shot
-    windows, rehearsals = one.windows, one.rehearsed
-    if min((found.n_loadings for found in rehearsals.values()), default=0) < N_LOADINGS_ELSEWHERE // 4:
+def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
+    document, shot = point_check.point.document, point_check.shot
+    windows, rehearsals = point_check.windows, point_check.rehearsed
+    if (
+        min((rehearsal.n_loadings for rehearsal in rehearsals.values()), default=0)
+        < N_LOADINGS_ELSEWHERE // 4
+    ):
         return
     for number, rehearsal in rehearsals.items():
         loc = (*shot[number].loc, "window")
@@ -504,19 +508,19 @@ def _judgement_warnings(assembly: Assembly, rearrangements: Sequence[int]) -> li
     return [assembly.document.problem(loc, what, "an 'image' step at the end of the shot", key=True)]
 
 
-def _parallelism_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
-    point = one.point
+def _parallelism_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
+    point = point_check.point
     asked = getattr(point.planner.settings, "degree_of_parallelism", None)
     limit = point.hardware.profile.motion.max_tweezers
     if isinstance(asked, int) and asked > limit:
-        loc = (*one.checks.run.assembly.sequence.planner.loc, "degree_of_parallelism")
+        loc = (*point_check.checks.run.assembly.sequence.planner.loc, "degree_of_parallelism")
         what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
         yield 0, point.document.problem(loc, f"{what}; at most {limit} are used")
 
 
-def _deadline_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+def _deadline_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
-    timeline, lab, point = one.timeline, one.lab, one.point
+    timeline, lab, point = point_check.timeline, point_check.lab, point_check.point
     waits = [bool(step.signal) for _, step in point.steps]
     for number, (_, step) in enumerate(point.steps):
         if not waits[number]:
@@ -531,29 +535,29 @@ def _deadline_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
             longest = format_quantity(longest_s, "time")
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
-            loc = (*one.shot[number].loc, "for")
+            loc = (*point_check.shot[number].loc, "for")
             hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
             yield number, point.document.problem(loc, what, hint=hint)
 
 
-def _instance_warnings(one: _PointCheck) -> Iterator[tuple[str, Problem]]:
+def _instance_warnings(point_check: _PointCheck) -> Iterator[tuple[str, Problem]]:
     """What the simulation and the mobile tweezers themselves warn of."""
-    lab = one.lab
+    lab = point_check.lab
     for name, instance in (("simulation", lab.simulation), ("mobile_tweezers", lab.mobile_tweezers)):
         if instance is not None:
-            for text in one.checks.guard.call(name, WARM_S, instance.warnings):
+            for text in point_check.checks.guard.call(name, WARM_S, instance.warnings):
                 yield text, Problem(text)
 
 
-def _device_warnings(one: _PointCheck) -> Iterator[tuple[int, Problem]]:
+def _device_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
     """What the settings of the devices themselves warn of."""
-    n_found = 0
-    for chosen in one.point.hardware.chosen.values():
+    number = 0
+    for chosen in point_check.point.hardware.chosen.values():
         if chosen.settings is None or chosen.document is None:
             continue
         for loc, what, expected in chosen.settings.warnings():
-            yield n_found, chosen.document.problem((*chosen.loc, *loc), what, expected)
-            n_found += 1
+            yield number, chosen.document.problem((*chosen.loc, *loc), what, expected)
+            number += 1
 
 
 def _shot_bytes(assembly: Assembly, lab: Lab, bars: Sequence[TimelineEntry]) -> int | None:

@@ -98,8 +98,8 @@ def _git(folder: Path, *arguments: str) -> str | None:
 @functools.cache
 def _packages() -> dict[str, str]:
     """Name -> version of each installed package; read only once, because it takes as long as a short shot."""
-    found = [name_and_version(distribution) for distribution in distributions()]
-    return {name: version for name, version in found if name}
+    packages = [name_and_version(distribution) for distribution in distributions()]
+    return {name: version for name, version in packages if name}
 
 
 def _user() -> str:

@@ -91,8 +91,8 @@ def rehearse(
         # only the first plan is made for the loading itself
         failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
     plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
-    found = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
-    return found, plans, failure
+    rehearsals = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
+    return rehearsals, plans, failure
 
 
 def _first_cycles(

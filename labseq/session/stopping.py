@@ -49,11 +49,11 @@ def running_here(profile: str | None = None) -> list[Path]:
     Raises:
         ConfigError: There is no such profile.
     """
-    found = runs_in_progress()
+    runs = runs_in_progress()
     if profile is not None:
         path = str(find_profile(profile, Path()).resolve())
-        found = {folder: key for folder, key in found.items() if key in {path, f"{path} (dry run)"}}
-    return [folder for folder in found if is_running(folder)]
+        runs = {folder: key for folder, key in runs.items() if key in {path, f"{path} (dry run)"}}
+    return [folder for folder in runs if is_running(folder)]
 
 
 def find_running(run: Path | None = None, profile: str | None = None) -> Path:
