@@ -23,7 +23,7 @@ from labseq.assembly.points import Point, ScanPoints, make_step, place_note
 from labseq.assembly.policies import make_policy, with_policies
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.assembly.search import Search, make_search
-from labseq.config.addresses import PROFILE, ROLES, find, split_overrides
+from labseq.config.addresses import PROFILE, PROFILE_ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
 from labseq.config.scan import AdaptiveScan, Scan
@@ -301,8 +301,8 @@ def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
 
 def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
     spec = hardware.profile
-    core = spec.model_dump(mode="json", exclude={*ROLES, "devices"})
-    roles = {role: hardware.dump(role) for role in hardware.chosen if role in ROLES}
+    core = spec.model_dump(mode="json", exclude={*PROFILE_ROLES, "devices"})
+    roles = {role: hardware.dump(role) for role in hardware.chosen if role in PROFILE_ROLES}
     roles["mobile_tweezers"]["overhead_per_cycle"] = hardware.motion.overhead_per_cycle_s
     if "amplitudes" in hardware.calibrations:
         rf = hardware.motion.rf

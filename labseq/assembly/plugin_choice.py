@@ -102,7 +102,7 @@ def _with_advice(error: ConfigError, document: Document, choice: Choice) -> Conf
     """Add how to drop settings that the file has for another plugin, if an option chose this one."""
     if document.root.mark_at((*choice.loc, choice.key)).line:
         return error
-    prefix = addresses.PROFILE if choice.loc[0] in (*addresses.ROLES, *addresses.NAMED) else ""
+    prefix = addresses.PROFILE if choice.loc[0] in (*addresses.PROFILE_ROLES, *addresses.NAMED) else ""
     address = prefix + ".".join(map(str, choice.loc))
     hint = f'to drop the settings of another plugin, use --set "{address}={{{choice.key}: {choice.use}}}"'
     return ConfigError(

@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_role, dump, named, resolve, validate
-from labseq.config.addresses import PROFILE, ROLES, VARIABLES
+from labseq.config.addresses import PROFILE, PROFILE_ROLES, VARIABLES
 from labseq.config.scan import Axis, Scan, put
 from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
 from labseq.messages import clean
@@ -231,7 +231,7 @@ class ScanPoints:
 
 def _may_be_scanned(of_profile: bool, loc: Loc) -> bool:
     if of_profile:
-        return loc[0] in ROLES or (loc[0] == "devices" and len(loc) > 2)
+        return loc[0] in PROFILE_ROLES or (loc[0] == "devices" and len(loc) > 2)
     return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
 
 

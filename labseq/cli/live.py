@@ -45,9 +45,9 @@ def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> 
 class LiveView:
     """Implements ``RunObserver`` with a picture of the run that is redrawn in place.
 
-    It is drawn when events arrive, never from a thread, so never while a device is being
-    called. With real hardware it is drawn only between shots: atoms are lost while the run
-    waits for the terminal.
+    In the process of a run it is drawn when events arrive, never from a thread, so never while a device is
+    being called; with real hardware only between shots, because atoms are lost while the run waits for the
+    terminal. `labseq watch` draws it by :meth:`refresh`, too.
 
     Args:
         run_now: Clock of the run in seconds; by default ``now``.

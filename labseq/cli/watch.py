@@ -49,7 +49,7 @@ def watch_run(
 
 
 class WatchedRun:
-    """The events of a run in another process, as the run passes them to its own view.
+    """The events of a run in another process, with the stages and last images of its shots from their files.
 
     Args:
         run_dir: The run's folder.
@@ -84,7 +84,7 @@ class WatchedRun:
         # after the events: a shot is in the index before its event is in the log
         for shot in self.follower.shots():
             self._rows[shot.index, shot.attempt, shot.status].append(shot.row)
-        rows = [self._row_of(event) for event in events]
+        rows = [self._row_ended_by(event) for event in events]
         # reading a shot's file takes 10 ms: of a run that is joined late, only the last ones are opened
         to_open = {id(row) for row in list(filter(None, rows))[-20:]}
         for event, row in zip(events, rows, strict=True):
@@ -96,7 +96,7 @@ class WatchedRun:
             yield event.name, values
         self._read_s = self._clock()
 
-    def _row_of(self, event: Event) -> IndexRow | None:
+    def _row_ended_by(self, event: Event) -> IndexRow | None:
         """The row of the attempt that an event ends; None for other events and damaged lines."""
         if event.name not in ("shot_finished", "shot_repeated"):
             return None
@@ -114,5 +114,6 @@ def _stages_and_image(shot: Shot) -> Iterator[tuple[str, Mapping[str, Any]]]:
         for timing in shot.timing:
             yield "stage", {"timing": timing}
         for image in shot.images[-1:]:
+            # the log has this event already; the view needs it just before the image of another shot
             yield "shot_started", {"shot": shot.index, "attempt": shot.attempt}
             yield "image", {"image": image, "filling_fraction": shot.filling_fraction}

@@ -13,7 +13,7 @@ PROFILE: Final = "profile."
 """Prefix of addresses in the profile."""
 VARIABLES: Final = "variables"
 """Key of the variables, which only expressions use."""
-ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lines", "simulation")
+PROFILE_ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lines", "simulation")
 """The roles of a profile that are each played by one plugin."""
 MAY_ADD: Final = (
     "timeouts",

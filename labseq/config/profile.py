@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, cast
 
 from pydantic import AfterValidator, Field, model_validator
 
-from labseq.config.addresses import MAY_ADD, ROLES, Override
+from labseq.config.addresses import MAY_ADD, PROFILE_ROLES, Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
 from labseq.config.find import find_profile
 from labseq.errors import ProblemCollector, collecting
@@ -107,7 +107,7 @@ def check_name(name: str, what: str) -> None:
 def check_devices(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
     """Raise for invalid device names, and add to each choice its place in the file."""
     for name in devices:
-        if name in (*ROLES, "planner"):
+        if name in (*PROFILE_ROLES, "planner"):
             raise setting_error(
                 f"a device is called '{name}', like a role", "another name", at=(name,), key=True
             )
@@ -334,7 +334,7 @@ class ProfileSpec(Settings):
     @property
     def choices(self) -> dict[str, Choice]:
         """The plugins chosen in this file, by role; lines and simulation only if they are given."""
-        choices = {role: getattr(self, role) for role in ROLES}
+        choices = {role: getattr(self, role) for role in PROFILE_ROLES}
         return {role: choice for role, choice in choices.items() if choice is not None}
 
     @property

@@ -1,7 +1,7 @@
 """Scans in a sequence: lists of values, ranges, and adaptive scans, whose points a scanner chooses.
 
 Only the form of a scan is checked here. Whether plugins accept the values is checked where the plugins
-are known, in ``labseq.assembly.points``; the scanner and its quantity in ``labseq.assembly.assemble``.
+are known, in ``labseq.assembly.points``; the scanner and its quantity in ``labseq.assembly.search``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WithJsonSchema, model_validator
 
-from labseq.config.addresses import MAY_ADD, PROFILE, ROLES, VARIABLES, Override, find
+from labseq.config.addresses import MAY_ADD, PROFILE, PROFILE_ROLES, VARIABLES, Override, find
 from labseq.config.document import Document
 from labseq.config.yaml_nodes import Mark, Node
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector
@@ -478,7 +478,7 @@ def _placed(axis: _A, document: Document) -> _A:
 
 def _placed_in_profile(axis: Axis, document: Document) -> Axis:
     axis = _found(axis, document)
-    if axis.loc[0] in (*ROLES, VARIABLES) or (axis.loc[0] == "devices" and len(axis.loc) > 1):
+    if axis.loc[0] in (*PROFILE_ROLES, VARIABLES) or (axis.loc[0] == "devices" and len(axis.loc) > 1):
         return axis
     raise _unscannable(axis)
 

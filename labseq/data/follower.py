@@ -11,7 +11,7 @@ from labseq.data.shot import Shot, caching_loader
 from labseq.files import NewLines
 from labseq.model.records import RunStatus
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
-from labseq.recording.index import IndexRow, row_of
+from labseq.recording.index import IndexRow, row_of_line
 from labseq.recording.run_file import read_state
 
 
@@ -67,7 +67,7 @@ class Follower:
             RecordingError: The index cannot be read.
         """
         for start, values in self._index.placed():
-            yield start, None if values is None else row_of(values)
+            yield start, None if values is None else row_of_line(values)
 
     def shots(self) -> list[Shot]:
         """The new attempts at shots, in the order in which they were written.

@@ -29,7 +29,7 @@ from labseq.files import (
 from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Lock, Process
 from labseq.recording import folders
-from labseq.recording.index import SHOT_FILE, IndexRow, index_row, row_of
+from labseq.recording.index import SHOT_FILE, IndexRow, row_of_line, row_of_record
 from labseq.recording.markers import Marker, markers
 from labseq.recording.run_file import (
     STATUSES,
@@ -297,7 +297,7 @@ class _Check:
         index = _LineFile(self.folder / folders.INDEX_FILE)
         rows, of_file = dict[int, IndexRow](), dict[str, list[int]]()
         for number, values in index.rows.items():
-            row = row_of(values)
+            row = row_of_line(values)
             if row is not None and _is_name(row):
                 rows[number] = row
                 of_file.setdefault(row.file, []).append(number)
@@ -381,7 +381,7 @@ class _Check:
                 pass
             n_bytes, sha256 = _size_and_hash(path)
             with damage_reported(path):
-                row = index_row(content.record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
+                row = row_of_record(content.record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return None

@@ -139,7 +139,9 @@ class IndexRow:
         return all(cycle < 0 for cycle in self.images.cycle[-1:])
 
 
-def index_row(shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str, n_bytes: int) -> IndexRow:
+def row_of_record(
+    shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str, n_bytes: int
+) -> IndexRow:
     """A shot as the index lists it: the same as when its line is read back.
 
     A scanner thus chooses the same points, whether the run was resumed or not.
@@ -173,7 +175,7 @@ def index_row(shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str
         "sha256": sha256,
         "bytes": n_bytes,
     }
-    row = row_of(to_plain(values))  # as it is read back: JSON has neither tuples nor infinities
+    row = row_of_line(to_plain(values))  # as it is read back: JSON has neither tuples nor infinities
     if row is None:
         raise RecordingError(
             file, f"cannot be listed in {INDEX_FILE}", "a value of the shot has another type"
@@ -219,12 +221,12 @@ def read_index(folder: Path) -> tuple[list[IndexRow], int]:
         RecordingError: It exists but cannot be read.
     """
     lines = NewLines(folder / INDEX_FILE).placed()
-    rows = [None if values is None else row_of(values) for _, values in lines]
+    rows = [None if values is None else row_of_line(values) for _, values in lines]
     intact = [row for row in rows if row is not None]
     return intact, len(rows) - len(intact)
 
 
-def row_of(line: Mapping[str, Any]) -> IndexRow | None:
+def row_of_line(line: Mapping[str, Any]) -> IndexRow | None:
     """The row in a line of the index; None if the line is damaged."""
     try:
         values: list[Any] = [read(line[name]) for name, read in _READ]

@@ -23,7 +23,7 @@ from labseq.model import RunRecord, ShotRecord
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, now_utc
 from labseq.recording import folders
-from labseq.recording.index import IndexRow, index_row
+from labseq.recording.index import IndexRow, row_of_record
 from labseq.recording.run_file import encode_run, encode_state, encode_text, read_run
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ class RunWriter:
         """
         data = self._encoder.encode(shot)
         file = self._free_name(shot.shot_index, shot.attempt, counts=shot.status == "complete")
-        row = index_row(shot, self.run.target, file=file, sha256="", n_bytes=data.nbytes)
+        row = row_of_record(shot, self.run.target, file=file, sha256="", n_bytes=data.nbytes)
         sha256 = SimpleQueue[str]()
         wait = self._on_disk(self._write_shot, row, data, sha256)
         sha256.put(hashlib.sha256(data).hexdigest())  # while the disk writes

@@ -21,7 +21,7 @@ from labseq.files import lines_in
 from labseq.model.estimate import Estimate, Rate, mean
 from labseq.plain import parse_object
 from labseq.recording.folders import INDEX_FILE
-from labseq.recording.index import IndexRow, row_of
+from labseq.recording.index import IndexRow, row_of_line
 
 _NUMBERS: Final[Mapping[str, Callable[[IndexRow], float]]] = {
     "success": lambda row: math.nan if row.success is None else row.success,
@@ -108,7 +108,7 @@ class RunHistory:
         with self._lock:
             start = self._start[line]
         values = parse_object(next(lines_in(self._path, start), b""))
-        row = None if values is None else row_of(values)
+        row = None if values is None else row_of_line(values)
         if row is None:
             raise RecordingError(self._path, "has a damaged line", "`labseq doctor` reports them")
         return row

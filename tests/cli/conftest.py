@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from labseq.model import ImageRecord, RunRecord, ShotRecord, StageTiming, TargetPattern
-from labseq.recording.index import IndexRow, index_row
+from labseq.recording.index import IndexRow, row_of_record
 
 Event = tuple[str, Mapping[str, Any]]
 Call = Callable[..., tuple[int, str, str]]
@@ -81,7 +81,7 @@ def make_shot(
 def make_row(index: int = 0, **changes: Any) -> IndexRow:
     """A shot as the index lists it."""
     file = "shots/shot_000000.h5"
-    return index_row(make_shot(index, **changes), make_target(), file=file, sha256="", n_bytes=0)
+    return row_of_record(make_shot(index, **changes), make_target(), file=file, sha256="", n_bytes=0)
 
 
 @dataclass

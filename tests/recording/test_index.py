@@ -11,7 +11,7 @@ import pytest
 
 from labseq.errors import RecordingError
 from labseq.plain import dumps
-from labseq.recording.index import IndexRow, index_row, row_of
+from labseq.recording.index import IndexRow, row_of_line, row_of_record
 from labseq.recording.schema import IN_INDEX
 
 from .records import make_run, make_shot
@@ -20,7 +20,7 @@ FILE = "shots/shot_000000.h5"
 
 
 def row(**changes: Any) -> IndexRow:
-    return index_row(make_shot(**changes), make_run().target, file=FILE, sha256="ab", n_bytes=7)
+    return row_of_record(make_shot(**changes), make_run().target, file=FILE, sha256="ab", n_bytes=7)
 
 
 def test_a_row_has_the_values_of_the_schema() -> None:
@@ -31,7 +31,7 @@ def test_a_row_has_the_values_of_the_schema() -> None:
 def test_a_row_that_is_read_back_is_the_same() -> None:
     """Also where JSON has null: a scanner must not see whether a run was resumed."""
     written = row(filling_fraction=math.nan, readings={"simulation.lost.vacuum": math.inf})
-    read = row_of(json.loads(dumps(written)))
+    read = row_of_line(json.loads(dumps(written)))
     assert read is not None
     assert dumps(read) == dumps(written)
     assert read.success is None
@@ -59,15 +59,15 @@ def test_a_row_that_is_read_back_is_the_same() -> None:
 )
 def test_a_damaged_line_is_no_row(damage: dict[str, Any]) -> None:
     values: dict[str, Any] = json.loads(dumps(row()))
-    assert row_of(values) is not None
-    assert row_of(values | damage) is None
+    assert row_of_line(values) is not None
+    assert row_of_line(values | damage) is None
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(IndexRow)])
 def test_every_value_is_needed(name: str) -> None:
     values: dict[str, Any] = json.loads(dumps(row()))
     del values[name]
-    assert row_of(values) is None
+    assert row_of_line(values) is None
 
 
 def test_a_shot_that_no_line_can_tell_is_refused() -> None:
