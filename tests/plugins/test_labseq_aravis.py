@@ -68,7 +68,9 @@ def test_opening_and_closing_leaves_nothing_behind(fake: FakeCamera) -> None:
         with Camera(fake.address) as camera:
             camera.create_stream(3)
     use()
-    assert counts() == before
+    after = counts()
+    # fewer if an earlier test's camera has only now been let go
+    assert all(now <= then for now, then in zip(after, before, strict=True)), (before, after)
 
 
 @needs_aravis
