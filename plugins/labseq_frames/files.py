@@ -6,7 +6,6 @@ import difflib
 import importlib
 import logging
 import re
-import struct
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,15 +23,15 @@ PNG: Final = (".png",)
 TIFF: Final = (".tif", ".tiff")
 EXPECTED: Final = "a run's folder, a TIFF stack, or a folder of PNG or TIFF files"
 
-PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-PNG_HEADER_BYTES: Final = 26
-PNG_COLOURS: Final = {
-    0: "gray",
-    2: "colour",
-    3: "palette colour",
-    4: "gray with transparency",
-    6: "colour with transparency",
+PNG_KINDS: Final = {
+    "1": "1 bit gray",
+    "L": "8 bit gray",
+    "LA": "gray with transparency",
+    "P": "palette colour",
+    "RGB": "colour",
+    "RGBA": "colour with transparency",
 }
+"""Pictures in PNG files that are not 16 bit gray, by Pillow's mode."""
 
 _LOG = logging.getLogger("tifffile")
 _LOG.addHandler(logging.NullHandler())  # we report what it logs about damaged files
@@ -251,36 +250,42 @@ def png_source(files: Sequence[Path]) -> Source:
     Raises:
         BadFramesError: A file is not a PNG, not 16 bit gray, or of another size.
     """
-    expected = _png_shape(files[0])
-    for file in files[1:]:
-        _check_shape(file, _png_shape(file), files[0], expected)
-    return Source(lambda: _png_pictures(files), {"source": "PNG", "n_files": len(files)})
-
-
-def _png_pictures(files: Sequence[Path]) -> Generator[Picture]:
     pillow = load("PIL.Image", "Pillow", files[0])
+    expected = _png_shape(pillow, files[0])
+    for file in files[1:]:
+        _check_shape(file, _png_shape(pillow, file), files[0], expected)
+    return Source(lambda: _png_pictures(pillow, files), {"source": "PNG", "n_files": len(files)})
+
+
+def _png_pictures(pillow: Any, files: Sequence[Path]) -> Generator[Picture]:
     for file in files:
-        try:
-            with pillow.open(file, formats=["PNG"]) as opened:
-                pixels = np.asarray(opened)
-        except Exception as error:  # Pillow raises SyntaxError, OSError, ValueError, zlib.error ...
-            raise BadFramesError(file, f"is damaged: {error}", hint="restore it from a backup") from error
+        with _opened_png(pillow, file) as opened:
+            pixels = np.asarray(opened)
         yield Picture(pixels.astype(np.uint16), str(file))  # older versions of Pillow give int32
 
 
-def _png_shape(file: Path) -> tuple[int, int]:
-    """(height, width), from the header, which also gives the number of bits that Pillow hides."""
-    with file.open("rb") as opened:
-        header = opened.read(PNG_HEADER_BYTES)
-    if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
-        raise BadFramesError(file, "is not a PNG", hint="restore it from a backup, or leave it out")
-    width, height, depth, colour = struct.unpack(">IIBB", header[16:])
-    if (depth, colour) != (16, 0):
-        text = f"the picture is {depth} bit {PNG_COLOURS.get(colour, 'of an unknown kind')}"
-        raise BadFramesError(
-            file, text, "16 bit gray", "save the camera's own counts, not a viewer's picture"
-        )
+def _png_shape(pillow: Any, file: Path) -> tuple[int, int]:
+    """(height, width), from the header."""
+    with _opened_png(pillow, file) as opened:
+        mode, (width, height) = opened.mode, opened.size
+    if mode not in ("I;16", "I"):  # the second is that of older versions
+        text = f"the picture is {PNG_KINDS.get(mode, mode)}"
+        hint = "save the camera's own counts, not a viewer's picture"
+        raise BadFramesError(file, text, "16 bit gray", hint)
     return height, width
+
+
+@contextmanager
+def _opened_png(pillow: Any, file: Path) -> Generator[Any]:
+    """Only the header is read until the pixels are asked for."""
+    try:
+        with pillow.open(file, formats=["PNG"]) as opened:
+            yield opened
+    except pillow.UnidentifiedImageError as error:
+        hint = "restore it from a backup, or leave it out"
+        raise BadFramesError(file, "is not a PNG", hint=hint) from error
+    except Exception as error:  # damaged data make it raise SyntaxError, OSError, ValueError, zlib.error ...
+        raise BadFramesError(file, f"is damaged: {error}", hint="restore it from a backup") from error
 
 
 # TIFF stacks

@@ -20,7 +20,7 @@ from labseq.plugin import Context
 from .blocks import ROOT, Block, blocks_of
 from .running import RUN, labseq
 
-LOOK: Final = ROOT / "plugins" / "labseq_frames" / "README.md"
+LOOK: Final = ROOT / "docs" / "how-to" / "replay-frames.md"
 """The page with the files ``look.yaml`` and ``replay.yaml``."""
 OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 """Pages that speak of the runs that they have taken themselves."""

@@ -110,7 +110,7 @@ def test_what_is_no_ordinary_file_is_not_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("mode", "message"),
-    [("RGB", "8 bit colour;"), ("RGBA", "8 bit colour with transparency;"), ("1", "1 bit gray;")],
+    [("RGB", "is colour;"), ("RGBA", "is colour with transparency;"), ("1", "is 1 bit gray;")],
 )
 def test_a_png_that_is_not_16_bit_gray_is_refused(tmp_path: Path, mode: str, message: str) -> None:
     Image.new(mode, (6, 4)).save(tmp_path / "x.png")

@@ -1,4 +1,4 @@
-"""Whole runs on frames of an earlier one: what is in the plugin's README and in the how-to."""
+"""Whole runs on frames of an earlier one: what is on the page about the camera `frames`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import yaml
 import labseq
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "plugins" / "labseq_frames" / "README.md").read_text()
-LOOK, REPLAY = re.findall(r"```yaml\n(.*?)```", README, re.DOTALL)
+PAGE = (ROOT / "docs" / "how-to" / "replay-frames.md").read_text()
+LOOK, REPLAY = re.findall(r"<!-- file: \S+ -->\n```yaml\n(.*?)```", PAGE, re.DOTALL)
 COMPACT = ROOT / "sequences" / "compact_225.yaml"
 THRESHOLD = 1630.0
 
 
 class Lab:
-    """A folder with the README's sequence, and runs in it whose frames are played again."""
+    """A folder with the page's sequence, and runs in it whose frames are played again."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -34,7 +34,7 @@ class Lab:
             return session.run()
 
     def playing(self, path: Path, **camera: Any) -> str:
-        """The README's profile, with other files in it; their path is relative to it."""
+        """The page's profile, with other files in it; their path is relative to it."""
         profile = yaml.safe_load(REPLAY)
         profile["camera"] |= {"path": path.relative_to(self.folder).as_posix(), **camera}
         file = self.folder / "replay.yaml"
