@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, Self
+from typing import Literal, Self
 
-from pydantic import Field, NonNegativeInt, PositiveInt, field_validator, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from labseq.errors import ConfigError, LimitError
+from labseq.errors import ConfigError
 from labseq.model import CameraFacts, Flip, Orientation, SensorMode
 from labseq.roles import Context, Simulation
 from labseq.settings import Duration, PositiveDuration, Settings
@@ -19,11 +19,6 @@ class RegionSettings(Settings):
     x: NonNegativeInt = Field(default=0, description="first column")
     height: PositiveInt = Field(description="number of rows")
     width: PositiveInt = Field(description="number of columns")
-
-
-_ARMING_TIME: Final = (
-    "time from arming for a series until it can be triggered, for budgets; simulated cameras take this long"
-)
 
 
 class OrientationSettings(Settings):
@@ -67,7 +62,8 @@ class CameraSettings(OrientationSettings):
     )
     arming_time: Duration = Field(
         default=0.0,
-        description=_ARMING_TIME,
+        description="time from arming for a series until it can be triggered, for budgets; simulated cameras "
+        "take this long",
     )
 
     @property
@@ -148,50 +144,6 @@ class CameraSettings(OrientationSettings):
         ):
             raise ValueError(text)
         return self
-
-
-class IndustrialCameraSettings(CameraSettings):
-    """Settings of cameras on GigE Vision and USB3 Vision, in addition to those of every camera."""
-
-    readout: Duration = Field(
-        default=5e-3,
-        description="time from the end of an exposure until its frame can be read, for budgets; the "
-        "simulated camera takes so long",
-    )
-    arming_time: Duration = Field(
-        default=40e-3,
-        description=_ARMING_TIME,
-    )
-    trigger_line: str = Field(
-        default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
-    )
-    trigger_edge: Literal["rising", "falling"] = Field(
-        default="rising", description="edge of the external trigger that starts an exposure"
-    )
-    packet_delay: Duration | None = Field(
-        default=None,
-        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
-        "camera is set",
-    )
-
-    @field_validator("camera", "serial", mode="before", check_fields=False)
-    @classmethod
-    def _number_is_text(cls, value: object) -> object:
-        """YAML reads a serial number without quotes as a number."""
-        return str(value) if type(value) is int else value
-
-    def region_on(self, sensor_shape: tuple[int, int], name: str) -> tuple[int, int, int, int]:
-        """First row, first column, height and width of the region on a sensor of (height, width) pixels.
-
-        Raises:
-            LimitError: It goes beyond the sensor of the camera ``name``.
-        """
-        y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
-        if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
-            end, size = f"row {y + height}, column {x + width}", "{} x {} pixels".format(*sensor_shape)
-            hint = "choose a smaller or another one"
-            raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
-        return y, x, height, width
 
 
 def _unbinnable(height: int, width: int, binning: int) -> str:

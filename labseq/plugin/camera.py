@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle
 from labseq.drivers.camera import check_step, nearest
-from labseq.drivers.settings import (
-    CameraSettings,
-    IndustrialCameraSettings,
-    OrientationSettings,
-)
+from labseq.drivers.settings import CameraSettings, OrientationSettings
 
 __all__ = [
     "CameraDriver",
     "CameraSettings",
     "Cooling",
     "ExposureResult",
-    "IndustrialCameraSettings",
     "OrientationSettings",
     "Series",
     "SimulatedSensor",

@@ -6,7 +6,7 @@ import ctypes
 import ipaddress
 import threading
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from labseq_aravis.library import AravisError, Library, load_library, text
 from labseq_aravis.stream import Stream, StreamOptions
@@ -15,9 +15,14 @@ INTERFACES: Final = ("GigEVision", "USB3Vision")
 """Interfaces that are searched. The library's others play back its own patterns, or are not GenICam."""
 
 CHECK_RANGES: Final = 1
-CONTINUOUS, MULTI_FRAME = 0, 2
 NO_PACKET_SOCKET: Final = 1
-"""Numbers of the library's policies for ranges, acquisition modes and streams."""
+"""Numbers of the library's policies for ranges and for streams."""
+
+KINDS: Final[dict[type, str]] = {str: "string", bool: "boolean", int: "integer", float: "float"}
+"""The library's names of kinds of features."""
+
+Value = TypeVar("Value", str, bool, int, float)
+Number = TypeVar("Number", int, float)
 
 _ControlLost = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 
@@ -178,14 +183,6 @@ class Camera:
         """Whether the camera has a feature and offers it now."""
         return bool(self._call("arv_camera_is_feature_available", feature.encode()))
 
-    def get_string(self, feature: str) -> str:
-        """Value of a text or of an enumeration."""
-        return text(self._call("arv_camera_get_string", feature.encode()))
-
-    def set_string(self, feature: str, value: str) -> None:
-        """Set a text or an enumeration."""
-        self._call("arv_camera_set_string", feature.encode(), value.encode())
-
     def options(self, feature: str) -> tuple[str, ...]:
         """Values of an enumeration that can be chosen; none if the camera does not have it."""
         if not self.is_available(feature):
@@ -193,112 +190,33 @@ class Camera:
         name = "arv_camera_dup_available_enumerations_as_strings"
         return self._library.texts(name, self._open_handle(), feature.encode())
 
-    def set_boolean(self, feature: str, value: bool) -> None:
-        """Switch something on or off."""
-        self._call("arv_camera_set_boolean", feature.encode(), int(value))
+    def get(self, feature: str, kind: type[Value]) -> Value:
+        """Value of a feature: a text or an enumeration as str, a number as int or float."""
+        value = self._call(f"arv_camera_get_{KINDS[kind]}", feature.encode())
+        return kind(text(value) if kind is str else value)
 
-    def get_integer(self, feature: str) -> int:
-        """Value of an integer."""
-        return int(self._call("arv_camera_get_integer", feature.encode()))
+    def set(self, feature: str, value: str | float) -> None:
+        """Set a feature of the kind that the value has: bool, int, float or str."""
+        encoded = value.encode() if isinstance(value, str) else value
+        self._call(f"arv_camera_set_{KINDS[type(value)]}", feature.encode(), encoded)
 
-    def set_integer(self, feature: str, value: int) -> None:
-        """Set an integer."""
-        self._call("arv_camera_set_integer", feature.encode(), value)
+    def bounds(self, feature: str, kind: type[Number]) -> tuple[Number, Number]:
+        """Smallest and largest value of a number."""
+        c_type = ctypes.c_int64 if kind is int else ctypes.c_double
+        low, high = c_type(), c_type()
+        places = ctypes.byref(low), ctypes.byref(high)
+        self._call(f"arv_camera_get_{KINDS[kind]}_bounds", feature.encode(), *places)
+        return kind(low.value), kind(high.value)
 
-    def integer_bounds(self, feature: str) -> tuple[int, int, int]:
-        """Smallest value, largest value and increment of an integer."""
-        low, high = self._pair(ctypes.c_int64, "arv_camera_get_integer_bounds", feature.encode())
-        return low, high, int(self._call("arv_camera_get_integer_increment", feature.encode()))
+    def increment(self, feature: str) -> int:
+        """Distance between two values of an integer."""
+        return int(self._call("arv_camera_get_integer_increment", feature.encode()))
 
-    def get_float(self, feature: str) -> float:
-        """Value of a float."""
-        return float(self._call("arv_camera_get_float", feature.encode()))
+    def execute(self, feature: str) -> None:
+        """Execute a command; returns when the camera has confirmed it."""
+        self._call("arv_camera_execute_command", feature.encode())
 
-    def float_bounds(self, feature: str) -> tuple[float, float]:
-        """Smallest and largest value of a float."""
-        return self._pair(ctypes.c_double, "arv_camera_get_float_bounds", feature.encode())
-
-    # what the library sets by itself, since names and units differ between cameras
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """Height and width of the sensor, in pixels."""
-        width, height = self._pair(ctypes.c_int, "arv_camera_get_sensor_size")
-        return height, width
-
-    def set_binning(self, vertical: int, horizontal: int) -> None:
-        """Set how many pixels are added up."""
-        if self._pair(ctypes.c_int, "arv_camera_get_binning") != (horizontal, vertical):
-            self._call("arv_camera_set_binning", horizontal, vertical)
-
-    @property
-    def pixel_formats(self) -> tuple[str, ...]:
-        """Pixel formats that the camera offers."""
-        return self._library.texts("arv_camera_dup_available_pixel_formats_as_strings", self._open_handle())
-
-    def set_pixel_format(self, name: str) -> None:
-        """Choose the pixel format, by name."""
-        self._call("arv_camera_set_pixel_format_from_string", name.encode())
-
-    @property
-    def exposure_s(self) -> float:
-        """Exposure time, in seconds."""
-        return float(self._call("arv_camera_get_exposure_time")) * 1e-6
-
-    def set_exposure_s(self, exposure_s: float) -> None:
-        """Set the exposure time, in seconds."""
-        self._call("arv_camera_set_exposure_time", exposure_s * 1e6)
-
-    @property
-    def exposure_bounds_s(self) -> tuple[float, float]:
-        """Shortest and longest exposure, in seconds."""
-        shortest, longest = self._pair(ctypes.c_double, "arv_camera_get_exposure_time_bounds")
-        return shortest * 1e-6, longest * 1e-6
-
-    @property
-    def has_gain(self) -> bool:
-        """Whether the gain can be set."""
-        return bool(self._call("arv_camera_is_gain_available"))
-
-    @property
-    def gain(self) -> float:
-        """Gain, in the camera's unit (dB, or raw)."""
-        return float(self._call("arv_camera_get_gain"))
-
-    def set_gain(self, gain: float) -> None:
-        """Set the gain, in the camera's unit."""
-        self._call("arv_camera_set_gain", gain)
-
-    @property
-    def gain_bounds(self) -> tuple[float, float]:
-        """Smallest and largest gain, in the camera's unit."""
-        return self._pair(ctypes.c_double, "arv_camera_get_gain_bounds")
-
-    @property
-    def frame_rate_hz(self) -> float:
-        """Frames per second without a trigger."""
-        return float(self._call("arv_camera_get_frame_rate"))
-
-    def set_frame_rate_hz(self, frame_rate_hz: float) -> None:
-        """Let the camera run without a trigger, at a frame rate in frames per second."""
-        self._call("arv_camera_set_frame_rate", frame_rate_hz)
-
-    @property
-    def trigger_sources(self) -> tuple[str, ...]:
-        """Possible triggers: "Software", "Line1", ..."""
-        return self._library.texts("arv_camera_dup_available_trigger_sources", self._open_handle())
-
-    def set_trigger(self, source: str | None) -> None:
-        """Choose what starts a frame: a rising edge of one of :attr:`trigger_sources`; None: nothing."""
-        if source is None:
-            self._call("arv_camera_clear_triggers")
-        else:
-            self._call("arv_camera_set_trigger", source.encode())
-
-    @property
-    def payload(self) -> int:
-        """Size of a frame, in bytes."""
-        return int(self._call("arv_camera_get_payload"))
+    # network packets, whose features have other names in this library
 
     @property
     def packet_size(self) -> int:
@@ -340,16 +258,14 @@ class Camera:
         stream.allocate(n_buffers, payload)
         return stream
 
-    def start(self, n_frames: int | None = None) -> None:
-        """Start the acquisition: frames come at the frame rate, or at each trigger; at most ``n_frames``."""
-        self._call("arv_camera_set_acquisition_mode", CONTINUOUS if n_frames is None else MULTI_FRAME)
-        if n_frames is not None:
-            self.set_integer("AcquisitionFrameCount", n_frames)
-        self._call("arv_camera_start_acquisition")
+    @property
+    def payload(self) -> int:
+        """Size of a frame, in bytes."""
+        return int(self._call("arv_camera_get_payload"))
 
-    def trigger(self) -> None:
-        """Trigger a frame by software; returns when the camera has confirmed it."""
-        self._call("arv_camera_software_trigger")
+    def start(self) -> None:
+        """Start the acquisition: frames come at the frame rate, or at each trigger."""
+        self._call("arv_camera_start_acquisition")
 
     def stop(self) -> None:
         """End the acquisition."""
@@ -357,12 +273,6 @@ class Camera:
 
     def _call(self, name: str, *arguments: Any) -> Any:
         return self._library.call(name, self._open_handle(), *arguments)
-
-    def _pair(self, type_: Any, name: str, *arguments: Any) -> tuple[Any, Any]:
-        """Call a function that writes two numbers."""
-        first, second = type_(), type_()
-        self._call(name, *arguments, ctypes.byref(first), ctypes.byref(second))
-        return first.value, second.value
 
     def _open_handle(self) -> int:
         if self._handle is None:

@@ -9,4 +9,4 @@ LABSEQ_API = 1
 def labseq_register(registry: Registry) -> None:
     """Register the camera ``genicam``; in a dry run a simulated GigE camera sees the simulated atoms."""
     camera, settings = "labseq_genicam.camera:GenicamCamera", "labseq_genicam.settings:GenicamSettings"
-    registry.camera("genicam", camera, settings, simulated="labseq_genicam.connection:simulated_settings")
+    registry.camera("genicam", camera, settings, simulated="labseq_genicam.aravis:simulated_settings")

@@ -15,56 +15,40 @@ import threading
 import weakref
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Final
 
 import numpy as np
+from labseq_genicam.features import Nodes
+from labseq_genicam.settings import BITS
+from labseq_genicam.simulated import MAX_WAIT_S, SimulatedExposures
 from numpy.typing import NDArray
 
-from labseq.plugin import Context, DeviceError, Trigger, wait_for
-from labseq.plugin.camera import ExposureResult, Series, SimulatedSensor
-from labseq.plugin.lines import trigger_line
-from labseq_pylon.acquisition import Acquisition
-from labseq_pylon.connection import EMULATION, CameraConnection
-from labseq_pylon.library import Nodes, Sdk
-from labseq_pylon.settings import BITS, PixelFormat, PylonSettings
+from labseq.plugin import Context, DeviceError, Frame
+from labseq.plugin.camera import ExposureResult, Series
+from labseq_pylon.connection import EMULATION, PylonConnection
+from labseq_pylon.library import Sdk
+from labseq_pylon.settings import PylonSettings
 
 VARIABLE: Final = "PYLON_CAMEMU"
 """Environment variable with the number of emulated cameras that pylon lists."""
 
-MAX_WAIT_S: Final = 5.0
-"""How long the emulated camera may take, in real time, for a frame that is due on the session's clock, and
-until it accepts a trigger: on a busy computer it is slow."""
-
 _LOCK: Final = threading.Lock()
 
 
-class EmulatedCamera(CameraConnection):
+class EmulatedConnection(SimulatedExposures, PylonConnection):
     """Gives the exposures of the simulation to pylon's emulated camera."""
 
     def __init__(self, settings: PylonSettings, context: Context) -> None:
         super().__init__(settings, context)
-        self._world, self._shape = settings.simulated_world(context)
-        self.sensor_shape = self._shape
-        self.ready_s = MAX_WAIT_S
-        self._sensor = SimulatedSensor(self._world, context.clock)
-        self._mode = settings.mode
-        self._readout_s = settings.readout
+        self.ready_s = MAX_WAIT_S  # on a busy computer it is slow
         self._folder: Path | None = None
         self._remove: Callable[[], object] = lambda: None
         self._layer: Any = None  # keeps the device alive
         self._nodes: Nodes | None = None
         self._bits = 16
-        self._trigger: Trigger = "software"
-        self._n_exposed = self._n_frames = 0
-        self._is_wired = trigger_line(context.lines, "camera") is not None
-
-    def warm(self) -> None:
-        """Compute what all frames have in common."""
-        self._world.prepare_sensor(self._mode)
+        self._n_shown = 0
 
     def device(self, sdk: Sdk) -> Any:
         """Create an emulated camera; each driver gets its own."""
@@ -75,75 +59,48 @@ class EmulatedCamera(CameraConnection):
             self._layer = layer
             return layer.CreateDevice(infos[0])
 
-    def set_up(self, nodes: Nodes) -> tuple[int, int]:
-        """Make the camera read files of the simulated sensor's size, or of its minimum size."""
-        for name, size in zip(("HeightMax", "WidthMax"), self._shape, strict=True):
-            node = nodes.get("size", name)
-            nodes.set_integer(node, "size", max(size, node.Min))
-        nodes.choose("TestImageSelector", "test image", "Off")
+    def open(self) -> Nodes:
+        """Open the camera, which reads files of the simulated sensor's size, or of its minimum size."""
+        self._nodes = nodes = super().open()
+        with self.doing("set its test image"):
+            for feature, size in zip(("HeightMax", "WidthMax"), self._shape, strict=True):
+                nodes.set(feature, max(size, nodes.bounds(feature, int)[0]))
+            nodes.set("TestImageSelector", "Off")
         self._folder = Path(mkdtemp(prefix="labseq-pylon-"))
         self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-        self._nodes = nodes
-        return self._shape
+        return nodes
 
-    def trigger_of(self, series: Series) -> Trigger:
-        """The internal trigger and edges of lines are made by software, when there is a picture to take."""
-        is_real = series.trigger not in ("software", "internal") and not self._is_wired
-        return series.trigger if is_real else "software"
-
-    def arm(self, series: Series, pixel_format: PixelFormat, acquisition: Acquisition) -> None:
+    def arm(self, series: Series, period_s: float) -> None:
         """Get ready for a series, before the camera is started.
 
         The camera's own exposure is as long as that of the series; on a virtual clock it is as short as
         possible. (Its node ``ExposureTime`` is checked and read back, but has no effect.)
         """
         assert self._nodes is not None
-        nodes, self._bits, self._trigger = self._nodes, BITS[pixel_format], series.trigger
-        self._n_exposed, self._n_frames = 0, series.n_frames
+        nodes, self._n_shown = self._nodes, 0
         for number in range(series.n_frames):
             self._path(number).touch()
-        nodes.get("image file", "ImageFilename").SetValue(str(self._path(0).parent))
-        nodes.choose("ImageFileMode", "image file", "On")
-        node = nodes.get("exposure", "ExposureTimeAbs")
-        own_us = min(max(1e6 * series.exposure_s, node.Min), node.Max)
-        node.SetValue(node.Min if self._clock.virtual else own_us)
-        if series.trigger not in ("software", "internal"):
-            self._sensor.follow_line(partial(self.fire, acquisition))
-        arm_s, cycle_s = self._settings.arming_time, self._settings.cycle_time or 0.0
-        self._sensor.arm(series, self._mode, self._readout_s, arm_s=arm_s, cycle_s=cycle_s)
+        with self.doing("choose its image file"):
+            self._bits = BITS[nodes.get("PixelFormat", str)]
+            nodes.set("ImageFilename", str(self._path(0).parent))
+            nodes.set("ImageFileMode", "On")
+            shortest_us, longest_us = nodes.bounds("ExposureTimeAbs", float)
+            own_us = min(max(1e6 * series.exposure_s, shortest_us), longest_us)
+            nodes.set("ExposureTimeAbs", shortest_us if self._clock.virtual else own_us)
+        super().arm(series, period_s)
 
-    def fire(
-        self, acquisition: Acquisition, t_s: float | None = None, exposure_s: float | None = None
-    ) -> None:
-        """Expose, now or at ``t_s`` of the clock, write the picture to the next file, and trigger it."""
-        if self._n_exposed == self._n_frames:
-            return
-        acquisition.wait_until_ready()
-        frame = self._sensor.expose(t_start_s=t_s, exposure_s=exposure_s)
-        if frame is not None:
-            self._path(self._n_exposed).write_bytes(tiff(self._picture(frame.image)))
-            self._n_exposed += 1
-            acquisition.trigger()
+    def show(self, frame: Frame) -> None:
+        """Write the picture to the next file, and trigger the camera."""
+        self._path(self._n_shown).write_bytes(tiff(self._picture(frame.image)))
+        self._n_shown += 1
+        self.fire()
 
-    def wait(self, acquisition: Acquisition, timeout_s: float) -> ExposureResult | None:
-        """Wait on the session's clock until the next frame is due, then in real time until it has come."""
-        if self._trigger not in ("software", "internal") and not self._is_wired:
-            return super().wait(acquisition, timeout_s)
-        start_s = self._clock.now()
-        self._sensor.expose_next(partial(self.fire, acquisition), timeout_s)
-        frame = self._sensor.take(max(0.0, timeout_s - (self._clock.now() - start_s)))
-        if frame is None:
-            return None
-        taken = wait_for(acquisition.poll, MAX_WAIT_S, self._clock)
-        if taken is None:
-            return None
-        self._path(taken.number).write_bytes(b"")
-        return replace(taken, t_start_s=frame.t_start_s)
-
-    def clear(self) -> None:
-        """Forget the series."""
-        self._n_frames = self._n_exposed
-        self._sensor.clear()
+    def poll(self, seconds: float) -> ExposureResult | None:
+        """Wait for the next buffer; the file that it came from is emptied."""
+        taken = super().poll(seconds)
+        if taken is not None and taken.number < self._n_shown:
+            self._path(taken.number).write_bytes(b"")
+        return taken
 
     @contextmanager
     def closing(self) -> Generator[None]:
@@ -152,9 +109,12 @@ class EmulatedCamera(CameraConnection):
             yield
 
     def close(self) -> None:
-        """Remove the files."""
-        self._nodes = self._layer = self._folder = None
-        self._remove()
+        """Release the camera, and remove the files."""
+        try:
+            super().close()
+        finally:
+            self._nodes = self._layer = self._folder = None
+            self._remove()
 
     def _path(self, number: int) -> Path:
         assert self._folder is not None
@@ -162,8 +122,9 @@ class EmulatedCamera(CameraConnection):
 
     def _picture(self, image: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """A picture of the whole sensor with a frame in its region, in the upper bits; zeros elsewhere."""
-        height, width = (size // self._mode.binning for size in self._shape)
-        y, x = (start // self._mode.binning for start in (self._mode.region or (0, 0))[:2])
+        mode = self._settings.mode
+        height, width = (size // mode.binning for size in self._shape)
+        y, x = (start // mode.binning for start in (mode.region or (0, 0))[:2])
         picture = np.zeros((height, width), np.uint16)
         counts = np.minimum(image, 2**self._bits - 1) << (16 - self._bits)
         picture[y : y + image.shape[0], x : x + image.shape[1]] = counts

@@ -89,12 +89,12 @@ class Rig:
     @property
     def genicam(self) -> Any:
         """The simulated GenICam camera, as libaravis has it."""
-        return self.camera._link.camera
+        return self.camera.connection.camera
 
     @property
     def pylon(self) -> Any:
         """pylon's own camera."""
-        return self.camera._camera
+        return self.camera.connection.camera
 
     def take(self, n_frames: int, exposure_s: float = 0.01, trigger: Trigger = "software") -> list[Frame]:
         """Trigger and read, one frame after the other."""

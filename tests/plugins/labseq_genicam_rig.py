@@ -31,7 +31,7 @@ def pattern(request: Exposure) -> NDArray[np.uint16]:
 def set_region(camera: Camera, region: Mapping[str, int]) -> None:
     """Set the region; the sizes first, which limit the offsets."""
     for feature in ("Width", "Height", "OffsetX", "OffsetY"):
-        camera.set_integer(feature, region[feature])
+        camera.set(feature, region[feature])
 
 
 @contextmanager
@@ -48,17 +48,17 @@ def plugged_in(
 @contextmanager
 def opened(
     fake: FakeCamera,
-    trigger: str | None = "Software",
     region: Mapping[str, int] = REGION,
     pixel_format: str = "Mono16",
     n_buffers: int = 6,
 ) -> Generator[tuple[Camera, Stream]]:
     """A camera that acquires, and its stream."""
     with Camera(fake.address) as camera:
-        camera.set_pixel_format(pixel_format)
+        camera.set("PixelFormat", pixel_format)
         set_region(camera, region)
         camera.set_packet_size(PACKET_SIZE)
-        camera.set_trigger(trigger)
+        camera.set("TriggerSource", "Software")
+        camera.set("TriggerMode", "On")
         stream = camera.create_stream(n_buffers, StreamOptions(frame_retention_s=RETENTION_S, resend=False))
         camera.start()
         yield camera, stream

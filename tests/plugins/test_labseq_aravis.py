@@ -43,7 +43,7 @@ def test_closing_is_legal_in_any_order_and_again(fake: FakeCamera) -> None:
         with pytest.raises(AravisError, match="closed"):
             stream.pop(0.0)
         with pytest.raises(AravisError, match="closed"):
-            camera.trigger()
+            camera.execute("TriggerSoftware")
     with opened(fake) as (camera, stream):
         stream.close()
         stream.close()
@@ -59,7 +59,7 @@ def test_opening_and_closing_leaves_nothing_behind(fake: FakeCamera) -> None:
 
     def use() -> None:
         with opened(fake) as (camera, stream):
-            camera.trigger()
+            camera.execute("TriggerSoftware")
             assert stream.pop(WAIT_S) is not None
 
     use()

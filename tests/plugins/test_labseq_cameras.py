@@ -185,8 +185,8 @@ def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver
 def test_a_trigger_that_the_camera_lacks_is_refused_when_it_is_opened(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(f"labseq_{name}.setup.WIDTH", "NoSuchMode")
-    monkeypatch.setattr(f"labseq_{name}.setup.series_trigger", lambda _: None)
+    monkeypatch.setattr("labseq_genicam.standard.WIDTH", "NoSuchMode")
+    monkeypatch.setattr("labseq_genicam.standard.series_trigger", lambda _: "")
     cases: dict[str, dict[str, Any]] = {
         "has no exposure mode NoSuchMode; leave out `line_trigger: bulb`": {"line_trigger": "bulb"},
         "starts no series by a trigger": {"line_trigger": "external_start", "cycle_time": "50 ms"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from labseq_genicam.acquisition import LAST_ID, FrameCounter
-from labseq_genicam.settings import FORMATS
-from labseq_genicam.setup import temperature_k
+from labseq_genicam.aravis import LAST_ID, FrameCounter
+from labseq_genicam.features import Features
+from labseq_genicam.settings import BITS
+from labseq_genicam.standard import temperature_k
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
@@ -31,11 +33,11 @@ rig = partial(opened_rig, "genicam")
 def test_the_camera_goes_on_waiting_from_one_series_to_the_next() -> None:
     with rig() as lab:
         lab.take(1)
-        stream = lab.camera._opened()._stream
+        stream = lab.camera.connection._stream
         for n_frames in (3, 12):
             del lab.world.shown[:]
             assert_shown(lab.take(n_frames), lab)
-        assert lab.camera._opened()._stream is stream
+        assert lab.camera.connection._stream is stream
 
 
 @needs_aravis
@@ -52,7 +54,7 @@ def test_a_series_that_is_broken_off_costs_the_next_one_no_packet() -> None:
 
 
 @needs_aravis
-def test_on_a_real_clock_it_runs_freely_and_shows_no_more_than_was_armed() -> None:
+def test_on_a_real_clock_it_exposes_in_turn_and_shows_no_more_than_was_armed() -> None:
     with rig(clock=NeverStopped(), readout="1 ms", frame_rate="200 Hz") as lab:
         for n_frames in (4, 10):
             del lab.world.shown[:]
@@ -67,13 +69,13 @@ def test_on_a_real_clock_it_runs_freely_and_shows_no_more_than_was_armed() -> No
 
 @needs_aravis
 @settings(max_examples=4)
-@given(sensor=sensors(tuple(name for name in FORMATS if name != "Mono14")))
+@given(sensor=sensors(tuple(name for name in BITS if name != "Mono14")))
 def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]) -> None:
     with rig(**sensor) as lab:
         about = lab.camera.facts.frame_shape
         (frame,) = lab.take(1)
         features = ("OffsetY", "OffsetX", "Height", "Width")
-        read = [lab.genicam.get_integer(feature) for feature in features]
+        read = [lab.genicam.get(feature, int) for feature in features]
     wanted = sensor.get("region") or {"y": 0, "x": 0, "height": 96, "width": 128}
     binned = [wanted[key] // sensor["binning"] for key in ("y", "x", "height", "width")]
     assert read == binned
@@ -84,12 +86,12 @@ def test_the_world_shows_the_region_that_the_camera_reads(sensor: dict[str, Any]
 
 @needs_aravis
 def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("labseq_genicam.camera.CHECK_PERIOD_S", 1e-3)
+    monkeypatch.setattr("labseq_genicam.aravis.CHECK_PERIOD_S", 1e-3)
     with rig(readout="5 ms") as lab:
-        acquisition, asked = lab.camera._opened(), list[None]()
-        poll = acquisition.poll
-        monkeypatch.setattr(lab.camera._link, "check_alive", lambda: asked.append(None))
-        monkeypatch.setattr(acquisition, "poll", lambda s: poll(s) if len(asked) > 2 else None)
+        connection, asked = lab.camera.connection, list[None]()
+        pop = connection._pop
+        monkeypatch.setattr(connection, "check_alive", lambda: asked.append(None))
+        monkeypatch.setattr(connection, "_pop", lambda s: pop(s) if len(asked) > 2 else None)
         frames = lab.take(1, 0.01)
         assert len(asked) >= 3  # the frame itself may take longer than such a period
         assert lab.clock.now() == pytest.approx(0.015)
@@ -100,11 +102,10 @@ def test_a_computer_that_is_slow_costs_no_time_on_a_virtual_clock(monkeypatch: p
 def test_the_camera_answers_while_its_image_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """However long that takes: a busy computer's camera is not gone."""
     with rig() as lab:
-        expose, link = lab.world.expose, lab.camera._link
-        assert link is not None
+        expose, connection = lab.world.expose, lab.camera.connection
 
         def slow(t_start_s: float, exposure_s: float, mode: SensorMode) -> Frame:
-            link.check_alive()
+            connection.check_alive()
             return expose(t_start_s, exposure_s, mode)
 
         monkeypatch.setattr(lab.world, "expose", slow)
@@ -169,11 +170,12 @@ def test_numbers_tell_how_many_frames_never_came(first: int, steps: list[int], i
 
 
 def test_the_temperature_of_a_camera_that_measures_one_is_in_kelvins() -> None:
-    features = {"DeviceTemperature": 21.5}
-    camera: Any = SimpleNamespace(is_available=features.__contains__, get_float=features.__getitem__)
-    assert temperature_k(camera) == pytest.approx(294.65)
-    features.clear()
-    assert temperature_k(camera) is None
+    values = {"TemperatureAbs": 21.5}
+    nodes: Any = SimpleNamespace(is_available=values.__contains__, get=lambda name, _: values[name])
+    features = Features("camera", nodes, lambda _: nullcontext())
+    assert temperature_k(features) == pytest.approx(294.65)
+    values.clear()
+    assert temperature_k(features) is None
 
 
 @needs_aravis
@@ -184,11 +186,14 @@ def test_a_pulse_or_the_start_of_a_series_is_chosen_by_the_features_of_the_stand
 
         def chosen(trigger: Trigger, selector: str) -> list[str]:
             lab.camera.arm(3, 0.01, trigger)
-            camera.set_string("TriggerSelector", selector)
-            return [camera.get_string(feature) for feature in features]
+            camera.set("TriggerSelector", selector)
+            return [camera.get(feature, str) for feature in features]
 
         assert chosen("external_start", "AcquisitionStart") == ["MultiFrame", "Timed", "On", "Line1"]
-        assert (camera.get_integer("AcquisitionFrameCount"), camera.frame_rate_hz) == (3, 20.0)
+        assert (camera.get("AcquisitionFrameCount", int), camera.get("AcquisitionFrameRate", float)) == (
+            3,
+            20.0,
+        )
         assert chosen("external_start", "FrameStart")[2] == "Off"
         assert chosen("bulb", "FrameStart") == ["Continuous", "TriggerWidth", "On", "Line1"]
         assert chosen("bulb", "AcquisitionStart")[2] == "Off"

@@ -28,7 +28,7 @@ def test_an_exposure_that_goes_wrong_fails_its_frame_and_is_reported() -> None:
 
     with plugged_in(expose) as fake, opened(fake) as (camera, stream):
         for n in range(3):
-            camera.trigger()
+            camera.execute("TriggerSoftware")
             assert fake.wait_for_image(n, WAIT_S)
         buffers = [stream.pop(WAIT_S) for _ in range(3)]
         assert [buffer is not None and buffer.image is not None for buffer in buffers] == [False, False, True]

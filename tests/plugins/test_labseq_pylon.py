@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from labseq_genicam.settings import BITS
 from labseq_pylon import connection
 from labseq_pylon.library import load_pypylon
-from labseq_pylon.settings import BITS, PylonSettings
+from labseq_pylon.settings import PylonSettings
 
 from .labseq_camera_rig import opened_rig, sensors
 
@@ -23,7 +24,7 @@ rig = partial(opened_rig, "pylon")
 
 @needs_pypylon
 @settings(max_examples=10)
-@given(sensor=sensors(tuple(BITS)))
+@given(sensor=sensors(tuple(name for name in BITS if name != "Mono14")))
 def test_the_camera_cuts_its_region_and_saturates_as_its_pixel_format_does(sensor: dict[str, Any]) -> None:
     with rig(**sensor) as lab:
         frames = lab.take(2)
@@ -52,9 +53,8 @@ def test_a_computer_that_is_slow_fails_no_trigger_and_costs_no_time_on_a_virtual
             n_waits += 1
             return n_waits > 3 and wait(milliseconds, handling)
 
-        monkeypatch.setattr(
-            lab.camera._opened(), "_camera", Changed(lab.pylon, WaitForFrameTriggerReady=wait_slowly)
-        )
+        slow = Changed(lab.pylon, WaitForFrameTriggerReady=wait_slowly)
+        monkeypatch.setattr(lab.camera.connection, "camera", slow)
         lab.take(1, 0.01)
     assert n_waits == 4
     assert lab.clock.now() == pytest.approx(0.015)
@@ -89,7 +89,7 @@ def test_time_stamps_of_the_camera_are_in_seconds(monkeypatch: pytest.MonkeyPatc
     with rig() as lab:
         retrieve = lab.pylon.RetrieveResult
         stamped = Changed(lab.pylon, RetrieveResult=lambda *_: Changed(retrieve(*_), TimeStamp=2_500_000_000))
-        monkeypatch.setattr(lab.camera._opened(), "_camera", stamped)
+        monkeypatch.setattr(lab.camera.connection, "camera", stamped)
         assert lab.take(1)[0].device_time_s == pytest.approx(2.5)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from labseq_pylon import connection
 from labseq_pylon.library import load_pypylon
-from labseq_pylon.settings import PylonSettings
 
 from labseq import DeviceError, LimitError, TransientError
 from labseq.plugin.messages import install_hint
@@ -100,7 +99,7 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
         lab.pylon.TriggerSelector.Value = "FrameBurstStart"
         assert lab.pylon.TriggerMode.Value == "Off"
     with rig(trigger_line="Line9") as lab:
-        with pytest.raises(DeviceError, match=r"source cannot be Line9; expected one of .*'Line1'"):
+        with pytest.raises(DeviceError, match=r"source cannot be Line9; the camera offers .*Line1"):
             lab.camera.arm(1, 0.01, "external")
         assert len(lab.take(1)) == 1
 
@@ -111,9 +110,9 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
     [
         ({"region": {"y": 3, "x": 0, "height": 32, "width": 32}, "binning": 2}, "the nearest good one is 4"),
         ({"binning": 8}, "binning is 8; the limit is 1 to 4, in steps of 1"),
-        ({"gain": 60.0}, "gain is 60 dB; the limit is 0 dB to 48 dB"),
+        ({"gain": 60.0}, "gain is 60; the limit is 0 to 48"),
         ({"gain_raw": 100}, "gain_raw is 100; the limit is 192 to 1023"),
-        ({"model": "acA1920-40um"}, "is an Emulation; expected an acA1920-40um"),
+        ({"model": "acA1920-40um"}, "has the model Emulation; expected acA1920-40um"),
     ],
 )
 def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(
@@ -173,14 +172,14 @@ def emulated_only(monkeypatch: pytest.MonkeyPatch) -> Any:
 @needs_pypylon
 def test_without_a_camera_it_says_so_and_does_not_take_an_emulated_one(emulated_only: Any) -> None:
     with pytest.raises(DeviceError, match=r"no Basler camera .*`camera: simulated`"):
-        connection.find_camera(emulated_only, PylonSettings())
+        connection.find_camera(emulated_only, None)
 
 
 @needs_pypylon
 def test_of_two_cameras_one_must_be_named(emulated_only: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "EMULATION", "no class")  # as if these two were real
     with pytest.raises(DeviceError, match=r"2 cameras .*'0815-0000', .*'0815-0001'.* serial number"):
-        connection.find_camera(emulated_only, PylonSettings())
+        connection.find_camera(emulated_only, None)
 
 
 @needs_pypylon

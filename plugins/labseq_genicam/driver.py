@@ -1,0 +1,118 @@
+"""The driver: a camera with the features of the GenICam standard, whatever library reaches it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+from labseq.plugin import CameraFacts, Context, DeviceError
+from labseq.plugin.camera import CameraDriver, ExposureResult, Series
+from labseq_genicam.connection import Connection
+from labseq_genicam.features import Features
+from labseq_genicam.settings import StandardSettings
+from labseq_genicam.standard import (
+    TIMED_BY_CAMERA,
+    frame_period_s,
+    read_exposure_s,
+    set_exposure,
+    set_trigger,
+    set_up,
+    temperature_k,
+)
+
+
+class StandardCamera(CameraDriver):
+    """A camera with the features of the GenICam standard.
+
+    Attributes:
+        connection: The library's access to the camera, or to a simulated one.
+        features: The features of the camera; None unless it is open.
+    """
+
+    model_name: ClassVar[str]
+    """What the camera is called until it has reported its model."""
+
+    def __init__(self, settings: StandardSettings, context: Context, connection: Connection) -> None:
+        super().__init__(context, settings.orientation)
+        self._settings = settings
+        self.connection = connection
+        self.features: Features | None = None
+        self.reported: dict[str, Any] = {}
+        self._exposure_s = math.nan
+
+    @property
+    def facts(self) -> CameraFacts:
+        """Read-out time of the settings; bounds of exposures and frame shape as soon as they are known."""
+        settings, connection = self._settings, self.connection
+        shape = self.reported.get("frame_shape") or settings.frame_shape(connection.sensor_shape)
+        known = connection.min_exposure_s, settings.max_exposure
+        shortest_s, longest_s = self.reported.get("exposure_bounds_s", known)
+        bounds_s = {"min_exposure_s": shortest_s, "max_exposure_s": min(longest_s, settings.max_exposure)}
+        return settings.facts(settings.readout, None if shape is None else (shape[0], shape[1]), **bounds_s)
+
+    def warm(self) -> None:
+        """Do slow work that can be done before the camera is opened."""
+        self.connection.warm()
+
+    def describe(self) -> Mapping[str, Any]:
+        """Settings; once opened, also what the camera reports, now its exposure and temperature too."""
+        described = {**self._settings.model_dump(mode="json"), "model": self.model_name, **self.reported}
+        if self.features is not None:
+            described["exposure_now_s"] = read_exposure_s(self.features)
+            described["temperature_k"] = temperature_k(self.features)
+        return described
+
+    def _connect(self) -> None:
+        connection, settings = self.connection, self._settings
+        self.features = features = Features(self._name, connection.open(), connection.doing)
+        connection.check_identity(model=settings.model)
+        firmware = features.read(str, "DeviceFirmwareVersion", "DeviceVersion") or ""
+        self.reported = {**connection.identity(), "firmware": firmware}
+        self.reported |= set_up(features, settings, connection.sensor_shape)
+        self.reported |= connection.set_packets(features)
+
+    def _disconnect(self) -> None:
+        self.features = None
+        self.connection.close()
+
+    def _start(self, series: Series) -> None:
+        features, settings, connection = self._opened(), self._settings, self.connection
+        trigger = connection.trigger_of(series)
+        if not connection.goes_on(trigger):
+            connection.stop()
+            set_trigger(features, settings, trigger, series.n_frames)
+        # with bulb the pulse is the exposure
+        self._exposure_s = (
+            series.exposure_s if trigger == "bulb" else set_exposure(features, series.exposure_s)
+        )
+        period_s = math.nan
+        if series.trigger in TIMED_BY_CAMERA:
+            period_s = frame_period_s(features, settings, series, trigger)
+        connection.arm(series, period_s)
+        connection.start(series, trigger)
+
+    def _fire(self) -> None:
+        self._opened()
+        self.connection.trigger()
+
+    def _take(self, timeout_s: float) -> ExposureResult | None:
+        self._opened()
+        taken = self.connection.wait(timeout_s)
+        if taken is None:
+            self.connection.check_alive()
+        return None if taken is None else replace(taken, exposure_s=self._exposure_s)
+
+    def _end(self) -> None:
+        self.connection.clear()
+        self.connection.end()
+
+    def _stop(self) -> None:
+        self.connection.clear()
+        self.connection.stop()
+
+    def _opened(self) -> Features:
+        if self.features is None:
+            raise DeviceError(self._name, "not open; call open() first")
+        return self.features
