@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import h5py
 import pytest
-from labseq_andor.library import load_pylablib
 from labseq_frames.files import BadFramesError, load
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylon.library import load_pypylon
@@ -50,7 +49,6 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("analysis", "pyarrow", "pyarrow"): lambda: check_export("parquet", Path("a.parquet")),
     ("analysis", "xarray", "xarray"): lambda: check_export("netcdf", Path("a.nc")),
     ("analysis", "h5netcdf", "h5netcdf"): lambda: check_export("netcdf", Path("a.nc")),
-    ("andor", "pylablib", "pylablib.devices.Andor.AndorSDK2"): lambda: load_pylablib("camera"),
     ("campaign", "distributed", "distributed"): lambda: connect("tcp://127.0.0.1:9", None),
     ("campaign", "cryptography", "cryptography"): lambda: make_certificates(Path("keys")),
     ("compress", "hdf5plugin", "hdf5plugin"): lambda: load_filter(Path("shot.h5"), compressed()),

@@ -1,4 +1,4 @@
-"""Andor EMCCD cameras, for example iXon, through Andor's SDK2 and pylablib."""
+"""Andor EMCCD cameras, for example iXon, through Andor's SDK2."""
 
 from labseq.plugin import Registry, hookimpl
 
@@ -7,6 +7,6 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Register the camera ``andor``; in a dry run the simulated camera, if pylablib is installed."""
+    """Register the camera ``andor``; in a dry run a simulated one."""
     camera, settings = "labseq_andor.camera:AndorCamera", "labseq_andor.settings:AndorSettings"
-    registry.camera("andor", camera, settings, simulated="labseq_andor.library:simulated_settings")
+    registry.camera("andor", camera, settings, simulated="labseq_andor.connection:simulated_settings")

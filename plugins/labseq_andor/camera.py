@@ -22,29 +22,36 @@ from labseq.plugin.camera import CameraDriver, ExposureResult, Series, settle
 from labseq.plugin.messages import one_of
 from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_andor.codes import (
+    EXTERNAL,
+    EXTERNAL_EXPOSURE,
+    EXTERNAL_START,
     GONE,
+    INTERNAL,
+    KINETIC,
     OVERRUN,
+    RUN_TILL_ABORT,
     SHUTTER_AUTO,
     SHUTTER_CLOSED,
     SHUTTER_OPEN,
+    SOFTWARE,
     Code,
     Features,
-    Triggers,
+    TriggerModes,
     explain,
 )
-from labseq_andor.library import library_for, load_pylablib, pylablib_version
-from labseq_andor.sdk import Sdk, code_of
+from labseq_andor.connection import code_of, connection_for
+from labseq_andor.sdk import AndorSdk
 from labseq_andor.settings import AndorSettings
 from labseq_andor.setup import set_up
 
-TRIGGERS: Final[Mapping[str, tuple[str, int]]] = {
-    "software": ("software", Triggers.CONTINUOUS),
-    "internal": ("int", Triggers.INTERNAL),
-    "external": ("ext", Triggers.EXTERNAL),
-    "external_start": ("ext_start", Triggers.EXTERNALSTART),
-    "bulb": ("ext_exp", Triggers.EXTERNALEXPOSURE),
+TRIGGERS: Final[Mapping[str, tuple[int, TriggerModes]]] = {
+    "software": (SOFTWARE, TriggerModes.CONTINUOUS),
+    "internal": (INTERNAL, TriggerModes.INTERNAL),
+    "external": (EXTERNAL, TriggerModes.EXTERNAL),
+    "external_start": (EXTERNAL_START, TriggerModes.EXTERNALSTART),
+    "bulb": (EXTERNAL_EXPOSURE, TriggerModes.EXTERNALEXPOSURE),
 }
-"""labseq's trigger -> pylablib's name for it, and the flag of a camera that has it."""
+"""labseq's trigger -> the SDK's trigger mode, and the flag of a camera that has it."""
 
 BULB_AND_TRANSFER: Final = Features.FTEXTERNALEXPOSURE | Features.KINETICEXTERNALEXPOSURE
 """Features of a camera that takes series with the bulb trigger and frame transfer."""
@@ -60,14 +67,14 @@ TEMPERATURE_PERIOD_S: Final = 1.0
 
 
 class AndorCamera(CameraDriver):
-    """An Andor EMCCD camera, for example an iXon, through Andor's SDK2 and pylablib.
+    """An Andor EMCCD camera, for example an iXon, through Andor's SDK2.
 
     The shutter is open from ``open()`` on, so that no frame waits for it, and closed in the safe state. EM
     gain is on during a series only. The cooler stays on in the safe state, and by default when the camera is
     closed.
 
     Attributes:
-        library: Andor's library, or the simulated one.
+        connection: The camera through Andor's library, or a simulated one.
 
     Raises:
         ConfigError: The region does not fit the sensor, or the simulated camera has no simulation.
@@ -77,14 +84,13 @@ class AndorCamera(CameraDriver):
         super().__init__(context, settings.orientation)
         self._settings = settings
         self._cooling = settings.cooling
-        self.library = library_for(settings, context)
-        self._sensor_shape: tuple[int, int] | None = self.library.sensor_shape
+        self.connection = connection_for(settings, context)
+        self._sensor_shape = self.connection.sensor_shape
         if self._sensor_shape is not None and (conflict := settings.sensor_conflict(self._sensor_shape)):
             raise ConfigError(conflict)
-        self._readout_s = settings.readout_s(self.library.head, self._sensor_shape)
+        self._readout_s = settings.readout_s(self.connection.head, self._sensor_shape)
         self._max_exposure_s = settings.max_exposure
         self._triggers = tuple(TRIGGERS)
-        self._sdk: Sdk | None = None
         self._reported: dict[str, Any] = {}
         self._em_gain = 1
         self._shutter = "none"
@@ -102,25 +108,22 @@ class AndorCamera(CameraDriver):
         return self._settings.facts(self._readout_s, shape, self._triggers, **known)
 
     def warm(self) -> None:
-        """Import pylablib, which takes seconds."""
-        with suppress(DeviceError):  # open() reports what is missing
-            load_pylablib(self._name)
-        self.library.warm(self.facts.em_gain)
+        """Do slow work that can be done before the camera is opened."""
+        self.connection.warm(self.facts.em_gain)
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those of the package, the SDK and the camera; no real camera was tried."""
-        found = self._reported
+        """Those of the SDK and the camera; no real camera was tried."""
+        reported = self._reported
         return {
-            "package pylablib": (pylablib_version(), "1.4.3, 1.4.5"),
-            "SDK2": (found.get("sdk_version", ""), ""),
-            "firmware": (found.get("firmware", ""), ""),
+            "SDK2": (reported.get("sdk_version", ""), ""),
+            "firmware": (reported.get("firmware", ""), ""),
         }
 
     def describe(self) -> Mapping[str, Any]:
         """Settings; once opened, also what the camera reports, and its current state."""
         described = {"model": "Andor EMCCD", **self._settings.model_dump(mode="json"), **self._reported}
         described |= {"readout_s": self._readout_s, "frame_shape": self.facts.frame_shape}
-        if self._sdk is not None:
+        if self.connection.is_open:
             described |= {"shutter_now": self._shutter, "em_gain_now": self._em_gain, "temperature_k": None}
             with suppress(DeviceError):  # the camera acquires, or measures no temperature
                 described["temperature_k"] = round(self._read_temperature()[1], 2)
@@ -129,49 +132,36 @@ class AndorCamera(CameraDriver):
     # open and close
 
     def _connect(self) -> None:
-        settings, andor = self._settings, load_pylablib(self._name)
-        indices = self.library.connect(andor)
-        self._sdk = sdk = Sdk(self._name, andor, self.library.folder)
-        sdk.connect(indices, settings.serial, settings.fan)
-        self._reported = set_up(sdk, settings, self._name)
-        self._set_for = None
-        height, width = self._reported["sensor_shape"]
-        self._sensor_shape = (height, width)
-        self._shutter = "none"
-        with sdk.selected() as lib:
-            self._readout_s = _without_rounding(float(lib.GetReadOutTime()), self._readout_s)
-            self._max_exposure_s = min(settings.max_exposure, float(lib.GetMaximumExposure()))
-            if sdk.capabilities.ulFeatures & Features.SHUTTER:
-                closing_ms, opening_ms = lib.GetShutterMinTimes()
-                self._shutter_times_ms = int(closing_ms), int(opening_ms)
-                self._shutter = "closed"
-        self._triggers = self._triggers_of(sdk)
-        self._open_shutter(sdk)
+        settings, connection = self._settings, self.connection
+        connection.open()
+        self._shutter, self._set_for = "none", None
+        with connection.selected() as sdk:
+            if connection.capabilities.ulFeatures & Features.SHUTTER:
+                self._shutter_times_ms = sdk.GetShutterMinTimes()
+                self._shutter = "open"
+                self._close_shutter(sdk)
+            self._reported = set_up(connection, settings, self._name)
+            height, width = self._reported["sensor_shape"]
+            self._sensor_shape = (height, width)
+            self._readout_s = _without_rounding(sdk.GetReadOutTime(), self._readout_s)
+            self._max_exposure_s = min(settings.max_exposure, sdk.GetMaximumExposure())
+        self._triggers = self._find_triggers()
+        self._open_shutter()
 
-    def _triggers_of(self, sdk: Sdk) -> tuple[str, ...]:
+    def _find_triggers(self) -> tuple[str, ...]:
         """The triggers that the camera has; with frame transfer, bulb has capabilities of its own."""
-        flags, features = sdk.capabilities.ulTriggerModes, sdk.capabilities.ulFeatures
-        found = [name for name, (_, flag) in TRIGGERS.items() if flags & flag]
-        if self._settings.frame_transfer and features & BULB_AND_TRANSFER != BULB_AND_TRANSFER:
-            found = [name for name in found if name != "bulb"]
-        if (wanted := self._settings.line_trigger) not in found and wanted != "external":
-            text = f"this camera has no {wanted} trigger with these settings; it has {one_of(found)}"
+        capabilities = self.connection.capabilities
+        triggers = [name for name, (_, flag) in TRIGGERS.items() if capabilities.ulTriggerModes & flag]
+        lacks_both = capabilities.ulFeatures & BULB_AND_TRANSFER != BULB_AND_TRANSFER
+        if self._settings.frame_transfer and lacks_both and "bulb" in triggers:
+            triggers.remove("bulb")
+        if (wanted := self._settings.line_trigger) not in triggers and wanted != "external":
+            text = f"this camera has no {wanted} trigger with these settings; it has {one_of(triggers)}"
             raise DeviceError(self._name, f"{text}; set another `line_trigger`")
-        return tuple(found)
+        return tuple(triggers)
 
     def _disconnect(self) -> None:
-        sdk, self._sdk = self._sdk, None
-        if sdk is not None:
-            if sdk.camera is not None:
-                sdk.attempt(self._leave_cooler)
-            sdk.disconnect()
-        self.library.disconnect()
-
-    def _leave_cooler(self, lib: Any) -> None:
-        keep = self._settings.cooler_after_close == "keep"
-        lib.SetCoolerMode(int(keep))
-        if not keep:
-            lib.CoolerOFF()
+        self.connection.close()
 
     # temperature
 
@@ -203,47 +193,48 @@ class AndorCamera(CameraDriver):
 
     def _read_temperature(self) -> tuple[int, float]:
         """The SDK's status of the cooling, and the temperature in kelvins."""
-        with self._opened().selected() as lib:
-            status, celsius = lib.GetTemperatureF()
-        return int(status), float(celsius) + ZERO_CELSIUS_K
+        with self.connection.selected() as sdk:
+            status, celsius = sdk.GetTemperatureF()
+        return status, celsius + ZERO_CELSIUS_K
 
     # a series
 
     def _start(self, series: Series) -> None:
-        sdk = self._opened()
-        with sdk.selected() as lib:
-            exposure_s = self._set_series(sdk, lib, series)
+        with self.connection.selected() as sdk:
+            exposure_s = self._set_series(sdk, series)
         if exposure_s > MAX_LENGTHENING * series.exposure_s:
             requested, shortest = (format_quantity(s, "time") for s in (series.exposure_s, exposure_s))
             hint = "with frame transfer it cannot be shorter than the read-out"
             raise LimitError(f"{self._name}: exposure", requested, f"at least {shortest}", hint)
-        self._set_em_gain(sdk, series.em_gain)
-        self._open_shutter(sdk)
+        self._set_em_gain(series.em_gain)
+        self._open_shutter()
         self._clock.sleep(max(0.0, self._shutter_open_at_s - self._clock.now()))
-        with sdk.selected() as lib:
-            lib.PrepareAcquisition()
-            lib.StartAcquisition()
+        with self.connection.selected() as sdk:
+            sdk.PrepareAcquisition()
+            sdk.StartAcquisition()
         self._n_fetched = 0
 
-    def _set_series(self, sdk: Sdk, lib: Any, series: Series) -> float:
+    def _set_series(self, sdk: AndorSdk, series: Series) -> float:
         """Set trigger and times, unless they are set already; returns the exposure that the camera makes."""
         n_frames = 0 if series.trigger == "software" else series.n_frames
         wanted = series.trigger, n_frames, series.exposure_s
-        if wanted != self._set_for:
-            self._set_for = None
-            sdk.camera.set_trigger_mode(TRIGGERS[series.trigger][0])
-            if series.trigger == "software":  # works only in the mode "run till abort"
-                sdk.camera.setup_cont_mode(0)
-            else:
-                cycle_s = self.facts.cycle_s if series.trigger == "external_start" else 0.0
-                sdk.camera.setup_kinetic_mode(n_frames, cycle_s)
-            lib.SetExposureTime(series.exposure_s)
-            exposure_s, _, cycle_s = map(float, lib.GetAcquisitionTimings())
-            if series.trigger == "external_start":
-                self._check_cycle(cycle_s)
-            if series.trigger == "bulb":  # the line makes it, whatever is set
-                exposure_s = series.exposure_s
-            self._set_for, self._exposure_s = wanted, _without_rounding(exposure_s, series.exposure_s)
+        if wanted == self._set_for:
+            return self._exposure_s
+        self._set_for = None
+        sdk.SetTriggerMode(TRIGGERS[series.trigger][0])
+        # the software trigger works only in the mode "run till abort"
+        sdk.SetAcquisitionMode(KINETIC if n_frames else RUN_TILL_ABORT)
+        if n_frames:
+            sdk.SetNumberAccumulations(1)
+            sdk.SetNumberKinetics(n_frames)
+        sdk.SetKineticCycleTime(self.facts.cycle_s if series.trigger == "external_start" else 0.0)
+        sdk.SetExposureTime(series.exposure_s)
+        exposure_s, _, cycle_s = sdk.GetAcquisitionTimings()
+        if series.trigger == "external_start":
+            self._check_cycle(cycle_s)
+        if series.trigger == "bulb":  # the line makes it, whatever is set
+            exposure_s = series.exposure_s
+        self._set_for, self._exposure_s = wanted, _without_rounding(exposure_s, series.exposure_s)
         return self._exposure_s
 
     def _check_cycle(self, made_s: float) -> None:
@@ -253,33 +244,31 @@ class AndorCamera(CameraDriver):
             what = f"{self._name}: cycle_time"
             raise LimitError(what, wanted, f"at least {least} with this exposure and read-out")
 
-    def _set_em_gain(self, sdk: Sdk, em_gain: float) -> None:
+    def _set_em_gain(self, em_gain: float) -> None:
         if self._reported["em_gain_range"] is not None:
             gain = round(em_gain)
-            with sdk.selected() as lib:
-                lib.SetEMCCDGain(gain if gain > 1 else 0)
+            with self.connection.selected() as sdk:
+                sdk.SetEMCCDGain(gain if gain > 1 else 0)
             self._em_gain = gain
 
-    def _open_shutter(self, sdk: Sdk) -> None:
+    def _open_shutter(self) -> None:
         """Start to open the shutter; no effect if it is open, or the camera controls none."""
         if self._shutter == "closed":
             is_auto = self._settings.shutter == "auto"
-            with sdk.selected() as lib:
-                lib.SetShutter(
-                    self._shutter_level, SHUTTER_AUTO if is_auto else SHUTTER_OPEN, *self._shutter_times_ms
-                )
+            with self.connection.selected() as sdk:
+                self._set_shutter(sdk, SHUTTER_AUTO if is_auto else SHUTTER_OPEN)
             self._shutter = self._settings.shutter
             opening_s = 0.0 if is_auto else self._shutter_times_ms[1] / 1e3
             self._shutter_open_at_s = self._clock.now() + opening_s
 
-    @property
-    def _shutter_level(self) -> int:
-        return 1 if self._settings.shutter_opens_at == "high" else 0
+    def _set_shutter(self, sdk: AndorSdk, mode: int) -> None:
+        level = 1 if self._settings.shutter_opens_at == "high" else 0
+        sdk.SetShutter(level, mode, *self._shutter_times_ms)
 
     def _fire(self) -> None:
         try:
-            with self._opened().selected() as lib:
-                lib.SendSoftwareTrigger()
+            with self.connection.selected() as sdk:
+                sdk.SendSoftwareTrigger()
         except DeviceError as error:
             if code_of(error) != Code.ERROR_CODES:
                 raise
@@ -289,33 +278,33 @@ class AndorCamera(CameraDriver):
     def _take(self, timeout_s: float) -> ExposureResult | None:
         if self._n_fetched is None:
             return None
-        return self.library.wait(self._look, timeout_s)
+        return self.connection.wait(self._look, timeout_s)
 
     def _look(self, wait_s: float) -> ExposureResult | None:
         """Fetch the oldest frame; wait for it for at most ``wait_s`` seconds."""
-        sdk, number = self._opened(), self._oldest_number()
+        number = self._oldest_number()
         if number is None and (fault := self._fault()):
             self._n_fetched = (self._n_fetched or 0) + 1
             return ExposureResult(self._n_fetched - 1, None, fault)
-        if number is None and wait_s > 0 and sdk.wait(wait_s):
+        if number is None and wait_s > 0 and self.connection.wait_in_sdk(wait_s):
             number = self._oldest_number()
         return None if number is None else self._fetch(number)
 
     def _oldest_number(self) -> int | None:
         """Number, from 1, of the oldest frame in the SDK's ring buffer that was not fetched."""
         try:
-            with self._opened().selected() as lib:
-                first, _ = lib.GetNumberNewImages()
+            with self.connection.selected() as sdk:
+                first, _ = sdk.GetNumberNewImages()
         except DeviceError as error:
             if code_of(error) == Code.NO_NEW_DATA:
                 return None
             raise
-        return int(first)
+        return first
 
     def _fault(self) -> str:
         """Why no further frame will come; empty if no reason is known."""
-        with self._opened().selected() as lib:
-            status = int(lib.GetStatus())
+        with self.connection.selected() as sdk:
+            status = sdk.GetStatus()
         if status in GONE:
             raise DeviceError(self._name, explain("GetStatus", status))
         if status in OVERRUN:
@@ -323,16 +312,15 @@ class AndorCamera(CameraDriver):
         return ""
 
     def _fetch(self, number: int) -> ExposureResult:
-        sdk = self._opened()
-        height, width = self._settings.mode.frame_shape(self._sensor_shape or (0, 0))
-        with sdk.selected() as lib:
-            pixels, _, _ = lib.GetImages16(number, number, height * width)
+        connection = self.connection
+        image = np.empty(self._settings.mode.frame_shape(self._sensor_shape or (0, 0)), np.uint16)
+        with connection.selected() as sdk:
+            sdk.GetImages16(number, number, image.ctypes.data, image.size)
         self._n_fetched = number
-        image = np.ascontiguousarray(pixels, np.uint16).reshape(height, width)
         time_s = math.nan
-        if sdk.capabilities.ulFeatures & Features.METADATA:
+        if connection.capabilities.ulFeatures & Features.METADATA:
             with suppress(DeviceError):  # a frame without its time stamp is still of use
-                time_s = sdk.time_stamp_s(number - 1)
+                time_s = connection.time_stamp_s(number - 1)
         return ExposureResult(number - 1, image, exposure_s=self._exposure_s, device_time_s=time_s)
 
     def _end(self) -> None:
@@ -342,33 +330,28 @@ class AndorCamera(CameraDriver):
     def _stop(self) -> None:
         self._attempt(_abort, self._turn_gain_off, self._close_shutter)
 
-    def _attempt(self, *actions: Callable[[Any], object]) -> None:
+    def _attempt(self, *actions: Callable[[AndorSdk], object]) -> None:
         """Make a wait return, then run all actions, even if some fail."""
-        sdk, self._n_fetched = self._sdk, None
-        if sdk is not None and sdk.camera is not None:
-            failure = sdk.attempt(lambda lib: lib.CancelWait(), *actions)
+        self._n_fetched = None
+        if self.connection.is_open:
+            failure = self.connection.attempt(lambda sdk: sdk.CancelWait(), *actions)
             if failure is not None:
                 raise failure
 
-    def _turn_gain_off(self, lib: Any) -> None:
+    def _turn_gain_off(self, sdk: AndorSdk) -> None:
         if self._reported.get("em_gain_range") is not None:
-            lib.SetEMCCDGain(0)
+            sdk.SetEMCCDGain(0)
             self._em_gain = 1
 
-    def _close_shutter(self, lib: Any) -> None:
+    def _close_shutter(self, sdk: AndorSdk) -> None:
         if self._shutter != "none":
-            lib.SetShutter(self._shutter_level, SHUTTER_CLOSED, *self._shutter_times_ms)
+            self._set_shutter(sdk, SHUTTER_CLOSED)
             self._shutter = "closed"
 
-    def _opened(self) -> Sdk:
-        if self._sdk is None:
-            raise DeviceError(self._name, "not open; call open() first")
-        return self._sdk
 
-
-def _abort(lib: Any) -> None:
-    if int(lib.GetStatus()) == Code.ACQUIRING:
-        lib.AbortAcquisition()
+def _abort(sdk: AndorSdk) -> None:
+    if sdk.GetStatus() == Code.ACQUIRING:
+        sdk.AbortAcquisition()
 
 
 def _without_rounding(value: float, wanted: float) -> float:

@@ -22,7 +22,6 @@ class Code(IntEnum):
     TEMP_STABILIZED = 20036
     TEMP_NOT_REACHED = 20037
     TEMP_DRIFT = 20040
-    GENERAL_ERRORS = 20049
     P1INVALID = 20066
     P2INVALID = 20067
     P3INVALID = 20068
@@ -42,14 +41,10 @@ class Code(IntEnum):
 class AcqModes(IntFlag):
     """Acquisition modes that a camera has (``ulAcqModes``)."""
 
-    SINGLE = 1
-    VIDEO = 2
-    ACCUMULATE = 4
-    KINETIC = 8
     FRAMETRANSFER = 16
 
 
-class Triggers(IntFlag):
+class TriggerModes(IntFlag):
     """Triggers that a camera has (``ulTriggerModes``); CONTINUOUS is the software trigger."""
 
     INTERNAL = 1
@@ -57,7 +52,6 @@ class Triggers(IntFlag):
     CONTINUOUS = 8
     EXTERNALSTART = 16
     EXTERNALEXPOSURE = 32
-    INVERTED = 64
 
 
 class SetFunctions(IntFlag):
@@ -66,7 +60,6 @@ class SetFunctions(IntFlag):
     VREADOUT = 0x01
     HREADOUT = 0x02
     TEMPERATURE = 0x04
-    EMCCDGAIN = 0x10
     BASELINECLAMP = 0x20
     PREAMPGAIN = 0x200
     CROPMODE = 0x400
@@ -74,20 +67,9 @@ class SetFunctions(IntFlag):
     EXTENDED_CROP_MODE = 0x10000000
 
 
-class GetFunctions(IntFlag):
-    """What can be read (``ulGetFunctions``)."""
-
-    TEMPERATURE = 0x01
-    TEMPERATURERANGE = 0x04
-    DETECTORSIZE = 0x08
-    EMCCDGAIN = 0x20
-    BASELINECLAMP = 0x8000
-
-
 class Features(IntFlag):
     """Other features of a camera (``ulFeatures``)."""
 
-    POLLING = 1
     SHUTTER = 8
     FANCONTROL = 128
     FTEXTERNALEXPOSURE = 0x1000
@@ -103,18 +85,27 @@ FULL_IMAGE: Final = 4
 """Mode of ``SetReadMode`` that reads images."""
 SHUTTER_AUTO, SHUTTER_OPEN, SHUTTER_CLOSED = 0, 1, 2
 """Modes of ``SetShutter``."""
+INTERNAL, EXTERNAL, EXTERNAL_START, EXTERNAL_EXPOSURE, SOFTWARE = 0, 1, 6, 7, 10
+"""Modes of ``SetTriggerMode``."""
+KINETIC, RUN_TILL_ABORT = 3, 5
+"""Modes of ``SetAcquisitionMode``."""
+SDK_VERSION: Final = 0x40000000
+"""What ``GetVersionInfo`` tells."""
 
 GONE: Final = frozenset({Code.ERROR_ACK, Code.USBERROR, Code.ERROR_NOCAMERA, Code.NOT_INITIALIZED})
 """Codes of a camera that no longer answers."""
 OVERRUN: Final = frozenset({Code.ACQ_BUFFER, Code.ACQ_DOWNFIFO_FULL, Code.SPOOLERROR})
 """Codes of an acquisition that ended because the computer did not take the data in time."""
 
+TEMPERATURE_STATUS: Final = frozenset(code for code in Code if code.name.startswith("TEMP_"))
+"""Codes by which ``GetTemperatureF`` tells the status of the cooling."""
+
 _UNPLUGGED: Final = "the camera does not answer any more; look at its power and its cable, then start again"
 _IN_USE: Final = (
     "the camera is there but cannot be used; close Solis and every other program that uses it, and if none "
     "does, switch the camera off and on"
 )
-_MEANINGS: Final = {
+_MEANINGS: Final[dict[int, str]] = {
     Code.ERROR_ACK: _UNPLUGGED,
     Code.USBERROR: _UNPLUGGED,
     Code.NOT_INITIALIZED: _UNPLUGGED,
@@ -127,7 +118,8 @@ _MEANINGS: Final = {
 }
 
 
-def explain(function: str, code: int, code_name: str = "") -> str:
+def explain(function: str, code: int) -> str:
     """What a return code means for a user, with the function and the code at the end."""
-    meaning = next((text for known, text in _MEANINGS.items() if known == code), "Andor's SDK refuses")
-    return f"{meaning} ({function} gave {f'{code}, {code_name}' if code_name else code})"
+    name = f", DRV_{Code(code).name}" if code in frozenset(Code) else ""
+    meaning = _MEANINGS.get(code, "Andor's SDK refuses")
+    return f"{meaning} ({function} gave {code}{name})"

@@ -1,163 +1,234 @@
-"""One camera of the SDK: each call selects the camera, and each failure is a DeviceError."""
+"""Andor's SDK2, called by ctypes: its functions as methods that return what C writes through pointers."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
+import os
+import sys
+from collections.abc import Callable
+from functools import lru_cache, partial
+from pathlib import Path
+from threading import RLock
 from typing import Any, Final
 
 from labseq.plugin import DeviceError
-from labseq_andor.codes import Code, explain
+from labseq_andor.codes import TEMPERATURE_STATUS, Code, explain
 
-MAX_STOP_S: Final = 0.2
-"""How long to wait for a call that hangs before the camera is stopped regardless, in seconds."""
-
-MAX_CALL_S: Final = 2.0
-"""How long to wait for another thread's call to return, in seconds."""
+OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"
+TEXT_BYTES: Final = 256
+"""Size of the buffers for texts."""
 
 
-class Sdk:
-    """pylablib's camera, and the SDK functions that pylablib does not wrap.
+class Capabilities(ctypes.Structure):
+    """The SDK's structure of what a camera can do; its numbers have 32 bits on every system."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_uint32)
+        for name in (
+            *("ulSize", "ulAcqModes", "ulReadModes", "ulTriggerModes", "ulCameraType", "ulPixelMode"),
+            *("ulSetFunctions", "ulGetFunctions", "ulFeatures", "ulPCICard", "ulEMGainCapability"),
+            *("ulFTReadModes", "ulFeatures2"),
+        )
+    )
+
+
+TYPES: Final[dict[str, Any]] = {
+    "i": ctypes.c_int32,
+    "u": ctypes.c_uint32,
+    "f": ctypes.c_float,
+    "p": ctypes.c_void_p,
+    "c": Capabilities,
+    "s": ctypes.c_char * TEXT_BYTES,
+    "n": ctypes.c_char * TEXT_BYTES,
+}
+"""C types of the letters in :data:`SIGNATURES`."""
+
+SIGNATURES: Final[dict[str, str]] = {
+    # cameras
+    "GetAvailableCameras": " i",
+    "GetCameraHandle": "i i",
+    "GetCurrentCamera": " i",
+    "SetCurrentCamera": "i ",
+    "Initialize": "p ",
+    "ShutDown": " ",
+    "GetVersionInfo": "i n",
+    "GetHeadModel": " s",
+    "GetCameraSerialNumber": " i",
+    "GetHardwareVersion": " uuuuuu",
+    "GetCapabilities": " c",
+    "GetDetector": " ii",
+    # amplifiers and speeds
+    "GetNumberADChannels": " i",
+    "GetBitDepth": "i i",
+    "SetADChannel": "i ",
+    "GetNumberAmp": " i",
+    "GetAmpDesc": "i n",
+    "SetOutputAmplifier": "i ",
+    "GetNumberHSSpeeds": "ii i",
+    "GetHSSpeed": "iii f",
+    "SetHSSpeed": "ii ",
+    "GetNumberPreAmpGains": " i",
+    "GetPreAmpGain": "i f",
+    "IsPreAmpGainAvailable": "iiii i",
+    "SetPreAmpGain": "i ",
+    "GetNumberVSSpeeds": " i",
+    "GetVSSpeed": "i f",
+    "GetFastestRecommendedVSSpeed": " if",
+    "SetVSSpeed": "i ",
+    "SetBaselineClamp": "i ",
+    # EM gain
+    "SetEMGainMode": "i ",
+    "SetEMAdvanced": "i ",
+    "GetEMGainRange": " ii",
+    "SetEMCCDGain": "i ",
+    # temperature
+    "GetTemperatureRange": " ii",
+    "SetTemperature": "i ",
+    "GetTemperatureF": " f",
+    "CoolerON": " ",
+    "CoolerOFF": " ",
+    "SetCoolerMode": "i ",
+    "SetFanMode": "i ",
+    # region and shutter
+    "SetReadMode": "i ",
+    "SetImage": "iiiiii ",
+    "SetIsolatedCropMode": "iiiii ",
+    "SetIsolatedCropModeEx": "iiiiiii ",
+    "SetFrameTransferMode": "i ",
+    "GetShutterMinTimes": " ii",
+    "SetShutter": "iiii ",
+    # times and triggers
+    "GetReadOutTime": " f",
+    "GetMaximumExposure": " f",
+    "SetExposureTime": "f ",
+    "SetAcquisitionMode": "i ",
+    "SetNumberAccumulations": "i ",
+    "SetNumberKinetics": "i ",
+    "SetKineticCycleTime": "f ",
+    "GetAcquisitionTimings": " fff",
+    "SetTriggerMode": "i ",
+    "SetTriggerInvert": "i ",
+    "SetFastExtTrigger": "i ",
+    "SetMetaData": "i ",
+    # acquisition
+    "PrepareAcquisition": " ",
+    "StartAcquisition": " ",
+    "AbortAcquisition": " ",
+    "SendSoftwareTrigger": " ",
+    "GetStatus": " i",
+    "WaitForAcquisitionByHandleTimeOut": "ii ",
+    "CancelWait": " ",
+    "GetNumberNewImages": " ii",
+    "GetImages16": "iipu ii",
+    "GetMetaDataInfo": "ppu ",
+}
+"""Types of the functions, by name: letters of what is passed, a space, those of what pointers lead to.
+
+They follow Andor's header: ``i`` int or at_32, ``u`` unsigned int or at_u32, ``f`` float, ``p`` any pointer,
+``c`` :class:`Capabilities`, ``s`` text, ``n`` text whose length is passed, too.
+"""
+
+
+class AndorError(Exception):
+    """A function of the SDK returned another code than success.
 
     Attributes:
-        camera: pylablib's ``AndorSDK2Camera``; None unless it is open.
-        capabilities: The SDK's structure of the camera's capabilities.
+        code: The code.
     """
 
-    def __init__(self, name: str, andor: Any, folder: str) -> None:
-        self._name = name
-        self._andor = andor
-        self._folder = folder
-        self._lock: Any = vars(andor)["_camsel_lock"]  # the SDK has one selected camera per process
-        self.camera: Any = None
-        self.capabilities: Any = None
+    def __init__(self, function: str, code: int) -> None:
+        self.code = code
+        super().__init__(explain(function, code))
 
-    def connect(self, indices: Sequence[int] | None, serial: int, fan: str) -> None:
-        """Open the camera with a serial number; 0: the only one. ``indices`` are places in the SDK's list."""
-        with self._translated_errors():
-            indices = range(int(self._andor.get_cameras_number())) if indices is None else indices
-        if not indices:
-            text = "no Andor camera is connected; look at its power and its cable, and close Solis"
-            raise DeviceError(self._name, text)
-        if serial == 0 and len(indices) > 1:
-            text = f"{len(indices)} Andor cameras are connected; choose one by `serial`"
-            raise DeviceError(self._name, text)
-        seen: list[int] = []
-        for index in indices:
-            self._open(index, fan)
-            seen.append(int(self.camera.device_info.serial_number))
-            if serial in (0, seen[-1]):
-                return
-            self.attempt(lambda lib: lib.SetCoolerMode(1))  # leave the other camera cold
-            self.disconnect()
-        numbers = " and ".join(str(number) for number in seen)
-        text = f"the connected camera has the serial number {numbers}; expected {serial}"
-        raise DeviceError(self._name, f"{text}; change `serial`, or connect the other one")
 
-    def _open(self, index: int, fan: str) -> None:
-        try:
-            with self._translated_errors():
-                # temperature=0 leaves the cooler as it is; without it pylablib would switch the cooler on
-                self.camera = self._andor.AndorSDK2Camera(index, self._folder, temperature=0, fan_mode=fan)
-        except (TypeError, ValueError, LookupError) as error:  # pylablib does not check what the SDK returns
-            text = f"pylablib cannot open this camera: {error}"
-            hint = "is it an EMCCD, and Andor's SDK2 of the newest version?"
-            raise DeviceError(self._name, f"{text}; {hint}") from error
-        self.capabilities = self.camera.capabilities
+class AndorSdk:
+    """The functions in :data:`SIGNATURES` as methods: ``sdk.GetReadOutTime()`` returns the time.
 
-    def disconnect(self) -> None:
-        """Release the camera; failures are ignored, since nothing can be done about them."""
-        camera, self.camera = self.camera, None
-        if camera is not None and self._lock.acquire(timeout=MAX_STOP_S):
-            try:
-                with suppress(self._andor.AndorError):
-                    camera.close()
-            finally:
-                self._lock.release()
+    Methods return nothing, a value or a tuple of values, and raise :class:`AndorError`.
 
-    @contextmanager
-    def selected(self) -> Generator[Any]:
-        """Within the block, pylablib's SDK functions act on this camera."""
-        if not self._lock.acquire(timeout=MAX_CALL_S):
-            raise DeviceError(self._name, "a call to Andor's SDK does not return; restart labseq")
-        try:
-            with self._translated_errors():
-                self._select()
-                yield self._andor.lib
-        finally:
-            self._lock.release()
+    Args:
+        library: Andor's library, loaded, or the simulated one: its attributes are the C functions.
 
-    def attempt(self, *actions: Callable[[Any], object]) -> DeviceError | None:
-        """Run all actions even if some fail, also while another thread hangs in a call.
+    Attributes:
+        lock: Held while a camera is selected and used, since the SDK has one selected camera.
+        n_open: Number of cameras that are open.
+    """
 
-        Returns:
-            The first failure; None if there was none.
-        """
-        first: DeviceError | None = None
-        has_lock = self._lock.acquire(timeout=MAX_STOP_S)
-        try:
-            for action in actions:
-                try:
-                    with self._translated_errors():
-                        self._select()
-                        action(self._andor.lib)
-                except DeviceError as error:
-                    first = first or error
-        finally:
-            if has_lock:
-                self._lock.release()
-        return first
+    def __init__(self, library: Any) -> None:
+        self._library = library
+        self.lock = RLock()
+        self.n_open = 0
 
-    def raw(self, function: str, *arguments: Any) -> None:
-        """Call a function of the library that pylablib does not wrap; within :meth:`selected`."""
-        code = int(getattr(self._andor.lib.lib, function)(*arguments))
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        inputs, outputs = SIGNATURES[name].split(" ")
+        function = getattr(self._library, name, None)
+        if function is None:
+            return partial(self._missing, name)
+        types = [TYPES[letter] for letter in inputs]
+        for letter in outputs:
+            types += _pointer_types(letter)
+        function.argtypes, function.restype = types, ctypes.c_uint
+        method = partial(self._call, name, function, outputs)
+        setattr(self, name, method)
+        return method
+
+    def _call(self, name: str, function: Callable[..., int], outputs: str, *inputs: Any) -> Any:
+        places = [TYPES[letter]() for letter in outputs]
+        pointers: list[Any] = []
+        for letter, place in zip(outputs, places, strict=True):
+            if letter == "c":
+                place.ulSize = ctypes.sizeof(place)
+            is_text = letter in "sn"
+            pointers += [place if is_text else ctypes.pointer(place)]
+            pointers += [TEXT_BYTES] if letter == "n" else []
+        code = function(*inputs, *pointers)
+        values = tuple(_value(place) for place in places)
+        if code in TEMPERATURE_STATUS:
+            return code, *values
         if code != Code.SUCCESS:
-            raise self._andor.AndorSDK2LibError(function, code)
+            raise AndorError(name, code)
+        return values[0] if len(values) == 1 else values
 
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for the next frame without blocking other calls; False if none came."""
-        try:
-            with self._translated_errors():
-                handle = self.camera.handle
-                self._andor.lib.WaitForAcquisitionByHandleTimeOut(handle, round(timeout_s * 1e3))
-        except DeviceError as error:
-            if code_of(error) == Code.NO_NEW_DATA:
-                return False
-            raise
-        return True
-
-    def time_stamp_s(self, index: int) -> float:
-        """The camera's time stamp of a frame counted from 0, in seconds from the start of the series."""
-        since_start_ms, start = ctypes.c_float(), (ctypes.c_uint16 * 8)()
-        with self.selected():
-            self.raw("GetMetaDataInfo", ctypes.byref(start), ctypes.byref(since_start_ms), index)
-        return since_start_ms.value / 1e3
-
-    def version(self) -> str:
-        """The SDK's version."""
-        with self._translated_errors():
-            return str(self._andor.get_SDK_version())
-
-    def _select(self) -> None:
-        if self.camera is None:
-            raise DeviceError(self._name, "not connected")
-        lib, handle = self._andor.lib, self.camera.handle
-        if lib.GetCurrentCamera() != handle:
-            lib.SetCurrentCamera(handle)
-
-    @contextmanager
-    def _translated_errors(self) -> Generator[None]:
-        try:
-            yield
-        except self._andor.AndorError as error:
-            code = getattr(error, "code", None)
-            if not isinstance(code, int):
-                raise DeviceError(self._name, str(error) or type(error).__name__) from error
-            function, code_name = str(getattr(error, "func", "a function")), str(getattr(error, "name", ""))
-            raise DeviceError(self._name, explain(function, code, code_name)) from error
+    def _missing(self, name: str, *_inputs: Any) -> Any:
+        raise AndorError(name, Code.NOT_SUPPORTED)
 
 
-def code_of(error: DeviceError) -> int:
-    """The SDK's return code that caused an error; 0 if there is none."""
-    return int(getattr(error.__cause__, "code", 0))
+def _pointer_types(letter: str) -> list[Any]:
+    if letter in "sn":
+        return [ctypes.c_char_p, ctypes.c_int32][: 1 + (letter == "n")]
+    return [ctypes.POINTER(TYPES[letter])]
+
+
+def _value(place: Any) -> Any:
+    value = getattr(place, "value", place)  # a structure has none
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
+def load_sdk(name: str, path: str) -> AndorSdk:
+    """Load Andor's library from a file, or, without one, from where Andor's installers put it.
+
+    Args:
+        name: Name of the camera in the profile, for errors.
+        path: The file; empty: search.
+    """
+    try:
+        return _loaded(path or _installed())
+    except OSError as error:
+        which = f"'{path or _installed()}' cannot be loaded ({str(error).splitlines()[0]})"
+        what = "install Andor SDK2 or Solis for this system, or give the library's file as `sdk`"
+        raise DeviceError(name, f"Andor's library {which}; {what}; {OTHERWISE}") from error
+
+
+@lru_cache(maxsize=8)
+def _loaded(path: str) -> AndorSdk:
+    return AndorSdk(getattr(ctypes, "WinDLL", ctypes.CDLL)(path))
+
+
+def _installed() -> str:
+    if sys.platform != "win32":
+        return "libandor.so"
+    bits = 8 * ctypes.sizeof(ctypes.c_void_p)
+    programs = Path(os.environ.get("PROGRAMFILES", r"C:\Program Files"))
+    names = f"atmcd{bits}d_legacy.dll", f"atmcd{bits}d.dll"
+    files = [programs / folder / name for folder in ("Andor SOLIS", "Andor SDK") for name in names]
+    return str(next((file for file in files if file.is_file()), names[1]))

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import Any, Final
 
 from labseq.plugin import ConfigError, DeviceError, format_quantity
 from labseq.plugin.messages import one_of
 from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_andor.codes import EM_GAIN_REAL, FULL_IMAGE, REAL_GAIN_MODE, AcqModes, Features, SetFunctions
-from labseq_andor.sdk import Sdk
+from labseq_andor.connection import AndorConnection
+from labseq_andor.sdk import AndorSdk, Capabilities
 from labseq_andor.settings import HIGH_GAIN, AndorSettings
 
 NEAR: Final = 0.02
 """Largest relative difference between a speed and the setting for it: the SDK gives speeds as float32."""
 
 
-def set_up(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
+def set_up(connection: AndorConnection, settings: AndorSettings, name: str) -> dict[str, Any]:
     """Set what stays the same in all series, with the shutter closed and without EM gain.
 
     Returns:
@@ -26,61 +29,104 @@ def set_up(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
         DeviceError: Another model than the settings say, or a setting that the camera does not have.
         ConfigError: The region does not fit the sensor.
     """
-    info = sdk.camera.device_info
-    model = str(info.head_model)
-    if not model.upper().startswith(settings.model.upper()):
-        text = f"the connected camera is a {model}; expected a model that begins with {settings.model}"
-        raise DeviceError(name, f"{text}; change `model`, or connect the other one")
-    with sdk.selected() as lib:
-        width, height = sdk.camera.get_detector_size()
-        *_, version, build = lib.GetHardwareVersion()
-    if conflict := settings.sensor_conflict((height, width)):
-        raise ConfigError(f"{name}: {conflict}")
-    facts: dict[str, Any] = {
-        "model": model,
-        "serial_number": str(info.serial_number),
-        "firmware": f"{version}.{build}",
-        "sdk_version": sdk.version(),
-        "sensor_shape": [height, width],
-    }
-    with sdk.selected() as lib:
-        facts |= _set_amplifier(sdk.camera, settings, name)
-        facts |= _set_cooler(sdk, settings, name)
-        _set_options(sdk, lib, settings, name)
-        _set_region(sdk, lib, settings, (height, width), name)
-        facts["em_gain_range"] = _set_gain_mode(sdk, lib, settings, name)
-    return facts
+    capabilities = connection.capabilities
+    with connection.selected() as sdk:
+        model = sdk.GetHeadModel()
+        if not model.upper().startswith(settings.model.upper()):
+            text = f"the connected camera is a {model}; expected a model that begins with {settings.model}"
+            raise DeviceError(name, f"{text}; change `model`, or connect the other one")
+        width, height = sdk.GetDetector()
+        if conflict := settings.sensor_conflict((height, width)):
+            raise ConfigError(f"{name}: {conflict}")
+        *_, version, build = sdk.GetHardwareVersion()
+        return {
+            "model": model,
+            "serial_number": str(connection.serial),
+            "firmware": f"{version}.{build}",
+            "sdk_version": connection.version(),
+            "sensor_shape": [height, width],
+            **_set_amplifier(sdk, capabilities, settings, name),
+            **_set_cooler(sdk, capabilities, settings, name),
+            **_set_options(sdk, capabilities, settings, name),
+            **_set_region(sdk, capabilities, settings, (height, width), name),
+            "em_gain_range": _set_gain_mode(sdk, capabilities, settings, name),
+        }
 
 
-def _set_amplifier(camera: Any, settings: AndorSettings, name: str) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class AmpMode:
+    """A way to read the sensor, with the SDK's numbers for it.
+
+    Attributes:
+        channel: Number of the converter.
+        amplifier: Number of the amplifier.
+        rate: Number of the read-out rate.
+        preamp: Number of the pre-amplifier's gain.
+        rate_hz: Pixels per second.
+        preamp_gain: Gain of the pre-amplifier.
+    """
+
+    channel: int
+    amplifier: int
+    rate: int
+    preamp: int
+    rate_hz: float
+    preamp_gain: float
+
+
+def _amp_modes(sdk: AndorSdk, amplifier: int) -> Iterator[AmpMode]:
+    """The ways to read the sensor with an amplifier."""
+    for channel in range(sdk.GetNumberADChannels()):
+        rates, preamps = range(sdk.GetNumberHSSpeeds(channel, amplifier)), range(sdk.GetNumberPreAmpGains())
+        for rate, preamp in product(rates, preamps):
+            if sdk.IsPreAmpGainAvailable(channel, amplifier, rate, preamp):
+                rate_hz = sdk.GetHSSpeed(channel, amplifier, rate) * 1e6
+                yield AmpMode(channel, amplifier, rate, preamp, rate_hz, sdk.GetPreAmpGain(preamp))
+
+
+def _set_amplifier(
+    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
+) -> dict[str, Any]:
     """Choose amplifier, read-out rate, pre-amplifier gain and shift speed."""
     kind = "conventional" if settings.amplifier == "conventional" else "multiplying"
-    all_modes = camera.get_all_amp_modes()
-    modes = [mode for mode in all_modes if kind in str(mode.oamp_kind).lower()]
-    if not modes:
-        kinds = one_of(sorted({str(mode.oamp_kind) for mode in all_modes}))
-        raise DeviceError(name, f"this camera has no amplifier of that kind; it has {kinds}")
-    rates_hz = [float(mode.hsspeed_MHz) * 1e6 for mode in modes]
-    wanted_hz = settings.readout_rate or max(rates_hz)
-    rate_hz = _nearest(rates_hz, wanted_hz, "readout_rate", "frequency", name)
-    modes = [mode for mode, its_hz in zip(modes, rates_hz, strict=True) if its_hz == rate_hz]
-    gains = [float(mode.preamp_gain) for mode in modes]
+    amplifiers = [sdk.GetAmpDesc(number) for number in range(sdk.GetNumberAmp())]
+    number = next((n for n, described in enumerate(amplifiers) if kind in described.lower()), None)
+    if number is None:
+        text = f"this camera has no amplifier of that kind; it has {one_of(sorted(amplifiers))}"
+        raise DeviceError(name, text)
+    modes = list(_amp_modes(sdk, number))
+    rates_hz = [mode.rate_hz for mode in modes]
+    rate_hz = _nearest(rates_hz, settings.readout_rate or max(rates_hz), "readout_rate", "frequency", name)
+    modes = [mode for mode in modes if mode.rate_hz == rate_hz]
+    gains = [mode.preamp_gain for mode in modes]
     gain = _nearest(gains, settings.preamp_gain or gains[0], "preamp_gain", "", name)
     mode = modes[gains.index(gain)]
-    camera.set_amp_mode(mode.channel, mode.oamp, mode.hsspeed, mode.preamp)
-    shifts_us = [float(speed) for speed in camera.get_all_vsspeeds()]
-    index = camera.get_max_vsspeed()
-    if settings.vertical_shift_speed is not None:
-        wanted_us = settings.vertical_shift_speed * 1e6
-        index = shifts_us.index(_nearest(shifts_us, wanted_us, "vertical_shift_speed", "us", name))
-    camera.set_vsspeed(index)
+    sdk.SetADChannel(mode.channel)
+    sdk.SetOutputAmplifier(mode.amplifier)
+    if capabilities.ulSetFunctions & SetFunctions.HREADOUT:
+        sdk.SetHSSpeed(mode.amplifier, mode.rate)
+    if capabilities.ulSetFunctions & SetFunctions.PREAMPGAIN:
+        sdk.SetPreAmpGain(mode.preamp)
     return {
-        "amplifier": str(mode.oamp_kind),
-        "bit_depth": int(mode.channel_bitdepth),
+        "amplifier": amplifiers[number],
+        "bit_depth": sdk.GetBitDepth(mode.channel),
         "readout_rate_hz": rate_hz,
         "preamp_gain": gain,
-        "vertical_shift_s": shifts_us[index] * 1e-6,
+        "vertical_shift_s": _set_shift(sdk, capabilities, settings, name),
     }
+
+
+def _set_shift(sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str) -> float:
+    """Choose the time to shift the rows by one; returns it, in seconds."""
+    shifts_us = [sdk.GetVSSpeed(index) for index in range(sdk.GetNumberVSSpeeds())]
+    index, shift_us = sdk.GetFastestRecommendedVSSpeed()
+    if settings.vertical_shift_speed is not None:
+        wanted_us = settings.vertical_shift_speed * 1e6
+        shift_us = _nearest(shifts_us, wanted_us, "vertical_shift_speed", "us", name)
+        index = shifts_us.index(shift_us)
+    if capabilities.ulSetFunctions & SetFunctions.VREADOUT:
+        sdk.SetVSSpeed(index)
+    return shift_us * 1e-6
 
 
 def _nearest(values: Sequence[float], wanted: float, setting: str, unit: str, name: str) -> float:
@@ -98,63 +144,75 @@ def _nearest(values: Sequence[float], wanted: float, setting: str, unit: str, na
     raise DeviceError(name, text)
 
 
-def _set_cooler(sdk: Sdk, settings: AndorSettings, name: str) -> dict[str, Any]:
+def _set_cooler(
+    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
+) -> dict[str, Any]:
     if settings.cooling is None:
         return {}
-    if not sdk.capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
+    if not capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
         raise DeviceError(name, "this camera has no cooler; leave `cooling` out")
     wanted_c = round(settings.cooling.temperature_k - ZERO_CELSIUS_K)
-    low_c, high_c = sdk.camera.get_temperature_range()
+    low_c, high_c = sdk.GetTemperatureRange()
     if not low_c <= wanted_c <= high_c:
         text = f"cooling: temperature is {wanted_c} degC; this camera takes {low_c} to {high_c} degC"
         raise DeviceError(name, text)
-    sdk.camera.set_temperature(wanted_c, enable_cooler=True)
+    sdk.SetTemperature(wanted_c)
+    sdk.CoolerON()
     return {"setpoint_k": wanted_c + ZERO_CELSIUS_K}
 
 
-def _set_options(sdk: Sdk, lib: Any, settings: AndorSettings, name: str) -> None:
-    capabilities = sdk.capabilities
+def _set_options(
+    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
+) -> dict[str, Any]:
     if capabilities.ulSetFunctions & SetFunctions.BASELINECLAMP:
-        lib.SetBaselineClamp(int(settings.baseline_clamp))
+        sdk.SetBaselineClamp(int(settings.baseline_clamp))
     if capabilities.ulFeatures & Features.METADATA:
-        lib.SetMetaData(1)
+        sdk.SetMetaData(1)
     if capabilities.ulAcqModes & AcqModes.FRAMETRANSFER:
-        sdk.camera.enable_frame_transfer_mode(settings.frame_transfer)
+        sdk.SetFrameTransferMode(int(settings.frame_transfer))
     elif settings.frame_transfer:
         raise DeviceError(name, "this camera has no frame transfer; leave `frame_transfer` out")
-    sdk.camera.setup_ext_trigger(invert=settings.trigger_edge == "falling")
+    if settings.trigger_edge == "falling":
+        sdk.SetTriggerInvert(1)
     if settings.fast_trigger:
-        lib.SetFastExtTrigger(1)
+        sdk.SetFastExtTrigger(1)
+    return {}
 
 
 def _set_region(
-    sdk: Sdk, lib: Any, settings: AndorSettings, sensor_shape: tuple[int, int], name: str
-) -> None:
+    sdk: AndorSdk,
+    capabilities: Capabilities,
+    settings: AndorSettings,
+    sensor_shape: tuple[int, int],
+    name: str,
+) -> dict[str, Any]:
     """Set region and binning; after frame transfer, which isolated crop needs."""
     y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
-    binning = settings.binning
-    lib.SetReadMode(FULL_IMAGE)
-    lib.SetImage(binning, binning, x + 1, x + width, y + 1, y + height)
+    binning, functions = settings.binning, capabilities.ulSetFunctions
+    sdk.SetReadMode(FULL_IMAGE)
+    sdk.SetImage(binning, binning, x + 1, x + width, y + 1, y + height)
     if not settings.isolated_crop:
-        return
-    functions = sdk.capabilities.ulSetFunctions
+        return {}
     if functions & SetFunctions.EXTENDED_CROP_MODE:
-        sdk.raw("SetIsolatedCropModeEx", 1, height, width, binning, binning, x + 1, y + 1)
+        sdk.SetIsolatedCropModeEx(1, height, width, binning, binning, x + 1, y + 1)
     elif functions & SetFunctions.CROPMODE and (y, x) == (0, 0):
-        sdk.raw("SetIsolatedCropMode", 1, height, width, binning, binning)
+        sdk.SetIsolatedCropMode(1, height, width, binning, binning)
     else:
         text = "this camera cannot crop this region; with `isolated_crop` it must begin at y: 0, x: 0"
         raise DeviceError(name, f"{text}, if the camera has isolated crop at all")
+    return {}
 
 
-def _set_gain_mode(sdk: Sdk, lib: Any, settings: AndorSettings, name: str) -> list[int] | None:
+def _set_gain_mode(
+    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
+) -> list[int] | None:
     """Choose the mode in which the EM gain is a factor; None for a camera or an amplifier without it."""
-    capabilities = sdk.capabilities
     if settings.amplifier == "em" and capabilities.ulEMGainCapability & EM_GAIN_REAL:
-        lib.SetEMGainMode(REAL_GAIN_MODE)
+        sdk.SetEMGainMode(REAL_GAIN_MODE)
+        sdk.SetEMCCDGain(0)
         if settings.em_gain > HIGH_GAIN and capabilities.ulSetFunctions & SetFunctions.EMADVANCED:
-            lib.SetEMAdvanced(1)
-        low, high = (int(value) for value in lib.GetEMGainRange())
+            sdk.SetEMAdvanced(1)
+        low, high = sdk.GetEMGainRange()
         if settings.em_gain != 1 and not low <= settings.em_gain <= high:
             text = f"`em_gain` is {settings.em_gain}; this camera takes 1 (off) and {low} to {high}"
             raise DeviceError(name, text)

@@ -1,6 +1,6 @@
-"""A simulator of Andor's SDK2 for ``labseq_andor``: an EMCCD camera below the real pylablib."""
+"""A simulator of Andor's SDK2 for ``labseq_andor``: an EMCCD camera behind its functions."""
 
 from labseq_andor_sim.camera import Faults, SimulatedCamera
-from labseq_andor_sim.library import SimulatedAndorLibrary, SimulatedSdk
+from labseq_andor_sim.connection import SimulatedConnection
 
-__all__ = ["Faults", "SimulatedAndorLibrary", "SimulatedCamera", "SimulatedSdk"]
+__all__ = ["Faults", "SimulatedCamera", "SimulatedConnection"]

@@ -1,5 +1,7 @@
 """How the simulated camera acquires series of frames, and the ring buffer that keeps them."""
 
+# ruff: noqa: N802 - the SDK's names
+
 from __future__ import annotations
 
 import ctypes
@@ -7,23 +9,22 @@ import math
 import threading
 import time
 from collections import OrderedDict, deque
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from labseq_andor.codes import Code
-
-from labseq.plugin import Clock, Frame, Trigger
-from labseq.plugin.camera import Series, SimulatedSensor
-from labseq_andor_sim.configuration import (
+from labseq_andor.codes import (
     EXTERNAL,
     EXTERNAL_EXPOSURE,
     EXTERNAL_START,
     INTERNAL,
     SOFTWARE,
-    Timing,
+    Code,
 )
-from labseq_andor_sim.functions import implements, require
+
+from labseq.plugin import Clock, Frame, Trigger
+from labseq.plugin.camera import Series, SimulatedSensor
+from labseq_andor_sim.faults import Faults
+from labseq_andor_sim.settings import Refused, Timing, require
 
 ROUNDING_S: Final = 1e-9
 BUFFER_BYTES: Final = 48 * 2**20
@@ -35,39 +36,6 @@ KINDS: Final[dict[int, Trigger]] = {
     EXTERNAL_EXPOSURE: "bulb",
     SOFTWARE: "software",
 }
-COLDEST_C: Final = -100.0
-"""Lowest temperature that the cooler reaches, in degrees Celsius (ours)."""
-
-
-@dataclass(slots=True)
-class Faults:
-    """Failures to simulate; may be changed at any time.
-
-    Attributes:
-        not_connected: The camera is not there.
-        held: Another program uses it.
-        unplugged: It answers no call any more.
-        unplugged_at: Number of the frame, from 1, at which it is unplugged; 0: never.
-        missed_triggers: How many of the next triggers the camera does not see.
-        late_s: Delay of each frame, in seconds.
-        buffer_error_at: Number of the frame, from 1, that the computer fails to take over; 0: none.
-        buffer_frames: Frames that the ring buffer holds; 0: as many as fit into 48 MiB (ours).
-        coldest_c: Lowest temperature that the cooler reaches, in degrees Celsius.
-        drift_k: How far the sensor has drifted from its temperature, in kelvins.
-        hang: Fetching a frame does not return until this is set; None: it returns.
-    """
-
-    not_connected: bool = False
-    held: bool = False
-    unplugged: bool = False
-    unplugged_at: int = 0
-    missed_triggers: int = 0
-    late_s: float = 0.0
-    buffer_error_at: int = 0
-    buffer_frames: int = 0
-    coldest_c: float = COLDEST_C
-    drift_k: float = 0.0
-    hang: threading.Event | None = None
 
 
 class Acquisition:
@@ -104,10 +72,10 @@ class Acquisition:
         self._busy_until_s = self._started_s = 0.0
         self._cycles_from_s = math.nan
         self._sensor.clear()
-        self._empty_buffer()
+        self.PrepareAcquisition()
 
-    @implements("PrepareAcquisition", "FreeInternalMemory", only_idle=True)
-    def _empty_buffer(self) -> None:
+    def PrepareAcquisition(self) -> None:
+        """Empty the ring buffer."""
         self._buffer: OrderedDict[int, Frame] = OrderedDict()
         self._n_arrived = self.n_fetched = 0
 
@@ -116,14 +84,13 @@ class Acquisition:
         height, width = self._timing.optics.frame_shape
         return self._faults.buffer_frames or max(2, BUFFER_BYTES // (2 * height * width))
 
-    @implements("StartAcquisition", only_idle=True)
-    def _start(self) -> None:
+    def StartAcquisition(self) -> None:
         """Arm the sensor; with the internal trigger the first exposure begins."""
         timing, mode = self._timing, self._timing.sensor_mode
         require(timing.optics.reads_images, Code.INVALID_MODE)
         is_bulb = timing.trigger == EXTERNAL_EXPOSURE
         require(not (is_bulb and timing.optics.frame_transfer), Code.INVALID_MODE)
-        self._empty_buffer()
+        self.PrepareAcquisition()
         series = Series(timing.n_frames, timing.exposure_s, KINDS[timing.trigger], mode.em_gain or 1.0)
         self._sensor.arm(series, mode, timing.readout_s, timing.kinetic_s, self._arm_s)
         self._n_left = timing.n_frames
@@ -133,17 +100,13 @@ class Acquisition:
         self._coming.clear()
         self.proceed()
 
-    @implements("AbortAcquisition")
-    def abort(self) -> Code:
+    def AbortAcquisition(self) -> None:
         """Stop; frames that were not read out are lost."""
-        if not self.is_acquiring:
-            return Code.IDLE
+        require(self.is_acquiring, Code.IDLE)
         self._finish()
         self._sensor.clear()
-        return Code.SUCCESS
 
-    @implements("SendSoftwareTrigger")
-    def _trigger(self) -> None:
+    def SendSoftwareTrigger(self) -> None:
         """Expose; refused during an exposure, or a read-out that cannot overlap with the next exposure."""
         require(self._timing.trigger == SOFTWARE and self._timing.runs_till_abort, Code.INVALID_MODE)
         require(self.is_acquiring, Code.IDLE)
@@ -170,24 +133,21 @@ class Acquisition:
             return math.nan
         return self._cycles_from_s + (self._timing.n_frames - self._n_left) * self._timing.kinetic_s
 
-    @implements("GetStatus", outputs=1)
-    def _get_status(self) -> tuple[int]:
+    def GetStatus(self) -> Code:
         """Idle, acquiring, or why the acquisition ended early."""
         self.proceed()
         idle = self._fault if self._fault != Code.SUCCESS else Code.IDLE
-        return (Code.ACQUIRING if self.is_acquiring else idle,)  # an output, not the return code
+        return Code.ACQUIRING if self.is_acquiring else idle
 
-    @implements("GetNumberNewImages", outputs=2)
-    def _get_new(self) -> tuple[int, int]:
+    def GetNumberNewImages(self) -> tuple[int, int]:
         """Numbers of the first and the last frame that were not fetched."""
         self.proceed()
         new = [number for number in self._buffer if number > self.n_fetched]
         require(new, Code.NO_NEW_DATA)
         return new[0], new[-1]
 
-    @implements("GetImages16", outputs=2, waits=True)
-    def _get_images(self, first: int, last: int, pixels: Any, size: int) -> tuple[int, int]:
-        """Copy frames into an array of ``size`` pixels."""
+    def GetImages16(self, first: int, last: int, pixels: int, size: int) -> tuple[int, int]:
+        """Copy frames to an address with room for ``size`` pixels."""
         if self._faults.hang is not None:
             self.hangs.set()
             self._faults.hang.wait()
@@ -195,44 +155,40 @@ class Acquisition:
         require(last in self._buffer and last >= first, Code.P2INVALID)
         images = [np.ascontiguousarray(self._buffer[number].image) for number in range(first, last + 1)]
         require(size == sum(image.size for image in images), Code.P4INVALID)
-        address = ctypes.addressof(pixels.contents)
         for image in images:
-            ctypes.memmove(address, image.ctypes.data, image.nbytes)
-            address += image.nbytes
+            ctypes.memmove(pixels, image.ctypes.data, image.nbytes)
+            pixels += image.nbytes
         self.n_fetched = max(self.n_fetched, last)
         return first, last
 
-    @implements("SetMetaData", only_idle=True)
     def _set_metadata(self, state: int) -> None:
         """No effect: there are always time stamps."""
         require(state in (0, 1))
 
-    @implements("GetMetaDataInfo")
-    def _get_time_stamp(self, _start: int | None, since_start_ms: Any, index: int) -> None:
+    def GetMetaDataInfo(self, _start: Any, since_start_ms: Any, index: int) -> None:
         """Milliseconds from the start of the series to that of a frame counted from 0."""
         require(index + 1 in self._buffer, Code.P2INVALID)
-        since_start_ms[0] = (self._buffer[index + 1].t_start_s - self._started_s) * 1e3
+        since_start_ms.contents.value = (self._buffer[index + 1].t_start_s - self._started_s) * 1e3
 
-    @implements("WaitForAcquisitionByHandleTimeOut", waits=True)
-    def _wait(self, _handle: int, timeout_ms: int) -> Code:
+    def WaitForAcquisitionByHandleTimeOut(self, _handle: int, timeout_ms: int) -> None:
         """Wait in real time for a frame; on a virtual clock it is there already, or does not come."""
         deadline_s = time.monotonic() + timeout_ms / 1e3
         with self._arrived:
             while True:
                 self.proceed()
                 if self._n_arrived > self.n_fetched:
-                    return Code.SUCCESS
+                    return
                 left_s = deadline_s - time.monotonic()
                 if self._is_cancelled or left_s <= 0:
                     self._is_cancelled = False
-                    return Code.NO_NEW_DATA
+                    raise Refused(Code.NO_NEW_DATA)
                 next_s = 1.0
                 if self._coming and not self._clock.virtual:
                     next_s = max(self._coming[0][0] - self._clock.now(), 1e-4)
                 self._arrived.wait(min(left_s, next_s))
 
-    @implements("CancelWait")
-    def _cancel_wait(self) -> None:
+    def CancelWait(self) -> None:
+        """Make a wait return."""
         with self._arrived:
             self._is_cancelled = True
             self._arrived.notify_all()

@@ -194,7 +194,7 @@ GIVEN: Final[dict[str, Callable[[Path], Given]]] = {
     "docs/how-to/replay-frames.md": _look,
     "docs/how-to/resume-a-run.md": _stopped,
     "docs/how-to/serial-devices.md": _serial,
-    "plugins/labseq_andor/README.md": _andor,
+    "docs/how-to/cameras-andor.md": _andor,
     "plugins/labseq_scans/README.md": lambda to: Given({"n_loadings=500": "n_loadings=2"}),
     "plugins/labseq_single/README.md": lambda to: Given({"(500, 20, 20)": "(2, 20, 20)"}),
 }

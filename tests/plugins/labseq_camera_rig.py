@@ -84,7 +84,7 @@ class Rig:
     @property
     def sim(self) -> Any:
         """The simulated Andor camera."""
-        return self.camera.library.camera
+        return self.camera.connection.camera
 
     @property
     def genicam(self) -> Any:

@@ -1,19 +1,19 @@
-"""The Andor driver with the real pylablib, on the simulator of the SDK: series, cooling, whole runs."""
+"""The Andor driver on the simulator of the SDK: series, cooling, whole runs."""
 
 from __future__ import annotations
 
+import ctypes
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
 import pytest
 from labseq_andor.camera import AndorCamera
-from labseq_andor.codes import Code
+from labseq_andor.codes import SDK_VERSION, Code
 from labseq_andor.heads import HEADS
-from labseq_andor.library import load_pylablib
+from labseq_andor.sdk import AndorError, AndorSdk
 from labseq_andor.settings import AndorSettings
-from labseq_andor_sim import SimulatedSdk
-from labseq_andor_sim.library import FUNCTIONS
 
 from labseq import DeviceError, DeviceTimeoutError, LimitError
 from labseq.plugin import Context
@@ -25,13 +25,6 @@ unopened = partial(Rig, "andor")
 rig = partial(opened_rig, "andor")
 
 COLD: Final[dict[str, Any]] = {"temperature": "-70 degC"}
-
-
-def test_nothing_is_compiled_to_import_pylablib() -> None:
-    load_pylablib("camera")
-    from pylablib.devices.Andor.atcore_lib import read_uint12
-
-    assert read_uint12.signatures == []
 
 
 def test_smaller_regions_and_isolated_crop_are_read_faster() -> None:
@@ -173,8 +166,8 @@ def test_a_drift_is_waited_for_too() -> None:
 
 def test_looking_for_a_serial_number_leaves_other_cameras_cold() -> None:
     lab = unopened(serial=4711)
-    lab.sim.cooler.set_temperature(-70)
-    lab.sim.cooler.switch_on()
+    lab.sim.cooler.SetTemperature(-70)
+    lab.sim.cooler.CoolerON()
     with pytest.raises(DeviceError, match="expected 4711"):
         lab.camera.open()
     assert lab.sim.cooler.is_on
@@ -196,18 +189,31 @@ def test_a_cycle_shorter_than_exposure_and_read_out_is_refused() -> None:
         lab.camera.arm(2, 5e-3, "external_start")
 
 
-def test_the_codes_are_those_of_andors_header() -> None:
-    names = load_pylablib("camera").DRV_STATUS
-    for code in Code:
-        assert names[f"DRV_{code.name}"] == code
+def test_functions_of_a_c_library_get_their_arguments_and_return_what_they_write() -> None:
+    seen: list[Any] = []
 
+    def get_speed(*arguments: Any) -> int:
+        seen.extend(arguments[:3])
+        arguments[3][0] = 17.0
+        return Code.SUCCESS
 
-def test_every_function_of_the_simulator_is_one_that_the_library_has() -> None:
-    define_functions = load_pylablib("camera").atmcd32d_lib.define_functions
-    sdk: Any = SimulatedSdk(define_functions)
-    define_functions(sdk)
-    for name in FUNCTIONS:
-        assert isinstance(getattr(sdk, name).argnames, list), name
+    def get_version(kind: int, text: Any, length: int) -> int:
+        seen.extend((kind, length))
+        ctypes.memmove(text, b"2.104\0", 6)
+        return Code.SUCCESS
+
+    integer, pointer = ctypes.c_int32, ctypes.POINTER(ctypes.c_float)
+    library = SimpleNamespace(
+        GetHSSpeed=ctypes.CFUNCTYPE(ctypes.c_uint, integer, integer, integer, pointer)(get_speed),
+        GetVersionInfo=ctypes.CFUNCTYPE(ctypes.c_uint, integer, ctypes.c_void_p, integer)(get_version),
+        CoolerON=ctypes.CFUNCTYPE(ctypes.c_uint)(lambda: int(Code.NOT_SUPPORTED)),
+    )
+    sdk = AndorSdk(library)
+    assert (sdk.GetHSSpeed(0, 1, 2), sdk.GetVersionInfo(SDK_VERSION)) == (17.0, "2.104")
+    assert seen == [0, 1, 2, SDK_VERSION, 256]
+    for function in (sdk.CoolerON, sdk.CoolerOFF):  # the second is missing, as from an old library
+        with pytest.raises(AndorError, match=r"this camera cannot do that .*20991, DRV_NOT_SUPPORTED"):
+            function()
 
 
 @pytest.mark.parametrize("head", HEADS, ids=lambda head: head.model)
