@@ -140,7 +140,7 @@ class AndorCamera(CameraDriver):
                 self._shutter_times_ms = sdk.GetShutterMinTimes()
                 self._shutter = "open"
                 self._close_shutter(sdk)
-            self._reported = set_up(connection, settings, self._name)
+            self._reported = set_up(connection)
             height, width = self._reported["sensor_shape"]
             self._sensor_shape = (height, width)
             self._readout_s = _without_rounding(sdk.GetReadOutTime(), self._readout_s)

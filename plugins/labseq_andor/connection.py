@@ -10,7 +10,7 @@ from typing import Final
 
 from labseq.plugin import Context, DeviceError, wait_for
 from labseq.plugin.camera import ExposureResult
-from labseq_andor.codes import SDK_VERSION, Code, Features
+from labseq_andor.codes import Code, Features
 from labseq_andor.sdk import AndorError, AndorSdk, Capabilities, load_sdk
 from labseq_andor.settings import SIMULATED, AndorSettings
 
@@ -42,6 +42,8 @@ class AndorConnection:
     """A camera through Andor's library; the simulated camera overrides which library that is.
 
     Attributes:
+        name: Name of the camera in the profile.
+        settings: Its settings.
         head: Head of the camera if it is known before the camera is opened.
         sensor_shape: (height, width) of its sensor, likewise.
         is_open: Whether the camera is open.
@@ -50,8 +52,8 @@ class AndorConnection:
     """
 
     def __init__(self, settings: AndorSettings, context: Context) -> None:
-        self._name = context.name or "camera"
-        self._settings = settings
+        self.name = context.name or "camera"
+        self.settings = settings
         self._clock = context.clock
         self.head = settings.head
         self.sensor_shape = None if self.head is None else self.head.sensor_shape
@@ -70,19 +72,19 @@ class AndorConnection:
 
     def load(self) -> AndorSdk:
         """Andor's library."""
-        return load_sdk(self._name, self._settings.sdk)
+        return load_sdk(self.name, self.settings.sdk)
 
     def open(self) -> None:
         """Open the camera with the serial number of the settings; 0: the only one."""
-        self._sdk, serial, seen = self.load(), self._settings.serial, list[int]()
+        self._sdk, serial, seen = self.load(), self.settings.serial, list[int]()
         with self._translated_errors() as sdk:
             indices = range(sdk.GetAvailableCameras())
         if not indices:
             text = "no Andor camera is connected; look at its power and its cable, and close Solis"
-            raise DeviceError(self._name, text)
+            raise DeviceError(self.name, text)
         if serial == 0 and len(indices) > 1:
             text = f"{len(indices)} Andor cameras are connected; choose one by `serial`"
-            raise DeviceError(self._name, text)
+            raise DeviceError(self.name, text)
         for index in indices:
             self._initialize(index)
             seen.append(self.serial)
@@ -92,7 +94,7 @@ class AndorConnection:
             self._shut_down()
         numbers = " and ".join(str(number) for number in seen)
         text = f"the connected camera has the serial number {numbers}; expected {serial}"
-        raise DeviceError(self._name, f"{text}; change `serial`, or connect the other one")
+        raise DeviceError(self.name, f"{text}; change `serial`, or connect the other one")
 
     def _initialize(self, index: int) -> None:
         with self._translated_errors() as sdk, sdk.lock:
@@ -104,7 +106,7 @@ class AndorConnection:
             self.serial = sdk.GetCameraSerialNumber()
             self.capabilities = sdk.GetCapabilities()
             if self.capabilities.ulFeatures & Features.FANCONTROL:
-                sdk.SetFanMode(("full", "low", "off").index(self._settings.fan))
+                sdk.SetFanMode(("full", "low", "off").index(self.settings.fan))
 
     def close(self) -> None:
         """Release the camera, with the cooler as the settings say; legal in any state."""
@@ -113,7 +115,7 @@ class AndorConnection:
         self._shut_down()
 
     def _leave_cooler(self, sdk: AndorSdk) -> None:
-        keep = self._settings.cooler_after_close == "keep"
+        keep = self.settings.cooler_after_close == "keep"
         sdk.SetCoolerMode(int(keep))
         if not keep:
             sdk.CoolerOFF()
@@ -136,7 +138,7 @@ class AndorConnection:
         """Within the block, the SDK's functions act on this camera."""
         with self._translated_errors() as sdk:
             if not sdk.lock.acquire(timeout=MAX_CALL_S):
-                raise DeviceError(self._name, "a call to Andor's SDK does not return; restart labseq")
+                raise DeviceError(self.name, "a call to Andor's SDK does not return; restart labseq")
             try:
                 self._select(sdk)
                 yield sdk
@@ -187,25 +189,20 @@ class AndorConnection:
             sdk.GetMetaDataInfo(ctypes.pointer(start), ctypes.pointer(since_start_ms), index)
         return since_start_ms.value / 1e3
 
-    def version(self) -> str:
-        """The SDK's version."""
-        with self._translated_errors() as sdk:
-            return str(sdk.GetVersionInfo(SDK_VERSION))
-
     def _select(self, sdk: AndorSdk) -> None:
         if self._handle is None:
-            raise DeviceError(self._name, "not open; call open() first")
+            raise DeviceError(self.name, "not open; call open() first")
         if sdk.GetCurrentCamera() != self._handle:
             sdk.SetCurrentCamera(self._handle)
 
     @contextmanager
     def _translated_errors(self) -> Generator[AndorSdk]:
         if self._sdk is None:
-            raise DeviceError(self._name, "not open; call open() first")
+            raise DeviceError(self.name, "not open; call open() first")
         try:
             yield self._sdk
         except AndorError as error:
-            raise DeviceError(self._name, str(error)) from error
+            raise DeviceError(self.name, str(error)) from error
 
 
 def code_of(error: DeviceError) -> int:

@@ -10,16 +10,24 @@ from typing import Any, Final
 from labseq.plugin import ConfigError, DeviceError, format_quantity
 from labseq.plugin.messages import one_of
 from labseq.plugin.units import ZERO_CELSIUS_K
-from labseq_andor.codes import EM_GAIN_REAL, FULL_IMAGE, REAL_GAIN_MODE, AcqModes, Features, SetFunctions
+from labseq_andor.codes import (
+    EM_GAIN_REAL,
+    FULL_IMAGE,
+    REAL_GAIN_MODE,
+    SDK_VERSION,
+    AcqModes,
+    Features,
+    SetFunctions,
+)
 from labseq_andor.connection import AndorConnection
-from labseq_andor.sdk import AndorSdk, Capabilities
-from labseq_andor.settings import HIGH_GAIN, AndorSettings
+from labseq_andor.sdk import AndorSdk
+from labseq_andor.settings import HIGH_GAIN
 
 NEAR: Final = 0.02
 """Largest relative difference between a speed and the setting for it: the SDK gives speeds as float32."""
 
 
-def set_up(connection: AndorConnection, settings: AndorSettings, name: str) -> dict[str, Any]:
+def set_up(camera: AndorConnection) -> dict[str, Any]:
     """Set what stays the same in all series, with the shutter closed and without EM gain.
 
     Returns:
@@ -29,28 +37,29 @@ def set_up(connection: AndorConnection, settings: AndorSettings, name: str) -> d
         DeviceError: Another model than the settings say, or a setting that the camera does not have.
         ConfigError: The region does not fit the sensor.
     """
-    capabilities = connection.capabilities
-    with connection.selected() as sdk:
+    settings = camera.settings
+    with camera.selected() as sdk:
         model = sdk.GetHeadModel()
         if not model.upper().startswith(settings.model.upper()):
             text = f"the connected camera is a {model}; expected a model that begins with {settings.model}"
-            raise DeviceError(name, f"{text}; change `model`, or connect the other one")
+            raise DeviceError(camera.name, f"{text}; change `model`, or connect the other one")
         width, height = sdk.GetDetector()
         if conflict := settings.sensor_conflict((height, width)):
-            raise ConfigError(f"{name}: {conflict}")
+            raise ConfigError(f"{camera.name}: {conflict}")
         *_, version, build = sdk.GetHardwareVersion()
-        return {
+        reported = {
             "model": model,
-            "serial_number": str(connection.serial),
+            "serial_number": str(camera.serial),
             "firmware": f"{version}.{build}",
-            "sdk_version": connection.version(),
+            "sdk_version": sdk.GetVersionInfo(SDK_VERSION),
             "sensor_shape": [height, width],
-            **_set_amplifier(sdk, capabilities, settings, name),
-            **_set_cooler(sdk, capabilities, settings, name),
-            **_set_options(sdk, capabilities, settings, name),
-            **_set_region(sdk, capabilities, settings, (height, width), name),
-            "em_gain_range": _set_gain_mode(sdk, capabilities, settings, name),
+            **_set_amplifier(sdk, camera),
+            "vertical_shift_s": _set_shift(sdk, camera),
+            "setpoint_k": _set_cooler(sdk, camera),
         }
+        _set_options(sdk, camera)
+        _set_region(sdk, camera, (height, width))
+        return {**reported, "em_gain_range": _set_gain_mode(sdk, camera)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +93,9 @@ def _amp_modes(sdk: AndorSdk, amplifier: int) -> Iterator[AmpMode]:
                 yield AmpMode(channel, amplifier, rate, preamp, rate_hz, sdk.GetPreAmpGain(preamp))
 
 
-def _set_amplifier(
-    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
-) -> dict[str, Any]:
-    """Choose amplifier, read-out rate, pre-amplifier gain and shift speed."""
+def _set_amplifier(sdk: AndorSdk, camera: AndorConnection) -> dict[str, Any]:
+    """Choose amplifier, read-out rate and pre-amplifier gain."""
+    settings, name, functions = camera.settings, camera.name, camera.capabilities.ulSetFunctions
     kind = "conventional" if settings.amplifier == "conventional" else "multiplying"
     amplifiers = [sdk.GetAmpDesc(number) for number in range(sdk.GetNumberAmp())]
     number = next((n for n, described in enumerate(amplifiers) if kind in described.lower()), None)
@@ -103,28 +111,27 @@ def _set_amplifier(
     mode = modes[gains.index(gain)]
     sdk.SetADChannel(mode.channel)
     sdk.SetOutputAmplifier(mode.amplifier)
-    if capabilities.ulSetFunctions & SetFunctions.HREADOUT:
+    if functions & SetFunctions.HREADOUT:
         sdk.SetHSSpeed(mode.amplifier, mode.rate)
-    if capabilities.ulSetFunctions & SetFunctions.PREAMPGAIN:
+    if functions & SetFunctions.PREAMPGAIN:
         sdk.SetPreAmpGain(mode.preamp)
     return {
         "amplifier": amplifiers[number],
         "bit_depth": sdk.GetBitDepth(mode.channel),
         "readout_rate_hz": rate_hz,
         "preamp_gain": gain,
-        "vertical_shift_s": _set_shift(sdk, capabilities, settings, name),
     }
 
 
-def _set_shift(sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str) -> float:
+def _set_shift(sdk: AndorSdk, camera: AndorConnection) -> float:
     """Choose the time to shift the rows by one; returns it, in seconds."""
+    wanted_s = camera.settings.vertical_shift_speed
     shifts_us = [sdk.GetVSSpeed(index) for index in range(sdk.GetNumberVSSpeeds())]
     index, shift_us = sdk.GetFastestRecommendedVSSpeed()
-    if settings.vertical_shift_speed is not None:
-        wanted_us = settings.vertical_shift_speed * 1e6
-        shift_us = _nearest(shifts_us, wanted_us, "vertical_shift_speed", "us", name)
+    if wanted_s is not None:
+        shift_us = _nearest(shifts_us, wanted_s * 1e6, "vertical_shift_speed", "us", camera.name)
         index = shifts_us.index(shift_us)
-    if capabilities.ulSetFunctions & SetFunctions.VREADOUT:
+    if camera.capabilities.ulSetFunctions & SetFunctions.VREADOUT:
         sdk.SetVSSpeed(index)
     return shift_us * 1e-6
 
@@ -144,26 +151,25 @@ def _nearest(values: Sequence[float], wanted: float, setting: str, unit: str, na
     raise DeviceError(name, text)
 
 
-def _set_cooler(
-    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
-) -> dict[str, Any]:
-    if settings.cooling is None:
-        return {}
-    if not capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
+def _set_cooler(sdk: AndorSdk, camera: AndorConnection) -> float | None:
+    """Start to cool; returns the temperature, in kelvins, None if the cooler is left as it is."""
+    cooling, name = camera.settings.cooling, camera.name
+    if cooling is None:
+        return None
+    if not camera.capabilities.ulSetFunctions & SetFunctions.TEMPERATURE:
         raise DeviceError(name, "this camera has no cooler; leave `cooling` out")
-    wanted_c = round(settings.cooling.temperature_k - ZERO_CELSIUS_K)
+    wanted_c = round(cooling.temperature_k - ZERO_CELSIUS_K)
     low_c, high_c = sdk.GetTemperatureRange()
     if not low_c <= wanted_c <= high_c:
         text = f"cooling: temperature is {wanted_c} degC; this camera takes {low_c} to {high_c} degC"
         raise DeviceError(name, text)
     sdk.SetTemperature(wanted_c)
     sdk.CoolerON()
-    return {"setpoint_k": wanted_c + ZERO_CELSIUS_K}
+    return wanted_c + ZERO_CELSIUS_K
 
 
-def _set_options(
-    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
-) -> dict[str, Any]:
+def _set_options(sdk: AndorSdk, camera: AndorConnection) -> None:
+    settings, capabilities = camera.settings, camera.capabilities
     if capabilities.ulSetFunctions & SetFunctions.BASELINECLAMP:
         sdk.SetBaselineClamp(int(settings.baseline_clamp))
     if capabilities.ulFeatures & Features.METADATA:
@@ -171,42 +177,34 @@ def _set_options(
     if capabilities.ulAcqModes & AcqModes.FRAMETRANSFER:
         sdk.SetFrameTransferMode(int(settings.frame_transfer))
     elif settings.frame_transfer:
-        raise DeviceError(name, "this camera has no frame transfer; leave `frame_transfer` out")
+        text = "this camera has no frame transfer; leave `frame_transfer` out"
+        raise DeviceError(camera.name, text)
     if settings.trigger_edge == "falling":
         sdk.SetTriggerInvert(1)
     if settings.fast_trigger:
         sdk.SetFastExtTrigger(1)
-    return {}
 
 
-def _set_region(
-    sdk: AndorSdk,
-    capabilities: Capabilities,
-    settings: AndorSettings,
-    sensor_shape: tuple[int, int],
-    name: str,
-) -> dict[str, Any]:
+def _set_region(sdk: AndorSdk, camera: AndorConnection, sensor_shape: tuple[int, int]) -> None:
     """Set region and binning; after frame transfer, which isolated crop needs."""
-    y, x, height, width = settings.mode.region or (0, 0, *sensor_shape)
-    binning, functions = settings.binning, capabilities.ulSetFunctions
+    settings, functions = camera.settings, camera.capabilities.ulSetFunctions
+    binning, (y, x, height, width) = settings.binning, settings.mode.region or (0, 0, *sensor_shape)
     sdk.SetReadMode(FULL_IMAGE)
     sdk.SetImage(binning, binning, x + 1, x + width, y + 1, y + height)
     if not settings.isolated_crop:
-        return {}
+        return
     if functions & SetFunctions.EXTENDED_CROP_MODE:
         sdk.SetIsolatedCropModeEx(1, height, width, binning, binning, x + 1, y + 1)
     elif functions & SetFunctions.CROPMODE and (y, x) == (0, 0):
         sdk.SetIsolatedCropMode(1, height, width, binning, binning)
     else:
         text = "this camera cannot crop this region; with `isolated_crop` it must begin at y: 0, x: 0"
-        raise DeviceError(name, f"{text}, if the camera has isolated crop at all")
-    return {}
+        raise DeviceError(camera.name, f"{text}, if the camera has isolated crop at all")
 
 
-def _set_gain_mode(
-    sdk: AndorSdk, capabilities: Capabilities, settings: AndorSettings, name: str
-) -> list[int] | None:
+def _set_gain_mode(sdk: AndorSdk, camera: AndorConnection) -> list[int] | None:
     """Choose the mode in which the EM gain is a factor; None for a camera or an amplifier without it."""
+    settings, name, capabilities = camera.settings, camera.name, camera.capabilities
     if settings.amplifier == "em" and capabilities.ulEMGainCapability & EM_GAIN_REAL:
         sdk.SetEMGainMode(REAL_GAIN_MODE)
         sdk.SetEMCCDGain(0)

@@ -1,6 +1,6 @@
 """How the simulated camera acquires series of frames, and the ring buffer that keeps them."""
 
-# ruff: noqa: N802 - the SDK's names
+# ruff: noqa: N802 - the SDK's names, which its manual explains
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The simulated camera: its identity, and which calls it accepts when."""
 
-# ruff: noqa: N802 - the SDK's names
+# ruff: noqa: D102, N802 - the SDK's names, which its manual explains
 
 from __future__ import annotations
 
@@ -96,11 +96,9 @@ class SimulatedCamera:
         return self.acquisition.pulse(self._clock.now() if t_s is None else t_s, width_s)
 
     def GetHeadModel(self) -> str:
-        """Model of the head."""
         return self.head.model
 
     def GetCameraSerialNumber(self) -> int:
-        """Serial number."""
         return self._serial
 
     def GetHardwareVersion(self) -> tuple[int, ...]:

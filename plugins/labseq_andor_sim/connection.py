@@ -1,6 +1,6 @@
 """The simulated library, and the camera behind it as the driver uses it."""
 
-# ruff: noqa: N802 - the SDK's names
+# ruff: noqa: D102, N802 - the SDK's names, which its manual explains
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class SimulatedConnection(AndorConnection):
 
     def warm(self, em_gain: float) -> None:
         """Compute what all simulated frames have in common."""
-        region = self._settings.mode.region
+        region = self.settings.mode.region
         is_whole = region == (0, 0, *self.camera.optics.sensor_shape)
-        mode = SensorMode(None if is_whole else region, self._settings.binning, em_gain)
+        mode = SensorMode(None if is_whole else region, self.settings.binning, em_gain)
         self._world.prepare_sensor(mode)
 
     def load(self) -> AndorSdk:
@@ -107,11 +107,9 @@ class Computer:
         return [camera for camera in self.cameras if not camera.faults.not_connected]
 
     def GetVersionInfo(self, _kind: int) -> str:
-        """Version of the SDK."""
         return "simulated"
 
     def GetAvailableCameras(self) -> int:
-        """Number of cameras."""
         return len(self._connected)
 
     def GetCameraHandle(self, index: int) -> int:
@@ -123,12 +121,10 @@ class Computer:
         return self._handle
 
     def SetCurrentCamera(self, handle: int) -> None:
-        """Select a camera."""
         self.camera(handle)
         self._handle = handle
 
     def Initialize(self, _folder: object) -> None:
-        """Get the camera that is selected ready."""
         self.camera().initialize()
 
     def ShutDown(self) -> None:

@@ -4,7 +4,7 @@ Methods that are named as functions of the SDK are these functions: they take wh
 written through pointers, and raise :class:`Refused` where the camera refuses the call.
 """
 
-# ruff: noqa: N802 - the SDK's names
+# ruff: noqa: D102, N802 - the SDK's names, which its manual explains
 
 from __future__ import annotations
 
@@ -114,26 +114,21 @@ class Cooler:
             self._change(is_on=False)
 
     def GetTemperatureRange(self) -> tuple[int, int]:
-        """Temperatures that can be set."""
         return COLDEST_SETPOINT_C, WARMEST_SETPOINT_C
 
     def SetTemperature(self, celsius: int) -> None:
-        """Set the temperature that the cooler aims at."""
         require(COLDEST_SETPOINT_C <= celsius <= WARMEST_SETPOINT_C)
         if celsius != self._setpoint_c:
             self._change(setpoint_c=celsius)
 
     def GetTemperatureF(self) -> float:
-        """Temperature; the code that is returned is the status."""
         return self.temperature_c
 
     def CoolerON(self) -> None:
-        """Start to cool."""
         if not self.is_on:
             self._change(is_on=True)
 
     def CoolerOFF(self) -> None:
-        """End cooling."""
         if self.is_on:
             self._change(is_on=False)
 
@@ -178,24 +173,19 @@ class Amplifiers:
         self._is_advanced = False
 
     def GetNumberADChannels(self) -> int:
-        """One converter."""
         return 1
 
     def SetADChannel(self, channel: int) -> None:
-        """Choose the converter."""
         require(channel == 0)
 
     def GetBitDepth(self, channel: int) -> int:
-        """Bits of the converter."""
         require(channel == 0)
         return 16
 
     def GetNumberAmp(self) -> int:
-        """Number of amplifiers."""
         return len(AMPLIFIERS)
 
     def GetAmpDesc(self, index: int) -> str:
-        """Name of an amplifier."""
         return pick(AMPLIFIERS, index)
 
     def SetOutputAmplifier(self, index: int) -> None:
@@ -204,7 +194,6 @@ class Amplifiers:
         self.is_em, self.rate_hz = index == 0, self._rates_hz[index][0]
 
     def GetNumberHSSpeeds(self, channel: int, amplifier: int) -> int:
-        """Number of read-out rates."""
         require(channel == 0)
         return len(pick(self._rates_hz, amplifier, Code.P2INVALID))
 
@@ -214,12 +203,10 @@ class Amplifiers:
         return pick(pick(self._rates_hz, amplifier, Code.P2INVALID), index, Code.P3INVALID) / 1e6
 
     def SetHSSpeed(self, amplifier: int, index: int) -> None:
-        """Choose the read-out rate."""
         require(amplifier == (0 if self.is_em else 1))
         self.rate_hz = pick(self._rates_hz[amplifier], index, Code.P2INVALID)
 
     def GetNumberVSSpeeds(self) -> int:
-        """Number of shift speeds."""
         return len(self._head.shifts_s)
 
     def GetVSSpeed(self, index: int) -> float:
@@ -231,15 +218,12 @@ class Amplifiers:
         return self._head.recommended_shift, self.GetVSSpeed(self._head.recommended_shift)
 
     def SetVSSpeed(self, index: int) -> None:
-        """Choose the shift speed."""
         self.shift_s = pick(self._head.shifts_s, index)
 
     def GetNumberPreAmpGains(self) -> int:
-        """Number of gains of the pre-amplifier."""
         return len(self._head.preamp_gains)
 
     def GetPreAmpGain(self, index: int) -> float:
-        """A gain of the pre-amplifier."""
         return pick(self._head.preamp_gains, index)
 
     def IsPreAmpGainAvailable(self, _channel: int, _amplifier: int, _rate: int, index: int) -> int:
@@ -264,7 +248,6 @@ class Amplifiers:
         self._is_advanced = bool(state)
 
     def GetEMGainRange(self) -> tuple[int, int]:
-        """Smallest and largest gain."""
         if self._gain_mode != REAL_GAIN_MODE:
             return 0, 255
         return MIN_GAIN, MAX_ADVANCED_GAIN if self._is_advanced else MAX_GAIN
@@ -343,7 +326,6 @@ class Optics:
         self.is_cropped = bool(active)
 
     def SetFrameTransferMode(self, state: int) -> None:
-        """Expose while the last frame is read."""
         self.frame_transfer = bool(state)
 
     def GetShutterMinTimes(self) -> tuple[int, int]:
@@ -351,7 +333,6 @@ class Optics:
         return CLOSING_MS, OPENING_MS
 
     def SetShutter(self, level: int, mode: int, closing_ms: int, opening_ms: int) -> None:
-        """Open or close the shutter."""
         require(level in (0, 1))
         require(mode in (SHUTTER_AUTO, SHUTTER_OPEN, SHUTTER_CLOSED), Code.P2INVALID)
         require(min(closing_ms, opening_ms) >= 0, Code.P3INVALID)
@@ -412,15 +393,12 @@ class Timing:
         return {KINETIC: self._n_kinetics, RUN_TILL_ABORT: ENDLESS}.get(self._mode, 1)
 
     def GetReadOutTime(self) -> float:
-        """Read-out time, in seconds."""
         return self.readout_s
 
     def GetMaximumExposure(self) -> float:
-        """Longest exposure, in seconds."""
         return MAX_EXPOSURE_S
 
     def SetExposureTime(self, seconds: float) -> None:
-        """Set the exposure."""
         require(0 <= seconds <= MAX_EXPOSURE_S)
         self._exposure_s = seconds
 
@@ -439,7 +417,6 @@ class Timing:
         self._mode = mode
 
     def SetNumberKinetics(self, number: int) -> None:
-        """Set the number of frames of a series."""
         require(number >= 1)
         self._n_kinetics = number
 
@@ -448,7 +425,6 @@ class Timing:
         require(number == 1)
 
     def SetTriggerMode(self, mode: int) -> None:
-        """Choose the trigger."""
         require(mode in (INTERNAL, EXTERNAL, EXTERNAL_START, EXTERNAL_EXPOSURE, SOFTWARE))
         self.trigger = mode
 
